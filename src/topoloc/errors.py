@@ -1,0 +1,58 @@
+"""Known failures, one line each on the command line; anything else is a bug and shows its traceback.
+
+TopolocError
+├── RecordingError        a recording (or one file of it) that cannot be read or makes no sense
+│   ├── UnknownFormatError    no format recognises the folder
+│   ├── CalibrationError      no calibration, or one that is not usable
+│   └── UnreadableImageError  an image that is missing, empty, truncated or too large
+├── TrajectoryError       a trajectory file with NaN, bad rotations, or times that match no frame
+├── MapError              a map that cannot be opened, read or written
+│   ├── MapVersionError       written by a later topoloc, schema unknown here
+│   └── EmptyMapError         no node could be built, or the map holds none
+├── QueryError            the call of a query is wrong (no camera, camera of another image size)
+└── MissingExtraError     an optional dependency is not installed; names the extra
+"""
+
+
+class TopolocError(Exception):
+    """A failure that the user can understand and mend: its text is one line, saying what and where."""
+
+
+class RecordingError(TopolocError):
+    """A recording that cannot be read."""
+
+
+class UnknownFormatError(RecordingError):
+    """No known format recognises this path."""
+
+
+class CalibrationError(RecordingError):
+    """Missing or unusable calibration."""
+
+
+class UnreadableImageError(RecordingError):
+    """An image file that is missing, empty, truncated, too large or no image at all."""
+
+
+class TrajectoryError(TopolocError):
+    """A trajectory that is malformed or fits no frame of the recording."""
+
+
+class MapError(TopolocError):
+    """A map file that cannot be opened, read or written."""
+
+
+class MapVersionError(MapError):
+    """A map file of a schema that this version does not know."""
+
+
+class EmptyMapError(MapError):
+    """A map without a single usable node."""
+
+
+class QueryError(TopolocError):
+    """A query that cannot be asked: no camera, or a camera of another image size."""
+
+
+class MissingExtraError(TopolocError):
+    """An optional dependency is missing; the text names the extra that brings it."""

@@ -1,0 +1,178 @@
+"""SE(3): rigid transforms between named frames.
+
+Frames are read right to left: ``cam_from_world = cam_from_node @ node_from_world``; equal neighbours cancel.
+Tangent vectors are ``xi = (translation, rotation)`` and perturbations act on the left:
+``exp(xi) @ a_from_b`` (Sola et al., *A micro Lie theory*, 2018).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from topoloc.errors import TrajectoryError
+
+_SMALL_ANGLE = 1e-7
+
+
+def skew(v: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """The matrix [v]x with ``skew(v) @ w == cross(v, w)``."""
+    x, y, z = v
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def exp_so3(omega: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Rotation matrix of a rotation vector (radians), by Rodrigues' formula."""
+    angle = float(np.linalg.norm(omega))
+    k = skew(omega)
+    if angle < _SMALL_ANGLE:
+        return np.eye(3) + k + 0.5 * k @ k
+    return np.eye(3) + np.sin(angle) / angle * k + (1.0 - np.cos(angle)) / angle**2 * (k @ k)
+
+
+def log_so3(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
+    """Rotation vector (radians, norm in [0, pi]) of a rotation matrix; stable at 0 and at pi by the quaternion."""
+    w, x, y, z = quat_wxyz_from_matrix(rotation)
+    v = np.array([x, y, z])
+    sin_half = float(np.linalg.norm(v))
+    if sin_half < _SMALL_ANGLE:
+        return 2.0 * v
+    return 2.0 * np.arctan2(sin_half, w) / sin_half * v
+
+
+def quat_wxyz_from_matrix(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
+    """Unit quaternion (w, x, y, z), w >= 0, of a rotation matrix (Shepperd's method)."""
+    m = rotation
+    four_squares = np.array(
+        [
+            1.0 + m[0, 0] + m[1, 1] + m[2, 2],
+            1.0 + m[0, 0] - m[1, 1] - m[2, 2],
+            1.0 - m[0, 0] + m[1, 1] - m[2, 2],
+            1.0 - m[0, 0] - m[1, 1] + m[2, 2],
+        ]
+    )
+    largest = int(np.argmax(four_squares))
+    s = four_squares[largest]
+    quat = (
+        np.array([s, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]),
+        np.array([m[2, 1] - m[1, 2], s, m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]]),
+        np.array([m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], s, m[1, 2] + m[2, 1]]),
+        np.array([m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], s]),
+    )[largest]
+    quat = quat / np.linalg.norm(quat)
+    return -quat if quat[0] < 0 else quat
+
+
+def matrix_from_quat_wxyz(quat_wxyz: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
+    """Rotation matrix of a quaternion (w, x, y, z), which need not be of unit length.
+
+    Raises:
+        TrajectoryError: the quaternion is not finite or has no length.
+    """
+    norm = float(np.linalg.norm(quat_wxyz))
+    if not np.isfinite(norm) or norm < 1e-6:
+        raise TrajectoryError(f"not a rotation: quaternion {np.asarray(quat_wxyz).tolist()}")
+    w, x, y, z = np.asarray(quat_wxyz, dtype=np.float64) / norm
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Rigid3:
+    """A rigid transform ``a_from_b``: ``point_a = rotation @ point_b + translation`` (metres)."""
+
+    rotation: Float[np.ndarray, "3 3"]
+    translation: Float[np.ndarray, "3"]
+
+    @staticmethod
+    def identity() -> Rigid3:
+        return Rigid3(np.eye(3), np.zeros(3))
+
+    @staticmethod
+    def from_matrix(matrix: np.ndarray, tolerance: float = 1e-2) -> Rigid3:
+        """From a 3x4 or 4x4 matrix, its rotation made exactly orthonormal.
+
+        Raises:
+            TrajectoryError: not finite, or not a rotation within `tolerance`.
+        """
+        m = np.asarray(matrix, dtype=np.float64)
+        if m.shape not in ((3, 4), (4, 4)) or not np.all(np.isfinite(m)):
+            raise TrajectoryError(f"not a pose: {'shape ' + str(m.shape) if m.ndim != 2 or m.size < 12 else 'NaN or infinite entries'}")
+        u, singular, vt = np.linalg.svd(m[:3, :3])
+        if np.any(np.abs(singular - 1.0) > tolerance) or np.linalg.det(u @ vt) < 0:
+            raise TrajectoryError("not a pose: its 3x3 part is no rotation")
+        return Rigid3(u @ vt, m[:3, 3].copy())
+
+    @staticmethod
+    def from_quat_wxyz(quat_wxyz: np.ndarray, translation: np.ndarray) -> Rigid3:
+        """From a quaternion (w, x, y, z) and a translation in metres.
+
+        Raises:
+            TrajectoryError: values that are not finite, or a quaternion of no length.
+        """
+        t = np.asarray(translation, dtype=np.float64)
+        if t.shape != (3,) or not np.all(np.isfinite(t)):
+            raise TrajectoryError(f"not a translation: {t.tolist()}")
+        return Rigid3(matrix_from_quat_wxyz(np.asarray(quat_wxyz, dtype=np.float64)), t)
+
+    @staticmethod
+    def exp(xi: Float[np.ndarray, "6"]) -> Rigid3:
+        """The transform of a tangent vector (translation, rotation)."""
+        rho, omega = xi[:3], xi[3:]
+        return Rigid3(exp_so3(omega), _left_jacobian_so3(omega) @ rho)
+
+    def log(self) -> Float[np.ndarray, "6"]:
+        """The tangent vector (translation, rotation) whose `exp` this is."""
+        omega = log_so3(self.rotation)
+        return np.concatenate([np.linalg.solve(_left_jacobian_so3(omega), self.translation), omega])
+
+    def __matmul__(self, other: Rigid3) -> Rigid3:
+        return Rigid3(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
+
+    def inverse(self) -> Rigid3:
+        return Rigid3(self.rotation.T.copy(), -(self.rotation.T @ self.translation))
+
+    def apply(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Points of frame b, given in frame a."""
+        return points @ self.rotation.T + self.translation
+
+    def matrix(self) -> Float[np.ndarray, "4 4"]:
+        m = np.eye(4)
+        m[:3, :3] = self.rotation
+        m[:3, 3] = self.translation
+        return m
+
+    def quat_wxyz(self) -> Float[np.ndarray, "4"]:
+        return quat_wxyz_from_matrix(self.rotation)
+
+    def adjoint(self) -> Float[np.ndarray, "6 6"]:
+        """Ad with ``self @ exp(xi) == exp(Ad @ xi) @ self``."""
+        ad = np.zeros((6, 6))
+        ad[:3, :3] = ad[3:, 3:] = self.rotation
+        ad[:3, 3:] = skew(self.translation) @ self.rotation
+        return ad
+
+    def angle(self) -> float:
+        """Rotation angle in radians, in [0, pi]."""
+        return float(np.linalg.norm(log_so3(self.rotation)))
+
+    def interpolate(self, other: Rigid3, fraction: float) -> Rigid3:
+        """The pose `fraction` of the way from this one to `other`: position linear, rotation along the geodesic."""
+        omega = log_so3(other.rotation @ self.rotation.T)
+        translation = (1.0 - fraction) * self.translation + fraction * other.translation
+        return Rigid3(exp_so3(fraction * omega) @ self.rotation, translation)
+
+
+def _left_jacobian_so3(omega: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    angle = float(np.linalg.norm(omega))
+    k = skew(omega)
+    if angle < 1e-5:  # the closed form loses all digits of (angle - sin angle) below this
+        return np.eye(3) + 0.5 * k + k @ k / 6.0
+    return np.eye(3) + (1.0 - np.cos(angle)) / angle**2 * k + (angle - np.sin(angle)) / angle**3 * (k @ k)
