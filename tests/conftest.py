@@ -1,0 +1,31 @@
+"""Shapes in the annotations are checked at run time in every test; the recordings beside the project are found here."""
+
+from __future__ import annotations
+
+import os
+import pkgutil
+from pathlib import Path
+
+import pytest
+from jaxtyping import install_import_hook
+
+import topoloc
+
+
+def _modules_with_checked_shapes() -> list[str]:
+    """All leaf modules but the Numba kernels, whose compiler cannot take a wrapped function."""
+    modules = pkgutil.walk_packages(topoloc.__path__, "topoloc.")
+    return [m.name for m in modules if not m.ispkg and not m.name.endswith("_kernels")]
+
+
+_hook = install_import_hook(_modules_with_checked_shapes(), "beartype.beartype")
+
+SHARED = Path(os.environ.get("TOPOLOC_SHARED", Path(__file__).parents[2] / "shared")).resolve()
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder of real recordings and reference values."""
+    if not (SHARED / "data").is_dir():
+        pytest.skip(f"no recordings at {SHARED} (set TOPOLOC_SHARED)")
+    return SHARED
