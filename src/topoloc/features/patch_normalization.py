@@ -1,0 +1,70 @@
+"""Patch normalisation: every pixel by the mean and standard deviation of its own neighbourhood.
+
+The paper, section III-C: ``N(p) = (I(p) - mu_P) / (sigma_P + epsilon)`` in 17x17 windows, before the key points, which
+makes the features outlive a change of lighting (Zhang and Kleeman, 2009).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from topoloc.features.bands import run_in_bands
+from topoloc.features.patch_normalization_kernels import normalize_band
+
+
+@dataclass(frozen=True)
+class PatchNormalizationConfig:
+    """How to normalise; `PatchNormalizationConfig.paper()` is the paper's own form.
+
+    window_px: side of the window, odd. epsilon: grey levels added to sigma; tiny as in the paper it only prevents the
+    division by zero, a few grey levels keep plain surfaces from becoming amplified sensor noise. shape: `square` weighs all
+    pixels of the window alike, `round` is the box of half the width applied twice, a pyramid-like bell of the same support
+    without the axis-parallel ringing. gain: grey levels of the result a unit of N, which is mapped to 128 + gain N and clipped.
+    """
+
+    window_px: int = 17
+    epsilon: float = 1e-3
+    shape: Literal["square", "round"] = "square"
+    gain: float = 40.0
+
+    def __post_init__(self) -> None:
+        largest = 127 if self.shape == "square" else 37  # sums of squares stay within 32 bits
+        if not 3 <= self.window_px <= largest or self.window_px % 2 == 0:
+            raise ValueError(f"window_px must be odd and within 3 .. {largest}, not {self.window_px}")
+        if not self.epsilon >= 0.0 or not self.gain > 0.0:
+            raise ValueError(f"epsilon must not be negative and gain be positive, not {self.epsilon} and {self.gain}")
+
+    @staticmethod
+    def paper() -> PatchNormalizationConfig:
+        """Square 17x17 windows, epsilon a mere guard against division by zero."""
+        return PatchNormalizationConfig(window_px=17, epsilon=1e-3, shape="square")
+
+    def boxes(self) -> tuple[int, int]:
+        """Sides of the two boxes that are applied one after the other; together they reach over `window_px`."""
+        if self.shape == "square":
+            return self.window_px, 1
+        second = (self.window_px + 1) // 2
+        return self.window_px + 1 - second, second
+
+
+def patch_normalize(image: UInt8[np.ndarray, "h w"], config: PatchNormalizationConfig, num_threads: int = 2) -> UInt8[np.ndarray, "h w"]:
+    """The normalised image N as 8 bit: 128 + gain N, rounded, clipped to 0 .. 255.
+
+    The picture is reflected at its borders (the border row itself not repeated). Where sigma + epsilon is 0, N is 0.
+    The result is the same, byte for byte, for any `num_threads`.
+    """
+    first_box, second_box = config.boxes()
+    radius = config.window_px // 2
+    padded = cv2.copyMakeBorder(image, radius, radius, radius, radius, cv2.BORDER_REFLECT_101)
+    normalized = np.empty_like(image, order="C")
+
+    def run(first_row: int, last_row: int) -> None:
+        normalize_band(padded, normalized, first_row, last_row, first_box, second_box, config.epsilon, config.gain)
+
+    run_in_bands(run, len(image), num_threads)
+    return normalized
