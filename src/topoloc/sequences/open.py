@@ -1,0 +1,70 @@
+"""Open a recording of any known format by looking at its folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from topoloc.errors import RecordingError, UnknownFormatError
+from topoloc.sequences import kitti, seven_scenes
+from topoloc.sequences.frame import StereoSequence
+from topoloc.sequences.selection import parse_selection, sequence_subset
+
+
+@dataclass(frozen=True)
+class SequenceFormat:
+    """How one format is told from the others, and opened."""
+
+    looks_for: str
+    recognises: Callable[[Path], bool]
+    open: Callable[[Path], StereoSequence]
+
+
+# In the order in which they are asked; the plain folder takes what is left.
+FORMATS = {
+    "seven_scenes": SequenceFormat(seven_scenes.LOOKS_FOR, seven_scenes.recognises, seven_scenes.open_seven_scenes),
+    "kitti": SequenceFormat(kitti.LOOKS_FOR, kitti.recognises, kitti.open_kitti),
+}
+
+
+def open_sequence(path: str | Path, format: str | None = None) -> StereoSequence:
+    """Open a recording, or some frames of it. Pictures are read frame by frame, when asked for.
+
+    Args:
+        path: a folder, or one picture file. A part is chosen by a suffix: ``PATH@START:STOP:STEP`` as Python slices,
+            several of them by commas (``@0:10,50:60``); ``PATH@0-59/100`` are the frames whose number modulo 100 is 0 to 59.
+        format: one of `FORMATS`; recognised where None.
+
+    Raises:
+        UnknownFormatError: `format` is none of these, or no format recognises the folder.
+        RecordingError: nothing is there, nothing is chosen, or the recording is broken; CalibrationError is one of these.
+        TrajectoryError: the recording's truth is malformed or fits no frame.
+    """
+    if format is not None and format not in FORMATS:
+        raise UnknownFormatError(f"format {format!r} is not known; there are {', '.join(FORMATS)}")
+    folder, selection = _split_selection(str(path))
+    if not folder.exists():
+        raise RecordingError(f"{folder}: no such file or folder")
+    sequence = FORMATS[format or _recognise(folder)].open(folder)
+    if selection is None:
+        return sequence
+    indices = parse_selection(selection, len(sequence))
+    if not indices:
+        raise RecordingError(f"{path}: none of the {len(sequence)} frames is chosen")
+    return sequence_subset(sequence, indices)
+
+
+def _split_selection(path: str) -> tuple[Path, str | None]:
+    folder, at, selection = path.rpartition("@")
+    if not at or Path(path).exists():
+        return Path(path), None
+    return Path(folder), selection
+
+
+def _recognise(path: Path) -> str:
+    for name, candidate in FORMATS.items():
+        if candidate.recognises(path):
+            return name
+    looked_for = "; ".join(f"{name}: {candidate.looks_for}" for name, candidate in FORMATS.items())
+    raise UnknownFormatError(f"{path}: no known recording. Looked for {looked_for}")

@@ -1,0 +1,155 @@
+"""The one sequence type behind every format: lists in memory, pictures on disk until they are asked for."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from topoloc.errors import RecordingError, UnreadableImageError
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rig import StereoRig
+from topoloc.geometry.rigid import Rigid3
+from topoloc.sequences.frame import DepthImage, Image, StereoFrame, StereoSequence
+from topoloc.sequences.pictures import PICTURE_SUFFIXES, read_depth, read_image
+
+# Recordings without times are taken to be of this rate.
+DEFAULT_RATE_HZ = 10
+
+
+@dataclass(frozen=True, eq=False)
+class RightPictures:
+    """The right picture of each frame, and the rig."""
+
+    paths: list[Path]
+    rig: StereoRig
+
+
+@dataclass(frozen=True, eq=False)
+class DepthPictures:
+    """The depth picture of each frame: its scale (file units a metre), its camera, and where that camera sits."""
+
+    paths: list[Path]
+    units_per_metre: float
+    camera: Camera
+    cam_from_depth: Rigid3
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A StereoSequence on disk. `names` are picture paths relative to `root`; `camera` is that of the left or colour picture."""
+
+    name: str
+    root: Path
+    names: list[str]
+    t_ns: list[int]
+    poses: list[Rigid3 | None]
+    camera: Camera | None
+    right: RightPictures | None = None
+    depth: DepthPictures | None = None
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, index: int) -> StereoFrame:
+        """Read one frame.
+
+        Raises:
+            IndexError: no such frame.
+            UnreadableImageError: a picture is missing, broken, or of another size than its camera.
+        """
+        path = self.root / self.names[index]
+        image = _read_as(path, self.camera)
+        frame = StereoFrame(self.names[index], self.t_ns[index], image, self.camera, world_from_cam=self.poses[index])
+        if self.right is not None:
+            right = _read_as(self.right.paths[index], self.right.rig.right)
+            return replace(frame, right=right, rig=self.right.rig)
+        if self.depth is not None:
+            depth = read_depth(self.depth.paths[index], self.depth.units_per_metre)
+            _check_size(self.depth.paths[index], depth.shape, self.depth.camera)
+            return replace(frame, depth=DepthImage(depth, self.depth.camera, self.depth.cam_from_depth))
+        return frame
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceView:
+    """Some frames of another sequence, in this order, with these poses."""
+
+    base: StereoSequence
+    indices: list[int]
+    poses: list[Rigid3 | None]
+
+    @property
+    def name(self) -> str:
+        return self.base.name
+
+    @property
+    def names(self) -> list[str]:
+        names = self.base.names
+        return [names[index] for index in self.indices]
+
+    @property
+    def t_ns(self) -> list[int]:
+        t_ns = self.base.t_ns
+        return [t_ns[index] for index in self.indices]
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __getitem__(self, index: int) -> StereoFrame:
+        """Read one frame. Raises as the sequence below does."""
+        return replace(self.base[self.indices[index]], world_from_cam=self.poses[index])
+
+
+def list_pictures(folder: Path, suffix: str = "") -> list[Path]:
+    """The picture files of a folder in natural order (2 before 10), those only whose name ends in `suffix` if given.
+
+    Raises:
+        RecordingError: the folder is missing or holds no picture.
+    """
+    try:
+        paths = [path for path in folder.iterdir() if path.suffix.lower() in PICTURE_SUFFIXES and path.stem.endswith(suffix)]
+    except OSError as error:
+        raise RecordingError(f"{folder}: {error.strerror}") from None
+    paths = [path for path in paths if not path.name.startswith(".")]
+    if not paths:
+        raise RecordingError(f"{folder}: no pictures in this folder")
+    return sorted(paths, key=lambda path: natural_key(path.name))
+
+
+def natural_key(name: str) -> list[tuple[int, str]]:
+    """A sort key by which numbers inside names compare as numbers."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", name)]
+
+
+def check_pairs(left: Sequence[Path], right: Sequence[Path]) -> None:
+    """Hold that two lists of pictures go together, frame by frame.
+
+    Raises:
+        RecordingError: of unequal lengths, or the numbers in two names that would go together differ.
+    """
+    if len(left) != len(right):
+        raise RecordingError(
+            f"{left[0].parent}: {len(left)} pictures here but {len(right)} in {right[0].parent.name}; every picture needs its partner"
+        )
+    for path, other in zip(left, right, strict=True):
+        if re.findall(r"\d+", path.stem)[-1:] != re.findall(r"\d+", other.stem)[-1:]:
+            raise RecordingError(f"{path}: its partner in {other.parent.name} is missing (the next there is {other.name})")
+
+
+def times_by_rate(num_frames: int, rate_hz: int = DEFAULT_RATE_HZ) -> list[int]:
+    """Times in nanoseconds of frames at a steady rate from 0."""
+    return [index * 1_000_000_000 // rate_hz for index in range(num_frames)]
+
+
+def _read_as(path: Path, camera: Camera | None) -> Image:
+    image = read_image(path)
+    if camera is not None:
+        _check_size(path, image.shape, camera)
+    return image
+
+
+def _check_size(path: Path, shape: tuple[int, ...], camera: Camera) -> None:
+    if shape[:2] != (camera.height, camera.width):
+        raise UnreadableImageError(f"{path}: {shape[1]}x{shape[0]} pixels, but its camera is of {camera.width}x{camera.height}")

@@ -1,0 +1,203 @@
+"""Trajectories: TUM files and KITTI rows, read, written, and looked up at the times of frames.
+
+TUM (Sturm et al., IROS 2012): a line is ``t tx ty tz qx qy qz qw``, seconds, comments start with ``#``.
+KITTI (Geiger et al., CVPR 2012): a line is the upper 3x4 of a pose matrix, row by row, one line a frame.
+Both are world_from_cam, in metres.
+"""
+
+from __future__ import annotations
+
+import bisect
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+
+from topoloc.errors import TrajectoryError
+from topoloc.geometry.rigid import Rigid3
+from topoloc.sequences.frame import StereoSequence
+from topoloc.sequences.recording import SequenceView
+
+NANOSECONDS = 1_000_000_000
+# Above this a time is taken for nanoseconds (ORB-SLAM3 writes EuRoC's so): as seconds it would be 30 000 years.
+_MAX_SECONDS = 10**12
+# Times written with few decimals still mean the frame they were made from.
+_SAME_TIME_NS = 1_000_000
+_QUATERNION_TOLERANCE = 1e-2
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Poses in order of time. `t_ns` are their times, strictly increasing, or None where a pose goes with a frame by its row."""
+
+    world_from_cam: list[Rigid3]
+    t_ns: list[int] | None = None
+
+    def __len__(self) -> int:
+        return len(self.world_from_cam)
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """Read a TUM file (8 columns; times in seconds, or nanoseconds by their size) or KITTI rows (12 columns).
+
+    Raises:
+        TrajectoryError: missing, empty, a wrong number of columns, NaN, no rotation, or times that do not increase; with the line.
+    """
+    rows = _read_rows(path)
+    if not rows:
+        raise TrajectoryError(f"{path}: no poses in this file")
+    num_columns = len(rows[0][1])
+    if num_columns not in (8, 12):
+        raise TrajectoryError(f"{path}, line {rows[0][0]}: {num_columns} columns; a TUM line has 8, a KITTI line 12")
+    for line, tokens in rows:
+        if len(tokens) != num_columns:
+            raise TrajectoryError(f"{path}, line {line}: {len(tokens)} columns, the lines before have {num_columns}")
+    if num_columns == 12:
+        return Trajectory([_pose(path, line, lambda t=tokens: Rigid3.from_matrix(_floats(t).reshape(3, 4))) for line, tokens in rows])
+    t_ns = parse_times([tokens[0] for _, tokens in rows], path, [line for line, _ in rows])
+    return Trajectory([_pose(path, line, lambda t=tokens: _pose_from_tum(t)) for line, tokens in rows], t_ns)
+
+
+def parse_times(tokens: Sequence[str], path: Path, lines: Sequence[int]) -> list[int]:
+    """Integer nanoseconds of written times, exact to the last decimal; seconds, or nanoseconds where a time is above 1e12.
+
+    Raises:
+        TrajectoryError: a token is no finite number, or the times do not increase strictly.
+    """
+    times: list[Decimal] = []
+    for token, line in zip(tokens, lines, strict=True):
+        try:
+            time = Decimal(token)
+        except InvalidOperation:
+            time = Decimal("nan")
+        if not time.is_finite():
+            raise TrajectoryError(f"{path}, line {line}: {token!r} is not a time")
+        times.append(time)
+    in_nanoseconds = max(times, default=Decimal(0)) > _MAX_SECONDS
+    t_ns = [int((time if in_nanoseconds else time.scaleb(9)).to_integral_value()) for time in times]
+    for index in range(1, len(t_ns)):
+        if t_ns[index] <= t_ns[index - 1]:
+            raise TrajectoryError(f"{path}, line {lines[index]}: time {tokens[index]} is not after {tokens[index - 1]}")
+    return t_ns
+
+
+def write_tum(path: Path, trajectory: Trajectory) -> None:
+    """Write a TUM file, atomically.
+
+    Raises:
+        TrajectoryError: the trajectory has no times, or the file cannot be written.
+    """
+    if trajectory.t_ns is None:
+        raise TrajectoryError(f"{path}: a TUM file needs times, and these poses have none")
+    lines = ["# t tx ty tz qx qy qz qw (s, m; world_from_cam)"]
+    for t_ns, pose in zip(trajectory.t_ns, trajectory.world_from_cam, strict=True):
+        w, x, y, z = pose.quat_wxyz()
+        lines.append(" ".join([f"{Decimal(t_ns).scaleb(-9):.9f}", *(f"{value:.12g}" for value in (*pose.translation, x, y, z, w))]))
+    _write_atomically(path, lines)
+
+
+def write_kitti(path: Path, trajectory: Trajectory) -> None:
+    """Write KITTI rows, atomically.
+
+    Raises:
+        TrajectoryError: the file cannot be written.
+    """
+    rows = (pose.matrix()[:3].ravel() for pose in trajectory.world_from_cam)
+    _write_atomically(path, [" ".join(f"{value:.12e}" for value in row) for row in rows])
+
+
+def poses_at(trajectory: Trajectory, t_ns: Sequence[int], max_gap: float = 0.2) -> list[Rigid3 | None]:
+    """The pose at each time: interpolated where its neighbours are at most `max_gap` seconds apart, else the pose within 1 ms, else None.
+
+    Raises:
+        TrajectoryError: the trajectory has no times.
+    """
+    if trajectory.t_ns is None:
+        raise TrajectoryError("these poses have no times, they go with frames row by row")
+    return [_pose_at(trajectory.t_ns, trajectory.world_from_cam, time, round(max_gap * NANOSECONDS)) for time in t_ns]
+
+
+def frame_poses(trajectory: Trajectory, t_ns: Sequence[int], path: Path, max_gap: float = 0.2) -> list[Rigid3 | None]:
+    """The pose of each frame: by time, or by row where the trajectory has no times.
+
+    Raises:
+        TrajectoryError: rows and frames differ in number, or no frame has a pose; names `path`.
+    """
+    if trajectory.t_ns is None:
+        if len(trajectory) != len(t_ns):
+            raise TrajectoryError(f"{path}: {len(trajectory)} poses for {len(t_ns)} frames")
+        return list(trajectory.world_from_cam)
+    poses = poses_at(trajectory, t_ns, max_gap)
+    if t_ns and all(pose is None for pose in poses):
+        span = f"{trajectory.t_ns[0] / 1e9:.3f} to {trajectory.t_ns[-1] / 1e9:.3f} s"
+        raise TrajectoryError(f"{path}: no frame has a pose; it covers {span}, the frames {t_ns[0] / 1e9:.3f} to {t_ns[-1] / 1e9:.3f} s")
+    return poses
+
+
+def with_trajectory(sequence: StereoSequence, path: Path) -> StereoSequence:
+    """The same recording with the poses of a trajectory file: TUM by time, KITTI rows frame by frame.
+
+    Raises:
+        TrajectoryError: the file is malformed, or fits no frame.
+    """
+    poses = frame_poses(read_trajectory(path), sequence.t_ns, path)
+    return SequenceView(sequence, list(range(len(sequence))), poses)
+
+
+def _pose_at(times: list[int], poses: list[Rigid3], time: int, max_gap_ns: int) -> Rigid3 | None:
+    after = bisect.bisect_left(times, time)
+    if after < len(times) and times[after] == time:
+        return poses[after]
+    if 0 < after < len(times) and times[after] - times[after - 1] <= max_gap_ns:
+        fraction = (time - times[after - 1]) / (times[after] - times[after - 1])
+        return poses[after - 1].interpolate(poses[after], fraction)
+    neighbours = [index for index in (after - 1, after) if 0 <= index < len(times)]
+    nearest = min(neighbours, key=lambda index: abs(times[index] - time), default=None)
+    return poses[nearest] if nearest is not None and abs(times[nearest] - time) <= _SAME_TIME_NS else None
+
+
+def _read_rows(path: Path) -> list[tuple[int, list[str]]]:
+    """Line number and columns of each line that is neither blank nor a comment."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise TrajectoryError(f"{path}: no such trajectory") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise TrajectoryError(f"{path}: not a trajectory file ({error.__class__.__name__})") from None
+    numbered = ((number, line.partition("#")[0].replace(",", " ").split()) for number, line in enumerate(text.splitlines(), start=1))
+    return [(number, tokens) for number, tokens in numbered if tokens]
+
+
+def _floats(tokens: list[str]) -> np.ndarray:
+    try:
+        return np.array([float(token) for token in tokens])
+    except ValueError:
+        raise TrajectoryError("not a number in it") from None
+
+
+def _pose_from_tum(tokens: list[str]) -> Rigid3:
+    _, tx, ty, tz, qx, qy, qz, qw = _floats(tokens)
+    quat_wxyz = np.array([qw, qx, qy, qz])
+    if abs(np.linalg.norm(quat_wxyz) - 1.0) > _QUATERNION_TOLERANCE:
+        raise TrajectoryError(f"not a rotation: quaternion of length {np.linalg.norm(quat_wxyz):g}")
+    return Rigid3.from_quat_wxyz(quat_wxyz, np.array([tx, ty, tz]))
+
+
+def _pose(path: Path, line: int, make) -> Rigid3:
+    try:
+        return make()
+    except TrajectoryError as error:
+        raise TrajectoryError(f"{path}, line {line}: {error}") from None
+
+
+def _write_atomically(path: Path, lines: list[str]) -> None:
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        os.replace(part, path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise TrajectoryError(f"{path}: cannot be written ({error.strerror})") from None
