@@ -23,7 +23,8 @@ from topoloc.errors import MapError, MapVersionError, TopolocError
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.mapping.topomap import CoarseModel, Edge, NodeSummary, PlaceImage, TopoMetricMap, TopoNode
+from topoloc.mapping.topomap import Edge, NodeSummary, PlaceImage, TopoMetricMap, TopoNode
+from topoloc.places.coarse import CoarseModel
 
 APPLICATION_ID = 0x544F504F  # "TOPO", in the database's header
 SCHEMA_VERSION = 1
@@ -237,10 +238,10 @@ class _StoredModels(Mapping[str, CoarseModel]):
         return iter(self._names)
 
     def __getitem__(self, name: str) -> CoarseModel:
+        if name not in self._names:
+            raise KeyError(name)
         with self._file.reading():
             row = self._file.database.execute("SELECT settings, arrays FROM coarse_models WHERE name = ?", (name,)).fetchone()
-            if row is None:
-                raise KeyError(name)
             with np.load(io.BytesIO(row[1]), allow_pickle=False) as arrays:
                 return CoarseModel(name, json.loads(row[0]), dict(arrays))
 

@@ -16,6 +16,7 @@ from jaxtyping import Float32
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.places.coarse import CoarseModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,15 +69,6 @@ class Edge:
 
     source_id: int
     target_id: int
-
-
-@dataclass(frozen=True, eq=False)
-class CoarseModel:
-    """A coarse localizer as the map keeps it: its settings and its arrays (vocabulary, vectors, node of each vector ...)."""
-
-    name: str
-    settings: Mapping[str, Any]
-    arrays: Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)

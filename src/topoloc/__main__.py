@@ -1,0 +1,8 @@
+"""`python -m topoloc` is `topoloc`."""
+
+import sys
+
+from topoloc.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,60 @@
+"""The command line: `topoloc COMMAND`. Each command is a module of this package, imported only when it is called."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+# name -> what `topoloc --help` says of it; the module of the same name holds a dataclass of the settings, `Command`, with `run`
+COMMANDS = {
+    "build": "map a place: a stereo or RGB-D recording becomes one map file",
+    "localize": "where were these images taken? 6-DoF poses of images, folders, recordings",
+    "evaluate": "localize a recording with known truth and judge the poses",
+    "info": "what a map file holds",
+}
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run one command. Returns the exit status: 0 done, 1 a known failure (one line on stderr), 2 wrong usage."""
+    args = sys.argv[1:] if args is None else args
+    if not args or args[0] in ("-h", "--help"):
+        print(_help())
+        return 0 if args else 2
+    if args[0] == "--version":
+        from importlib.metadata import version
+
+        print(version("topoloc"))
+        return 0
+    name, *rest = args
+    if name not in COMMANDS:
+        print(f"error: unknown command {name!r}; commands: {', '.join(COMMANDS)}", file=sys.stderr)
+        return 2
+    return _run(name, rest)
+
+
+def _run(name: str, args: list[str]) -> int:
+    import tyro
+
+    from topoloc.errors import TopolocError
+
+    module = importlib.import_module(f"topoloc.cli.{name}")
+    try:
+        return tyro.cli(module.Command, args=args, prog=f"topoloc {name}", description=COMMANDS[name].capitalize() + ".").run()
+    except TopolocError as error:
+        print("error: " + " ".join(str(error).split()), file=sys.stderr)
+    except KeyboardInterrupt:
+        print("error: interrupted; no file was changed", file=sys.stderr)
+    except BrokenPipeError:  # the reader of our output went away
+        sys.stderr.close()
+    return 1
+
+
+def _help() -> str:
+    width = max(map(len, COMMANDS))
+    commands = "\n".join(f"  {name:<{width}}  {summary}" for name, summary in COMMANDS.items())
+    return (
+        "usage: topoloc COMMAND ...\n\n"
+        "Walk through a place once with a stereo or RGB-D camera; afterwards any single image of it gets a 6-DoF pose.\n\n"
+        f"commands:\n{commands}\n\n"
+        "`topoloc COMMAND --help` says everything about one; `topoloc --version` prints the version."
+    )

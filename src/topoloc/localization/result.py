@@ -1,0 +1,80 @@
+"""What a query gets: a pose with its uncertainty, or an honest "not here". Never a fallback pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from topoloc.geometry.rigid import Rigid3
+from topoloc.places.coarse import NodeScore
+
+Reason = Literal["too_few_matches", "too_few_inliers", "ambiguous", "not_in_map", "jump", "unreadable"]
+
+
+@dataclass(frozen=True, eq=False)
+class Localization:
+    """The image was taken at `world_from_cam`.
+
+    `covariance` (6, 6) is that of the left perturbation of world_from_cam, order (translation, rotation), metres and
+    radians. `probability` is that of the pose being right. `node_id` is the node that most inliers come from; `times_ms`
+    the milliseconds of each stage.
+    """
+
+    world_from_cam: Rigid3
+    covariance: Float[np.ndarray, "6 6"]
+    probability: float
+    node_id: int
+    candidates: list[NodeScore]
+    num_matches: int
+    num_inliers: int
+    times_ms: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def localized(self) -> Literal[True]:
+        return True
+
+    def to_json(self, query: str) -> dict[str, Any]:
+        """One line of the result file, see docs/results.md."""
+        pose = {"translation": self.world_from_cam.translation.tolist(), "quat_wxyz": self.world_from_cam.quat_wxyz().tolist()}
+        return {
+            "query": query,
+            "localized": True,
+            "world_from_cam": pose,
+            "covariance": self.covariance.tolist(),
+            "probability": self.probability,
+            "node": self.node_id,
+            **_evidence_json(self),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class NotLocalized:
+    """No pose can be vouched for; `reason` says why."""
+
+    reason: Reason
+    candidates: list[NodeScore] = field(default_factory=list)
+    num_matches: int = 0
+    num_inliers: int = 0
+    times_ms: dict[str, float] = field(default_factory=dict)
+    detail: str = ""
+
+    @property
+    def localized(self) -> Literal[False]:
+        return False
+
+    def to_json(self, query: str) -> dict[str, Any]:
+        """One line of the result file, see docs/results.md."""
+        line = {"query": query, "localized": False, "reason": self.reason, **_evidence_json(self)}
+        return line | ({"detail": self.detail} if self.detail else {})
+
+
+def _evidence_json(result: Localization | NotLocalized) -> dict[str, Any]:
+    return {
+        "candidates": [[c.node_id, round(c.score, 4)] for c in result.candidates],
+        "num_matches": result.num_matches,
+        "num_inliers": result.num_inliers,
+        "times_ms": {stage: round(ms, 3) for stage, ms in result.times_ms.items()},
+    }

@@ -1,0 +1,125 @@
+"""surf-vlad: VLAD of the map's own local features (Jegou et al. 2010), no weights, no torch.
+
+The vocabulary is learnt from the map's descriptors. Residuals are normalised one by one (Delhumeau et al. 2013), each
+word's sum is normalised on its own (Arandjelovic & Zisserman 2013), and the whole is whitened by the PCA of the mapping
+images where there are enough of them to learn it from.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import faiss
+import numpy as np
+from jaxtyping import Float32, Int
+
+from topoloc.features.features import Features
+from topoloc.places.coarse import CoarseModel, Image, NodeScore
+from topoloc.places.neighbours import PlaceIndex
+
+
+@dataclass(frozen=True)
+class VladConfig:
+    """Settings of surf-vlad."""
+
+    num_words: int = 64
+    """Visual words of the vocabulary."""
+    dimension: int = 256
+    """Length of a place vector after PCA, at most."""
+    max_training_descriptors: int = 100_000
+    """Descriptors that the vocabulary is learnt from, at most."""
+    seed: int = 0
+
+
+class SurfVlad:
+    """The coarse localizer `surf-vlad`."""
+
+    name = "surf-vlad"
+
+    def __init__(
+        self,
+        words: Float32[np.ndarray, "k d"],
+        mean: Float32[np.ndarray, " kd"],
+        projection: Float32[np.ndarray, "p kd"],
+        vectors: Float32[np.ndarray, "n p"],
+        node_ids: Int[np.ndarray, " n"],
+        config: VladConfig,
+    ) -> None:
+        self._words, self._mean, self._projection, self._vectors = words, mean, projection, vectors
+        self._node_ids, self._config = node_ids, config
+        self._index = PlaceIndex(vectors, node_ids)
+
+    @staticmethod
+    def fit(words: Float32[np.ndarray, "k d"], vlads: Float32[np.ndarray, "n kd"], node_ids: Int[np.ndarray, " n"], config: VladConfig) -> SurfVlad:
+        """From the vocabulary (`learn_words`), the `vlad` of each mapping image and the node it belongs to."""
+        mean, projection = _learn_whitening(vlads, config.dimension)
+        return SurfVlad(words, mean, projection, _project(vlads, mean, projection), node_ids, config)
+
+    def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
+        """See `CoarseLocalizer.rank`; the picture itself is not looked at."""
+        vector = _project(vlad(features.descriptors, self._words)[None], self._mean, self._projection)[0]
+        return self._index.rank_nodes(vector, num_candidates)
+
+    def to_model(self) -> CoarseModel:
+        """What the map file keeps: vectors as half floats, a quarter of a kilobyte to half of one an image."""
+        arrays = {"words": self._words, "mean": self._mean, "projection": self._projection.astype(np.float16)}
+        arrays |= {"vectors": self._vectors.astype(np.float16), "node_ids": self._node_ids.astype(np.int32)}
+        return CoarseModel(self.name, asdict(self._config), arrays)
+
+    @staticmethod
+    def from_model(model: CoarseModel) -> SurfVlad:
+        """The inverse of `to_model`."""
+        a = model.arrays
+        projection, vectors = a["projection"].astype(np.float32), a["vectors"].astype(np.float32)
+        return SurfVlad(a["words"], a["mean"], projection, vectors, a["node_ids"], VladConfig(**model.settings))
+
+
+def vlad(descriptors: Float32[np.ndarray, "n d"], words: Float32[np.ndarray, "k d"]) -> Float32[np.ndarray, " kd"]:
+    """VLAD of unit-length descriptors over `words`; zero for an image without features."""
+    sums = np.zeros(words.shape, np.float32)
+    if len(descriptors):
+        # nearest word of a unit vector: |d - w|^2 = 1 - 2 d.w + |w|^2
+        nearest = np.argmax(descriptors @ words.T - 0.5 * np.sum(words**2, axis=1), axis=1)
+        residuals = descriptors - words[nearest]
+        residuals /= np.maximum(np.linalg.norm(residuals, axis=1, keepdims=True), 1e-6)
+        order = np.argsort(nearest, kind="stable")
+        present, starts = np.unique(nearest[order], return_index=True)
+        sums[present] = np.add.reduceat(residuals[order], starts, axis=0)
+        sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-6)
+    flat = sums.reshape(-1)
+    return flat / max(float(np.linalg.norm(flat)), 1e-6)
+
+
+def learn_words(descriptors: Float32[np.ndarray, "n d"], config: VladConfig) -> Float32[np.ndarray, "k d"]:
+    """The visual words: k-means centres of the map's descriptors, fewer where there are few of them."""
+    rng = np.random.default_rng(config.seed)
+    if len(descriptors) > config.max_training_descriptors:
+        descriptors = descriptors[np.sort(rng.choice(len(descriptors), config.max_training_descriptors, replace=False))]
+    num_words = max(1, min(config.num_words, len(descriptors) // 40))
+    kmeans = faiss.Kmeans(descriptors.shape[1], num_words, niter=20, seed=config.seed + 1, min_points_per_centroid=1)
+    kmeans.train(np.ascontiguousarray(descriptors))
+    assert kmeans.centroids is not None
+    return np.asarray(kmeans.centroids, np.float32).reshape(num_words, -1)
+
+
+def _learn_whitening(raw: Float32[np.ndarray, "n kd"], dimension: int) -> tuple[Float32[np.ndarray, " kd"], Float32[np.ndarray, "p kd"]]:
+    """Mean and projection to at most `dimension` whitened components.
+
+    The variances are softened by the mean one, since the trailing components of few images are noise, which plain
+    whitening would blow up.
+    """
+    mean = raw.mean(axis=0)
+    centred = raw - mean
+    eigenvalues, coefficients = np.linalg.eigh(centred @ centred.T)  # the small side: images, not dimensions
+    keep = [i for i in np.argsort(-eigenvalues)[:dimension] if eigenvalues[i] > 1e-6 * max(eigenvalues.max(), 1e-12)]
+    if not keep:  # one image, or all alike
+        direction = mean / max(float(np.linalg.norm(mean)), 1e-6)
+        return np.zeros_like(mean), direction[None].astype(np.float32)
+    axes = centred.T @ coefficients[:, keep] / np.sqrt(eigenvalues[keep])
+    softened = np.sqrt(eigenvalues[keep] + eigenvalues[keep].mean())
+    return mean.astype(np.float32), np.ascontiguousarray((axes / softened).T, np.float32)
+
+
+def _project(raw: Float32[np.ndarray, "n kd"], mean: Float32[np.ndarray, " kd"], projection: Float32[np.ndarray, "p kd"]) -> Float32[np.ndarray, "n p"]:
+    projected = (raw - mean) @ projection.T
+    return np.ascontiguousarray(projected / np.maximum(np.linalg.norm(projected, axis=1, keepdims=True), 1e-6), np.float32)
