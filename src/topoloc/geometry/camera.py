@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 
 from topoloc.errors import CalibrationError
+from topoloc.geometry.distortion import distort_fisheye, distort_rational, max_radius, undistort_fisheye, undistort_rational
 
 # Parameter names of each model, in COLMAP's order.
 MODELS: dict[str, tuple[str, ...]] = {
@@ -24,6 +24,7 @@ MODELS: dict[str, tuple[str, ...]] = {
     "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
+_TWO_FOCAL = {"SIMPLE_PINHOLE": "PINHOLE", "SIMPLE_RADIAL": "OPENCV", "RADIAL": "OPENCV"}
 
 
 @dataclass(frozen=True)
@@ -75,8 +76,13 @@ class Camera:
         return self._param("cy")
 
     @property
+    def is_fisheye(self) -> bool:
+        return self.model == "OPENCV_FISHEYE"
+
+    @property
     def is_distorted(self) -> bool:
-        return any(value != 0.0 for name, value in zip(MODELS[self.model], self.params, strict=True) if name[0] in "kp")
+        """Anything but a plain pinhole; a fisheye lens is, whatever its coefficients."""
+        return self.is_fisheye or any(value != 0.0 for name, value in zip(MODELS[self.model], self.params, strict=True) if name[0] in "kp")
 
     def matrix(self) -> Float[np.ndarray, "3 3"]:
         """K: pixels from the normalised plane."""
@@ -84,36 +90,38 @@ class Camera:
 
     def distortion(self) -> Float[np.ndarray, " d"]:
         """Coefficients in OpenCV's order: (k1, k2, p1, p2, k3 .. k6), or (k1 .. k4) for fisheye."""
-        names = ("k1", "k2", "k3", "k4") if self.model == "OPENCV_FISHEYE" else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+        names = ("k1", "k2", "k3", "k4") if self.is_fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
         return np.array([self._param(name) for name in names])
 
     def img_from_cam(self, points_cam: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
-        """Pixels of points in the camera frame (metres). Points at or behind the camera give NaN."""
-        points = np.ascontiguousarray(points_cam, dtype=np.float64)
-        if len(points) == 0:
-            return np.zeros((0, 2))
-        in_front = points[:, 2] > 1e-9
-        safe = np.where(in_front[:, None], points, [0.0, 0.0, 1.0])
-        if not self.is_distorted and self.model != "OPENCV_FISHEYE":
-            pixels = safe[:, :2] / safe[:, 2:] * [self.fx, self.fy] + [self.cx, self.cy]
-        elif self.model == "OPENCV_FISHEYE":
-            pixels = cv2.fisheye.projectPoints(safe[:, None], np.zeros(3), np.zeros(3), self.matrix(), self.distortion())[0][:, 0]
-        else:
-            pixels = cv2.projectPoints(safe[:, None], np.zeros(3), np.zeros(3), self.matrix(), self.distortion())[0][:, 0]
-        return np.where(in_front[:, None], pixels, np.nan)
+        """Pixels of points in the camera frame (metres).
+
+        Points at or behind the camera, and points beyond the field that the distortion model describes, give NaN.
+        """
+        in_front = points_cam[:, 2] > 1e-9
+        normalized = points_cam[:, :2] / np.where(in_front, points_cam[:, 2], np.nan)[:, None]
+        if self.is_distorted:
+            in_field = np.linalg.norm(normalized, axis=1) <= max_radius(tuple(self.distortion().tolist()), self.is_fisheye)
+            normalized = self._distort(np.where(in_field[:, None], normalized, np.nan))[0]
+        return normalized * [self.fx, self.fy] + [self.cx, self.cy]
 
     def normalized_from_img(self, points_img: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Undistorted coordinates (x / z, y / z) on the plane z = 1 of pixels."""
-        points = np.ascontiguousarray(points_img, dtype=np.float64)
-        if len(points) == 0:
-            return np.zeros((0, 2))
-        if self.model == "OPENCV_FISHEYE":
-            return cv2.fisheye.undistortPoints(points[:, None], self.matrix(), self.distortion())[:, 0]
-        if self.is_distorted:
-            # OpenCV's default five iterations leave whole pixels at the corners of wide lenses.
-            criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-10)
-            return cv2.undistortPointsIter(points[:, None], self.matrix(), self.distortion(), np.eye(3), np.eye(3), criteria)[:, 0]
-        return (points - [self.cx, self.cy]) / [self.fx, self.fy]
+        """Undistorted coordinates (x / z, y / z) on the plane z = 1 of pixels; NaN for pixels that no ray reaches."""
+        distorted = (np.asarray(points_img, dtype=np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
+        if not self.is_distorted:
+            return distorted
+        undistort = undistort_fisheye if self.is_fisheye else undistort_rational
+        return undistort(self.distortion(), distorted)
+
+    def img_jacobian(self, normalized: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2 2"]:
+        """Derivative of the pixel by the undistorted coordinates on the plane z = 1, at these."""
+        focal = np.array([self.fx, self.fy])
+        if not self.is_distorted:
+            return np.broadcast_to(np.diag(focal), (len(normalized), 2, 2)).copy()
+        return focal[:, None] * self._distort(normalized)[1]
+
+    def _distort(self, normalized: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
+        return (distort_fisheye if self.is_fisheye else distort_rational)(self.distortion(), normalized)
 
     def rays_from_img(self, points_img: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
         """Unit direction in the camera frame of each pixel."""
@@ -126,22 +134,42 @@ class Camera:
         return Camera.pinhole(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
 
     def rescaled(self, width: int, height: int) -> Camera:
-        """The same camera for its image resized to width x height; pixel centres stay pixel centres."""
+        """The same camera for its image resized to width x height; pixel centres stay pixel centres.
+
+        Models with one focal length become their two-focal siblings where the two scales differ.
+        """
         scale_x, scale_y = width / self.width, height / self.height
-        scaled = dict(zip(MODELS[self.model], self.params, strict=True))
-        for name in scaled:
-            if name in ("f", "fx"):
-                scaled[name] *= scale_x
-            elif name == "fy":
-                scaled[name] *= scale_y
-            elif name in ("cx", "cy"):
-                scale = scale_x if name == "cx" else scale_y
-                scaled[name] = (scaled[name] + 0.5) * scale - 0.5
-        return replace(self, width=width, height=height, params=tuple(scaled.values()))
+        model = self.model if scale_x == scale_y else _TWO_FOCAL.get(self.model, self.model)
+        values = {name: self._param(name) for name in MODELS[model]}
+        for name, value in (("f", self.fx * scale_x), ("fx", self.fx * scale_x), ("fy", self.fy * scale_y)):
+            if name in values:
+                values[name] = value
+        values["cx"] = (self.cx + 0.5) * scale_x - 0.5
+        values["cy"] = (self.cy + 0.5) * scale_y - 0.5
+        return Camera(model, width, height, tuple(values.values()))
+
+    def to_colmap(self) -> tuple[str, int, int, tuple[float, ...]]:
+        """(model, width, height, params) as COLMAP writes them: there the centre of the top-left pixel is (0.5, 0.5)."""
+        return self.model, self.width, self.height, self._shifted(0.5)
+
+    @staticmethod
+    def from_colmap(model: str, width: int, height: int, params: tuple[float, ...]) -> Camera:
+        """The camera of one entry of COLMAP's cameras file; inverse of `to_colmap`.
+
+        Raises:
+            CalibrationError: a model that is not known here, or parameters that are not usable.
+        """
+        camera = Camera(model, width, height, tuple(float(value) for value in params))
+        return replace(camera, params=camera._shifted(-0.5))
+
+    def _shifted(self, offset_px: float) -> tuple[float, ...]:
+        named = zip(MODELS[self.model], self.params, strict=True)
+        return tuple(value + offset_px if name in ("cx", "cy") else value for name, value in named)
 
     def to_json(self) -> dict[str, object]:
         """As in ``camera.json``: model, width, height and the parameters by name."""
-        return {"model": self.model, "width": self.width, "height": self.height} | dict(zip(MODELS[self.model], self.params, strict=True))
+        size: dict[str, object] = {"model": self.model, "width": self.width, "height": self.height}
+        return size | dict(zip(MODELS[self.model], self.params, strict=True))
 
     @staticmethod
     def from_json(data: dict[str, object]) -> Camera:
@@ -150,11 +178,13 @@ class Camera:
         Raises:
             CalibrationError: a key is missing or not a number, or the camera is not usable.
         """
+        if not isinstance(data, dict):
+            raise CalibrationError(f"camera: an object of named values is expected, not {type(data).__name__}")
         try:
             model = str(data.get("model", "PINHOLE"))
             params = tuple(float(data[name]) for name in MODELS.get(model, ()))  # type: ignore[arg-type]
             return Camera(model, int(data["width"]), int(data["height"]), params)  # type: ignore[call-overload]
         except KeyError as error:
             raise CalibrationError(f"camera: {error.args[0]!r} is missing") from None
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise CalibrationError(f"camera: {error}") from None

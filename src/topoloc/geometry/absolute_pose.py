@@ -1,0 +1,271 @@
+"""The pose of a camera from matches of its pixels with points of the world: robust PnP, and how far to trust it.
+
+`method="poselib"`: PoseLib's LO-RANSAC with P3P (Persson and Nordberg, 2018; https://github.com/PoseLib/PoseLib), PROSAC
+ordering (Chum and Matas, 2005) where priorities are given, then a robust refinement that weighs every match by the
+uncertainty of both its pixel and its point. `method="opencv"`: the paper's own variant, section III-B: OpenCV's RANSAC
+with EPnP and Levenberg-Marquardt refinement on the inliers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+import poselib
+from jaxtyping import Bool, Float
+
+from topoloc.geometry.absolute_pose_kernels import normal_equations
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+
+_MIN_POINTS = 4
+_CAUCHY_SCALE = 2.3849  # 95 % efficiency on Gaussian residuals (Holland and Welsch, 1977)
+# What Cauchy's weights w do to Gaussian residuals r of two dimensions, so that the covariance is not biased by them:
+# E[w r^2] / 2, and E[w] E[w^2 r^2 / 2] / E[w - w^2 r^2 / c^2]^2, the M-estimator's variance over the inverse of its information.
+_MEAN_WEIGHTED_SQUARE = 0.6302
+_VARIANCE_OF_ESTIMATE = 0.8265
+
+
+@dataclass(frozen=True)
+class AbsolutePoseConfig:
+    """`sigma_px` is the standard deviation of a matched key point along x and along y; the threshold decides what an inlier is."""
+
+    method: Literal["poselib", "opencv"] = "poselib"
+    max_reprojection_error_px: float = 4.0
+    sigma_px: float = 1.0
+    max_iterations: int = 2000
+    min_iterations: int = 50
+    confidence: float = 0.9999
+    max_refinement_steps: int = 10
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class AbsolutePose:
+    """A pose with its evidence, for n matches.
+
+    `covariance` is that of the left perturbation (translation, rotation) of `cam_from_world` (m, rad).
+    `reprojection_errors_px` are distances in the image as it was taken; infinite behind the camera or outside its field.
+    """
+
+    cam_from_world: Rigid3
+    inliers: Bool[np.ndarray, " n"]
+    covariance: Float[np.ndarray, "6 6"]
+    reprojection_errors_px: Float[np.ndarray, " n"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Matches:
+    """The usable matches; pixels also on the plane z = 1, with their covariance there."""
+
+    points_img: Float[np.ndarray, "n 2"]
+    normalized: Float[np.ndarray, "n 2"]
+    covariances: Float[np.ndarray, "n 2 2"]
+    points_world: Float[np.ndarray, "n 3"]
+    point_covariances: Float[np.ndarray, "n 3 3"] | Float[np.ndarray, "0 3 3"]
+
+
+def estimate_absolute_pose(
+    points_img: Float[np.ndarray, "n 2"],
+    points_world: Float[np.ndarray, "n 3"],
+    camera: Camera,
+    config: AbsolutePoseConfig | None = None,
+    *,
+    point_covariances: Float[np.ndarray, "n 3 3"] | None = None,
+    priorities: Float[np.ndarray, " n"] | None = None,
+) -> AbsolutePose | None:
+    """cam_from_world from n matches of pixels with world points (metres); None where no pose follows from them.
+
+    Args:
+        point_covariances: of the world points, in the world frame (m^2); exact points without it.
+        priorities: larger is likelier right; RANSAC tries these first (not with OpenCV).
+
+    Matches with a value that is not finite are outliers. The same input gives the same bytes.
+    """
+    config = config or AbsolutePoseConfig()
+    normalized = camera.normalized_from_img(points_img)
+    usable = np.isfinite(normalized).all(axis=1) & np.isfinite(points_world).all(axis=1)
+    if point_covariances is not None:
+        usable &= np.isfinite(point_covariances).all(axis=(1, 2))
+    order = np.flatnonzero(usable)
+    if priorities is not None:
+        order = order[np.argsort(-priorities[order], kind="stable")]
+    matches = _Matches(
+        points_img=np.ascontiguousarray(points_img[order], dtype=np.float64),
+        normalized=normalized[order],
+        covariances=_normalized_covariances(camera, normalized[order], config.sigma_px),
+        points_world=np.ascontiguousarray(points_world[order], dtype=np.float64),
+        point_covariances=np.zeros((0, 3, 3)) if point_covariances is None else np.ascontiguousarray(point_covariances[order]),
+    )
+    if not _spans_a_plane(matches.points_world) or not _spans_a_plane(np.insert(matches.normalized, 2, 0.0, axis=1)):
+        return None
+    solve = _solve_with_opencv if config.method == "opencv" else _solve_with_poselib
+    cam_from_world = solve(matches, camera, config, priorities is not None)
+    if cam_from_world is None:
+        return None
+    return _with_evidence(cam_from_world, matches, camera, config, order, len(points_img))
+
+
+def covariance_of_inverse(a_from_b: Rigid3, covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
+    """Covariance of the left perturbation of ``b_from_a = a_from_b.inverse()``, from that of `a_from_b`.
+
+    As ``(exp(xi) @ a_from_b).inverse() == exp(-Ad @ xi) @ b_from_a`` with Ad the adjoint of b_from_a.
+    The result's translation part is of the frame b at its origin; see `position_covariance` for the camera's own position.
+    """
+    adjoint = a_from_b.inverse().adjoint()
+    return adjoint @ covariance @ adjoint.T
+
+
+def position_covariance(cam_from_world: Rigid3, covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "3 3"]:
+    """Covariance (m^2, world axes) of the camera's position, from that of the left perturbation of `cam_from_world`.
+
+    The position is ``-R' t``; moving R and t by (rho, omega) moves it by ``-R' rho`` alone, to first order.
+    """
+    return cam_from_world.rotation.T @ covariance[:3, :3] @ cam_from_world.rotation
+
+
+def _solve_with_poselib(matches: _Matches, camera: Camera, config: AbsolutePoseConfig, is_sorted: bool) -> Rigid3 | None:
+    # A pinhole of the same focal length in pixels that are already undistorted: thresholds keep their meaning, and
+    # every model works alike. PoseLib adds no half pixel of its own.
+    undistorted = matches.normalized * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    pinhole = {
+        "model": "PINHOLE",
+        "width": camera.width,
+        "height": camera.height,
+        "params": [camera.fx, camera.fy, camera.cx, camera.cy],
+    }
+    ransac = {
+        "max_reproj_error": config.max_reprojection_error_px,
+        "max_iterations": config.max_iterations,
+        "min_iterations": config.min_iterations,
+        "success_prob": config.confidence,
+        "progressive_sampling": is_sorted,
+        "seed": config.seed,
+    }
+    bundle = {"loss_type": "CAUCHY", "loss_scale": config.sigma_px * _CAUCHY_SCALE, "max_iterations": 25}
+    pose, _ = poselib.estimate_absolute_pose(undistorted, matches.points_world, pinhole, ransac, bundle)
+    matrix = np.asarray(pose.Rt, dtype=np.float64)
+    if not np.isfinite(matrix).all():
+        return None
+    cam_from_world = Rigid3(matrix[:, :3].copy(), matrix[:, 3].copy())
+    for _ in range(2):  # the second time with the inliers of the first
+        inliers = _reprojection_errors(cam_from_world, matches, camera) <= config.max_reprojection_error_px
+        if not _spans_a_plane(matches.points_world[inliers]):
+            return None
+        cam_from_world = _refine(cam_from_world, matches, inliers, config.max_refinement_steps)
+    return cam_from_world
+
+
+def _refine(cam_from_world: Rigid3, matches: _Matches, active: Bool[np.ndarray, " n"], max_steps: int) -> Rigid3:
+    """Iteratively reweighted Gauss-Newton under Cauchy's loss; stops where the cost falls no more."""
+    information, gradient, cost, _ = _normal_equations(cam_from_world, matches, active)
+    for _ in range(max_steps):
+        step = _solve(information, -gradient)
+        if step is None:
+            break
+        candidate = Rigid3.exp(step) @ cam_from_world
+        information, gradient, new_cost, _ = _normal_equations(candidate, matches, active)
+        if not new_cost <= cost:
+            break
+        converged = cost - new_cost <= 1e-9 * cost
+        cam_from_world, cost = candidate, new_cost
+        if converged:
+            break
+    return cam_from_world
+
+
+def _solve_with_opencv(matches: _Matches, camera: Camera, config: AbsolutePoseConfig, is_sorted: bool) -> Rigid3 | None:
+    del is_sorted  # OpenCV's RANSAC knows no order
+    undistorted = matches.normalized * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    try:
+        found, rotation, translation, idx = cv2.solvePnPRansac(
+            matches.points_world,
+            undistorted,
+            camera.matrix(),
+            None,
+            iterationsCount=config.max_iterations,
+            reprojectionError=config.max_reprojection_error_px,
+            confidence=config.confidence,
+            flags=cv2.SOLVEPNP_EPNP,
+        )
+        if not found or idx is None or len(idx) < _MIN_POINTS:
+            return None
+        rows = np.sort(idx[:, 0])
+        rotation, translation = cv2.solvePnPRefineLM(
+            matches.points_world[rows], undistorted[rows], camera.matrix(), None, rotation, translation
+        )
+    except cv2.error:  # thrown for some degenerate samples
+        return None
+    if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
+        return None
+    return Rigid3(cv2.Rodrigues(rotation)[0], translation[:, 0].copy())
+
+
+def _with_evidence(
+    cam_from_world: Rigid3, matches: _Matches, camera: Camera, config: AbsolutePoseConfig, order: np.ndarray, num_points: int
+) -> AbsolutePose | None:
+    errors = _reprojection_errors(cam_from_world, matches, camera)
+    active = errors <= config.max_reprojection_error_px
+    if np.count_nonzero(active) < _MIN_POINTS or not _spans_a_plane(matches.points_world[active]):
+        return None
+    information, _, _, squares = _normal_equations(cam_from_world, matches, active)
+    inverse = _solve(information, np.eye(6))
+    if inverse is None:
+        return None
+    # Residuals larger than sigma_px accounts for widen the covariance; smaller ones, which few matches give by chance, do not.
+    num_residuals = max(2 * np.count_nonzero(active) - 6, 1)
+    excess = max(1.0, squares / (_MEAN_WEIGHTED_SQUARE * num_residuals))
+    covariance = _VARIANCE_OF_ESTIMATE * excess * (inverse + inverse.T) / 2.0
+    inliers = np.zeros(num_points, dtype=np.bool_)
+    inliers[order] = active
+    all_errors = np.full(num_points, np.inf)
+    all_errors[order] = errors
+    return AbsolutePose(cam_from_world, inliers, covariance, all_errors)
+
+
+def _normal_equations(
+    cam_from_world: Rigid3, matches: _Matches, active: Bool[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, "6"], float, float]:
+    return normal_equations(
+        np.ascontiguousarray(cam_from_world.rotation),
+        cam_from_world.translation,
+        matches.normalized,
+        matches.covariances,
+        matches.points_world,
+        matches.point_covariances,
+        active,
+        _CAUCHY_SCALE,
+    )
+
+
+def _solve(information: Float[np.ndarray, "6 6"], right: Float[np.ndarray, "6 *m"]) -> Float[np.ndarray, "6 *m"] | None:
+    """The solution of information @ x = right, None where the information does not fix all six degrees of freedom."""
+    diagonal = np.sqrt(np.diag(information))
+    if not (np.isfinite(information).all() and np.all(diagonal > 0.0)):
+        return None
+    scaled = information / np.outer(diagonal, diagonal)  # metres and radians made comparable
+    if np.linalg.eigvalsh(scaled)[0] < 1e-12:
+        return None
+    scale = diagonal.reshape((6,) + (1,) * (right.ndim - 1))
+    return np.linalg.solve(scaled, right / scale) / scale
+
+
+def _reprojection_errors(cam_from_world: Rigid3, matches: _Matches, camera: Camera) -> Float[np.ndarray, " n"]:
+    errors = np.linalg.norm(camera.img_from_cam(cam_from_world.apply(matches.points_world)) - matches.points_img, axis=1)
+    return np.where(np.isfinite(errors), errors, np.inf)
+
+
+def _normalized_covariances(camera: Camera, normalized: Float[np.ndarray, "n 2"], sigma_px: float) -> Float[np.ndarray, "n 2 2"]:
+    to_normalized = sigma_px * np.linalg.inv(camera.img_jacobian(normalized))
+    return to_normalized @ to_normalized.transpose(0, 2, 1)
+
+
+def _spans_a_plane(points: Float[np.ndarray, "n 3"]) -> bool:
+    """At least four points, not all on a line."""
+    if len(points) < _MIN_POINTS:
+        return False
+    centred = points - points.mean(axis=0)
+    variances = np.linalg.eigvalsh(centred.T @ centred)
+    return bool(variances[1] > 1e-9 * variances[2])

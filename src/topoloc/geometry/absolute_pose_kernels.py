@@ -1,0 +1,66 @@
+"""Compiled inner loops of `absolute_pose`: one pass over the points a call, no allocation a point."""
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True)
+def normal_equations(rotation, translation, normalized, covariances, points_world, point_covariances, active, cauchy_scale):
+    """Gauss-Newton's normal equations of the whitened reprojection errors on the plane z = 1.
+
+    `covariances` (n, 2, 2) are those of `normalized`; `point_covariances` is (n, 3, 3), or (0, 3, 3) for exact points.
+    The residual is e = projected - observed, its covariance S = covariances + D R P R' D' with D the projection's derivative,
+    and its derivative by the left perturbation (translation, rotation) is D [I, -[p]x].
+    Each point weighs 1 / (1 + e' S^-1 e / c^2), Cauchy's weight.
+    Returns the information (6, 6), the gradient (6), the Cauchy cost and the sum of the weighted squared residuals.
+    """
+    information = np.zeros((6, 6))
+    gradient = np.zeros(6)
+    cost = 0.0
+    squares = 0.0
+    jacobian = np.zeros((2, 6))
+    for i in range(len(normalized)):
+        if not active[i]:
+            continue
+        x = rotation[0, 0] * points_world[i, 0] + rotation[0, 1] * points_world[i, 1] + rotation[0, 2] * points_world[i, 2] + translation[0]
+        y = rotation[1, 0] * points_world[i, 0] + rotation[1, 1] * points_world[i, 1] + rotation[1, 2] * points_world[i, 2] + translation[1]
+        z = rotation[2, 0] * points_world[i, 0] + rotation[2, 1] * points_world[i, 1] + rotation[2, 2] * points_world[i, 2] + translation[2]
+        if z < 1e-6:
+            cost += 1e6
+            continue
+        u, v, w = x / z, y / z, 1.0 / z
+        e0, e1 = u - normalized[i, 0], v - normalized[i, 1]
+        s00, s01, s11 = covariances[i, 0, 0], covariances[i, 0, 1], covariances[i, 1, 1]
+        if len(point_covariances) > 0:
+            for k in range(3):
+                for m in range(3):
+                    ak = w * (rotation[0, k] - u * rotation[2, k])
+                    bk = w * (rotation[1, k] - v * rotation[2, k])
+                    am = w * (rotation[0, m] - u * rotation[2, m])
+                    bm = w * (rotation[1, m] - v * rotation[2, m])
+                    s00 += ak * point_covariances[i, k, m] * am
+                    s01 += ak * point_covariances[i, k, m] * bm
+                    s11 += bk * point_covariances[i, k, m] * bm
+        determinant = s00 * s11 - s01 * s01
+        if not determinant > 0.0:
+            continue
+        i00, i01, i11 = s11 / determinant, -s01 / determinant, s00 / determinant
+        squared = e0 * e0 * i00 + 2.0 * e0 * e1 * i01 + e1 * e1 * i11
+        weight = 1.0 / (1.0 + squared / cauchy_scale**2)
+        cost += 0.5 * cauchy_scale**2 * np.log1p(squared / cauchy_scale**2)
+        squares += weight * squared
+        # Rows of D [I, -[p]x] with p = (x, y, z), D = [[w, 0, -u w], [0, w, -v w]].
+        jacobian[0, 0], jacobian[0, 1], jacobian[0, 2] = w, 0.0, -u * w
+        jacobian[1, 0], jacobian[1, 1], jacobian[1, 2] = 0.0, w, -v * w
+        jacobian[0, 3], jacobian[0, 4], jacobian[0, 5] = -u * v, 1.0 + u * u, -v
+        jacobian[1, 3], jacobian[1, 4], jacobian[1, 5] = -(1.0 + v * v), u * v, u
+        for a in range(6):
+            p0 = weight * (jacobian[0, a] * i00 + jacobian[1, a] * i01)
+            p1 = weight * (jacobian[0, a] * i01 + jacobian[1, a] * i11)
+            gradient[a] += p0 * e0 + p1 * e1
+            for b in range(a, 6):
+                information[a, b] += p0 * jacobian[0, b] + p1 * jacobian[1, b]
+    for a in range(6):
+        for b in range(a):
+            information[a, b] = information[b, a]
+    return information, gradient, cost, squares
