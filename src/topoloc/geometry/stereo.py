@@ -70,7 +70,7 @@ def covariances_from_disparity(
     """
     noise = noise or StereoNoise()
     sigma_z = points_cam[:, 2] ** 2 / (rig.left.fx * rig.baseline) * noise.sigma_disparity_px
-    return _covariances(points_cam, sigma_z, rig.left, noise.sigma_px)
+    return ray_covariances(points_cam, sigma_z, rig.left, np.full(len(points_cam), noise.sigma_px))
 
 
 def covariances_from_depth(
@@ -79,17 +79,20 @@ def covariances_from_depth(
     """Covariances (m^2) of points of the camera frame that a depth sensor measured, to first order."""
     noise = noise or DepthNoise()
     sigma_z = noise.constant + noise.quadratic * (points_cam[:, 2] - noise.offset) ** 2
-    return _covariances(points_cam, sigma_z, camera, noise.sigma_px)
+    return ray_covariances(points_cam, sigma_z, camera, np.full(len(points_cam), noise.sigma_px))
 
 
-def _covariances(
-    points_cam: Float[np.ndarray, "n 3"], sigma_z: Float[np.ndarray, " n"], camera: Camera, sigma_px: float
+def ray_covariances(
+    points_cam: Float[np.ndarray, "n 3"], sigma_z: Float[np.ndarray, " n"], camera: Camera, sigma_px: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 3 3"]:
-    """With p = z (x, y, 1): dp/dz = p / z along the ray, and dp/d(pixel) = z d(x, y)/d(pixel) across it."""
+    """Covariances (m^2) of points of the camera frame from the uncertainty of each one's depth (m) and pixel (px).
+
+    With p = z (x, y, 1): dp/dz = p / z along the ray, and dp/d(pixel) = z d(x, y)/d(pixel) across it.
+    """
     z = points_cam[:, 2:]
     ray = points_cam / z
     img_jacobian = camera.img_jacobian(ray[:, :2])
-    across = sigma_px * z[:, :, None] * np.linalg.inv(img_jacobian)
+    across = sigma_px[:, None, None] * z[:, :, None] * np.linalg.inv(img_jacobian)
     covariances = sigma_z[:, None, None] ** 2 * ray[:, :, None] * ray[:, None, :]
     covariances[:, :2, :2] += across @ across.transpose(0, 2, 1)
     return covariances
