@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.errors import CalibrationError, RecordingError, TrajectoryError
+from topoloc.errors import CalibrationError, RecordingError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.pictures import image_size
-from topoloc.sequences.recording import Recording, RightPictures, check_pairs, list_pictures, times_by_rate
-from topoloc.sequences.trajectory import frame_poses, parse_times, read_trajectory
+from topoloc.sequences.recording import Recording, RightPictures, check_pairs, list_pictures
+from topoloc.sequences.truth import read_times, read_truth
 
 LOOKS_FOR = "image_0/ and image_1/ (or image_2/ and image_3/) with calib.txt"
 _PAIRS = ((0, 1), (2, 3))
@@ -83,25 +83,6 @@ def read_calib(path: Path) -> dict[str, Float[np.ndarray, "3 4"]]:
     return projections
 
 
-def read_times(path: Path, num_frames: int) -> list[int]:
-    """Times in nanoseconds from a file of one time in seconds a line; 10 Hz where there is no file.
-
-    Raises:
-        RecordingError: malformed, not increasing, or their number is not that of the frames.
-    """
-    if not path.is_file():
-        return times_by_rate(num_frames)
-    numbered = [(number, line.strip()) for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1)]
-    numbered = [(number, line) for number, line in numbered if line and not line.startswith("#")]
-    try:
-        t_ns = parse_times([line.split()[0] for _, line in numbered], path, [number for number, _ in numbered])
-    except TrajectoryError as error:
-        raise RecordingError(str(error)) from None
-    if len(t_ns) != num_frames:
-        raise RecordingError(f"{path}: {len(t_ns)} times for {num_frames} pictures")
-    return t_ns
-
-
 def _camera(path: Path, projections: dict[str, np.ndarray], number: int, size: tuple[int, int]) -> Camera:
     if f"P{number}" not in projections:
         raise CalibrationError(f"{path / 'calib.txt'}: no line P{number} for image_{number}")
@@ -124,12 +105,10 @@ def _cam_from_cam0(projection: Float[np.ndarray, "3 4"]) -> Float[np.ndarray, "3
 
 
 def _truth(path: Path, t_ns: list[int], cam0_from_cam: Rigid3) -> list[Rigid3 | None]:
-    if (path / "truth.tum").is_file():
-        return frame_poses(read_trajectory(path / "truth.tum"), t_ns, path / "truth.tum")
     absolute = path.resolve()
-    for rows in (path / "poses.txt", absolute.parent.parent / "poses" / f"{absolute.name}.txt"):
-        if rows.is_file():
-            # KITTI's rows are the poses of camera 0 whichever pair is used.
-            poses = frame_poses(read_trajectory(rows), t_ns, rows)
-            return [pose @ cam0_from_cam if pose is not None else None for pose in poses]
-    return [None] * len(t_ns)
+    rows = [path / "poses.txt", absolute.parent.parent / "poses" / f"{absolute.name}.txt"]
+    poses = read_truth(path / "truth.tum", rows, t_ns)
+    if (path / "truth.tum").is_file():
+        return poses
+    # KITTI's rows are the poses of camera 0 whichever pair is used.
+    return [pose @ cam0_from_cam if pose is not None else None for pose in poses]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from topoloc.errors import RecordingError, UnknownFormatError
-from topoloc.sequences import kitti, seven_scenes
+from topoloc.sequences import euroc, folder, kitti, seven_scenes, tum
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.selection import parse_selection, sequence_subset
 
@@ -23,8 +23,11 @@ class SequenceFormat:
 
 # In the order in which they are asked; the plain folder takes what is left.
 FORMATS = {
+    "euroc": SequenceFormat(euroc.LOOKS_FOR, euroc.recognises, euroc.open_euroc),
+    "tum": SequenceFormat(tum.LOOKS_FOR, tum.recognises, tum.open_tum),
     "seven_scenes": SequenceFormat(seven_scenes.LOOKS_FOR, seven_scenes.recognises, seven_scenes.open_seven_scenes),
     "kitti": SequenceFormat(kitti.LOOKS_FOR, kitti.recognises, kitti.open_kitti),
+    "folder": SequenceFormat(folder.LOOKS_FOR, folder.recognises, folder.open_folder),
 }
 
 

@@ -1,7 +1,7 @@
 """What the bytes of a picture file say before they are decoded: its size, and whether it is all there.
 
-PNG (ISO/IEC 15948, sections 5.2-5.6), JPEG (ITU-T T.81, annex B), BMP and binary PNM are read; other types are left to
-the decoder.
+PNG (ISO/IEC 15948, sections 5.2-5.6), JPEG (ITU-T T.81, annex B), BMP and binary PNM are read; TIFF and WebP are known
+by their first bytes and left to the decoder.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import zlib
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
-_PNM = re.compile(rb"P([456])(?:\s+|#[^\n]*\n)+(\d+)(?:\s+|#[^\n]*\n)+(\d+)(?:(?:\s+|#[^\n]*\n)+(\d+))?\s")
+_PNM = re.compile(rb"P([56])(?:\s+|#[^\n]*\n)+(\d+)(?:\s+|#[^\n]*\n)+(\d+)(?:\s+|#[^\n]*\n)+(\d+)\s")
 # Start-of-frame markers; C4, C8 and CC in the same range are tables.
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_SCAN = 0xDA
@@ -23,10 +23,10 @@ class BrokenPicture(Exception):
 
 
 def header_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height in pixels of a complete PNG, JPEG, BMP or binary PNM file; None for bytes of another type.
+    """Width and height in pixels of a complete PNG, JPEG, BMP or binary PNM file; None for TIFF and WebP.
 
     Raises:
-        BrokenPicture: the file is truncated, or its checksums do not hold.
+        BrokenPicture: the file is truncated, its checksums do not hold, or it is of none of these types.
     """
     if data.startswith(_PNG_SIGNATURE):
         return _png_size(data)
@@ -34,8 +34,11 @@ def header_size(data: bytes) -> tuple[int, int] | None:
         return _jpeg_size(data)
     if data.startswith(b"BM") and len(data) >= 26:
         return _bmp_size(data)
-    header = _PNM.match(data)
-    return _pnm_size(data, header) if header else None
+    if header := _PNM.match(data):
+        return _pnm_size(data, header)
+    if data.startswith((b"II*\0", b"MM\0*")) or (data.startswith(b"RIFF") and data[8:12] == b"WEBP"):
+        return None
+    raise BrokenPicture("not a picture, or not of a known type (PNG, JPEG, BMP, PNM, TIFF, WebP)")
 
 
 def _png_size(data: bytes) -> tuple[int, int]:
@@ -90,9 +93,8 @@ def _bmp_size(data: bytes) -> tuple[int, int]:
 
 def _pnm_size(data: bytes, header: re.Match[bytes]) -> tuple[int, int]:
     kind, width, height = header[1], int(header[2]), int(header[3])
-    if kind == b"4" or header[4] is None:
-        return width, height
-    num_bytes = width * height * (3 if kind == b"6" else 1) * (2 if int(header[4]) > 255 else 1)
+    num_channels, num_bytes_each = (3 if kind == b"6" else 1), (2 if int(header[4]) > 255 else 1)
+    num_bytes = width * height * num_channels * num_bytes_each
     if len(data) - header.end() < num_bytes:
         raise BrokenPicture("truncated PNM file")
     return width, height

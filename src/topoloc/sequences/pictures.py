@@ -7,6 +7,9 @@ pixels as they are stored.
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -19,6 +22,7 @@ from topoloc.sequences.picture_headers import BrokenPicture, header_size
 
 PICTURE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp"})
 MAX_PIXELS = 100_000_000
+_LOG_LEVEL_LOCK = threading.Lock()
 
 
 def read_image(path: Path) -> Image:
@@ -27,7 +31,7 @@ def read_image(path: Path) -> Image:
     Raises:
         UnreadableImageError: missing, empty, truncated, damaged, no picture, or of more than 100 megapixels.
     """
-    pixels = _decode(path, cv2.IMREAD_UNCHANGED)
+    pixels = _decode(path)
     if pixels.dtype == np.uint16:
         pixels = cv2.convertScaleAbs(pixels, alpha=1.0 / 257.0)
     if pixels.dtype != np.uint8:
@@ -52,7 +56,7 @@ def read_depth(path: Path, units_per_metre: float) -> Float32[np.ndarray, "h w"]
     Raises:
         UnreadableImageError: as `read_image`, or not a picture of one channel of 16 bits.
     """
-    pixels = _decode(path, cv2.IMREAD_UNCHANGED)
+    pixels = _decode(path)
     if pixels.dtype != np.uint16 or pixels.ndim != 2:
         raise UnreadableImageError(f"{path}: depth must be one channel of 16 bits, not shape {pixels.shape} of {pixels.dtype}")
     depth = pixels.astype(np.float32) / np.float32(units_per_metre)
@@ -68,7 +72,7 @@ def image_size(path: Path) -> tuple[int, int]:
     """
     size = _checked_size(path, _read_bytes(path))
     if size is None:
-        height, width = _decode(path, cv2.IMREAD_UNCHANGED).shape[:2]
+        height, width = _decode(path).shape[:2]
         return width, height
     return size
 
@@ -96,11 +100,14 @@ def _checked_size(path: Path, data: bytes) -> tuple[int, int] | None:
     return size
 
 
-def _decode(path: Path, flags: int) -> np.ndarray:
+def _decode(path: Path) -> np.ndarray:
     data = _read_bytes(path)
-    _checked_size(path, data)
     try:
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        if _checked_size(path, data) is not None:
+            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        else:
+            with _opencv_silent():
+                pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         pixels = None
     if pixels is None or pixels.size == 0:
@@ -108,3 +115,15 @@ def _decode(path: Path, flags: int) -> np.ndarray:
     if pixels.shape[0] * pixels.shape[1] > MAX_PIXELS:
         raise UnreadableImageError(f"{path}: {pixels.shape[1]}x{pixels.shape[0]} is more than {MAX_PIXELS // 1_000_000} megapixels")
     return pixels
+
+
+@contextmanager
+def _opencv_silent() -> Iterator[None]:
+    """No OpenCV messages on stderr: types that are checked only by decoding make it write there about every broken file."""
+    with _LOG_LEVEL_LOCK:
+        level = cv2.utils.logging.getLogLevel()
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        try:
+            yield
+        finally:
+            cv2.utils.logging.setLogLevel(level)

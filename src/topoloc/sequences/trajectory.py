@@ -61,6 +61,23 @@ def read_trajectory(path: Path) -> Trajectory:
     return Trajectory([_pose(path, line, lambda t=tokens: _pose_from_tum(t)) for line, tokens in rows], t_ns)
 
 
+def read_asl_poses(path: Path) -> Trajectory:
+    """Read the poses of an ASL ground truth data.csv: ``t [ns], px, py, pz, qw, qx, qy, qz``, and columns beyond, which are left.
+
+    Raises:
+        TrajectoryError: missing, empty, columns missing, NaN, no rotation, or times that do not increase; with the line.
+    """
+    rows = _read_rows(path)
+    for line, tokens in rows:
+        if len(tokens) < 8:
+            raise TrajectoryError(f"{path}, line {line}: {len(tokens)} columns, a pose has 8")
+    if not rows:
+        raise TrajectoryError(f"{path}: no poses in this file")
+    t_ns = parse_times([tokens[0] for _, tokens in rows], path, [line for line, _ in rows])
+    in_tum_order = [(line, [*tokens[:4], *tokens[5:8], tokens[4]]) for line, tokens in rows]
+    return Trajectory([_pose(path, line, lambda t=tokens: _pose_from_tum(t)) for line, tokens in in_tum_order], t_ns)
+
+
 def parse_times(tokens: Sequence[str], path: Path, lines: Sequence[int]) -> list[int]:
     """Integer nanoseconds of written times, exact to the last decimal; seconds, or nanoseconds where a time is above 1e12.
 
