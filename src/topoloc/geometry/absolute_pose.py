@@ -16,7 +16,7 @@ import numpy as np
 import poselib
 from jaxtyping import Bool, Float
 
-from topoloc.geometry.absolute_pose_kernels import normal_equations
+from topoloc.geometry.absolute_pose_kernels import normal_equations, refine
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 
@@ -35,7 +35,7 @@ class AbsolutePoseConfig:
     method: Literal["poselib", "opencv"] = "poselib"
     max_reprojection_error_px: float = 4.0
     sigma_px: float = 1.0
-    max_iterations: int = 2000
+    max_iterations: int = 5000
     min_iterations: int = 50
     confidence: float = 0.9999
     max_refinement_steps: int = 10
@@ -141,6 +141,7 @@ def _solve_with_poselib(matches: _Matches, camera: Camera, config: AbsolutePoseC
         "max_iterations": config.max_iterations,
         "min_iterations": config.min_iterations,
         "success_prob": config.confidence,
+        "dyn_num_trials_mult": 1.0,  # PoseLib's own 3 triples the time; its local optimisation finds as many poses without
         "progressive_sampling": is_sorted,
         "seed": config.seed,
     }
@@ -159,21 +160,8 @@ def _solve_with_poselib(matches: _Matches, camera: Camera, config: AbsolutePoseC
 
 
 def _refine(cam_from_world: Rigid3, matches: _Matches, active: Bool[np.ndarray, " n"], max_steps: int) -> Rigid3:
-    """Iteratively reweighted Gauss-Newton under Cauchy's loss; stops where the cost falls no more."""
-    information, gradient, cost, _ = _normal_equations(cam_from_world, matches, active)
-    for _ in range(max_steps):
-        step = _solve(information, -gradient)
-        if step is None:
-            break
-        candidate = Rigid3.exp(step) @ cam_from_world
-        information, gradient, new_cost, _ = _normal_equations(candidate, matches, active)
-        if not new_cost <= cost:
-            break
-        converged = cost - new_cost <= 1e-9 * cost
-        cam_from_world, cost = candidate, new_cost
-        if converged:
-            break
-    return cam_from_world
+    rotation, translation = refine(*_arguments(cam_from_world, matches, active), max_steps)
+    return Rigid3(rotation, translation)
 
 
 def _solve_with_opencv(matches: _Matches, camera: Camera, config: AbsolutePoseConfig, is_sorted: bool) -> Rigid3 | None:
@@ -210,25 +198,23 @@ def _with_evidence(
     active = errors <= config.max_reprojection_error_px
     if np.count_nonzero(active) < _MIN_POINTS or not _spans_a_plane(matches.points_world[active]):
         return None
-    information, _, _, squares = _normal_equations(cam_from_world, matches, active)
-    inverse = _solve(information, np.eye(6))
+    information, _, _, squares = normal_equations(*_arguments(cam_from_world, matches, active))
+    inverse = _inverse(information)
     if inverse is None:
         return None
     # Residuals larger than sigma_px accounts for widen the covariance; smaller ones, which few matches give by chance, do not.
     num_residuals = max(2 * np.count_nonzero(active) - 6, 1)
     excess = max(1.0, squares / (_MEAN_WEIGHTED_SQUARE * num_residuals))
-    covariance = _VARIANCE_OF_ESTIMATE * excess * (inverse + inverse.T) / 2.0
     inliers = np.zeros(num_points, dtype=np.bool_)
     inliers[order] = active
     all_errors = np.full(num_points, np.inf)
     all_errors[order] = errors
-    return AbsolutePose(cam_from_world, inliers, covariance, all_errors)
+    return AbsolutePose(cam_from_world, inliers, _VARIANCE_OF_ESTIMATE * excess * inverse, all_errors)
 
 
-def _normal_equations(
-    cam_from_world: Rigid3, matches: _Matches, active: Bool[np.ndarray, " n"]
-) -> tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, "6"], float, float]:
-    return normal_equations(
+def _arguments(cam_from_world: Rigid3, matches: _Matches, active: Bool[np.ndarray, " n"]) -> tuple[object, ...]:
+    """What both kernels take."""
+    return (
         np.ascontiguousarray(cam_from_world.rotation),
         cam_from_world.translation,
         matches.normalized,
@@ -240,16 +226,16 @@ def _normal_equations(
     )
 
 
-def _solve(information: Float[np.ndarray, "6 6"], right: Float[np.ndarray, "6 *m"]) -> Float[np.ndarray, "6 *m"] | None:
-    """The solution of information @ x = right, None where the information does not fix all six degrees of freedom."""
+def _inverse(information: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"] | None:
+    """Its inverse, None where it does not fix all six degrees of freedom."""
     diagonal = np.sqrt(np.diag(information))
     if not (np.isfinite(information).all() and np.all(diagonal > 0.0)):
         return None
-    scaled = information / np.outer(diagonal, diagonal)  # metres and radians made comparable
-    if np.linalg.eigvalsh(scaled)[0] < 1e-12:
+    scales = np.outer(diagonal, diagonal)  # makes metres and radians comparable
+    if np.linalg.eigvalsh(information / scales)[0] < 1e-12:
         return None
-    scale = diagonal.reshape((6,) + (1,) * (right.ndim - 1))
-    return np.linalg.solve(scaled, right / scale) / scale
+    inverse = np.linalg.inv(information / scales) / scales
+    return (inverse + inverse.T) / 2.0
 
 
 def _reprojection_errors(cam_from_world: Rigid3, matches: _Matches, camera: Camera) -> Float[np.ndarray, " n"]:
@@ -258,7 +244,7 @@ def _reprojection_errors(cam_from_world: Rigid3, matches: _Matches, camera: Came
 
 
 def _normalized_covariances(camera: Camera, normalized: Float[np.ndarray, "n 2"], sigma_px: float) -> Float[np.ndarray, "n 2 2"]:
-    to_normalized = sigma_px * np.linalg.inv(camera.img_jacobian(normalized))
+    to_normalized = sigma_px * camera.normalized_jacobian(normalized)
     return to_normalized @ to_normalized.transpose(0, 2, 1)
 
 

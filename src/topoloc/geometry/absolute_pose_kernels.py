@@ -64,3 +64,81 @@ def normal_equations(rotation, translation, normalized, covariances, points_worl
         for b in range(a):
             information[a, b] = information[b, a]
     return information, gradient, cost, squares
+
+
+@njit(cache=True)
+def refine(rotation, translation, normalized, covariances, points_world, point_covariances, active, cauchy_scale, max_steps):
+    """Iteratively reweighted Gauss-Newton under Cauchy's loss; ends where the cost falls no more. Returns (rotation, translation)."""
+    information, gradient, cost, _ = normal_equations(
+        rotation, translation, normalized, covariances, points_world, point_covariances, active, cauchy_scale
+    )
+    for _ in range(max_steps):
+        is_definite, step = _solve_definite(information, -gradient)
+        if not is_definite:
+            break
+        turn = _exp_so3(step[3:])
+        new_rotation, new_translation = np.zeros((3, 3)), np.zeros(3)
+        for i in range(3):
+            new_translation[i] = step[i]
+            for k in range(3):
+                new_translation[i] += turn[i, k] * translation[k]
+                for j in range(3):
+                    new_rotation[i, j] += turn[i, k] * rotation[k, j]
+        information, gradient, new_cost, _ = normal_equations(
+            new_rotation, new_translation, normalized, covariances, points_world, point_covariances, active, cauchy_scale
+        )
+        if not new_cost <= cost:
+            break
+        rotation, translation = new_rotation, new_translation
+        if cost - new_cost <= 1e-9 * cost:
+            break
+        cost = new_cost
+    return rotation, translation
+
+
+@njit(cache=True)
+def _solve_definite(matrix, right):
+    """(True, x) with matrix @ x = right by Cholesky's decomposition; (False, _) if not positive definite."""
+    n = len(right)
+    lower = np.zeros((n, n))
+    x = np.zeros(n)
+    for i in range(n):
+        for j in range(i + 1):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= lower[i, k] * lower[j, k]
+            if i == j:
+                if not total > 1e-12 * matrix[i, i]:
+                    return False, x
+                lower[i, i] = np.sqrt(total)
+            else:
+                lower[i, j] = total / lower[j, j]
+    for i in range(n):
+        total = right[i]
+        for k in range(i):
+            total -= lower[i, k] * x[k]
+        x[i] = total / lower[i, i]
+    for i in range(n - 1, -1, -1):
+        total = x[i]
+        for k in range(i + 1, n):
+            total -= lower[k, i] * x[k]
+        x[i] = total / lower[i, i]
+    return True, x
+
+
+@njit(cache=True)
+def _exp_so3(omega):
+    """Rodrigues' formula."""
+    x, y, z = omega[0], omega[1], omega[2]
+    squared = x * x + y * y + z * z
+    angle = np.sqrt(squared)
+    a, b = 1.0, 0.5
+    if angle > 1e-7:
+        a, b = np.sin(angle) / angle, 2.0 * np.sin(0.5 * angle) ** 2 / squared
+    return np.array(
+        [
+            [1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
+            [b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x],
+            [b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)],
+        ]
+    )

@@ -113,12 +113,14 @@ class Camera:
         undistort = undistort_fisheye if self.is_fisheye else undistort_rational
         return undistort(self.distortion(), distorted)
 
-    def img_jacobian(self, normalized: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2 2"]:
-        """Derivative of the pixel by the undistorted coordinates on the plane z = 1, at these."""
+    def normalized_jacobian(self, normalized: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2 2"]:
+        """Derivative of `normalized_from_img` at the pixels whose undistorted coordinates these are."""
         focal = np.array([self.fx, self.fy])
         if not self.is_distorted:
-            return np.broadcast_to(np.diag(focal), (len(normalized), 2, 2)).copy()
-        return focal[:, None] * self._distort(normalized)[1]
+            return np.broadcast_to(np.diag(1.0 / focal), (len(normalized), 2, 2)).copy()
+        (a, b), (c, d) = self._distort(normalized)[1].transpose(1, 2, 0)
+        inverse = np.stack([d, -b, -c, a], axis=1) / (a * d - b * c)[:, None]
+        return inverse.reshape(-1, 2, 2) / focal
 
     def _distort(self, normalized: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
         return (distort_fisheye if self.is_fisheye else distort_rational)(self.distortion(), normalized)

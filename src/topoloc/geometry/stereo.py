@@ -91,8 +91,7 @@ def ray_covariances(
     """
     z = points_cam[:, 2:]
     ray = points_cam / z
-    img_jacobian = camera.img_jacobian(ray[:, :2])
-    across = sigma_px[:, None, None] * z[:, :, None] * np.linalg.inv(img_jacobian)
+    across = sigma_px[:, None, None] * z[:, :, None] * camera.normalized_jacobian(ray[:, :2])
     covariances = sigma_z[:, None, None] ** 2 * ray[:, :, None] * ray[:, None, :]
     covariances[:, :2, :2] += across @ across.transpose(0, 2, 1)
     return covariances
