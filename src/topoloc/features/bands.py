@@ -1,4 +1,4 @@
-"""Image rows shared out to threads: kernels that release the GIL fill one band of rows each."""
+"""Rows (of an image, of a table of products) shared out to threads: kernels that release the GIL fill one band each."""
 
 from __future__ import annotations
 

@@ -1,0 +1,131 @@
+"""Descriptor matching: nearest neighbour, ratio test (Lowe, 2004) and mutual check.
+
+`exact` compares all pairs through one matrix product; `flann` is the paper's choice, randomised KD-trees ("FLANN-based
+matching", section III-B). Descriptors must have unit length, so that distance^2 = 2 - 2 product.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, Int32
+
+from topoloc.features.features import Matches
+from topoloc.features.matching_kernels import find_unrivalled
+
+_ROWS_AT_ONCE = 256  # their products are read again while they are still in the cache
+_FLANN_KDTREE = 1
+_FLANN_NEIGHBOURS = 8  # of these the nearest that is no twin is the rival
+_NO_POINTS = np.zeros((0, 3), np.float32)
+_NO_RADII = np.zeros(0, np.float32)
+
+
+@dataclass(frozen=True)
+class MatchingConfig:
+    """How to match. ratio: a match must be nearer than `ratio` times its nearest rival; 0 accepts every nearest neighbour.
+
+    mutual: the train feature's nearest query feature must be this one. trees and checks are FLANN's: KD-trees built, leaves visited.
+    """
+
+    method: Literal["exact", "flann"] = "exact"
+    ratio: float = 0.8
+    mutual: bool = True
+    trees: int = 5
+    checks: int = 50
+
+
+def match_features(
+    query_descriptors: Float32[np.ndarray, "n d"],
+    train_descriptors: Float32[np.ndarray, "m d"],
+    config: MatchingConfig,
+) -> Matches:
+    """Matches between two images, at most one for a query feature, in the order of the query features."""
+    return _match(query_descriptors, train_descriptors, _NO_POINTS, _NO_RADII, config)
+
+
+def match_pooled(
+    query_descriptors: Float32[np.ndarray, "n d"],
+    train_descriptors: Float32[np.ndarray, "m d"],
+    train_points_world: Float[np.ndarray, "m 3"],
+    train_radii: Float[np.ndarray, " m"],
+    config: MatchingConfig,
+) -> Matches:
+    """Matches between an image and the features of several map nodes thrown together.
+
+    Neighbouring nodes hold the same physical point more than once, and such twins are no rivals of each other in the ratio
+    test: features whose points lie within the larger of their two `train_radii` (metres: what the depth error allows) are twins.
+    """
+    points, radii = train_points_world.astype(np.float32), train_radii.astype(np.float32)
+    return _match(query_descriptors, train_descriptors, points, radii, config)
+
+
+def _match(
+    query: Float32[np.ndarray, "n d"],
+    train: Float32[np.ndarray, "m d"],
+    points: Float32[np.ndarray, "p 3"],
+    radii: Float32[np.ndarray, " p"],
+    config: MatchingConfig,
+) -> Matches:
+    if len(query) == 0 or len(train) == 0:
+        return Matches(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros(0, np.float32))
+    if config.method == "exact":
+        train_idx, products = _nearest(query, train, config.ratio, points, radii)
+    else:
+        train_idx, products = _nearest_flann(query, train, points, radii, config)
+    query_idx = np.flatnonzero(train_idx >= 0).astype(np.int32)
+    if config.mutual and len(query_idx):
+        # Only the columns that won are asked back: far cheaper than column maxima of the whole table.
+        asked, of_asked = np.unique(train_idx[query_idx], return_inverse=True)
+        back_idx, _ = _nearest(train[asked], query, 0.0, _NO_POINTS, _NO_RADII)
+        query_idx = query_idx[back_idx[of_asked] == query_idx]
+    distances = np.sqrt(np.maximum(2.0 - 2.0 * products[query_idx], 0.0)).astype(np.float32)
+    return Matches(query_idx, train_idx[query_idx], distances)
+
+
+def _nearest(
+    query: Float32[np.ndarray, "n d"],
+    train: Float32[np.ndarray, "m d"],
+    ratio: float,
+    points: Float32[np.ndarray, "p 3"],
+    radii: Float32[np.ndarray, " p"],
+) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
+    """The nearest train row of each query row, -1 where the ratio test fails, and their scalar product."""
+    nearest_idx, products = np.empty(len(query), np.int32), np.empty(len(query), np.float32)
+    table = np.empty((min(_ROWS_AT_ONCE, len(query)), len(train)), np.float32)
+    for start in range(0, len(query), _ROWS_AT_ONCE):
+        rows = slice(start, min(start + _ROWS_AT_ONCE, len(query)))
+        block = table[: rows.stop - start]
+        np.matmul(query[rows], train.T, out=block)
+        np.max(block, axis=1, out=products[rows])
+        find_unrivalled(block, products[rows], ratio, points, radii, nearest_idx[rows])
+    return nearest_idx, products
+
+
+def _nearest_flann(
+    query: Float32[np.ndarray, "n d"],
+    train: Float32[np.ndarray, "m d"],
+    points: Float32[np.ndarray, "p 3"],
+    radii: Float32[np.ndarray, " p"],
+    config: MatchingConfig,
+) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
+    """As `_nearest`, by approximate neighbours."""
+    cv2.setRNGSeed(0)  # the trees split at random; two runs must give the same bytes
+    matcher = cv2.FlannBasedMatcher({"algorithm": _FLANN_KDTREE, "trees": config.trees}, {"checks": config.checks})
+    found = matcher.knnMatch(np.ascontiguousarray(query), np.ascontiguousarray(train), k=2 if len(points) == 0 else _FLANN_NEIGHBOURS)
+    nearest_idx, products = np.full(len(query), -1, np.int32), np.zeros(len(query), np.float32)
+    for row, neighbours in enumerate(found):
+        if not neighbours:
+            continue
+        best = neighbours[0]
+        products[row] = 1.0 - best.distance**2 / 2.0
+        others = [other for other in neighbours[1:] if not _are_twins(points, radii, best.trainIdx, other.trainIdx)]
+        if config.ratio <= 0.0 or not others or best.distance < config.ratio * others[0].distance:
+            nearest_idx[row] = best.trainIdx
+    return nearest_idx, products
+
+
+def _are_twins(points: Float32[np.ndarray, "p 3"], radii: Float32[np.ndarray, " p"], a: int, b: int) -> bool:
+    return len(points) > 0 and bool(np.linalg.norm(points[a] - points[b]) <= max(radii[a], radii[b]))

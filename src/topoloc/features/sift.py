@@ -1,0 +1,49 @@
+"""SIFT (Lowe, 2004), OpenCV's, as `Features`; by default with RootSIFT descriptors (Arandjelovic and Zisserman, 2012)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from topoloc.features.features import Features
+
+
+@dataclass(frozen=True)
+class SiftConfig:
+    """OpenCV's settings under their own names. max_features: the strongest are kept, 0 keeps all.
+
+    root: descriptors are L1-normalised and their square root is taken, so that their distance is Hellinger's.
+    """
+
+    max_features: int = 2000
+    contrast_threshold: float = 0.02
+    edge_threshold: float = 10.0
+    sigma: float = 1.6
+    num_octave_layers: int = 3
+    root: bool = True
+
+
+def extract_sift(image: UInt8[np.ndarray, "h w"], config: SiftConfig) -> Features:
+    """Key points and 128-d descriptors of a grey image, strongest first."""
+    detector = cv2.SIFT_create(
+        nfeatures=config.max_features,
+        nOctaveLayers=config.num_octave_layers,
+        contrastThreshold=config.contrast_threshold,
+        edgeThreshold=config.edge_threshold,
+        sigma=config.sigma,
+    )
+    keypoints, descriptors = detector.detectAndCompute(image, None)
+    if len(keypoints) == 0:
+        return Features.empty(128)
+    table = np.array([(*k.pt, k.size, k.angle, k.response) for k in keypoints], np.float32)
+    order = np.argsort(-table[:, 4], kind="stable")
+    if config.max_features:
+        order = order[: config.max_features]  # OpenCV keeps all that tie with the last
+    table, descriptors = table[order], descriptors[order].astype(np.float32)
+    descriptors /= np.maximum(np.linalg.norm(descriptors, ord=1 if config.root else 2, axis=1, keepdims=True), 1e-6)
+    if config.root:
+        descriptors = np.sqrt(descriptors)
+    return Features(table[:, :2].copy(), table[:, 2].copy(), np.deg2rad(table[:, 3]), table[:, 4].copy(), descriptors)

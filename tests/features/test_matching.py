@@ -1,0 +1,114 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from topoloc.features.matching import MatchingConfig, match_features, match_pooled
+
+
+def unit(rows: np.ndarray) -> np.ndarray:
+    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+
+
+def random_descriptors(seed: int, num: int, size: int = 64) -> np.ndarray:
+    return unit(np.random.default_rng(seed).normal(size=(num, size)))
+
+
+def blurred(descriptors: np.ndarray, seed: int, noise: float = 0.05) -> np.ndarray:
+    return unit(descriptors + noise * np.random.default_rng(seed).normal(size=descriptors.shape))
+
+
+def naive(query: np.ndarray, train: np.ndarray, ratio: float, mutual: bool) -> dict[int, int]:
+    distances = np.linalg.norm(query[:, None].astype(np.float64) - train[None], axis=2)
+    found = {}
+    for row, of_row in enumerate(distances):
+        first, *rest = np.argsort(of_row)
+        if rest and not of_row[first] < ratio * of_row[rest[0]]:
+            continue
+        if not mutual or distances[:, first].argmin() == row:
+            found[row] = int(first)
+    return found
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.integers(0, 10_000),
+    st.integers(1, 60),
+    st.integers(1, 90),
+    st.sampled_from([3, 8, 64]),
+    st.sampled_from([0.7, 0.8, 0.95]),
+    st.booleans(),
+)
+def test_exact_is_the_textbook(seed, num_query, num_train, size, ratio, mutual):
+    query, train = random_descriptors(seed, num_query, size), random_descriptors(seed + 1, num_train, size)
+    half = min(num_query, num_train) // 2
+    query[:half] = blurred(train[:half], seed + 2)
+    matches = match_features(query, train, MatchingConfig(ratio=ratio, mutual=mutual))
+    assert dict(zip(matches.query_idx.tolist(), matches.train_idx.tolist(), strict=True)) == naive(query, train, ratio, mutual)
+    exact = np.linalg.norm(query[matches.query_idx] - train[matches.train_idx], axis=1)
+    np.testing.assert_allclose(matches.distances, exact, atol=1e-3)
+
+
+@pytest.mark.parametrize("num_query", [255, 256, 257, 700])
+def test_more_queries_than_fit_one_block(num_query):
+    train = random_descriptors(0, 1000)
+    order = np.random.default_rng(1).permutation(1000)[:num_query]
+    matches = match_features(blurred(train[order], 2), train, MatchingConfig())
+    assert np.array_equal(matches.query_idx, np.arange(num_query))
+    assert np.array_equal(matches.train_idx, order)
+
+
+def test_ratio_zero_takes_every_nearest_neighbour():
+    query, train = random_descriptors(0, 50), random_descriptors(1, 30)
+    assert len(match_features(query, train, MatchingConfig(ratio=0.0, mutual=False))) == 50
+
+
+def test_mutual_keeps_one_query_a_train_feature():
+    train = random_descriptors(0, 40)
+    query = np.concatenate([blurred(train, 1), blurred(train, 2)])
+    assert len(match_features(query, train, MatchingConfig(mutual=False))) == 80
+    assert len(set(match_features(query, train, MatchingConfig()).train_idx)) == len(match_features(query, train, MatchingConfig())) == 40
+
+
+@pytest.mark.parametrize("method", ["exact", "flann"])
+@pytest.mark.parametrize(("num_query", "num_train"), [(0, 5), (5, 0), (0, 0)])
+def test_nothing_to_match(method, num_query, num_train):
+    empty = match_features(np.zeros((num_query, 64), np.float32), np.zeros((num_train, 64), np.float32), MatchingConfig(method=method))
+    assert len(empty) == 0
+
+
+def test_flann_finds_nearly_what_exact_finds_and_the_same_again():
+    train = random_descriptors(0, 800)
+    query = blurred(train, 1)
+    exact, flann = (match_features(query, train, MatchingConfig(method=method)) for method in ("exact", "flann"))
+    again = match_features(query, train, MatchingConfig(method="flann"))
+    agreeing = set(zip(exact.query_idx, exact.train_idx, strict=True)) & set(zip(flann.query_idx, flann.train_idx, strict=True))
+    assert len(agreeing) > 0.8 * len(exact)
+    assert np.array_equal(flann.query_idx, again.query_idx)
+    assert np.array_equal(flann.train_idx, again.train_idx)
+
+
+@pytest.mark.parametrize("method", ["exact", "flann"])
+def test_twins_of_a_point_are_no_rivals_but_other_points_are(method):
+    config = MatchingConfig(method=method, mutual=False)
+    one_node = random_descriptors(0, 20)
+    train = np.concatenate([one_node, blurred(one_node, 1, 0.01)])
+    points = np.random.default_rng(2).uniform(-10, 10, (20, 3))
+    query = blurred(one_node, 3, 0.01)
+    radii = np.full(40, 0.1)
+    assert len(match_features(query, train, config)) < 20
+    same_place = match_pooled(query, train, np.concatenate([points, points + 0.05]), radii, config)
+    assert np.array_equal(same_place.query_idx, np.arange(20))
+    assert np.array_equal(same_place.train_idx % 20, np.arange(20))
+    elsewhere = match_pooled(query, train, np.concatenate([points, points + 0.5]), radii, config)
+    plain = match_features(query, train, config)
+    assert np.array_equal(elsewhere.query_idx, plain.query_idx)
+
+
+def test_the_wider_radius_of_the_two_decides():
+    config = MatchingConfig(mutual=False)
+    descriptor = random_descriptors(0, 1)
+    train = np.concatenate([descriptor, descriptor])
+    points = np.array([[0.0, 0.0, 5.0], [0.0, 0.0, 5.5]])
+    assert len(match_pooled(descriptor, train, points, np.array([0.1, 0.6]), config)) == 1
+    assert len(match_pooled(descriptor, train, points, np.array([0.1, 0.4]), config)) == 0
