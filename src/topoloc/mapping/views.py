@@ -56,8 +56,8 @@ def _stereo_view(frame: StereoFrame, right: Image, rig: StereoRig, world_from_le
     if rig.is_rectified:
         return MappingView(frame.image, grey_of(frame.image), rig.left, world_from_left, grey_of(right), rig)
     r = _rectification(rig)
-    picture = cv2.remap(frame.image, *r.left_maps, cv2.INTER_LINEAR)
-    right_grey = cv2.remap(grey_of(right), *r.right_maps, cv2.INTER_LINEAR)
+    picture = cv2.remap(frame.image, r.left_map, None, cv2.INTER_LINEAR)
+    right_grey = cv2.remap(grey_of(right), r.right_map, None, cv2.INTER_LINEAR)
     world_from_rectified = world_from_left @ r.rectified_from_left.inverse()
     return MappingView(picture, grey_of(picture), r.rig.left, world_from_rectified, right_grey, r.rig)
 
