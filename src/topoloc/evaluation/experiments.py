@@ -1,0 +1,65 @@
+"""Ask a map about recordings whose truth is known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from topoloc.errors import CalibrationError, TrajectoryError
+from topoloc.evaluation.metrics import Answer
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.localizer import Localizer
+from topoloc.localization.result import Localization, NotLocalized
+from topoloc.mapping.nodes import node_distances
+from topoloc.sequences.frame import StereoFrame, StereoSequence
+
+
+def answer_queries(
+    localizer: Localizer,
+    sequence: StereoSequence,
+    map_from_truth: Rigid3 | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> list[Answer]:
+    """Localize every frame whose pose is known; only the left (or colour) picture is shown to the localizer.
+
+    Args:
+        map_from_truth: the recording's world given in the map's, where the two differ.
+
+    Raises:
+        TrajectoryError: the recording holds no truth.
+        CalibrationError: it holds no camera.
+    """
+    nodes = [summary.world_from_cam for summary in localizer.topomap.summaries]
+    lambda_rot = float(localizer.topomap.config["nodes"]["lambda_rot"])
+    frames = [i for i, pose in enumerate(sequence.poses) if pose is not None]
+    if not frames:
+        raise TrajectoryError(f"{sequence.name}: no frame has a known pose to judge against")
+    answers = []
+    for done, i in enumerate(frames):
+        frame = sequence[i]
+        assert frame.world_from_cam is not None
+        world_from_cam = (map_from_truth or Rigid3.identity()) @ frame.world_from_cam
+        nearest = int(np.argmin(node_distances(world_from_cam, nodes, lambda_rot)))
+        answers.append(Answer(frame.name, _localize(localizer, frame), world_from_cam, nearest))
+        if progress:
+            progress(sequence.name, done + 1, len(frames))
+    return answers
+
+
+def answer_elsewhere(
+    localizer: Localizer, sequence: StereoSequence, progress: Callable[[str, int, int], None] | None = None
+) -> list[Answer]:
+    """Show the localizer images that were not taken in the map: every pose that it gives is false."""
+    answers = []
+    for i, name in enumerate(sequence.names):
+        answers.append(Answer(name, _localize(localizer, sequence[i]), None))
+        if progress:
+            progress(f"{sequence.name} (elsewhere)", i + 1, len(sequence))
+    return answers
+
+
+def _localize(localizer: Localizer, frame: StereoFrame) -> Localization | NotLocalized:
+    if frame.camera is None:
+        raise CalibrationError(f"{frame.name}: no calibration; put a camera.json into the recording's folder")
+    return localizer.localize(frame.image, frame.camera)

@@ -1,0 +1,82 @@
+"""How good are these answers? Errors against truth, recall, false accepts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from topoloc.geometry.alignment import rotation_error, translation_error
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.result import Localization, NotLocalized
+
+# A query counts as recalled when its pose is within both (metres, degrees), of all queries.
+RECALL_THRESHOLDS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
+# An answer further off than both allow is a false accept: a wrong place, not a poor pose.
+MAX_TRANSLATION, MAX_ROTATION_DEG = 0.5, 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """A query with its result and its truth, which is None for an image from elsewhere: any pose given for that is false."""
+
+    query: str
+    result: Localization | NotLocalized
+    world_from_cam: Rigid3 | None
+    nearest_node_id: int | None = None
+
+    @property
+    def translation_m(self) -> float:
+        """Distance from the truth, metres; NaN where there is no pose or no truth."""
+        if isinstance(self.result, NotLocalized) or self.world_from_cam is None:
+            return float("nan")
+        return translation_error(self.result.world_from_cam, self.world_from_cam)
+
+    @property
+    def rotation_deg(self) -> float:
+        """Angle from the truth, degrees; NaN where there is no pose or no truth."""
+        if isinstance(self.result, NotLocalized) or self.world_from_cam is None:
+            return float("nan")
+        return float(np.rad2deg(rotation_error(self.result.world_from_cam, self.world_from_cam)))
+
+    @property
+    def is_false_accept(self) -> bool:
+        if isinstance(self.result, NotLocalized):
+            return False
+        return self.world_from_cam is None or self.translation_m > MAX_TRANSLATION or self.rotation_deg > MAX_ROTATION_DEG
+
+
+def summarize(answers: list[Answer]) -> dict[str, Any]:
+    """The evaluation as JSON: counts, medians over what was localized, recall over all queries that have a truth."""
+    with_truth = [a for a in answers if a.world_from_cam is not None]
+    translation = np.array([a.translation_m for a in with_truth])
+    rotation = np.array([a.rotation_deg for a in with_truth])
+    localized = np.isfinite(translation)
+    ranked = [a for a in with_truth if a.nearest_node_id is not None]
+    hits = [bool(a.result.candidates) and a.result.candidates[0].node_id == a.nearest_node_id for a in ranked]
+    stages = sorted({stage for a in answers for stage in a.result.times_ms})
+    return {
+        "num_queries": len(with_truth),
+        "num_localized": int(localized.sum()),
+        "median_translation_m": _median(translation[localized]),
+        "median_rotation_deg": _median(rotation[localized]),
+        "recall": {
+            f"{metres:g}m_{degrees:g}deg": float(np.mean((translation <= metres) & (rotation <= degrees))) if len(with_truth) else None
+            for metres, degrees in RECALL_THRESHOLDS
+        },
+        "topological_accuracy": float(np.mean(hits)) if hits else None,
+        "num_elsewhere": len(answers) - len(with_truth),
+        "false_accepts": sum(a.is_false_accept for a in answers),
+        "not_localized": _reasons(answers),
+        "median_times_ms": {stage: _median(np.array([a.result.times_ms.get(stage, 0.0) for a in answers])) for stage in stages},
+    }
+
+
+def _reasons(answers: list[Answer]) -> dict[str, int]:
+    reasons = [a.result.reason for a in answers if isinstance(a.result, NotLocalized)]
+    return {reason: reasons.count(reason) for reason in sorted(set(reasons))}
+
+
+def _median(values: np.ndarray) -> float | None:
+    return float(np.median(values)) if len(values) else None
