@@ -1,0 +1,192 @@
+"""SURF: speeded-up robust features, our own, on two CPU cores and without a build of OpenCV's non-free modules.
+
+H. Bay, T. Tuytelaars, L. Van Gool, "SURF: Speeded Up Robust Features", ECCV 2006; with A. Ess, CVIU 110(3), 2008. Filter
+sizes, sampling, orientation window and the order of a descriptor's numbers are those of OpenCV's implementation: key points
+have the same places and sizes, and descriptors of either can be matched with the other's.
+
+Patents: the method (not any one implementation) was patented by its authors' employers, KU Leuven and ETH Zurich, with
+Toyota Motor Europe: US 8,165,401, granted in 2012, and EP 2 027 558, of the international application WO 2007/128452, with a
+priority of 2006. Terms of twenty years from filing end, nominally, in 2026 or 2027, and differ from country to country; whether
+one is still in force where you are has not been checked here, and this is not legal advice. Where it matters, choose SIFT
+(`topoloc.features.sift`): its patent, US 6,711,293, expired in March 2020.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cache
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import Float32, Int32, Int64, UInt8
+
+from topoloc.features.features import Features
+from topoloc.features.surf_descriptor_kernels import box_mean_rows, describe, orient
+from topoloc.features.surf_detector_kernels import detect_band, integral_image, split_columns
+
+Result = TypeVar("Result")
+
+DESCRIPTOR_LENGTH = 64
+SMALLEST_FILTER_PX = 9  # whose sigma is 1.2 pixels (Bay et al. 2008, 3.3)
+FILTER_INCREMENT_PX = 6
+SIGMA_OF_FILTER = 1.2 / SMALLEST_FILTER_PX
+PATCH_SAMPLES = 21
+# 32-bit sums hold a filter response up to this side (whole box 1 by 5/9 of it, values of 255).
+LARGEST_FILTER_PX = 3600
+# (step, box) of the smoothed images that descriptors are sampled from; see `_choose_levels`.
+LEVELS = ((1, 2), (1, 3), (1, 4), *((step, box * step) for step in (2, 4, 8, 16, 32, 64, 128) for box in (2, 3)))
+
+
+@dataclass(frozen=True)
+class SurfConfig:
+    """What to detect. hessian_threshold is for images of 0..255, as OpenCV's; num_layers are the layers kept of each octave."""
+
+    hessian_threshold: float = 400.0
+    num_octaves: int = 4
+    num_layers: int = 3
+    upright: bool = False
+    max_features: int = 2000
+    num_threads: int = 2
+
+    def __post_init__(self) -> None:
+        if self.hessian_threshold < 0 or min(self.num_octaves, self.num_layers, self.num_threads) < 1 or self.max_features < 0:
+            raise ValueError(f"SURF: threshold and max_features must be at least 0, the other numbers at least 1: {self}")
+        if (SMALLEST_FILTER_PX + FILTER_INCREMENT_PX * (self.num_layers + 1)) << (self.num_octaves - 1) > LARGEST_FILTER_PX:
+            raise ValueError(f"SURF: filters beyond {LARGEST_FILTER_PX} px, fewer octaves or layers are needed: {self}")
+
+
+def extract_surf(
+    image: UInt8[np.ndarray, "h w"], config: SurfConfig = SurfConfig(), mask: UInt8[np.ndarray, "h w"] | None = None
+) -> Features:
+    """The strongest SURF key points of a grey image, strongest first, with descriptors (n, 64) of unit length.
+
+    Where `mask` is 0 nothing is found: at least half of the filter of a key point must lie on non-zero mask. Upright
+    key points have angle 0; their windows are read as OpenCV's are, turned by 270 degrees. The result is the same for any
+    number of threads.
+    """
+    integral = integral_image(np.ascontiguousarray(image))
+    found = _detect(integral, config)
+    if mask is not None:
+        found = found[_on_mask(mask, found)]
+    found = found[np.argsort(-found[:, 3], kind="stable")[: config.max_features]]
+    if len(found) == 0:
+        return Features.empty(DESCRIPTOR_LENGTH)
+    points, sizes = np.ascontiguousarray(found[:, :2]), found[:, 2].copy()
+    angles, descriptors = _describe(integral, points, sizes * np.float32(SIGMA_OF_FILTER), config)
+    return Features(points, sizes, angles, found[:, 3].copy(), descriptors)
+
+
+def _filter_sizes(octave: int, num_layers: int) -> Int64[np.ndarray, " layers"]:
+    """Filter sizes of an octave in pixels, with the layer below and the one above those in which maxima are sought."""
+    return (SMALLEST_FILTER_PX + FILTER_INCREMENT_PX * np.arange(num_layers + 2)) << octave
+
+
+def _pattern_edges(sizes: Int64[np.ndarray, " layers"]) -> Int64[np.ndarray, "layers 10"]:
+    """Where the lobes of a 9x9 second-derivative pattern begin and end when it is scaled to each size, in pixels."""
+    return np.rint(np.outer((sizes / SMALLEST_FILTER_PX).astype(np.float32), np.arange(10, dtype=np.float32))).astype(np.int64)
+
+
+def _detect(integral: Int32[np.ndarray, "h1 w1"], config: SurfConfig) -> Float32[np.ndarray, "m 4"]:
+    """Maxima of the Hessian's determinant: rows x, y, size, response."""
+    height, width = integral.shape[0] - 1, integral.shape[1] - 1
+
+    def detect(octave: int, first: int, last: int) -> Float32[np.ndarray, "m 4"]:
+        step = 1 << octave
+        edges = _pattern_edges(_filter_sizes(octave, config.num_layers))
+        columns, top, rows = edges, 0, integral
+        if step > 1:
+            top = max((first - 1) * step - int(edges[-1, -1]), 0)
+            rows = split_columns(integral, step, top, min(last * step + int(edges[-1, -1]) + step, height + 1))
+            columns = edges % step * (rows.shape[1] // step) + edges // step
+        return detect_band(rows, top, height, width, edges, columns, step, first, last, np.float32(config.hessian_threshold))
+
+    def detect_part(part: int) -> list[Float32[np.ndarray, "m 4"]]:
+        found = []
+        for octave in octaves:
+            num_rows = height >> octave
+            found.append(detect(octave, num_rows * part // num_parts, num_rows * (part + 1) // num_parts))
+        return found
+
+    # Maxima need the layer above theirs, thus the four smallest filters at the least; the first empty octave ends the search.
+    octaves = [o for o in range(config.num_octaves) if _filter_sizes(o, config.num_layers)[2] < min(height, width)]
+    if not octaves:
+        return np.zeros((0, 4), np.float32)
+    num_parts = config.num_threads
+    parts = _in_threads(detect_part, range(num_parts))
+    # By octave, then row: the order, and so the ranking of equal responses, does not depend on the number of parts.
+    return np.concatenate([part[k] for k in range(len(octaves)) for part in parts])
+
+
+def _on_mask(mask: UInt8[np.ndarray, "h w"], found: Float32[np.ndarray, "m 4"]) -> np.ndarray:
+    """Which filters lie with at least half of their area on the mask."""
+    counts = integral_image((mask > 0).astype(np.uint8))
+    half = found[:, 2:3] / 2
+    low = np.clip(np.rint(found[:, :2] + 0.5 - half).astype(int), 0, None)
+    high = np.minimum(np.rint(found[:, :2] + 0.5 + half).astype(int), mask.shape[::-1])
+    (left, top), (right, bottom) = low.T, high.T
+    covered = counts[bottom, right] - counts[top, right] - counts[bottom, left] + counts[top, left]
+    return 2 * covered >= (right - left) * (bottom - top)
+
+
+def _choose_levels(spacings: Float32[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
+    """The level whose smoothing is nearest to that of averaging over windows of the sample spacing (pixels).
+
+    Reading bilinearly from box means has the variance (box^2 - 1) / 12 + step^2 / 6, averaging bilinear reads of the
+    image itself over windows has (spacing^2 + 1) / 12 + 1 / 6.
+    """
+    spacing_of_level = [np.sqrt(box**2 + 2 * step**2 - 4) for step, box in LEVELS]
+    bounds = np.sqrt(np.multiply(spacing_of_level[1:], spacing_of_level[:-1]))
+    return np.searchsorted(bounds, spacings)
+
+
+def _describe(
+    integral: Int32[np.ndarray, "h1 w1"], points: Float32[np.ndarray, "n 2"], scales: Float32[np.ndarray, " n"], config: SurfConfig
+) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, "n 64"]]:
+    """Angles in radians and descriptors of key points at these scales (sigma, pixels)."""
+    num_parts = config.num_threads
+    angles = np.zeros(len(points), np.float32)
+    descriptors = np.empty((len(points), DESCRIPTOR_LENGTH), np.float32)
+    # OpenCV averages over a whole number of pixels a side
+    spacings = (np.floor(PATCH_SAMPLES * scales) / PATCH_SAMPLES).astype(np.float32)
+    level_idx = _choose_levels(spacings)
+    levels = {int(k): _empty_level(integral, *LEVELS[k]) for k in np.unique(level_idx)}
+
+    def prepare_part(part: int) -> None:
+        for k, level in levels.items():
+            step, box = LEVELS[k]
+            box_mean_rows(integral, box, step, level, len(level) * part // num_parts, len(level) * (part + 1) // num_parts)
+        if not config.upright:
+            share = slice(len(points) * part // num_parts, len(points) * (part + 1) // num_parts)
+            orient(integral, points[share], scales[share], angles[share])
+
+    def describe_part(part: int) -> None:
+        for k, level in levels.items():
+            step, box = LEVELS[k]
+            rows = np.flatnonzero(level_idx == k)[part::num_parts].copy()
+            describe(level, (box - 1) / 2, step, points, spacings, directions, rows, descriptors)
+
+    _in_threads(prepare_part, range(num_parts))
+    directions = np.full_like(angles, 1.5 * np.pi) if config.upright else angles
+    _in_threads(describe_part, range(num_parts))
+    return angles, descriptors
+
+
+def _empty_level(integral: Int32[np.ndarray, "h1 w1"], step: int, box: int) -> Float32[np.ndarray, "lh lw"]:
+    height, width = integral.shape
+    return np.empty(((height - 1 - box) // step + 1, (width - 1 - box) // step + 1), np.float32)
+
+
+@cache
+def _pool(process_id: int) -> ThreadPoolExecutor:
+    """One pool a process: threads do not survive a fork."""
+    return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="surf")
+
+
+def _in_threads(function: Callable[[int], Result], parts: Iterable[int]) -> list[Result]:
+    """The results of function(part) of each part in order, the first computed by the caller."""
+    first, *others = parts
+    futures = [_pool(os.getpid()).submit(function, part) for part in others]
+    return [function(first), *(future.result() for future in futures)]

@@ -1,0 +1,190 @@
+"""Numba kernels of `surf`, first half: integral image, determinant of the Hessian, maxima over place and scale.
+
+All sums live in int32 that may wrap: a difference of wrapped sums is still right as long as the box itself fits.
+"""
+
+import numpy as np
+from numba import njit
+
+
+@njit(nogil=True, cache=True)
+def integral_image(image):
+    """(h + 1, w + 1) int32, modulo 2^32: entry (y, x) is the sum of image[:y, :x]."""
+    height, width = image.shape
+    integral = np.empty((height + 1, width + 1), np.int32)
+    integral[0] = 0
+    for y in range(height):
+        source = image[y]
+        above = integral[y][1:]
+        integral[y + 1, 0] = 0
+        below = integral[y + 1][1:]
+        total = np.int32(0)
+        for x in range(width):
+            total = np.int32(total + source[x])
+            below[x] = total
+        for x in range(width):
+            below[x] = np.int32(below[x] + above[x])
+    return integral
+
+
+@njit(nogil=True, cache=True)
+def split_columns(integral, step, first, last):
+    """Rows [first, last) of the integral image, columns reordered: first those at 0, step, 2 step, ..., then those at 1, 1 + step, ...
+
+    What a filter bank sampled at every step-th pixel reads is then contiguous, so that its loops vectorise.
+    """
+    width = integral.shape[1]
+    phase_length = (width + step - 1) // step
+    split = np.zeros((last - first, step * phase_length), np.int32)
+    for y in range(last - first):
+        source = integral[first + y]
+        for phase in range(step):
+            target = split[y, phase * phase_length : (phase + 1) * phase_length]
+            for j in range((width - phase + step - 1) // step):
+                target[j] = source[phase + j * step]
+    return split
+
+
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+def _hessian_row(sums, top, edges, columns, rows, out):
+    """Determinants of one row of filters with their upper edge at row `top` of `sums`.
+
+    edges are the ten edge positions of the pattern in pixels, columns the places where `split_columns` put them.
+    """
+    rows_xx, rows_yy, rows_xy = rows[0], rows[1], rows[2]
+    i0, i1, i2, i3, i4 = sums[top], sums[top + edges[1]], sums[top + edges[2]], sums[top + edges[3]], sums[top + edges[4]]
+    i5, i6, i7 = sums[top + edges[5]], sums[top + edges[6]], sums[top + edges[7]]
+    i8, i9 = sums[top + edges[8]], sums[top + edges[9]]
+    # A second derivative is the whole box less three times its middle third: two boxes in place of three.
+    for x in range(rows.shape[1]):
+        rows_xx[x] = np.int32(i7[x] - i2[x])
+        rows_yy[x] = np.int32(i9[x] - i0[x] - 3 * (i6[x] - i3[x]))
+        rows_xy[x] = np.int32(i4[x] - i1[x] - i8[x] + i5[x])
+    xx_0, xx_3, xx_6, xx_9 = rows_xx, rows_xx[columns[3] :], rows_xx[columns[6] :], rows_xx[columns[9] :]
+    yy_2, yy_7 = rows_yy[columns[2] :], rows_yy[columns[7] :]
+    xy_1, xy_4, xy_5, xy_8 = rows_xy[columns[1] :], rows_xy[columns[4] :], rows_xy[columns[5] :], rows_xy[columns[8] :]
+    lobe = np.float32(1.0) / np.float32((edges[6] - edges[3]) * (edges[7] - edges[2]))
+    quarter = np.float32(0.9) / np.float32((edges[4] - edges[1]) * (edges[4] - edges[1]))  # 0.9^2 = 0.81, Bay et al. 2008, Eq. 3
+    for x in range(out.shape[0]):
+        dxx = np.float32(np.int32(xx_9[x] - xx_0[x] - 3 * (xx_6[x] - xx_3[x]))) * lobe
+        dyy = np.float32(np.int32(yy_7[x] - yy_2[x])) * lobe
+        dxy = np.float32(np.int32(xy_4[x] - xy_1[x] - xy_8[x] + xy_5[x])) * quarter
+        out[x] = dxx * dyy - dxy * dxy
+
+
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+def _mark_candidates(below, up, mid, down, above, first, last, threshold, marks):
+    """marks[j] = 1 where mid[j] exceeds the threshold and six of its 26 neighbours: a cheap sieve that vectorises."""
+    count = last - first
+    centre, left, right = mid[first:last], mid[first - 1 : last - 1], mid[first + 1 : last + 1]
+    north, south, smaller, larger = up[first:last], down[first:last], below[first:last], above[first:last]
+    for j in range(count):
+        value = centre[j]
+        ring = max(max(max(left[j], right[j]), max(north[j], south[j])), max(max(smaller[j], larger[j]), threshold))
+        marks[j] = np.uint8(value > ring)
+
+
+@njit(nogil=True, cache=True)
+def _is_maximum(ring, layer, up, mid, down, j):
+    value = ring[layer, mid, j]
+    for other in range(layer - 1, layer + 2):
+        for row in (up, mid, down):
+            for column in range(j - 1, j + 2):
+                if ring[other, row, column] >= value and not (other == layer and row == mid and column == j):
+                    return False
+    return True
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _refine(ring, layer, up, mid, down, j):
+    """The vertex (x, y, scale) of the quadratic through the 27 determinants, in grid units; ok is False beyond one unit."""
+    below, here, above = ring[layer - 1], ring[layer], ring[layer + 1]
+    value = np.float64(here[mid, j])
+    gx = (here[mid, j + 1] - here[mid, j - 1]) * 0.5
+    gy = (here[down, j] - here[up, j]) * 0.5
+    gs = (above[mid, j] - below[mid, j]) * 0.5
+    xx = here[mid, j + 1] - 2.0 * value + here[mid, j - 1]
+    yy = here[down, j] - 2.0 * value + here[up, j]
+    ss = above[mid, j] - 2.0 * value + below[mid, j]
+    xy = (here[down, j + 1] - here[down, j - 1] - here[up, j + 1] + here[up, j - 1]) * 0.25
+    xs = (above[mid, j + 1] - above[mid, j - 1] - below[mid, j + 1] + below[mid, j - 1]) * 0.25
+    ys = (above[down, j] - above[up, j] - below[down, j] + below[up, j]) * 0.25
+    cofactor_xx, cofactor_xy, cofactor_xs = yy * ss - ys * ys, xs * ys - xy * ss, xy * ys - yy * xs
+    determinant = xx * cofactor_xx + xy * cofactor_xy + xs * cofactor_xs
+    if determinant == 0.0:
+        return False, 0.0, 0.0, 0.0
+    cofactor_yy, cofactor_ys, cofactor_ss = xx * ss - xs * xs, xy * xs - xx * ys, xx * yy - xy * xy
+    dx = -(cofactor_xx * gx + cofactor_xy * gy + cofactor_xs * gs) / determinant
+    dy = -(cofactor_xy * gx + cofactor_yy * gy + cofactor_ys * gs) / determinant
+    ds = -(cofactor_xs * gx + cofactor_ys * gy + cofactor_ss * gs) / determinant
+    return max(abs(dx), abs(dy), abs(ds)) <= 1.0, dx, dy, ds
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _collect_row(ring, layer, i, sizes, step, threshold, marks, words, found, count):
+    """Append the maxima of row i of this layer to `found` (x, y, size, response); returns the (grown) array and its count."""
+    num_columns = ring.shape[2]
+    margin = sizes[layer + 1] // 2 // step + 1
+    up, mid, down = (i - 1) % 3, i % 3, (i + 1) % 3
+    last = num_columns - margin
+    _mark_candidates(
+        ring[layer - 1, mid], ring[layer, up], ring[layer, mid], ring[layer, down], ring[layer + 1, mid], margin, last, threshold, marks
+    )
+    num_marks = last - margin
+    for k in range(num_marks, min((num_marks + 7) // 8 * 8, marks.shape[0])):
+        marks[k] = 0
+    size = sizes[layer]
+    for word in range((num_marks + 7) // 8):
+        if words[word] == 0:
+            continue
+        for k in range(word * 8, word * 8 + 8):
+            j = k + margin
+            if marks[k] == 0 or not _is_maximum(ring, layer, up, mid, down, j):
+                continue
+            ok, dx, dy, ds = _refine(ring, layer, up, mid, down, j)
+            if not ok:
+                continue
+            if count == found.shape[0]:
+                grown = np.empty((2 * count, 4), np.float32)
+                grown[:count] = found
+                found = grown
+            half = (size - 1) * 0.5
+            found[count, 0] = step * (j - size // 2 // step) + half + dx * step
+            found[count, 1] = step * (i - size // 2 // step) + half + dy * step
+            found[count, 2] = np.rint(size + ds * (size - sizes[layer - 1]))
+            found[count, 3] = ring[layer, mid, j]
+            count += 1
+    return found, count
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def detect_band(sums, sums_top, height, width, edges, columns, step, first, last, threshold):
+    """Maxima (m, 4) = x, y, size, response in rows [first, last) of an octave's grid (every step-th pixel).
+
+    sums are the rows from `sums_top` on of the integral image of a (height, width) image, as `split_columns` orders them.
+    edges and columns (n, 10) describe the filters of the octave's n layers. Only three rows of each layer are ever held.
+    """
+    sizes = edges[:, 9].copy()
+    num_layers, num_rows, num_columns = sizes.shape[0], height // step, width // step
+    ring = np.zeros((num_layers, 3, num_columns), np.float32)
+    rows = np.empty((3, sums.shape[1]), np.int32)
+    marks = np.zeros((num_columns + 7) // 8 * 8, np.uint8)
+    words = marks.view(np.uint64)
+    found = np.empty((256, 4), np.float32)
+    count = 0
+    for i in range(max(first - 1, 0), min(last + 1, num_rows)):
+        for layer in range(num_layers):
+            size = sizes[layer]
+            margin = size // 2 // step
+            if i < margin or (i - margin) * step + size > height or width < size:
+                continue
+            out = ring[layer, i % 3, margin : margin + 1 + (width - size) // step]
+            _hessian_row(sums, (i - margin) * step - sums_top, edges[layer], columns[layer], rows, out)
+        row = i - 1
+        if row < first:
+            continue
+        for layer in range(1, num_layers - 1):
+            margin = sizes[layer + 1] // 2 // step + 1
+            if margin <= row < num_rows - margin and num_columns > 2 * margin:
+                found, count = _collect_row(ring, layer, row, sizes, step, threshold, marks, words, found, count)
+    return found[:count].copy()
