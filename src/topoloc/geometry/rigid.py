@@ -29,7 +29,7 @@ def exp_so3(omega: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     k = skew(omega)
     if angle < _SMALL_ANGLE:
         return np.eye(3) + k + 0.5 * k @ k
-    return np.eye(3) + np.sin(angle) / angle * k + (1.0 - np.cos(angle)) / angle**2 * (k @ k)
+    return np.eye(3) + np.sin(angle) / angle * k + 2.0 * np.sin(angle / 2.0) ** 2 / angle**2 * (k @ k)
 
 
 def log_so3(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
@@ -103,8 +103,10 @@ class Rigid3:
             TrajectoryError: not finite, or not a rotation within `tolerance`.
         """
         m = np.asarray(matrix, dtype=np.float64)
-        if m.shape not in ((3, 4), (4, 4)) or not np.all(np.isfinite(m)):
-            raise TrajectoryError(f"not a pose: {'shape ' + str(m.shape) if m.ndim != 2 or m.size < 12 else 'NaN or infinite entries'}")
+        if m.shape not in ((3, 4), (4, 4)):
+            raise TrajectoryError(f"not a pose: a matrix of shape {m.shape}, not 3x4 or 4x4")
+        if not np.all(np.isfinite(m)):
+            raise TrajectoryError("not a pose: NaN or infinite entries")
         u, singular, vt = np.linalg.svd(m[:3, :3])
         if np.any(np.abs(singular - 1.0) > tolerance) or np.linalg.det(u @ vt) < 0:
             raise TrajectoryError("not a pose: its 3x3 part is no rotation")
@@ -175,4 +177,4 @@ def _left_jacobian_so3(omega: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"
     k = skew(omega)
     if angle < 1e-5:  # the closed form loses all digits of (angle - sin angle) below this
         return np.eye(3) + 0.5 * k + k @ k / 6.0
-    return np.eye(3) + (1.0 - np.cos(angle)) / angle**2 * k + (angle - np.sin(angle)) / angle**3 * (k @ k)
+    return np.eye(3) + 2.0 * np.sin(angle / 2.0) ** 2 / angle**2 * k + (angle - np.sin(angle)) / angle**3 * (k @ k)

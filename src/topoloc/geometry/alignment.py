@@ -1,0 +1,122 @@
+"""Bringing two coordinate frames together, and the distance between two poses.
+
+A trajectory here is a list of ``world_from_cam`` poses; two of them, of the same moments in worlds a and b, give
+``a_from_b`` of the worlds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from topoloc.errors import TrajectoryError
+from topoloc.geometry.rigid import Rigid3
+
+# A spread below this share of the longest one, or of a micrometre, is rounding: the points are on a line.
+_MIN_RELATIVE_SPREAD = 1e-6
+_MIN_SPREAD = 1e-6
+
+
+def align_points(points_a: Float[np.ndarray, "n 3"], points_b: Float[np.ndarray, "n 3"]) -> Rigid3:
+    """a_from_b that minimises the squared distances between points_a and the moved points_b.
+
+    Umeyama, *Least-squares estimation of transformation parameters between two point patterns*, 1991, with the scale held at 1.
+
+    Raises:
+        TrajectoryError: fewer than three points, all on a line, or not finite: no single rotation fits best.
+    """
+    rotation, _ = _umeyama_rotation(points_a, points_b)
+    return Rigid3(rotation, points_a.mean(axis=0) - rotation @ points_b.mean(axis=0))
+
+
+def align_points_with_scale(points_a: Float[np.ndarray, "n 3"], points_b: Float[np.ndarray, "n 3"]) -> tuple[Rigid3, float]:
+    """(a_from_b, scale) with ``points_a ~ a_from_b.apply(scale * points_b)``, for a b without metric scale (Umeyama 1991, Eq. 40-42).
+
+    Raises:
+        TrajectoryError: as `align_points`.
+    """
+    rotation, trace = _umeyama_rotation(points_a, points_b)
+    centre_a, centre_b = points_a.mean(axis=0), points_b.mean(axis=0)
+    scale = float(trace / np.sum((points_b - centre_b) ** 2))
+    return Rigid3(rotation, centre_a - scale * rotation @ centre_b), scale
+
+
+def align_trajectories(world_a_from_cams: Sequence[Rigid3], world_b_from_cams: Sequence[Rigid3]) -> Rigid3:
+    """world_a_from_world_b by the positions alone, as in the usual absolute trajectory error.
+
+    Raises:
+        TrajectoryError: different lengths, or positions that fix no rotation: a straight or standing camera; see `align_poses`.
+    """
+    _check_lengths(world_a_from_cams, world_b_from_cams)
+    return align_points(_positions(world_a_from_cams), _positions(world_b_from_cams))
+
+
+def align_poses(
+    world_a_from_cams: Sequence[Rigid3],
+    world_b_from_cams: Sequence[Rigid3],
+    sigma_translation: float = 0.05,
+    sigma_rotation: float = 0.02,
+) -> Rigid3:
+    """world_a_from_world_b by positions and orientations together: for short, straight and standing trajectories, too.
+
+    The rotation minimises squared position residuals over `sigma_translation` (m) plus squared chordal distances of the
+    orientations over `sigma_rotation` (rad): one Wahba problem, in closed form. With a long way the positions decide,
+    with a short one the orientations.
+
+    Raises:
+        TrajectoryError: different lengths, no pose, or values that are not finite.
+    """
+    _check_lengths(world_a_from_cams, world_b_from_cams)
+    if len(world_a_from_cams) == 0:
+        raise TrajectoryError("no common pose to align the trajectories by")
+    positions_a, positions_b = _positions(world_a_from_cams), _positions(world_b_from_cams)
+    centre_a, centre_b = positions_a.mean(axis=0), positions_b.mean(axis=0)
+    correlation = (positions_a - centre_a).T @ (positions_b - centre_b) / sigma_translation**2
+    for a, b in zip(world_a_from_cams, world_b_from_cams, strict=True):
+        # A chordal distance ||R_a - R R_b||^2 is twice the squared angle, for small angles.
+        correlation += a.rotation @ b.rotation.T / (2.0 * sigma_rotation**2)
+    if not np.isfinite(correlation).all():
+        raise TrajectoryError("trajectories to align hold poses that are not finite")
+    rotation, _ = _nearest_rotation(correlation)
+    return Rigid3(rotation, centre_a - rotation @ centre_b)
+
+
+def translation_error(a_from_b: Rigid3, estimated_a_from_b: Rigid3) -> float:
+    """Distance of the two translations, metres: of poses world_from_cam, the distance of the camera's positions."""
+    return float(np.linalg.norm(a_from_b.translation - estimated_a_from_b.translation))
+
+
+def rotation_error(a_from_b: Rigid3, estimated_a_from_b: Rigid3) -> float:
+    """Angle between the two rotations, radians in [0, pi]; precise for small angles, where the trace's arccosine is not."""
+    return Rigid3(a_from_b.rotation.T @ estimated_a_from_b.rotation, np.zeros(3)).angle()
+
+
+def _umeyama_rotation(points_a: Float[np.ndarray, "n 3"], points_b: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3 3"], float]:
+    """The best rotation and the trace of the signed singular values (Umeyama's tr(D S), times n)."""
+    if len(points_a) != len(points_b):
+        raise TrajectoryError(f"point sets to align have {len(points_a)} and {len(points_b)} points")
+    if not (np.isfinite(points_a).all() and np.isfinite(points_b).all()):
+        raise TrajectoryError("points to align hold values that are not finite")
+    for points in (points_a, points_b):
+        spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) if len(points) >= 3 else np.zeros(3)
+        if spread[1] <= max(_MIN_SPREAD, _MIN_RELATIVE_SPREAD * spread[0]):
+            raise TrajectoryError(f"{len(points)} points on one line (or fewer than three) fix no rotation")
+    return _nearest_rotation((points_a - points_a.mean(axis=0)).T @ (points_b - points_b.mean(axis=0)))
+
+
+def _nearest_rotation(correlation: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarray, "3 3"], float]:
+    """The rotation R of the largest tr(R' C), and that trace."""
+    u, singular, vt = np.linalg.svd(correlation)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    return u * signs @ vt, float(singular @ signs)
+
+
+def _positions(world_from_cams: Sequence[Rigid3]) -> Float[np.ndarray, "n 3"]:
+    return np.array([pose.translation for pose in world_from_cams], dtype=np.float64).reshape(-1, 3)
+
+
+def _check_lengths(world_a_from_cams: Sequence[Rigid3], world_b_from_cams: Sequence[Rigid3]) -> None:
+    if len(world_a_from_cams) != len(world_b_from_cams):
+        raise TrajectoryError(f"trajectories to align have {len(world_a_from_cams)} and {len(world_b_from_cams)} poses")
