@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import bisect
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -203,7 +203,7 @@ def _pose_from_tum(tokens: list[str]) -> Rigid3:
     return Rigid3.from_quat_wxyz(quat_wxyz, np.array([tx, ty, tz]))
 
 
-def _pose(path: Path, line: int, make) -> Rigid3:
+def _pose(path: Path, line: int, make: Callable[[], Rigid3]) -> Rigid3:
     try:
         return make()
     except TrajectoryError as error:

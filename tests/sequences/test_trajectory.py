@@ -1,0 +1,141 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tiny_recordings import assert_same_pose, kitti_row, pose, tum_line
+
+from topoloc.errors import TrajectoryError
+from topoloc.geometry.rigid import Rigid3
+from topoloc.sequences.open import open_sequence
+from topoloc.sequences.trajectory import Trajectory, poses_at, read_trajectory, with_trajectory, write_kitti, write_tum
+
+SECOND = 1_000_000_000
+
+
+def shift(x: float) -> Rigid3:
+    return Rigid3(np.eye(3), np.array([x, 0.0, 0.0]))
+
+
+def test_tum_times_are_exact(tmp_path: Path):
+    path = tmp_path / "a.tum"
+    path.write_text(f"# a comment\n\n{tum_line('1403715273.262142976', pose(0))}\n{tum_line('1403715273.262142977', pose(1))} # last\n")
+    trajectory = read_trajectory(path)
+    assert trajectory.t_ns == [1403715273262142976, 1403715273262142977]
+    assert_same_pose(trajectory.world_from_cam[1], pose(1))
+
+
+def test_nanoseconds_are_told_by_their_size(tmp_path: Path):
+    path = tmp_path / "a.tum"
+    path.write_text(f"{tum_line('1403715273262142976.000000', pose(0))}\n{tum_line('1403715273312143104', pose(1))}\n")
+    assert read_trajectory(path).t_ns == [1403715273262142976, 1403715273312143104]
+
+
+def test_kitti_rows(tmp_path: Path):
+    path = tmp_path / "a.txt"
+    path.write_text(f"{kitti_row(pose(0))}\n{kitti_row(pose(1))}\n")
+    trajectory = read_trajectory(path)
+    assert trajectory.t_ns is None
+    assert_same_pose(trajectory.world_from_cam[1], pose(1))
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.integers(-5 * SECOND, 2_000_000_000 * SECOND), min_size=1, max_size=5, unique=True), st.integers(0, 1000))
+def test_what_is_written_is_read_again(tmp_path_factory: pytest.TempPathFactory, times: list[int], seed: int):
+    folder = tmp_path_factory.mktemp("trip")
+    poses = [Rigid3.exp(xi) for xi in np.random.default_rng(seed).normal(size=(len(times), 6))]
+    write_tum(folder / "a.tum", Trajectory(poses, sorted(times)))
+    write_kitti(folder / "a.txt", Trajectory(poses))
+    assert read_trajectory(folder / "a.tum").t_ns == sorted(times)
+    for name in ("a.tum", "a.txt"):
+        for one, other in zip(read_trajectory(folder / name).world_from_cam, poses, strict=True):
+            assert_same_pose(one, other)
+    assert sorted(path.name for path in folder.iterdir()) == ["a.tum", "a.txt"]
+
+
+def test_writing_replaces_the_file_or_leaves_it(tmp_path: Path):
+    path = tmp_path / "a.tum"
+    path.write_text("old")
+    with pytest.raises(TrajectoryError, match="times"):
+        write_tum(path, Trajectory([pose(0)]))
+    assert path.read_text() == "old"
+    write_tum(path, Trajectory([pose(0)], [7]))
+    assert read_trajectory(path).t_ns == [7]
+    with pytest.raises(TrajectoryError, match="cannot be written"):
+        write_kitti(tmp_path / "nowhere" / "a.txt", Trajectory([pose(0)]))
+
+
+@pytest.mark.parametrize(
+    ("lines", "says"),
+    [
+        (["0 0 0 0 0 0 0 1", "1 nan 0 0 0 0 0 1"], r"line 2.*nan"),
+        (["0 0 0 0 0 0 0 1", "1 x 0 0 0 0 0 1"], r"line 2.*number"),
+        (["0 0 0 0 0 0 0 1", "nan 0 0 0 0 0 0 1"], r"line 2.*not a time"),
+        (["0 0 0 0 0 0 0 1", "1 0 0 0 0 0 1"], r"line 2.*7 columns"),
+        (["0 0 0 0 0 0 1"], r"line 1.*7 columns"),
+        (["# comment", "0 0 0 0 0 0 0 0"], r"line 2.*rotation"),
+        (["0 0 0 0 0 0 0.5 0.5"], r"line 1.*rotation"),
+        (["1 0 0 0 0 0 0 1", "1 0 0 0 0 0 0 1"], r"line 2.*not after"),
+        (["2 0 0 0 0 0 0 1", "1 0 0 0 0 0 0 1"], r"line 2.*not after"),
+        (["1 0 0 0 0 1 0 0 0 0 1 0", "1 0 0 0 0 1 0 0 0 0 -1 0"], r"line 2.*rotation"),
+        (["1 0 0 0 0 1 0 0 0 0 inf 0"], r"line 1.*infinite"),
+        (["# nothing"], "no poses"),
+    ],
+)
+def test_bad_lines_are_named(tmp_path: Path, lines: list[str], says: str):
+    path = tmp_path / "bad.tum"
+    path.write_text("\n".join(lines))
+    with pytest.raises(TrajectoryError, match=r"bad\.tum.*" + says):
+        read_trajectory(path)
+
+
+def test_missing_and_binary_files(tmp_path: Path):
+    with pytest.raises(TrajectoryError, match="no such"):
+        read_trajectory(tmp_path / "gone.tum")
+    (tmp_path / "binary.tum").write_bytes(b"\xff\xfe\x00\x81" * 9)
+    with pytest.raises(TrajectoryError, match=r"binary\.tum"):
+        read_trajectory(tmp_path / "binary.tum")
+
+
+def test_poses_between_are_interpolated_and_gaps_are_not():
+    trajectory = Trajectory([shift(0), shift(1), shift(5)], [0, SECOND // 10, SECOND])
+    times = [0, SECOND // 40, SECOND // 10, SECOND // 2, SECOND, SECOND + 500_000, SECOND + 2_000_000, -500_000, SECOND // 10 + 900_000]
+    found = [None if pose is None else round(float(pose.translation[0]), 9) for pose in poses_at(trajectory, times)]
+    assert found == [0.0, 0.25, 1.0, None, 5.0, 5.0, None, 0.0, 1.0]
+    assert poses_at(trajectory, [SECOND // 2], max_gap=1.0)[0] is not None
+
+
+def test_rows_have_no_times_to_look_up():
+    with pytest.raises(TrajectoryError, match="row"):
+        poses_at(Trajectory([shift(0)]), [0])
+
+
+def test_other_poses_for_the_same_recording(kitti: Path, tmp_path: Path):
+    sequence = open_sequence(kitti)
+    (tmp_path / "slam.tum").write_text(f"{tum_line('0.0', pose(5))}\n{tum_line('0.1', pose(6))}\n")
+    other = with_trajectory(sequence, tmp_path / "slam.tum")
+    assert_same_pose(other[0].world_from_cam, pose(5))
+    assert_same_pose(other.poses[1], pose(6))
+    assert other.poses[2] is None
+    assert other[2].world_from_cam is None
+    np.testing.assert_array_equal(other[2].image, sequence[2].image)
+    assert_same_pose(sequence[0].world_from_cam, pose(0))
+
+
+def test_a_trajectory_that_fits_no_frame(kitti: Path, tmp_path: Path):
+    sequence = open_sequence(kitti)
+    (tmp_path / "later.tum").write_text(tum_line("1000.0", pose(0)))
+    with pytest.raises(TrajectoryError, match=r"later\.tum: no frame"):
+        with_trajectory(sequence, tmp_path / "later.tum")
+    (tmp_path / "short.txt").write_text(kitti_row(pose(0)))
+    with pytest.raises(TrajectoryError, match=r"short\.txt: 1 poses for 3 frames"):
+        with_trajectory(sequence, tmp_path / "short.txt")
+
+
+def test_euroc_trajectory_in_nanoseconds(euroc: Path, tmp_path: Path):
+    sequence = open_sequence(euroc)
+    path = tmp_path / "CameraTrajectory.txt"
+    path.write_text("".join(f"{tum_line(f'{t_ns}.000000', pose(i))}\n" for i, t_ns in enumerate(sequence.t_ns)))
+    for index, found in enumerate(with_trajectory(sequence, path).poses):
+        assert_same_pose(found, pose(index))
