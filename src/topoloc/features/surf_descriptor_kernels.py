@@ -5,8 +5,8 @@ from numba import njit
 
 PATCH_SIZE = 20  # samples a side of the described window, in units of the key point's scale s
 ORIENTATION_RADIUS = 6  # in units of s
-NUM_SECTORS = 72  # steps of 5 degrees for the sliding window
-WINDOW_SECTORS = 12  # of 60 degrees
+SECTOR_DEG = 5  # by which the window of the orientation slides
+WINDOW_SECTORS = 12
 
 
 def _gaussian(length, sigma):
@@ -46,64 +46,85 @@ def box_mean_rows(integral, box, step, level, first, last):
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
-def _haar_samples(integral, centre_x, centre_y, scale, gradients):
-    """Fill gradients (2, n) with the weighted Haar responses (side about 4 s) around a key point; returns their number."""
-    height, width = integral.shape
-    half = np.int64(np.rint(2 * scale))
-    side = 2 * half
-    start_x, start_y = centre_x - (side - 1) * 0.5, centre_y - (side - 1) * 0.5
-    count = 0
-    for k in range(ORIENTATION_SAMPLES.shape[1]):
-        x = np.int64(np.rint(start_x + ORIENTATION_SAMPLES[0, k] * scale))
-        y = np.int64(np.rint(start_y + ORIENTATION_SAMPLES[1, k] * scale))
-        if x < 0 or y < 0 or x >= width - side or y >= height - side:
-            continue
-        a, b, c = integral[y, x], integral[y, x + half], integral[y, x + side]
-        d, f = integral[y + half, x], integral[y + half, x + side]
-        g, h, i = integral[y + side, x], integral[y + side, x + half], integral[y + side, x + side]
-        weight = ORIENTATION_SAMPLES[2, k]
-        gradients[0, count] = np.float32(np.int32(i - g - c + a - 2 * (h - b) + 2 * (g - a))) * weight
-        gradients[1, count] = np.float32(np.int32(i - g - c + a - 2 * (f - d) + 2 * (c - a))) * weight
-        count += 1
-    return count
+def _haar_samples(integral, centre_x, centre_y, scale, corners, weights, gradients):
+    """Fill gradients (2, n) with the weighted Haar responses (side about 4 s) around a key point, zero beyond the image.
+
+    corners and weights (n,) are scratch space: first the places of all windows, in a loop that vectorises, then their sums.
+    """
+    stride = np.int32(integral.shape[1])
+    half = np.int32(np.rint(np.float32(2.0) * scale))
+    side = np.int32(2 * half)
+    last_x, last_y = np.int32(integral.shape[1] - side), np.int32(integral.shape[0] - side)
+    start_x, start_y = centre_x - (side - 1) * np.float32(0.5), centre_y - (side - 1) * np.float32(0.5)
+    for k in range(corners.shape[0]):
+        x = np.int32(np.rint(start_x + ORIENTATION_SAMPLES[0, k] * scale))
+        y = np.int32(np.rint(start_y + ORIENTATION_SAMPLES[1, k] * scale))
+        inside = (x >= 0) & (y >= 0) & (x < last_x) & (y < last_y)
+        corners[k] = np.int32(y * stride + x) if inside else np.int32(0)
+        weights[k] = ORIENTATION_SAMPLES[2, k] if inside else np.float32(0.0)
+    a_flat = integral.ravel()
+    b_flat, c_flat = a_flat[half:], a_flat[side:]
+    d_flat, f_flat = a_flat[half * stride :], a_flat[half * stride + side :]
+    g_flat, h_flat, i_flat = a_flat[side * stride :], a_flat[side * stride + half :], a_flat[side * stride + side :]
+    for k in range(corners.shape[0]):
+        at = np.uintp(corners[k])
+        rising = np.int32(i_flat[at] - a_flat[at])
+        falling = np.int32(g_flat[at] - c_flat[at])
+        across = np.int32(rising - 2 * (h_flat[at] - b_flat[at]) + falling)
+        down = np.int32(rising - 2 * (f_flat[at] - d_flat[at]) - falling)
+        gradients[0, k] = np.float32(across) * weights[k]
+        gradients[1, k] = np.float32(down) * weights[k]
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
-def _sectors(gradients, count, sectors):
-    """The 5-degree sector of each gradient, by a polynomial for the arc tangent (error below 0.01 degrees)."""
-    per_radian = np.float32(NUM_SECTORS / (2 * np.pi))
-    quarter = np.float32(NUM_SECTORS / 4)
-    for k in range(count):
+def _sectors(gradients, sectors, first_degree):
+    """The sector of each gradient's direction, rounded to whole degrees; first_degree (2, n) repeats those at a sector's first.
+
+    The arc tangent is a polynomial, good to 0.001 degrees, and without branches, so that the loop vectorises.
+    """
+    for k in range(sectors.shape[0]):
         x, y = gradients[0, k], gradients[1, k]
         ax, ay = abs(x), abs(y)
         ratio = min(ax, ay) / max(max(ax, ay), np.float32(1e-30))
-        r2 = ratio * ratio
-        poly = np.float32(-0.01172120) * r2 + np.float32(0.05265332)
-        poly = poly * r2 - np.float32(0.11643287)
-        poly = poly * r2 + np.float32(0.19354346)
-        poly = poly * r2 - np.float32(0.33262347)
-        poly = poly * r2 + np.float32(0.99997726)
-        turn = ratio * poly * per_radian
-        turn = quarter - turn if ay > ax else turn
-        turn = 2 * quarter - turn if x < 0 else turn
-        turn = 4 * quarter - turn if y < 0 else turn
-        sectors[k] = min(np.int32(turn), np.int32(NUM_SECTORS - 1))
+        square = ratio * ratio
+        angle = np.float32(-0.01172120) * square + np.float32(0.05265332)
+        angle = angle * square - np.float32(0.11643287)
+        angle = angle * square + np.float32(0.19354346)
+        angle = angle * square - np.float32(0.33262347)
+        angle = (angle * square + np.float32(0.99997726)) * ratio * np.float32(180 / np.pi)
+        angle = np.float32(90.0) - angle if ay > ax else angle
+        angle = np.float32(180.0) - angle if x < 0 else angle
+        angle = np.float32(360.0) - angle if y < 0 else angle
+        degree = np.int32(angle + np.float32(0.5))
+        degree = np.int32(0) if degree >= 360 else degree
+        sector = np.int32(np.float32(degree) * np.float32(1 / SECTOR_DEG) + np.float32(0.1))
+        is_first = degree == sector * np.int32(SECTOR_DEG)
+        sectors[k] = sector
+        first_degree[0, k] = x if is_first else np.float32(0.0)
+        first_degree[1, k] = y if is_first else np.float32(0.0)
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
-def _dominant_angle(gradients, sectors, count, sums):
-    """The direction of the longest sum of gradients within any window of 60 degrees (Bay et al. 2008, 4.1)."""
+def _dominant_angle(gradients, sectors, first_degree, sums, windows):
+    """The direction of the longest sum of gradients within any window of 60 degrees (Bay et al. 2008, 4.1).
+
+    Windows are centred on multiples of 5 degrees and open, 59 whole degrees wide: twelve sectors less the first degree.
+    """
+    num_sectors = windows.shape[1]
     sums[:] = 0
-    for k in range(count):
-        sums[0, sectors[k]] += gradients[0, k]
-        sums[1, sectors[k]] += gradients[1, k]
-    sums[:, NUM_SECTORS:] = sums[:, :WINDOW_SECTORS]
+    windows[:] = 0
+    for axis in range(2):
+        for k in range(sectors.shape[0]):
+            sums[axis, sectors[k]] += gradients[axis, k]
+            windows[axis, sectors[k]] -= first_degree[axis, k]
+        for sector in range(WINDOW_SECTORS):
+            sums[axis, num_sectors + sector] = sums[axis, sector]
+        for offset in range(WINDOW_SECTORS):
+            for first in range(num_sectors):
+                windows[axis, first] += sums[axis, first + offset]
     best, best_x, best_y = np.float32(-1.0), np.float32(0.0), np.float32(0.0)
-    for first in range(NUM_SECTORS):
-        x, y = np.float32(0.0), np.float32(0.0)
-        for sector in range(first, first + WINDOW_SECTORS):
-            x += sums[0, sector]
-            y += sums[1, sector]
+    for first in range(num_sectors):
+        x, y = windows[0, first], windows[1, first]
         length = x * x + y * y
         if length > best:
             best, best_x, best_y = length, x, y
@@ -113,13 +134,16 @@ def _dominant_angle(gradients, sectors, count, sums):
 @njit(nogil=True, cache=True, error_model="numpy")
 def orient(integral, points, scales, angles):
     """Fill angles (n,) of the key points at points (n, 2) of scales (n,)."""
-    gradients = np.zeros((2, ORIENTATION_SAMPLES.shape[1]), np.float32)
-    sectors = np.zeros(ORIENTATION_SAMPLES.shape[1], np.int32)
-    sums = np.zeros((2, NUM_SECTORS + WINDOW_SECTORS), np.float32)
+    num_samples, num_sectors = ORIENTATION_SAMPLES.shape[1], 360 // SECTOR_DEG
+    corners, sectors = np.empty(num_samples, np.int32), np.empty(num_samples, np.int32)
+    weights = np.empty(num_samples, np.float32)
+    gradients, first_degree = np.empty((2, num_samples), np.float32), np.empty((2, num_samples), np.float32)
+    sums = np.empty((2, num_sectors + WINDOW_SECTORS), np.float32)
+    windows = np.empty((2, num_sectors), np.float32)
     for k in range(points.shape[0]):
-        count = _haar_samples(integral, points[k, 0], points[k, 1], scales[k], gradients)
-        _sectors(gradients, count, sectors)
-        angles[k] = _dominant_angle(gradients, sectors, count, sums)
+        _haar_samples(integral, points[k, 0], points[k, 1], scales[k], corners, weights, gradients)
+        _sectors(gradients, sectors, first_degree)
+        angles[k] = _dominant_angle(gradients, sectors, first_degree, sums, windows)
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")

@@ -146,7 +146,9 @@ def _collect_row(ring, layer, i, sizes, step, threshold, marks, words, found, co
                 continue
             if count == found.shape[0]:
                 grown = np.empty((2 * count, 4), np.float32)
-                grown[:count] = found
+                for row in range(count):
+                    for column in range(4):
+                        grown[row, column] = found[row, column]
                 found = grown
             half = (size - 1) * 0.5
             found[count, 0] = step * (j - size // 2 // step) + half + dx * step
