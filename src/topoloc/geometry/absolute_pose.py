@@ -16,11 +16,13 @@ import numpy as np
 import poselib
 from jaxtyping import Bool, Float
 
-from topoloc.geometry.absolute_pose_kernels import normal_equations, refine
+from topoloc.geometry.absolute_pose_kernels import normal_equations, refine, squared_errors
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 
 _MIN_POINTS = 4
+_MAX_WIDENING = 3.0
+_MAX_SCALE_STEPS = 30
 _CAUCHY_SCALE = 2.3849  # 95 % efficiency on Gaussian residuals (Holland and Welsch, 1977)
 # What Cauchy's weights w do to Gaussian residuals r of two dimensions, so that the covariance is not biased by them:
 # E[w r^2] / 2, and E[w] E[w^2 r^2 / 2] / E[w - w^2 r^2 / c^2]^2, the M-estimator's variance over the inverse of its information.
@@ -30,7 +32,11 @@ _VARIANCE_OF_ESTIMATE = 0.8265
 
 @dataclass(frozen=True)
 class AbsolutePoseConfig:
-    """`sigma_px` is the standard deviation of a matched key point along x and along y; the threshold decides what an inlier is."""
+    """`sigma_px` is the standard deviation of a matched key point along x and along y.
+
+    `max_reprojection_error_px` decides what an inlier is. With the poselib method, the uncertainty of a point, projected,
+    widens it up to threefold: in proportion to the standard deviation that it adds to `sigma_px`.
+    """
 
     method: Literal["poselib", "opencv"] = "poselib"
     max_reprojection_error_px: float = 4.0
@@ -152,7 +158,7 @@ def _solve_with_poselib(matches: _Matches, camera: Camera, config: AbsolutePoseC
         return None
     cam_from_world = Rigid3(matrix[:, :3].copy(), matrix[:, 3].copy())
     for _ in range(2):  # the second time with the inliers of the first
-        inliers = _reprojection_errors(cam_from_world, matches, camera) <= config.max_reprojection_error_px
+        inliers = _select_inliers(cam_from_world, matches, _reprojection_errors(cam_from_world, matches, camera), config)
         if not _spans_a_plane(matches.points_world[inliers]):
             return None
         cam_from_world = _refine(cam_from_world, matches, inliers, config.max_refinement_steps)
@@ -160,7 +166,7 @@ def _solve_with_poselib(matches: _Matches, camera: Camera, config: AbsolutePoseC
 
 
 def _refine(cam_from_world: Rigid3, matches: _Matches, active: Bool[np.ndarray, " n"], max_steps: int) -> Rigid3:
-    rotation, translation = refine(*_arguments(cam_from_world, matches, active), max_steps)
+    rotation, translation = refine(*_arguments(cam_from_world, matches), active, _CAUCHY_SCALE, max_steps)
     return Rigid3(rotation, translation)
 
 
@@ -195,25 +201,40 @@ def _with_evidence(
     cam_from_world: Rigid3, matches: _Matches, camera: Camera, config: AbsolutePoseConfig, order: np.ndarray, num_points: int
 ) -> AbsolutePose | None:
     errors = _reprojection_errors(cam_from_world, matches, camera)
-    active = errors <= config.max_reprojection_error_px
+    active = _select_inliers(cam_from_world, matches, errors, config)
     if np.count_nonzero(active) < _MIN_POINTS or not _spans_a_plane(matches.points_world[active]):
         return None
-    information, _, _, squares = normal_equations(*_arguments(cam_from_world, matches, active))
+    scale = _noise_scale(squared_errors(*_arguments(cam_from_world, matches))[active])
+    information, *_ = normal_equations(*_arguments(cam_from_world, matches), active, _CAUCHY_SCALE * scale)
     inverse = _inverse(information)
     if inverse is None:
         return None
-    # Residuals larger than sigma_px accounts for widen the covariance; smaller ones, which few matches give by chance, do not.
-    num_residuals = max(2 * np.count_nonzero(active) - 6, 1)
-    excess = max(1.0, squares / (_MEAN_WEIGHTED_SQUARE * num_residuals))
+    covariance = _VARIANCE_OF_ESTIMATE * scale**2 * inverse
     inliers = np.zeros(num_points, dtype=np.bool_)
     inliers[order] = active
     all_errors = np.full(num_points, np.inf)
     all_errors[order] = errors
-    return AbsolutePose(cam_from_world, inliers, _VARIANCE_OF_ESTIMATE * excess * inverse, all_errors)
+    return AbsolutePose(cam_from_world, inliers, covariance, all_errors)
 
 
-def _arguments(cam_from_world: Rigid3, matches: _Matches, active: Bool[np.ndarray, " n"]) -> tuple[object, ...]:
-    """What both kernels take."""
+def _noise_scale(squares: Float[np.ndarray, " n"]) -> float:
+    """How many times larger than assumed the noise is, at least 1, of squared whitened residuals (Huber's proposal 2, 1964).
+
+    Never below 1: that few matches fit well is chance, or the fit itself.
+    """
+    num_free = max(2 * len(squares) - 6, 1)
+    variance = 1.0
+    for _ in range(_MAX_SCALE_STEPS):
+        scaled = squares / variance
+        ratio = float(np.sum(scaled / (1.0 + scaled / _CAUCHY_SCALE**2))) / (_MEAN_WEIGHTED_SQUARE * num_free)
+        if ratio <= 1.001:
+            break
+        variance *= ratio
+    return float(np.sqrt(variance))
+
+
+def _arguments(cam_from_world: Rigid3, matches: _Matches) -> tuple[object, ...]:
+    """What all kernels take."""
     return (
         np.ascontiguousarray(cam_from_world.rotation),
         cam_from_world.translation,
@@ -221,8 +242,6 @@ def _arguments(cam_from_world: Rigid3, matches: _Matches, active: Bool[np.ndarra
         matches.covariances,
         matches.points_world,
         matches.point_covariances,
-        active,
-        _CAUCHY_SCALE,
     )
 
 
@@ -236,6 +255,17 @@ def _inverse(information: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"] 
         return None
     inverse = np.linalg.inv(information / scales) / scales
     return (inverse + inverse.T) / 2.0
+
+
+def _select_inliers(
+    cam_from_world: Rigid3, matches: _Matches, errors_px: Float[np.ndarray, " n"], config: AbsolutePoseConfig
+) -> Bool[np.ndarray, " n"]:
+    limit_px = config.max_reprojection_error_px
+    if config.method == "opencv" or len(matches.point_covariances) == 0:
+        return errors_px <= limit_px
+    # A plain threshold would cut the errors of uncertain points short, and what is left would look too precise.
+    squares = squared_errors(*_arguments(cam_from_world, matches))
+    return (squares <= (limit_px / config.sigma_px) ** 2) & (errors_px <= _MAX_WIDENING * limit_px)
 
 
 def _reprojection_errors(cam_from_world: Rigid3, matches: _Matches, camera: Camera) -> Float[np.ndarray, " n"]:

@@ -5,13 +5,52 @@ from numba import njit
 
 
 @njit(cache=True)
+def _whitened(rotation, translation, normalized, covariance, point_world, point_covariances, i):
+    """(u, v, 1/z, e, S^-1, e' S^-1 e) of match i, with e = projected - observed on the plane z = 1; the last is infinite behind.
+
+    S = `covariance` + D R P R' D' with D the projection's derivative and P the point's covariance, absent if there are none.
+    """
+    x = rotation[0, 0] * point_world[0] + rotation[0, 1] * point_world[1] + rotation[0, 2] * point_world[2] + translation[0]
+    y = rotation[1, 0] * point_world[0] + rotation[1, 1] * point_world[1] + rotation[1, 2] * point_world[2] + translation[1]
+    z = rotation[2, 0] * point_world[0] + rotation[2, 1] * point_world[1] + rotation[2, 2] * point_world[2] + translation[2]
+    if not z > 1e-6:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.inf
+    u, v, w = x / z, y / z, 1.0 / z
+    s00, s01, s11 = covariance[0, 0], covariance[0, 1], covariance[1, 1]
+    if len(point_covariances) > 0:
+        for k in range(3):
+            ak = w * (rotation[0, k] - u * rotation[2, k])
+            bk = w * (rotation[1, k] - v * rotation[2, k])
+            for m in range(3):
+                am = w * (rotation[0, m] - u * rotation[2, m])
+                bm = w * (rotation[1, m] - v * rotation[2, m])
+                s00 += ak * point_covariances[i, k, m] * am
+                s01 += ak * point_covariances[i, k, m] * bm
+                s11 += bk * point_covariances[i, k, m] * bm
+    determinant = s00 * s11 - s01 * s01
+    if not determinant > 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.inf
+    e0, e1 = u - normalized[0], v - normalized[1]
+    i00, i01, i11 = s11 / determinant, -s01 / determinant, s00 / determinant
+    return u, v, w, e0, e1, i00, i01, i11, e0 * e0 * i00 + 2.0 * e0 * e1 * i01 + e1 * e1 * i11
+
+
+@njit(cache=True)
+def squared_errors(rotation, translation, normalized, covariances, points_world, point_covariances):
+    """Squared Mahalanobis length of each match's reprojection error; infinite behind the camera."""
+    squares = np.empty(len(normalized))
+    for i in range(len(normalized)):
+        squares[i] = _whitened(rotation, translation, normalized[i], covariances[i], points_world[i], point_covariances, i)[8]
+    return squares
+
+
+@njit(cache=True)
 def normal_equations(rotation, translation, normalized, covariances, points_world, point_covariances, active, cauchy_scale):
     """Gauss-Newton's normal equations of the whitened reprojection errors on the plane z = 1.
 
     `covariances` (n, 2, 2) are those of `normalized`; `point_covariances` is (n, 3, 3), or (0, 3, 3) for exact points.
-    The residual is e = projected - observed, its covariance S = covariances + D R P R' D' with D the projection's derivative,
-    and its derivative by the left perturbation (translation, rotation) is D [I, -[p]x].
-    Each point weighs 1 / (1 + e' S^-1 e / c^2), Cauchy's weight.
+    The derivative of an error by the left perturbation (translation, rotation) is D [I, -[p]x]; each match weighs
+    1 / (1 + e' S^-1 e / c^2), Cauchy's weight.
     Returns the information (6, 6), the gradient (6), the Cauchy cost and the sum of the weighted squared residuals.
     """
     information = np.zeros((6, 6))
@@ -22,30 +61,12 @@ def normal_equations(rotation, translation, normalized, covariances, points_worl
     for i in range(len(normalized)):
         if not active[i]:
             continue
-        x = rotation[0, 0] * points_world[i, 0] + rotation[0, 1] * points_world[i, 1] + rotation[0, 2] * points_world[i, 2] + translation[0]
-        y = rotation[1, 0] * points_world[i, 0] + rotation[1, 1] * points_world[i, 1] + rotation[1, 2] * points_world[i, 2] + translation[1]
-        z = rotation[2, 0] * points_world[i, 0] + rotation[2, 1] * points_world[i, 1] + rotation[2, 2] * points_world[i, 2] + translation[2]
-        if z < 1e-6:
-            cost += 1e6
+        u, v, w, e0, e1, i00, i01, i11, squared = _whitened(
+            rotation, translation, normalized[i], covariances[i], points_world[i], point_covariances, i
+        )
+        if squared == np.inf:
+            cost += 1e6  # a step that puts a match behind the camera is not taken
             continue
-        u, v, w = x / z, y / z, 1.0 / z
-        e0, e1 = u - normalized[i, 0], v - normalized[i, 1]
-        s00, s01, s11 = covariances[i, 0, 0], covariances[i, 0, 1], covariances[i, 1, 1]
-        if len(point_covariances) > 0:
-            for k in range(3):
-                for m in range(3):
-                    ak = w * (rotation[0, k] - u * rotation[2, k])
-                    bk = w * (rotation[1, k] - v * rotation[2, k])
-                    am = w * (rotation[0, m] - u * rotation[2, m])
-                    bm = w * (rotation[1, m] - v * rotation[2, m])
-                    s00 += ak * point_covariances[i, k, m] * am
-                    s01 += ak * point_covariances[i, k, m] * bm
-                    s11 += bk * point_covariances[i, k, m] * bm
-        determinant = s00 * s11 - s01 * s01
-        if not determinant > 0.0:
-            continue
-        i00, i01, i11 = s11 / determinant, -s01 / determinant, s00 / determinant
-        squared = e0 * e0 * i00 + 2.0 * e0 * e1 * i01 + e1 * e1 * i11
         weight = 1.0 / (1.0 + squared / cauchy_scale**2)
         cost += 0.5 * cauchy_scale**2 * np.log1p(squared / cauchy_scale**2)
         squares += weight * squared

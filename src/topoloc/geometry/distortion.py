@@ -88,7 +88,7 @@ def undistort_fisheye(coefficients: Float[np.ndarray, "4"], distorted: Float[np.
                 break
             theta = np.clip(theta + (theta_d - value) / slope, 0.0, limit)
         scale = np.where(theta_d > 1e-9, np.tan(theta) / np.maximum(theta_d, 1e-9), 1.0)
-    return np.where((error < 1e-9)[:, None], distorted * scale[:, None], np.nan)
+        return np.where((error < 1e-9)[:, None], distorted * scale[:, None], np.nan)
 
 
 @lru_cache(maxsize=256)
