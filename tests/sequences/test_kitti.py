@@ -121,6 +121,13 @@ def test_bad_times(kitti: Path, times: str, says: str):
         open_kitti(kitti)
 
 
+@pytest.mark.parametrize("name", ["times.txt", "calib.txt"])
+def test_what_is_no_text(kitti: Path, name: str):
+    (kitti / name).write_bytes(b"\xff\xfe\x00\x81" * 9)
+    with pytest.raises(RecordingError, match=name):
+        open_kitti(kitti)
+
+
 def test_truth_of_another_length(kitti: Path):
     (kitti / "poses.txt").write_text(kitti_row(pose(0)))
     with pytest.raises(TrajectoryError, match=r"poses\.txt: 1 poses for 3"):

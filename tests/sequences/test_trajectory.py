@@ -80,7 +80,7 @@ def test_writing_replaces_the_file_or_leaves_it(tmp_path: Path):
         (["2 0 0 0 0 0 0 1", "1 0 0 0 0 0 0 1"], r"line 2.*not after"),
         (["1 0 0 0 0 1 0 0 0 0 1 0", "1 0 0 0 0 1 0 0 0 0 -1 0"], r"line 2.*rotation"),
         (["1 0 0 0 0 1 0 0 0 0 inf 0"], r"line 1.*infinite"),
-        (["# nothing"], "no poses"),
+        (["# nothing"], "nothing in"),
     ],
 )
 def test_bad_lines_are_named(tmp_path: Path, lines: list[str], says: str):
@@ -121,6 +121,14 @@ def test_other_poses_for_the_same_recording(kitti: Path, tmp_path: Path):
     assert other[2].world_from_cam is None
     np.testing.assert_array_equal(other[2].image, sequence[2].image)
     assert_same_pose(sequence[0].world_from_cam, pose(0))
+
+
+def test_rows_of_the_whole_recording_for_a_part_of_it(kitti: Path, tmp_path: Path):
+    part = open_sequence(f"{kitti}@0::2")
+    (tmp_path / "whole.txt").write_text("\n".join(kitti_row(pose(index)) for index in (5, 6, 7)))
+    assert_same_pose(with_trajectory(part, tmp_path / "whole.txt")[1].world_from_cam, pose(7))
+    (tmp_path / "part.txt").write_text("\n".join(kitti_row(pose(index)) for index in (8, 9)))
+    assert_same_pose(with_trajectory(part, tmp_path / "part.txt").poses[1], pose(9))
 
 
 def test_a_trajectory_that_fits_no_frame(kitti: Path, tmp_path: Path):

@@ -51,7 +51,7 @@ def test_truth_of_another_day(tum: Path):
 
 @pytest.mark.parametrize(
     ("text", "says"),
-    [("# none\n", "no pictures"), ("1.0\n", "line 1"), ("2 a.png\n1 b.png\n", "line 2.*not after"), ("1 a.png\n", "")],
+    [("# none\n", "nothing in"), ("1.0\n", "line 1"), ("2 a.png\n1 b.png\n", "line 2.*not after"), ("1 a.png\n", "")],
 )
 def test_bad_lists(tum: Path, text: str, says: str):
     (tum / "depth.txt").write_text(text)

@@ -17,7 +17,8 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.recording import Recording, RightPictures
-from topoloc.sequences.trajectory import parse_times, poses_at, read_asl_poses
+from topoloc.sequences.text_rows import read_file_list
+from topoloc.sequences.trajectory import poses_at, read_asl_poses
 
 LOOKS_FOR = "mav0/ with cam0/data.csv, or cam0/data.csv"
 MAX_TRUTH_GAP = 0.05
@@ -122,18 +123,8 @@ def _numbers(path: Path, text: str, key: str, count: int) -> list[float]:
 
 def _read_csv(path: Path) -> dict[int, Path]:
     """Picture of each time stamp."""
-    numbered = [(number, line) for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), start=1)]
-    rows = [(number, [cell.strip() for cell in line.split(",")]) for number, line in numbered if line.strip() and line[0] != "#"]
-    for number, cells in rows:
-        if len(cells) < 2 or not cells[1]:
-            raise RecordingError(f"{path}, line {number}: not a time and a file name")
-    if not rows:
-        raise RecordingError(f"{path}: no pictures in this list")
-    try:
-        t_ns = parse_times([cells[0] for _, cells in rows], path, [number for number, _ in rows])
-    except TrajectoryError as error:
-        raise RecordingError(str(error)) from None
-    return {time: path.parent / "data" / cells[1] for time, (_, cells) in zip(t_ns, rows, strict=True)}
+    t_ns, names = read_file_list(path, RecordingError)
+    return {time: path.parent / "data" / name for time, name in zip(t_ns, names, strict=True)}
 
 
 def _truth(mav: Path, t_ns: list[int], sensor: Sensor) -> list[Rigid3 | None]:

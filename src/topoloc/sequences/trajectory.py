@@ -11,7 +11,7 @@ import bisect
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +20,8 @@ from topoloc.errors import TrajectoryError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.recording import SequenceView
+from topoloc.sequences.text_rows import NANOSECONDS, parse_times, read_rows
 
-NANOSECONDS = 1_000_000_000
-# Above this a time is taken for nanoseconds (ORB-SLAM3 writes EuRoC's so): as seconds it would be 30 000 years.
-_MAX_SECONDS = 10**12
 # Times written with few decimals still mean the frame they were made from.
 _SAME_TIME_NS = 1_000_000
 _QUATERNION_TOLERANCE = 1e-2
@@ -46,9 +44,7 @@ def read_trajectory(path: Path) -> Trajectory:
     Raises:
         TrajectoryError: missing, empty, a wrong number of columns, NaN, no rotation, or times that do not increase; with the line.
     """
-    rows = _read_rows(path)
-    if not rows:
-        raise TrajectoryError(f"{path}: no poses in this file")
+    rows = read_rows(path, TrajectoryError)
     num_columns = len(rows[0][1])
     if num_columns not in (8, 12):
         raise TrajectoryError(f"{path}, line {rows[0][0]}: {num_columns} columns; a TUM line has 8, a KITTI line 12")
@@ -57,7 +53,7 @@ def read_trajectory(path: Path) -> Trajectory:
             raise TrajectoryError(f"{path}, line {line}: {len(tokens)} columns, the lines before have {num_columns}")
     if num_columns == 12:
         return Trajectory([_pose(path, line, lambda t=tokens: Rigid3.from_matrix(_floats(t).reshape(3, 4))) for line, tokens in rows])
-    t_ns = parse_times([tokens[0] for _, tokens in rows], path, [line for line, _ in rows])
+    t_ns = parse_times(rows, path, TrajectoryError)
     return Trajectory([_pose(path, line, lambda t=tokens: _pose_from_tum(t)) for line, tokens in rows], t_ns)
 
 
@@ -67,38 +63,13 @@ def read_asl_poses(path: Path) -> Trajectory:
     Raises:
         TrajectoryError: missing, empty, columns missing, NaN, no rotation, or times that do not increase; with the line.
     """
-    rows = _read_rows(path)
+    rows = read_rows(path, TrajectoryError)
     for line, tokens in rows:
         if len(tokens) < 8:
             raise TrajectoryError(f"{path}, line {line}: {len(tokens)} columns, a pose has 8")
-    if not rows:
-        raise TrajectoryError(f"{path}: no poses in this file")
-    t_ns = parse_times([tokens[0] for _, tokens in rows], path, [line for line, _ in rows])
+    t_ns = parse_times(rows, path, TrajectoryError)
     in_tum_order = [(line, [*tokens[:4], *tokens[5:8], tokens[4]]) for line, tokens in rows]
     return Trajectory([_pose(path, line, lambda t=tokens: _pose_from_tum(t)) for line, tokens in in_tum_order], t_ns)
-
-
-def parse_times(tokens: Sequence[str], path: Path, lines: Sequence[int]) -> list[int]:
-    """Integer nanoseconds of written times, exact to the last decimal; seconds, or nanoseconds where a time is above 1e12.
-
-    Raises:
-        TrajectoryError: a token is no finite number, or the times do not increase strictly.
-    """
-    times: list[Decimal] = []
-    for token, line in zip(tokens, lines, strict=True):
-        try:
-            time = Decimal(token)
-        except InvalidOperation:
-            time = Decimal("nan")
-        if not time.is_finite():
-            raise TrajectoryError(f"{path}, line {line}: {token!r} is not a time")
-        times.append(time)
-    in_nanoseconds = max(times, default=Decimal(0)) > _MAX_SECONDS
-    t_ns = [int((time if in_nanoseconds else time.scaleb(9)).to_integral_value()) for time in times]
-    for index in range(1, len(t_ns)):
-        if t_ns[index] <= t_ns[index - 1]:
-            raise TrajectoryError(f"{path}, line {lines[index]}: time {tokens[index]} is not after {tokens[index - 1]}")
-    return t_ns
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
@@ -157,11 +128,16 @@ def frame_poses(trajectory: Trajectory, t_ns: Sequence[int], path: Path, max_gap
 def with_trajectory(sequence: StereoSequence, path: Path) -> StereoSequence:
     """The same recording with the poses of a trajectory file: TUM by time, KITTI rows frame by frame.
 
+    Rows for a part of a recording may be those of the part or of the whole.
+
     Raises:
         TrajectoryError: the file is malformed, or fits no frame.
     """
-    poses = frame_poses(read_trajectory(path), sequence.t_ns, path)
-    return SequenceView(sequence, list(range(len(sequence))), poses)
+    trajectory = read_trajectory(path)
+    if trajectory.t_ns is None and isinstance(sequence, SequenceView) and len(trajectory) == len(sequence.base) != len(sequence):
+        rows = frame_poses(trajectory, sequence.base.t_ns, path)
+        return SequenceView(sequence.base, sequence.indices, [rows[index] for index in sequence.indices])
+    return SequenceView(sequence, list(range(len(sequence))), frame_poses(trajectory, sequence.t_ns, path))
 
 
 def _pose_at(times: list[int], poses: list[Rigid3], time: int, max_gap_ns: int) -> Rigid3 | None:
@@ -174,18 +150,6 @@ def _pose_at(times: list[int], poses: list[Rigid3], time: int, max_gap_ns: int) 
     neighbours = [index for index in (after - 1, after) if 0 <= index < len(times)]
     nearest = min(neighbours, key=lambda index: abs(times[index] - time), default=None)
     return poses[nearest] if nearest is not None and abs(times[nearest] - time) <= _SAME_TIME_NS else None
-
-
-def _read_rows(path: Path) -> list[tuple[int, list[str]]]:
-    """Line number and columns of each line that is neither blank nor a comment."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise TrajectoryError(f"{path}: no such trajectory") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise TrajectoryError(f"{path}: not a trajectory file ({error.__class__.__name__})") from None
-    numbered = ((number, line.partition("#")[0].replace(",", " ").split()) for number, line in enumerate(text.splitlines(), start=1))
-    return [(number, tokens) for number, tokens in numbered if tokens]
 
 
 def _floats(tokens: list[str]) -> np.ndarray:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from topoloc.errors import RecordingError, TrajectoryError
+from topoloc.errors import RecordingError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.recording import times_by_rate
-from topoloc.sequences.trajectory import frame_poses, parse_times, read_trajectory
+from topoloc.sequences.text_rows import parse_times, read_rows
+from topoloc.sequences.trajectory import frame_poses, read_trajectory
 
 
 def read_truth(tum: Path, kitti_rows: list[Path], t_ns: list[int]) -> list[Rigid3 | None]:
@@ -30,12 +31,7 @@ def read_times(path: Path, num_frames: int) -> list[int]:
     """
     if not path.is_file():
         return times_by_rate(num_frames)
-    numbered = [(number, line.split()) for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), start=1)]
-    numbered = [(number, tokens) for number, tokens in numbered if tokens and not tokens[0].startswith("#")]
-    try:
-        t_ns = parse_times([tokens[0] for _, tokens in numbered], path, [number for number, _ in numbered])
-    except TrajectoryError as error:
-        raise RecordingError(str(error)) from None
+    t_ns = parse_times(read_rows(path, RecordingError), path, RecordingError)
     if len(t_ns) != num_frames:
         raise RecordingError(f"{path}: {len(t_ns)} times for {num_frames} pictures")
     return t_ns

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
-from topoloc.errors import CalibrationError, RecordingError, TrajectoryError
+from topoloc.errors import CalibrationError, RecordingError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.camera_json import FILE_NAME, CameraFile, read_camera_json
 from topoloc.sequences.recording import DepthPictures, Recording
-from topoloc.sequences.trajectory import parse_times
+from topoloc.sequences.text_rows import read_file_list
 from topoloc.sequences.truth import read_truth
 
 LOOKS_FOR = "rgb.txt and depth.txt"
@@ -43,8 +43,8 @@ def open_tum(path: Path) -> Recording:
         TrajectoryError: the truth is malformed or fits no frame.
     """
     calibration = _calibration(path)
-    colour_times, colour = _read_list(path / "rgb.txt")
-    depth_times, depth = _read_list(path / "depth.txt")
+    colour_times, colour = read_file_list(path / "rgb.txt", RecordingError)
+    depth_times, depth = read_file_list(path / "depth.txt", RecordingError)
     nearest = _nearest(np.array(colour_times), np.array(depth_times))
     kept = [row for row, other in enumerate(nearest) if abs(colour_times[row] - depth_times[other]) <= MAX_DEPTH_DELAY * 1e9]
     if not kept:
@@ -67,25 +67,6 @@ def _calibration(path: Path) -> CameraFile:
     if number is None:
         raise CalibrationError(f"{path / FILE_NAME}: no calibration here, and the folder's name does not say freiburg1, 2 or 3")
     return CameraFile(_FREIBURG[number[1]])
-
-
-def _read_list(path: Path) -> tuple[list[int], list[str]]:
-    """Times in nanoseconds and file names."""
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except OSError as error:
-        raise RecordingError(f"{path}: {error.strerror}") from None
-    rows = [(number, line.split()) for number, line in enumerate(lines, start=1) if line.strip() and not line.lstrip().startswith("#")]
-    for number, cells in rows:
-        if len(cells) < 2:
-            raise RecordingError(f"{path}, line {number}: not a time and a file name")
-    if not rows:
-        raise RecordingError(f"{path}: no pictures in this list")
-    try:
-        t_ns = parse_times([cells[0] for _, cells in rows], path, [number for number, _ in rows])
-    except TrajectoryError as error:
-        raise RecordingError(str(error)) from None
-    return t_ns, [cells[1] for _, cells in rows]
 
 
 def _nearest(times: np.ndarray, others: np.ndarray) -> list[int]:

@@ -1,0 +1,70 @@
+"""Text files of one record a line: the lists, times and poses of recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+from topoloc.errors import TopolocError
+
+NANOSECONDS = 1_000_000_000
+# Above this a time is taken for nanoseconds (ORB-SLAM3 writes EuRoC's so): as seconds it would be 30 000 years.
+_MAX_SECONDS = 10**12
+
+
+def read_rows(path: Path, error: type[TopolocError]) -> list[tuple[int, list[str]]]:
+    """Line number and columns (split at spaces and commas) of each line; blank lines and comments (``#``) are left out.
+
+    Raises:
+        error: the file is missing, no text, or holds no row; names it.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise error(f"{path}: no such file") from None
+    except UnicodeDecodeError:
+        raise error(f"{path}: not a text file") from None
+    except OSError as failure:
+        raise error(f"{path}: {failure.strerror}") from None
+    numbered = ((number, line.partition("#")[0].replace(",", " ").split()) for number, line in enumerate(text.splitlines(), start=1))
+    rows = [(number, columns) for number, columns in numbered if columns]
+    if not rows:
+        raise error(f"{path}: nothing in this file")
+    return rows
+
+
+def parse_times(rows: Sequence[tuple[int, list[str]]], path: Path, error: type[TopolocError]) -> list[int]:
+    """Integer nanoseconds of the first column, exact to the last decimal; it is in seconds, or nanoseconds where one is above 1e12.
+
+    Raises:
+        error: not a finite number, or the times do not increase strictly; names file and line.
+    """
+    times: list[Decimal] = []
+    for line, columns in rows:
+        try:
+            time = Decimal(columns[0])
+        except InvalidOperation:
+            time = Decimal("nan")
+        if not time.is_finite():
+            raise error(f"{path}, line {line}: {columns[0]!r} is not a time")
+        times.append(time)
+    in_nanoseconds = max(times) > _MAX_SECONDS
+    t_ns = [int((time if in_nanoseconds else time.scaleb(9)).to_integral_value()) for time in times]
+    for (line, columns), before, after in zip(rows[1:], t_ns[:-1], t_ns[1:], strict=True):
+        if after <= before:
+            raise error(f"{path}, line {line}: time {columns[0]} is not after the one before")
+    return t_ns
+
+
+def read_file_list(path: Path, error: type[TopolocError]) -> tuple[list[int], list[str]]:
+    """Times in nanoseconds and file names of a list of pictures.
+
+    Raises:
+        error: as `read_rows` and `parse_times`, or a line has no second column.
+    """
+    rows = read_rows(path, error)
+    for line, columns in rows:
+        if len(columns) < 2:
+            raise error(f"{path}, line {line}: not a time and a file name")
+    return parse_times(rows, path, error), [columns[1] for _, columns in rows]
