@@ -136,6 +136,9 @@ def test_no_sensor_and_no_rotation(euroc: Path, tmp_path: Path):
     (tmp_path / "sensor.yaml").write_text(sensor_yaml(bent))
     with pytest.raises(CalibrationError, match="rotation"):
         read_sensor(tmp_path / "sensor.yaml")
+    (euroc / "mav0" / "cam1" / "sensor.yaml").write_text(sensor_yaml(BODY_FROM_CAM[0]))
+    with pytest.raises(CalibrationError, match=r"cam1/sensor\.yaml.*baseline of 0 m"):
+        open_euroc(euroc)
     (euroc / "mav0" / "cam1" / "sensor.yaml").unlink()
     with pytest.raises(CalibrationError, match=r"cam1/sensor\.yaml: no calibration"):
         open_euroc(euroc)

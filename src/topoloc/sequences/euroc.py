@@ -68,13 +68,10 @@ def open_euroc(path: Path) -> Recording:
             raise RecordingError(
                 f"{mav}: none of the {len(left)} pictures of cam0 has a partner of its time among {len(right_by_time)} of cam1"
             )
-        right_from_left = right_sensor.body_from_cam.inverse() @ sensor.body_from_cam
-        right = RightPictures([right_by_time[time] for time in t_ns], StereoRig(sensor.camera, right_sensor.camera, right_from_left))
+        right = RightPictures([right_by_time[time] for time in t_ns], _rig(mav, sensor, right_sensor))
     names = [left[time].relative_to(path).as_posix() for time in t_ns]
-    root = path.resolve()
-    return Recording(
-        root.parent.name if root.name == "mav0" else root.name, path, names, t_ns, _truth(mav, t_ns, sensor), sensor.camera, right
-    )
+    name = mav.resolve().parent.name if mav.resolve().name == "mav0" else path.resolve().name
+    return Recording(name, path, names, t_ns, _truth(mav, t_ns, sensor), sensor.camera, right)
 
 
 def read_sensor(path: Path) -> Sensor:
@@ -104,6 +101,13 @@ def read_sensor(path: Path) -> Sensor:
         return Sensor(camera, Rigid3.from_matrix(np.array(_numbers(path, text, "T_BS", 16)).reshape(4, 4)))
     except (CalibrationError, TrajectoryError) as error:
         raise CalibrationError(f"{path}: {error}") from None
+
+
+def _rig(mav: Path, left: Sensor, right: Sensor) -> StereoRig:
+    try:
+        return StereoRig(left.camera, right.camera, right.body_from_cam.inverse() @ left.body_from_cam)
+    except CalibrationError as error:
+        raise CalibrationError(f"{mav / 'cam1' / 'sensor.yaml'}: with that of cam0, {error}") from None
 
 
 def _word(text: str, key: str, default: str) -> str:
