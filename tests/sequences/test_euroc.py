@@ -137,7 +137,7 @@ def test_no_sensor_and_no_rotation(euroc: Path, tmp_path: Path):
     with pytest.raises(CalibrationError, match="rotation"):
         read_sensor(tmp_path / "sensor.yaml")
     (euroc / "mav0" / "cam1" / "sensor.yaml").write_text(sensor_yaml(BODY_FROM_CAM[0]))
-    with pytest.raises(CalibrationError, match=r"cam1/sensor\.yaml.*baseline of 0 m"):
+    with pytest.raises(CalibrationError, match=r"cam1/sensor\.yaml.*baseline of"):
         open_euroc(euroc)
     (euroc / "mav0" / "cam1" / "sensor.yaml").unlink()
     with pytest.raises(CalibrationError, match=r"cam1/sensor\.yaml: no calibration"):
