@@ -165,7 +165,7 @@ def mean_normalized_error(camera: Camera, num_trials: int, config: AbsolutePoseC
 @pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "OPENCV_FISHEYE"])
 @pytest.mark.parametrize("depth_noise", [0.0, 0.002])
 def test_covariance_tells_the_error(model, depth_noise):
-    assert 4.5 < mean_normalized_error(CAMERAS[model], 150, sigma_px=1.0, depth_noise=depth_noise) < 8.0
+    assert 4.5 < mean_normalized_error(CAMERAS[model], 100, sigma_px=1.0, depth_noise=depth_noise) < 8.0
 
 
 def test_covariance_grows_where_the_noise_is_more_than_assumed():

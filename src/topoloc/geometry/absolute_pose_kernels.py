@@ -18,15 +18,16 @@ def _whitened(rotation, translation, normalized, covariance, point_world, point_
     u, v, w = x / z, y / z, 1.0 / z
     s00, s01, s11 = covariance[0, 0], covariance[0, 1], covariance[1, 1]
     if len(point_covariances) > 0:
-        for k in range(3):
-            ak = w * (rotation[0, k] - u * rotation[2, k])
-            bk = w * (rotation[1, k] - v * rotation[2, k])
-            for m in range(3):
-                am = w * (rotation[0, m] - u * rotation[2, m])
-                bm = w * (rotation[1, m] - v * rotation[2, m])
-                s00 += ak * point_covariances[i, k, m] * am
-                s01 += ak * point_covariances[i, k, m] * bm
-                s11 += bk * point_covariances[i, k, m] * bm
+        p = point_covariances[i]
+        a0, b0 = w * (rotation[0, 0] - u * rotation[2, 0]), w * (rotation[1, 0] - v * rotation[2, 0])
+        a1, b1 = w * (rotation[0, 1] - u * rotation[2, 1]), w * (rotation[1, 1] - v * rotation[2, 1])
+        a2, b2 = w * (rotation[0, 2] - u * rotation[2, 2]), w * (rotation[1, 2] - v * rotation[2, 2])
+        pa0, pb0 = p[0, 0] * a0 + p[0, 1] * a1 + p[0, 2] * a2, p[0, 0] * b0 + p[0, 1] * b1 + p[0, 2] * b2
+        pa1, pb1 = p[1, 0] * a0 + p[1, 1] * a1 + p[1, 2] * a2, p[1, 0] * b0 + p[1, 1] * b1 + p[1, 2] * b2
+        pa2, pb2 = p[2, 0] * a0 + p[2, 1] * a1 + p[2, 2] * a2, p[2, 0] * b0 + p[2, 1] * b1 + p[2, 2] * b2
+        s00 += a0 * pa0 + a1 * pa1 + a2 * pa2
+        s01 += a0 * pb0 + a1 * pb1 + a2 * pb2
+        s11 += b0 * pb0 + b1 * pb1 + b2 * pb2
     determinant = s00 * s11 - s01 * s01
     if not determinant > 0.0:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.inf
@@ -111,7 +112,7 @@ def refine(rotation, translation, normalized, covariances, points_world, point_c
         if not new_cost <= cost:
             break
         rotation, translation = new_rotation, new_translation
-        if cost - new_cost <= 1e-9 * cost:
+        if cost - new_cost <= 1e-7 * cost:  # a hundredth of a standard deviation
             break
         cost = new_cost
     return rotation, translation
