@@ -13,21 +13,15 @@ one is still in force where you are has not been checked here, and this is not l
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache
-from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float32, Int32, Int64, UInt8
 
+from topoloc.features.bands import run_in_bands
 from topoloc.features.features import Features
-from topoloc.features.surf_descriptor_kernels import box_mean_rows, describe, orient
+from topoloc.features.surf_descriptor_kernels import describe, orient, smooth_rows
 from topoloc.features.surf_detector_kernels import detect_band, integral_image, split_columns
-
-Result = TypeVar("Result")
 
 DESCRIPTOR_LENGTH = 64
 SMALLEST_FILTER_PX = 9  # whose sigma is 1.2 pixels (Bay et al. 2008, 3.3)
@@ -36,8 +30,9 @@ SIGMA_OF_FILTER = 1.2 / SMALLEST_FILTER_PX
 PATCH_SAMPLES = 21
 # 32-bit sums hold a filter response up to this side (whole box 1 by 5/9 of it, values of 255).
 LARGEST_FILTER_PX = 3600
-# (step, box) of the smoothed images that descriptors are sampled from; see `_choose_levels`.
-LEVELS = ((1, 2), (1, 3), (1, 4), *((step, box * step) for step in (2, 4, 8, 16, 32, 64, 128) for box in (2, 3)))
+# Sample spacings in pixels, from that of the smallest key points on, for which smoothed images are made.
+LEVEL_RATIO = 1.2
+LEVEL_SPACINGS = 1.4 * LEVEL_RATIO ** np.arange(33)
 
 
 @dataclass(frozen=True)
@@ -103,21 +98,20 @@ def _detect(integral: Int32[np.ndarray, "h1 w1"], config: SurfConfig) -> Float32
             columns = edges % step * (rows.shape[1] // step) + edges // step
         return detect_band(rows, top, height, width, edges, columns, step, first, last, np.float32(config.hessian_threshold))
 
-    def detect_part(part: int) -> list[Float32[np.ndarray, "m 4"]]:
-        found = []
+    def detect_part(part: int, _: int) -> None:
         for octave in octaves:
             num_rows = height >> octave
-            found.append(detect(octave, num_rows * part // num_parts, num_rows * (part + 1) // num_parts))
-        return found
+            found[octave, part] = detect(octave, num_rows * part // num_parts, num_rows * (part + 1) // num_parts)
 
     # Maxima need the layer above theirs, thus the four smallest filters at the least; the first empty octave ends the search.
     octaves = [o for o in range(config.num_octaves) if _filter_sizes(o, config.num_layers)[2] < min(height, width)]
     if not octaves:
         return np.zeros((0, 4), np.float32)
     num_parts = config.num_threads
-    parts = _in_threads(detect_part, range(num_parts))
+    found: dict[tuple[int, int], Float32[np.ndarray, "m 4"]] = {}
+    run_in_bands(detect_part, num_parts, num_parts)
     # By octave, then row: the order, and so the ranking of equal responses, does not depend on the number of parts.
-    return np.concatenate([part[k] for k in range(len(octaves)) for part in parts])
+    return np.concatenate([found[key] for key in sorted(found)])
 
 
 def _on_mask(mask: UInt8[np.ndarray, "h w"], found: Float32[np.ndarray, "m 4"]) -> np.ndarray:
@@ -131,15 +125,32 @@ def _on_mask(mask: UInt8[np.ndarray, "h w"], found: Float32[np.ndarray, "m 4"]) 
     return 2 * covered >= (right - left) * (bottom - top)
 
 
-def _choose_levels(spacings: Float32[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
-    """The level whose smoothing is nearest to that of averaging over windows of the sample spacing (pixels).
+@dataclass(frozen=True)
+class _Level:
+    """A smoothed image of every step-th pixel; pixel (0, 0) is at (offset, offset) of the image, `share` as in `smooth_rows`."""
 
-    Reading bilinearly from box means has the variance (box^2 - 1) / 12 + step^2 / 6, averaging bilinear reads of the
-    image itself over windows has (spacing^2 + 1) / 12 + 1 / 6.
+    pixels: Float32[np.ndarray, "lh lw"]
+    step: int
+    box: int
+    share: float
+
+    @property
+    def offset(self) -> float:
+        return (self.box + 1) / 2
+
+
+def _empty_level(integral: Int32[np.ndarray, "h1 w1"], spacing: float) -> _Level:
+    """A level, yet to be filled, that read bilinearly is as smooth as the image averaged over windows of `spacing` pixels.
+
+    Bilinear reads have a variance of step^2 / 6 on the mean, on top of a box's (side^2 - 1) / 12. What OpenCV does has
+    (spacing^2 + 1) / 12 + 1 / 6: it reads the image bilinearly, then averages.
     """
-    spacing_of_level = [np.sqrt(box**2 + 2 * step**2 - 4) for step, box in LEVELS]
-    bounds = np.sqrt(np.multiply(spacing_of_level[1:], spacing_of_level[:-1]))
-    return np.searchsorted(bounds, spacings)
+    step = 1 << max(int(np.log2(spacing / 2.2)), 0)
+    side = float(np.sqrt(spacing**2 + 4 - 2 * step**2))
+    box = int(side)
+    height, width = ((size - 1 - (box + 2)) // step + 1 for size in integral.shape)
+    share = ((box + 2) ** 2 - side**2) / ((box + 2) ** 2 - box**2)
+    return _Level(np.empty((height, width), np.float32), step, box, share)
 
 
 def _describe(
@@ -151,42 +162,23 @@ def _describe(
     descriptors = np.empty((len(points), DESCRIPTOR_LENGTH), np.float32)
     # OpenCV averages over a whole number of pixels a side
     spacings = (np.floor(PATCH_SAMPLES * scales) / PATCH_SAMPLES).astype(np.float32)
-    level_idx = _choose_levels(spacings)
-    levels = {int(k): _empty_level(integral, *LEVELS[k]) for k in np.unique(level_idx)}
+    level_idx = np.searchsorted(LEVEL_SPACINGS[:-1] * np.sqrt(LEVEL_RATIO), spacings)
+    levels = {int(k): _empty_level(integral, float(LEVEL_SPACINGS[k])) for k in np.unique(level_idx)}
 
-    def prepare_part(part: int) -> None:
-        for k, level in levels.items():
-            step, box = LEVELS[k]
-            box_mean_rows(integral, box, step, level, len(level) * part // num_parts, len(level) * (part + 1) // num_parts)
+    def prepare_part(part: int, _: int) -> None:
+        for level in levels.values():
+            first, last = (len(level.pixels) * p // num_parts for p in (part, part + 1))
+            smooth_rows(integral, level.box, level.share, level.step, level.pixels, first, last)
         if not config.upright:
             share = slice(len(points) * part // num_parts, len(points) * (part + 1) // num_parts)
             orient(integral, points[share], scales[share], angles[share])
 
-    def describe_part(part: int) -> None:
+    def describe_part(part: int, _: int) -> None:
         for k, level in levels.items():
-            step, box = LEVELS[k]
             rows = np.flatnonzero(level_idx == k)[part::num_parts].copy()
-            describe(level, (box - 1) / 2, step, points, spacings, directions, rows, descriptors)
+            describe(level.pixels, level.offset, level.step, points, spacings, directions, rows, descriptors)
 
-    _in_threads(prepare_part, range(num_parts))
+    run_in_bands(prepare_part, num_parts, num_parts)
     directions = np.full_like(angles, 1.5 * np.pi) if config.upright else angles
-    _in_threads(describe_part, range(num_parts))
+    run_in_bands(describe_part, num_parts, num_parts)
     return angles, descriptors
-
-
-def _empty_level(integral: Int32[np.ndarray, "h1 w1"], step: int, box: int) -> Float32[np.ndarray, "lh lw"]:
-    height, width = integral.shape
-    return np.empty(((height - 1 - box) // step + 1, (width - 1 - box) // step + 1), np.float32)
-
-
-@cache
-def _pool(process_id: int) -> ThreadPoolExecutor:
-    """One pool a process: threads do not survive a fork."""
-    return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="surf")
-
-
-def _in_threads(function: Callable[[int], Result], parts: Iterable[int]) -> list[Result]:
-    """The results of function(part) of each part in order, the first computed by the caller."""
-    first, *others = parts
-    futures = [_pool(os.getpid()).submit(function, part) for part in others]
-    return [function(first), *(future.result() for future in futures)]

@@ -29,20 +29,32 @@ PATCH_WEIGHTS = np.outer(_gaussian(PATCH_SIZE, 3.3), _gaussian(PATCH_SIZE, 3.3))
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
-def box_mean_rows(integral, box, step, level, first, last):
-    """Rows [first, last) of `level`: means of the box x box windows whose upper left corners are at multiples of step."""
-    scale = np.float32(1.0) / np.float32(box * box)
+def smooth_rows(integral, box, share, step, level, first, last):
+    """Rows [first, last) of `level`: at every step-th pixel `share` of the mean over box x box, the rest over box + 2 a side.
+
+    Pixel (0, 0) of the level is where the larger box touches the upper left corner of the image.
+    """
+    inner = np.float32(share / (box * box))
+    outer = np.float32((1 - share) / ((box + 2) * (box + 2)))
+    width = integral.shape[1]
+    line = np.empty(width - (box + 2), np.float32)
+    columns, larger = np.empty(width, np.int32), box + 2
+    columns_inner = np.empty(width, np.int32)
     for i in range(first, last):
-        top, bottom = integral[i * step], integral[i * step + box]
-        top_right, bottom_right = top[box:], bottom[box:]
-        target = level[i]
-        if step == 1:
+        row = i * step
+        top, bottom = integral[row], integral[row + larger]
+        top_inner, bottom_inner = integral[row + 1], integral[row + 1 + box]
+        for x in range(width):
+            columns[x] = np.int32(bottom[x] - top[x])
+            columns_inner[x] = np.int32(bottom_inner[x] - top_inner[x])
+        right, left_inner, right_inner = columns[larger:], columns_inner[1:], columns_inner[1 + box :]
+        # The whole line although every step-th of it is kept: only reads without a stride vectorise.
+        target = level[i] if step == 1 else line
+        for x in range(line.shape[0]):
+            target[x] = np.float32(np.int32(right[x] - columns[x])) * outer + np.float32(np.int32(right_inner[x] - left_inner[x])) * inner
+        if step > 1:
             for j in range(level.shape[1]):
-                target[j] = np.float32(np.int32(bottom_right[j] - bottom[j] - top_right[j] + top[j])) * scale
-        else:
-            for j in range(level.shape[1]):
-                x = j * step
-                target[j] = np.float32(np.int32(bottom_right[x] - bottom[x] - top_right[x] + top[x])) * scale
+                level[i, j] = line[j * step]
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
