@@ -1,1 +1,66 @@
-"""topoloc."""
+"""topoloc: a place mapped once with a stereo or RGB-D camera; afterwards any single image of it gets a metric 6-DoF pose.
+
+The public names; each loads its module when it is first asked for, so that `import topoloc` costs nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from topoloc.errors import TopolocError
+    from topoloc.geometry.camera import Camera
+    from topoloc.geometry.rigid import Rigid3
+    from topoloc.localization.localizer import Localizer, LocalizerConfig
+    from topoloc.localization.result import Localization, NotLocalized
+    from topoloc.mapping.build import BuildConfig, build_map
+    from topoloc.mapping.topomap import TopoMetricMap
+    from topoloc.sequences.open import open_sequence
+
+    __version__: str
+
+__all__ = [
+    "BuildConfig",
+    "Camera",
+    "Localization",
+    "Localizer",
+    "LocalizerConfig",
+    "NotLocalized",
+    "Rigid3",
+    "TopoMetricMap",
+    "TopolocError",
+    "__version__",
+    "build_map",
+    "open_sequence",
+]
+
+_MODULES = {
+    "BuildConfig": "topoloc.mapping.build",
+    "Camera": "topoloc.geometry.camera",
+    "Localization": "topoloc.localization.result",
+    "Localizer": "topoloc.localization.localizer",
+    "LocalizerConfig": "topoloc.localization.localizer",
+    "NotLocalized": "topoloc.localization.result",
+    "Rigid3": "topoloc.geometry.rigid",
+    "TopoMetricMap": "topoloc.mapping.topomap",
+    "TopolocError": "topoloc.errors",
+    "build_map": "topoloc.mapping.build",
+    "open_sequence": "topoloc.sequences.open",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("topoloc")
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(_MODULES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return list(__all__)

@@ -1,0 +1,48 @@
+# make install   the program with all its extras and the tests' tools, into .venv, at the versions of constraints.txt
+# make test      all checks: ruff, import contract, types, tests; installs into .venv only what these need
+# make lint      the same without the tests
+# make clean     remove what the above made
+# PYTHON=... chooses the interpreter that .venv is made with.
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check install --constraint constraints.txt
+CANDIDATES := $(PYTHON) python3.13 python3.12 python3.11 python3
+# Without a look at the network for a newer pyright; its node comes from the package index.
+PYRIGHT := PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright
+
+.PHONY: install test lint clean
+.DELETE_ON_ERROR:
+
+install: $(VENV)/installed-all
+
+test: lint
+	@$(BIN)/pytest --numprocesses auto --maxprocesses 4
+
+lint: $(VENV)/installed-test
+	@$(BIN)/ruff check --quiet
+	@$(BIN)/ruff format --check --quiet || { $(BIN)/ruff format --check; exit 1; }
+	@$(BIN)/lint-imports --no-logo > $(VENV)/lint-imports.txt || { cat $(VENV)/lint-imports.txt; exit 1; }
+	@$(PYRIGHT)
+
+$(VENV)/installed-test: EXTRAS = test
+$(VENV)/installed-all: EXTRAS = all,test
+$(VENV)/installed-test $(VENV)/installed-all: pyproject.toml constraints.txt $(BIN)/python
+	@echo "installing topoloc[$(EXTRAS)] into $(VENV) ..."
+	@$(PIP) hatchling editables
+	@$(PIP) --no-build-isolation --editable '.[$(EXTRAS)]'
+	@touch $@ $(VENV)/installed-test
+
+$(BIN)/python:
+	@for python in $(CANDIDATES); do \
+	    $$python -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 || continue; \
+	    echo "making $(VENV) with $$($$python --version) ($$python)"; \
+	    $$python -m venv $(VENV) && exit 0; \
+	    rm -rf $(VENV); \
+	done; \
+	echo "error: no Python 3.11 or later with venv and ensurepip (tried: $(strip $(CANDIDATES))); install one, or: make PYTHON=/path/to/python" >&2; \
+	exit 1
+
+clean:
+	@rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
