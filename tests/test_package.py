@@ -1,0 +1,127 @@
+"""What a stranger installs: the wheel is whole, the command answers, and nothing heavy is loaded before it is needed."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import topoloc
+from topoloc.cli import COMMANDS, main
+
+ROOT = Path(__file__).parents[1]
+HEAVY = ("cv2", "faiss", "matplotlib", "numba", "numpy", "poselib", "torch", "tyro")
+# What the core runs without: the extras, and the tests' own tools.
+FOREIGN = ("torch", "torchvision", "mitsuba", "fastapi", "uvicorn", "pydantic", "viser", "scipy", "hypothesis", "beartype", "pytest")
+_IMPORT_ALL = """
+import importlib, json, pkgutil, sys
+
+class Barred:
+    asked = set()
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in FOREIGN:
+            self.asked.add(name.split(".")[0])
+            raise ModuleNotFoundError(name)
+
+sys.meta_path.insert(0, Barred())
+import topoloc
+names = [module.name for module in pkgutil.walk_packages(topoloc.__path__, "topoloc.") if module.name != "topoloc.__main__"]
+for name in names:
+    importlib.import_module(name)
+print(json.dumps([names, sorted(Barred.asked)]))
+"""
+
+
+def _run(*command: str | Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([str(part) for part in command], capture_output=True, text=True, env=environment, timeout=120, check=False)
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel, made from the source distribution as an index would serve it."""
+    folder = tmp_path_factory.mktemp("dist")
+    built = _run(sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, ROOT, **os.environ)
+    assert built.returncode == 0, built.stdout + built.stderr
+    (wheel,) = folder.glob("*.whl")
+    return wheel
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of programs of a virtual environment with the wheel and nothing else, not even its dependencies."""
+    folder = tmp_path_factory.mktemp("venv")
+    venv.create(folder, with_pip=False, symlinks=os.name != "nt")
+    programs = folder / ("Scripts" if os.name == "nt" else "bin")
+    pip = (sys.executable, "-m", "pip", "--python", programs / "python", "install", "--quiet", "--no-index", "--no-deps", wheel)
+    done = _run(*pip, **os.environ)
+    assert done.returncode == 0, done.stderr
+    return programs
+
+
+def test_the_wheel_holds_every_module_and_the_licence(wheel: Path):
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+    modules = {path.relative_to(ROOT / "src").as_posix() for path in (ROOT / "src" / "topoloc").rglob("*.py")}
+    assert modules <= names
+    assert {name.split("/")[0] for name in names} == {"topoloc", f"topoloc-{topoloc.__version__}.dist-info"}
+    assert any(name.endswith("/LICENSE") for name in names)
+
+
+@pytest.mark.parametrize("program", [("topoloc",), ("python", "-m", "topoloc")], ids=" ".join)
+def test_help_answers_in_an_empty_environment(installed: Path, program: tuple[str, ...]):
+    answer = _run(installed / program[0], *program[1:], "--help")
+    assert answer.returncode == 0, answer.stderr
+    assert answer.stderr == ""
+    assert all(f"  {command}  " in answer.stdout for command in COMMANDS)
+
+
+def test_the_version_is_the_one_of_the_package(installed: Path):
+    answer = _run(installed / "topoloc", "--version")
+    assert (answer.returncode, answer.stdout) == (0, f"{topoloc.__version__}\n")
+
+
+@pytest.mark.parametrize(
+    ("args", "complaint"), [((), ""), (("fly",), "error: unknown command 'fly'"), (("info", "x.topo", "--fly"), "--fly")]
+)
+def test_wrong_usage_exits_with_2(args: tuple[str, ...], complaint: str):
+    answer = _run(sys.executable, "-m", "topoloc", *args, **os.environ)
+    assert answer.returncode == 2
+    assert complaint in answer.stderr
+    assert "Traceback" not in answer.stderr
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as stopped:
+        main([command, "--help"])
+    assert stopped.value.code == 0
+    assert f"usage: topoloc {command} " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("statement", ["import topoloc", "from topoloc.cli import main; main(['--help'])"])
+def test_nothing_heavy_is_loaded_before_it_is_needed(statement: str):
+    code = f"import sys; {statement}; print([name for name in {HEAVY} if name in sys.modules])"
+    answer = _run(sys.executable, "-c", code, **os.environ)
+    assert answer.stdout.splitlines()[-1] == "[]", answer.stderr
+
+
+def test_every_module_loads_without_extras_and_none_asks_for_torch():
+    answer = _run(sys.executable, "-c", f"FOREIGN = {FOREIGN}\n{_IMPORT_ALL}", **os.environ)
+    assert answer.returncode == 0, answer.stderr
+    modules, asked = json.loads(answer.stdout)
+    assert "topoloc.localization.localizer" in modules
+    assert not {"torch", "torchvision"} & set(asked)
+
+
+def test_public_names_are_there_and_no_others():
+    assert dir(topoloc) == topoloc.__all__
+    for name in topoloc.__all__:
+        assert getattr(topoloc, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'fly'"):
+        topoloc.fly  # noqa: B018 # pyright: ignore[reportAttributeAccessIssue]
