@@ -11,12 +11,15 @@ from dataclasses import asdict, dataclass, field
 
 import cv2
 import numpy as np
+from jaxtyping import Float
 
 from topoloc.errors import EmptyMapError, TrajectoryError
 from topoloc.features.extraction import FeatureConfig, extract_features
+from topoloc.features.features import Features
 from topoloc.geometry.rigid import Rigid3
-from topoloc.mapping.node_points import NodePointsConfig, locate_points
-from topoloc.mapping.nodes import NodeConfig, label_frames, place_nodes
+from topoloc.mapping.landmarks import LandmarkConfig, Observations, observe_points, refine_points
+from topoloc.mapping.node_points import NodePointsConfig, keypoint_sigmas, locate_points
+from topoloc.mapping.nodes import NodeConfig, node_distances, place_nodes
 from topoloc.mapping.topomap import Edge, NodeSummary, PlaceImage, TopoMetricMap, TopoNode
 from topoloc.mapping.views import MappingView, mapping_view
 from topoloc.places.vlad import SurfVlad, VladConfig, learn_words, vlad
@@ -33,6 +36,7 @@ class BuildConfig:
     nodes: NodeConfig = field(default_factory=NodeConfig)
     features: FeatureConfig = field(default_factory=FeatureConfig)
     points: NodePointsConfig = field(default_factory=NodePointsConfig)
+    landmarks: LandmarkConfig = field(default_factory=LandmarkConfig)
     vlad: VladConfig = field(default_factory=VladConfig)
     max_node_points: int = 900
     """Features that a node keeps, the strongest ones."""
@@ -52,12 +56,25 @@ class _MappingFrame:
     index: int
     world_from_cam: Rigid3
 
-    def view(self) -> MappingView:
-        return mapping_view(self.sequence[self.index])
+    def view(self, with_depth: bool = True) -> MappingView:
+        return mapping_view(self.sequence[self.index], with_depth)
 
     @property
     def name(self) -> str:
         return self.sequence.names[self.index]
+
+
+@dataclass(eq=False)
+class _NodeDraft:
+    """A node in the making: its points as first measured, and what the other images have seen of them so far."""
+
+    frame: _MappingFrame
+    world_from_cam: Rigid3
+    view: MappingView
+    features: Features
+    points_cam: Float[np.ndarray, "n 3"]
+    covariances: Float[np.ndarray, "n 3 3"]
+    observations: list[Observations]
 
 
 def build_map(sequences: StereoSequence | Sequence[StereoSequence], config: BuildConfig | None = None, progress: Progress | None = None) -> TopoMetricMap:
@@ -74,8 +91,9 @@ def build_map(sequences: StereoSequence | Sequence[StereoSequence], config: Buil
         sequences = [sequences]
     frames = [frame for sequence in sequences for frame in _posed_frames(sequence)]
     node_config = _resolve_node_config(frames, config)
-    nodes = _make_nodes(frames, node_config, config, progress)
-    place_images, coarse = _learn_places(frames, nodes, node_config, config, progress)
+    drafts = _draft_nodes(frames, node_config, config, progress)
+    place_images, coarse = _visit_all_images(frames, drafts, node_config, config, progress)
+    nodes = [_finish_node(node_id, draft, config) for node_id, draft in enumerate(drafts)]
     return TopoMetricMap(
         summaries=[node.summary for node in nodes],
         nodes=nodes,
@@ -110,56 +128,78 @@ def _resolve_node_config(frames: list[_MappingFrame], config: BuildConfig) -> No
     return config.nodes.resolved(float(np.median(all_depths)))
 
 
-def _make_nodes(frames: list[_MappingFrame], node_config: NodeConfig, config: BuildConfig, progress: Progress) -> list[TopoNode]:
+def _draft_nodes(frames: list[_MappingFrame], node_config: NodeConfig, config: BuildConfig, progress: Progress) -> list[_NodeDraft]:
     """The trajectory discretised by Eq. 1; a picture with too few points (dark, blurred, blank) becomes no node."""
-    assignment = place_nodes([frame.world_from_cam for frame in frames], node_config)
-    nodes: list[TopoNode] = []
-    for done, frame_idx in enumerate(assignment.node_frame_idx):
-        progress("nodes", done, len(assignment.node_frame_idx))
-        node = _make_node(len(nodes), frames[frame_idx], config)
-        if node is not None:
-            nodes.append(node)
-    progress("nodes", len(assignment.node_frame_idx), len(assignment.node_frame_idx))
-    if not nodes:
+    frame_idx = place_nodes([frame.world_from_cam for frame in frames], node_config).node_frame_idx
+    drafts: list[_NodeDraft] = []
+    for done, i in enumerate(frame_idx):
+        draft = _draft_node(frames[i], config)
+        if len(draft.features) >= config.min_node_points:
+            drafts.append(draft)
+        progress("nodes", done + 1, len(frame_idx))
+    if not drafts:
         raise EmptyMapError(f"{frames[0].sequence.name}: no picture has {config.min_node_points} features with a 3-D position")
-    return nodes
+    return drafts
 
 
-def _make_node(node_id: int, frame: _MappingFrame, config: BuildConfig) -> TopoNode | None:
+def _draft_node(frame: _MappingFrame, config: BuildConfig) -> _NodeDraft:
     view = frame.view()
     features = extract_features(view.grey, config.features)
     located = locate_points(features, view, config.points)
-    rows = np.flatnonzero(located.valid)[: config.max_node_points]
-    if len(rows) < config.min_node_points:
-        return None
-    sqrt_covs = np.linalg.cholesky(located.covariances[rows])[:, *np.tril_indices(3)]
-    return TopoNode(
-        NodeSummary(node_id, frame.sequence.name, frame.name, frame.sequence.t_ns[frame.index], view.world_from_cam, len(rows)),
-        view.camera,
-        features.select(rows),
-        located.points_cam[rows].astype(np.float32),
-        sqrt_covs.astype(np.float32),
-        _encode_jpeg(view.picture, config.template_side_px, quality=75),
-    )
+    rows = np.flatnonzero(located.valid)
+    return _NodeDraft(frame, view.world_from_cam, view, features.select(rows), located.points_cam[rows], located.covariances[rows], [])
 
 
-def _learn_places(
-    frames: list[_MappingFrame], nodes: list[TopoNode], node_config: NodeConfig, config: BuildConfig, progress: Progress
+def _visit_all_images(
+    frames: list[_MappingFrame], drafts: list[_NodeDraft], node_config: NodeConfig, config: BuildConfig, progress: Progress
 ) -> tuple[list[PlaceImage], SurfVlad]:
-    """Label every mapping image with its nearest node, and teach the coarse localizer."""
+    """Label every mapping image with its nearest node, let it observe the points of the nodes around, and teach the
+    coarse localizer with it."""
     assert node_config.lambda_rot is not None
-    node_ids = label_frames([f.world_from_cam for f in frames], [n.summary.world_from_cam for n in nodes], node_config.lambda_rot)
-    words = learn_words(np.concatenate([node.features.descriptors for node in nodes]), config.vlad)
+    words = learn_words(np.concatenate([draft.features.descriptors for draft in drafts]), config.vlad)
+    world_from_nodes = [draft.world_from_cam for draft in drafts]
     images: list[PlaceImage] = []
     vlads = []
-    for frame, node_id in zip(frames, node_ids, strict=True):
-        progress("places", len(images), len(frames))
-        view = frame.view()
-        vlads.append(vlad(extract_features(view.grey, config.features).descriptors, words))
-        jpeg = _encode_jpeg(view.picture, config.place_side_px, quality=70)
-        images.append(PlaceImage(frame.sequence.name, frame.name, int(node_id), view.world_from_cam, jpeg))
-    progress("places", len(frames), len(frames))
+    for done, frame in enumerate(frames):
+        view = frame.view(with_depth=False)
+        features = extract_features(view.grey, config.features)
+        nearest = np.argsort(node_distances(view.world_from_cam, world_from_nodes, node_config.lambda_rot), kind="stable")
+        for node_id in nearest[: config.landmarks.nodes_per_image]:
+            _observe(drafts[node_id], frame, view, features, config)
+        vlads.append(vlad(features.descriptors, words))
+        jpeg = _encode_jpeg(view.picture, config.place_side_px, quality=60)
+        images.append(PlaceImage(frame.sequence.name, frame.name, int(nearest[0]), view.world_from_cam, jpeg))
+        progress("images", done + 1, len(frames))
+    node_ids = np.array([image.node_id for image in images])
     return images, SurfVlad.fit(words, np.stack(vlads), node_ids, config.vlad)
+
+
+def _observe(draft: _NodeDraft, frame: _MappingFrame, view: MappingView, features: Features, config: BuildConfig) -> None:
+    if frame is draft.frame:
+        return
+    cam_from_node = view.world_from_cam.inverse() @ draft.world_from_cam
+    sigmas_px = keypoint_sigmas(features, config.points)
+    seen = observe_points(
+        draft.features, draft.points_cam, draft.covariances, features, sigmas_px, view.camera, cam_from_node, config.landmarks
+    )
+    draft.observations.append(seen)
+
+
+def _finish_node(node_id: int, draft: _NodeDraft, config: BuildConfig) -> TopoNode:
+    """Refine the points by what was observed; keep those seen again first, the strongest among them."""
+    refined = refine_points(draft.points_cam, draft.covariances, draft.observations, config.landmarks)
+    rows = np.flatnonzero(refined.agrees)
+    rows = np.sort(rows[np.argsort(-np.minimum(refined.num_observations[rows], 2), kind="stable")][: config.max_node_points])
+    sqrt_covs = np.linalg.cholesky(refined.covariances[rows])[:, *np.tril_indices(3)]
+    sequence, index = draft.frame.sequence, draft.frame.index
+    return TopoNode(
+        NodeSummary(node_id, sequence.name, draft.frame.name, sequence.t_ns[index], draft.world_from_cam, len(rows)),
+        draft.view.camera,
+        draft.features.select(rows),
+        refined.points_cam[rows].astype(np.float32),
+        sqrt_covs.astype(np.float32),
+        _encode_jpeg(draft.view.picture, config.template_side_px, quality=75),
+    )
 
 
 def _edges_along(node_ids: Iterable[int]) -> list[Edge]:

@@ -33,8 +33,10 @@ class MappingView:
     depth: Float32[np.ndarray, "h w"] | None = None
 
 
-def mapping_view(frame: StereoFrame) -> MappingView:
+def mapping_view(frame: StereoFrame, with_depth: bool = True) -> MappingView:
     """Rectify a stereo pair, or bring depth into the picture's camera.
+
+    Without `with_depth` only the picture itself is made ready, which is all that images between the nodes need.
 
     Raises:
         CalibrationError: the frame has no camera.
@@ -45,19 +47,21 @@ def mapping_view(frame: StereoFrame) -> MappingView:
     if frame.world_from_cam is None:
         raise RecordingError(f"{frame.name}: no pose")
     if frame.right is not None and frame.rig is not None:
-        return _stereo_view(frame, frame.right, frame.rig, frame.world_from_cam)
+        return _stereo_view(frame, frame.right if with_depth else None, frame.rig, frame.world_from_cam)
     if frame.depth is not None:
-        depth = registered_depth(frame.depth, frame.camera)
+        depth = registered_depth(frame.depth, frame.camera) if with_depth else None
         return MappingView(frame.image, grey_of(frame.image), frame.camera, frame.world_from_cam, depth=depth)
     raise RecordingError(f"{frame.name}: a map needs stereo pairs or depth images, this recording has single pictures only")
 
 
-def _stereo_view(frame: StereoFrame, right: Image, rig: StereoRig, world_from_left: Rigid3) -> MappingView:
+def _stereo_view(frame: StereoFrame, right: Image | None, rig: StereoRig, world_from_left: Rigid3) -> MappingView:
+    right_grey = None if right is None else grey_of(right)
     if rig.is_rectified:
-        return MappingView(frame.image, grey_of(frame.image), rig.left, world_from_left, grey_of(right), rig)
+        return MappingView(frame.image, grey_of(frame.image), rig.left, world_from_left, right_grey, rig)
     r = _rectification(rig)
     picture = cv2.remap(frame.image, r.left_map, None, cv2.INTER_LINEAR)
-    right_grey = cv2.remap(grey_of(right), r.right_map, None, cv2.INTER_LINEAR)
+    if right_grey is not None:
+        right_grey = cv2.remap(right_grey, r.right_map, None, cv2.INTER_LINEAR)
     world_from_rectified = world_from_left @ r.rectified_from_left.inverse()
     return MappingView(picture, grey_of(picture), r.rig.left, world_from_rectified, right_grey, r.rig)
 

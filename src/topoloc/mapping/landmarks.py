@@ -1,0 +1,138 @@
+"""A node's points made better by the other mapping images that see them too.
+
+One stereo pair or depth image measures a point once, over a short baseline. The mapping images near the node see it from
+elsewhere, at poses that are known; triangulating from all of them, with the first measurement as the prior, shrinks the
+long axis of its uncertainty, and shows up points that are not where they seemed (mismatched, or moving).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from topoloc.features.features import Features
+from topoloc.features.matching import MatchingConfig, match_features
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+
+_CAUCHY_SCALE = 2.385  # of a residual in standard deviations
+
+
+@dataclass(frozen=True)
+class LandmarkConfig:
+    """How points are re-observed and refined."""
+
+    nodes_per_image: int = 3
+    """Each mapping image is matched with this many of its nearest nodes; 0 leaves every point as it was first measured."""
+    matching: MatchingConfig = field(default_factory=lambda: MatchingConfig(ratio=0.85))
+    gate: float = 4.0
+    """An observation further from the point's projection than this many standard deviations (of both) is none."""
+    pose_sigma_px: float = 0.7
+    """What the errors of the mapping poses and of rectification add to a key point's own uncertainty, pixels."""
+    num_iterations: int = 6
+    max_disagreement: float = 3.0
+    """Points whose refined residuals stay above this many standard deviations (root mean square) are dropped."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """One mapping image's view of a node's points: point `rows[k]` is seen at `normalized[k]` (plane z = 1).
+
+    `sigmas` are standard deviations on that plane, `cam_from_node` the transform into the image's camera.
+    """
+
+    rows: Int[np.ndarray, " m"]
+    normalized: Float[np.ndarray, "m 2"]
+    sigmas: Float[np.ndarray, " m"]
+    cam_from_node: Rigid3
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedPoints:
+    """`agrees` is False for points that their observations contradict; `num_observations` counts images besides the node's own."""
+
+    points_cam: Float[np.ndarray, "n 3"]
+    covariances: Float[np.ndarray, "n 3 3"]
+    num_observations: Int[np.ndarray, " n"]
+    agrees: Bool[np.ndarray, " n"]
+
+
+def observe_points(
+    node_features: Features,
+    points_cam: Float[np.ndarray, "n 3"],
+    covariances: Float[np.ndarray, "n 3 3"],
+    features: Features,
+    feature_sigmas_px: Float[np.ndarray, " m"],
+    camera: Camera,
+    cam_from_node: Rigid3,
+    config: LandmarkConfig,
+) -> Observations:
+    """Find a node's points among the features of another mapping image: by descriptor, then by where they must be."""
+    matches = match_features(node_features.descriptors, features.descriptors, config.matching)
+    rows, columns = matches.query_idx.astype(np.int64), matches.train_idx
+    normalized = camera.normalized_from_img(features.points_img[columns].astype(np.float64))
+    sigmas = np.hypot(feature_sigmas_px[columns], config.pose_sigma_px) / camera.fx
+    residuals, jacobians, in_front = _project(points_cam[rows], normalized, cam_from_node)
+    expected = jacobians @ covariances[rows] @ jacobians.transpose(0, 2, 1) + sigmas[:, None, None] ** 2 * np.eye(2)
+    squares = np.einsum("mi,mij,mj->m", residuals, np.linalg.inv(expected), residuals)
+    seen = in_front & (squares < config.gate**2)
+    return Observations(rows[seen], normalized[seen], sigmas[seen], cam_from_node)
+
+
+def refine_points(
+    points_cam: Float[np.ndarray, "n 3"], covariances: Float[np.ndarray, "n 3 3"], observations: list[Observations], config: LandmarkConfig
+) -> RefinedPoints:
+    """Triangulate a node's points (node's camera frame, metres) from all observations, poses held fixed.
+
+    Gauss-Newton, every point on its own, Cauchy's loss on each observation; the first measurement and its covariance are
+    the prior.
+    """
+    prior = np.linalg.inv(covariances)
+    points = points_cam.copy()
+    information = prior
+    for _ in range(config.num_iterations):
+        information, gradient, _ = _normal_equations(points, points_cam, prior, observations)
+        points = points - np.linalg.solve(information, gradient[:, :, None])[:, :, 0]
+    information, _, squares = _normal_equations(points, points_cam, prior, observations)
+    num_observations = np.zeros(len(points), np.int64)
+    for seen in observations:
+        num_observations[seen.rows] += 1
+    rms = np.sqrt(squares / np.maximum(2 * num_observations, 1))
+    agrees = (rms < config.max_disagreement) & np.isfinite(points).all(axis=1) & (points[:, 2] > 0)
+    return RefinedPoints(points, np.linalg.inv(information), num_observations, agrees)
+
+
+def _normal_equations(
+    points: Float[np.ndarray, "n 3"], first: Float[np.ndarray, "n 3"], prior: Float[np.ndarray, "n 3 3"], observations: list[Observations]
+) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    """Information, gradient, and the summed squared residuals (in standard deviations) of each point."""
+    offset = points - first
+    information, gradient = prior.copy(), np.einsum("nij,nj->ni", prior, offset)
+    squares = np.einsum("ni,ni->n", gradient, offset)
+    for seen in observations:
+        residuals, jacobians, in_front = _project(points[seen.rows], seen.normalized, seen.cam_from_node)
+        scaled = residuals / seen.sigmas[:, None]
+        square = np.sum(scaled**2, axis=1)
+        weights = np.where(in_front, 1.0 / (1.0 + square / _CAUCHY_SCALE**2), 0.0)
+        weighted = jacobians.transpose(0, 2, 1) * (weights / seen.sigmas**2)[:, None, None]
+        # a point occurs at most once in an image, so plain indexed addition is exact
+        information[seen.rows] += weighted @ jacobians
+        gradient[seen.rows] += np.einsum("nij,nj->ni", weighted, residuals)
+        squares[seen.rows] += np.where(in_front, square, 1e6)
+    return information, gradient, squares
+
+
+def _project(
+    points_node: Float[np.ndarray, "m 3"], normalized: Float[np.ndarray, "m 2"], cam_from_node: Rigid3
+) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2 3"], Bool[np.ndarray, " m"]]:
+    """Residuals on the plane z = 1, their derivatives by the points, and which points are in front of the camera."""
+    points = cam_from_node.apply(points_node)
+    in_front = points[:, 2] > 1e-3
+    z = np.where(in_front, points[:, 2], 1.0)
+    projected = points[:, :2] / z[:, None]
+    by_cam = np.zeros((len(points), 2, 3))
+    by_cam[:, 0, 0] = by_cam[:, 1, 1] = 1.0 / z
+    by_cam[:, :, 2] = -projected / z[:, None]
+    return projected - normalized, by_cam @ cam_from_node.rotation, in_front
