@@ -20,6 +20,7 @@ from topoloc.geometry.absolute_pose_kernels import normal_equations, refine, squ
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 
+_Array = np.ndarray
 _MIN_POINTS = 4
 _MAX_WIDENING = 3.0
 # OpenCV draws five points a sample and refines no candidate: what PoseLib does in milliseconds would take it a second.
@@ -107,7 +108,9 @@ def estimate_absolute_pose(
         normalized=normalized[order],
         covariances=_normalized_covariances(camera, normalized[order], config.sigma_px),
         points_world=np.ascontiguousarray(points_world[order], dtype=np.float64),
-        point_covariances=np.zeros((0, 3, 3)) if point_covariances is None else np.ascontiguousarray(point_covariances[order]),
+        point_covariances=np.zeros((0, 3, 3))
+        if point_covariances is None
+        else np.ascontiguousarray(point_covariances[order], dtype=np.float64),
     )
     if not _spans_a_plane(matches.points_world) or not _spans_a_plane(np.insert(matches.normalized, 2, 0.0, axis=1)):
         return None
@@ -190,7 +193,7 @@ def _solve_with_opencv(matches: _Matches, camera: Camera, config: AbsolutePoseCo
         )
         if not found or idx is None or len(idx) < _MIN_POINTS:
             return None
-        rows = np.sort(idx[:, 0])
+        rows = np.sort(np.asarray(idx, dtype=np.intp)[:, 0])
         rotation, translation = cv2.solvePnPRefineLM(
             matches.points_world[rows], undistorted[rows], camera.matrix(), None, rotation, translation
         )
@@ -237,11 +240,11 @@ def _noise_scale(squares: Float[np.ndarray, " n"]) -> float:
     return float(np.sqrt(variance))
 
 
-def _arguments(cam_from_world: Rigid3, matches: _Matches) -> tuple[object, ...]:
+def _arguments(cam_from_world: Rigid3, matches: _Matches) -> tuple[_Array, _Array, _Array, _Array, _Array, _Array]:
     """What all kernels take."""
     return (
         np.ascontiguousarray(cam_from_world.rotation),
-        cam_from_world.translation,
+        np.ascontiguousarray(cam_from_world.translation),
         matches.normalized,
         matches.covariances,
         matches.points_world,
