@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -70,7 +71,7 @@ def with_topoloc(scene: Scene, config: AbsolutePoseConfig, covariances: bool, pr
     return None if pose is None else pose.cam_from_world
 
 
-def with_opencv(scene: Scene, **settings: float) -> Rigid3 | None:
+def with_opencv(scene: Scene, **settings: Any) -> Rigid3 | None:
     found, rotation, translation, _ = cv2.solvePnPRansac(scene.points_world, scene.points_img, CAMERA.matrix(), None, **settings)
     return Rigid3(cv2.Rodrigues(rotation)[0], translation[:, 0]) if found else None
 
