@@ -1,0 +1,219 @@
+"""SURF against OpenCV's own numbers, on turned, shrunk and darkened images, and at the edges of what it may be given."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from surf_reference import describe_as_opencv
+
+from topoloc.features.features import Features
+from topoloc.features.surf import SurfConfig, extract_surf
+
+IMAGES = ("kitchen", "zed", "kitti")
+ALL = SurfConfig(max_features=5000)
+
+
+def load_reference(shared: Path, name: str, kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The image, OpenCV's key points (x, y, size, angle in degrees, ...), strongest first, and their descriptors."""
+    path = shared / "reference" / "surf" / f"{name}.npz"
+    if not path.is_file():
+        pytest.skip(f"no reference values at {path}")
+    data = np.load(path)
+    return data["image"], data[f"keypoints_{kind}"], data[f"descriptors_{kind}"]
+
+
+def texture(height: int, width: int, seed: int = 0) -> np.ndarray:
+    """Smooth noise of several scales, full contrast."""
+    rng = np.random.default_rng(seed)
+    layers = [
+        cv2.resize(rng.normal(size=(height // s + 2, width // s + 2)), (width, height), interpolation=cv2.INTER_CUBIC) for s in (4, 9, 20)
+    ]
+    return cv2.normalize(sum(layers), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def assert_same(first: Features, second: Features) -> None:
+    for field in fields(Features):
+        np.testing.assert_array_equal(getattr(first, field.name), getattr(second, field.name), err_msg=field.name)
+
+
+@pytest.mark.parametrize("name", IMAGES)
+def test_key_points_are_those_of_opencv(shared: Path, name: str) -> None:
+    image, keypoints, _ = load_reference(shared, name, "rotated")
+    features = extract_surf(image, ALL)
+    assert abs(len(features) - len(keypoints)) <= 0.01 * len(keypoints)
+    strongest = keypoints[:500]
+    distances = np.linalg.norm(features.points_img[None] - strongest[:, None, :2], axis=2)
+    sizes_agree = abs(features.sizes_px[None] / strongest[:, None, 2] - 1) < 0.15
+    angles_apart = abs((np.rad2deg(features.angles)[None] - strongest[:, None, 3] + 180) % 360 - 180)
+    found = (distances < 1) & sizes_agree
+    assert np.mean(found.any(axis=1)) >= 0.98
+    assert np.mean((found & (angles_apart < 5)).any(axis=1)) >= 0.97
+    nearest = np.argmin(np.where(found, distances, np.inf), axis=1)
+    np.testing.assert_allclose(features.responses[nearest], strongest[:, 4], rtol=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["rotated", "upright"])
+@pytest.mark.parametrize("name", IMAGES)
+def test_descriptors_can_be_matched_with_those_of_opencv(shared: Path, name: str, kind: str) -> None:
+    image, keypoints, descriptors = load_reference(shared, name, kind)
+    features = extract_surf(image, replace(ALL, upright=kind == "upright"))
+    nearest = np.argmax(descriptors @ features.descriptors.T, axis=1)
+    at_the_place = np.linalg.norm(features.points_img[nearest] - keypoints[:, :2], axis=1) < 1
+    # OpenCV's upright windows begin at whole pixels, ours do not.
+    assert np.mean(at_the_place) >= (0.99 if kind == "rotated" else 0.96)
+    distances = np.linalg.norm(features.descriptors[nearest] - descriptors, axis=1)
+    assert np.median(distances) < (0.03 if kind == "rotated" else 0.06)
+
+
+def turn(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    height, width = image.shape
+    cosine, sine = np.cos(np.pi / 6), np.sin(np.pi / 6)
+    rotation = np.array([[cosine, -sine], [sine, cosine]])
+    size = np.ceil(abs(rotation) @ [width, height]).astype(int)
+    affine = np.c_[rotation, (size - 1) / 2 - rotation @ [(width - 1) / 2, (height - 1) / 2]]
+    return cv2.warpAffine(image, affine, tuple(size.tolist()), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), affine
+
+
+def shrink(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    size = np.array([int(0.7 * image.shape[1]), int(0.7 * image.shape[0])])
+    scale = size / image.shape[::-1]
+    small = cv2.resize(image, tuple(size.tolist()), interpolation=cv2.INTER_AREA)
+    return small, np.c_[np.diag(scale), (scale - 1) / 2]
+
+
+def darken(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return np.rint(255 * 0.33 * (image / 255) ** 1.5).astype(np.uint8), np.eye(2, 3)
+
+
+def count_right_matches(
+    points: np.ndarray, descriptors: np.ndarray, other_points: np.ndarray, other_descriptors: np.ndarray, affine: np.ndarray
+) -> int:
+    """Matches that pass Lowe's test at 0.8 and lie within 3 pixels of where the point has gone."""
+    squares = np.maximum(2 - 2 * descriptors @ other_descriptors.T, 0)
+    two = np.argsort(squares, axis=1)[:, :2]
+    best, second = np.take_along_axis(squares, two, axis=1).T
+    moved = points @ affine[:, :2].T + affine[:, 2]
+    near = np.linalg.norm(other_points[two[:, 0]] - moved, axis=1) < 3
+    return int(np.sum((best < 0.8**2 * second) & near))
+
+
+@pytest.mark.parametrize("change", [turn, shrink, darken])
+@pytest.mark.parametrize("name", ["kitchen", "zed"])
+def test_as_many_right_matches_as_opencv(shared: Path, name: str, change) -> None:
+    """Within 3 %: which of two images does a little better is chance; over many images and changes they are even."""
+    image, keypoints, descriptors = load_reference(shared, name, "rotated")
+    changed, affine = change(image)
+    ours, theirs = extract_surf(image, ALL), extract_surf(changed, ALL)
+    _, of_opencv = describe_as_opencv(changed, np.c_[theirs.points_img, theirs.sizes_px])
+    yardstick = count_right_matches(keypoints[:, :2], descriptors, theirs.points_img, of_opencv, affine)
+    assert count_right_matches(ours.points_img, ours.descriptors, theirs.points_img, theirs.descriptors, affine) >= 0.97 * yardstick
+
+
+def test_the_yardstick_is_opencv(shared: Path) -> None:
+    image, keypoints, descriptors = load_reference(shared, "kitchen", "rotated")
+    angles_deg, described = describe_as_opencv(image, keypoints[:200, :3])
+    np.testing.assert_allclose(angles_deg, keypoints[:200, 3], atol=1e-3)
+    assert np.max(np.linalg.norm(described - descriptors[:200], axis=1)) < 0.02
+
+
+def test_unit_length_strongest_first_and_no_more_than_asked() -> None:
+    features = extract_surf(texture(240, 320), SurfConfig(hessian_threshold=100.0))
+    assert len(features) > 100
+    np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1, atol=1e-5)
+    assert np.all(np.diff(features.responses) <= 0)
+    assert np.all(features.responses > 100)
+    few = extract_surf(texture(240, 320), SurfConfig(hessian_threshold=100.0, max_features=50))
+    assert_same(few, features.select(np.arange(50)))
+
+
+@pytest.mark.parametrize("upright", [False, True])
+def test_same_bytes_for_any_number_of_threads_and_again(upright: bool) -> None:
+    config = SurfConfig(hessian_threshold=50.0, upright=upright, num_threads=1)
+    image = texture(301, 402)
+    alone = extract_surf(image, config)
+    assert len(alone) > 200
+    for num_threads in (1, 2, 3, 7):
+        assert_same(extract_surf(image, replace(config, num_threads=num_threads)), alone)
+
+
+def test_upright_ignores_rotation_and_says_so() -> None:
+    image = texture(200, 200)
+    upright, rotated = extract_surf(image, SurfConfig(upright=True)), extract_surf(image)
+    assert np.all(upright.angles == 0)
+    np.testing.assert_array_equal(upright.points_img, rotated.points_img)
+    turned = extract_surf(np.rot90(image).copy())
+    assert np.mean(np.max(rotated.descriptors @ turned.descriptors.T, axis=1) > 0.95) > 0.9
+
+
+def test_place_and_size_of_a_blob() -> None:
+    def strongest(sigma: float) -> Features:
+        y, x = np.mgrid[:200, :240]
+        square = (x - 120.25) ** 2 + (y - 90.75) ** 2
+        return extract_surf((200 * np.exp(-square / (2 * sigma**2))).astype(np.uint8)).select(np.array([0]))
+
+    small, large = strongest(3.0), strongest(9.0)
+    for found in (small, large):
+        np.testing.assert_allclose(found.points_img[0], [120.25, 90.75], atol=0.3)
+    np.testing.assert_allclose(large.sizes_px / small.sizes_px, 3, rtol=0.15)
+
+
+def test_mask() -> None:
+    image = texture(240, 320)
+    mask = np.zeros_like(image)
+    mask[:, :160] = 1
+    everywhere, masked = extract_surf(image), extract_surf(image, mask=mask)
+    left = everywhere.points_img[:, 0] < 155
+    right = everywhere.points_img[:, 0] > 165
+    kept = {tuple(point) for point in masked.points_img}
+    assert all((tuple(p) in kept) == inside for p, inside in zip(everywhere.points_img[left | right], left[left | right], strict=True))
+    assert left.sum() > 20
+    assert len(extract_surf(image, mask=np.zeros_like(image))) == 0
+    assert_same(extract_surf(image, mask=np.full_like(image, 255)), everywhere)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 300), (300, 1), (8, 8), (26, 26), (28, 28), (33, 70), (40, 500)])
+def test_small_images(shape: tuple[int, int]) -> None:
+    image = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
+    features = extract_surf(image, SurfConfig(hessian_threshold=0.0, num_threads=3))
+    assert features.descriptors.shape == (len(features), 64)
+    assert np.all((features.points_img >= 0) & (features.points_img < shape[::-1]))
+    assert (len(features) > 0) == (min(shape) >= 33)
+
+
+def test_flat_image_has_no_key_points() -> None:
+    assert len(extract_surf(np.full((200, 200), 255, np.uint8), SurfConfig(hessian_threshold=0.0))) == 0
+
+
+def test_read_only_and_strided_images() -> None:
+    image = texture(200, 300)
+    frozen = image.copy()
+    frozen.flags.writeable = False
+    wide = np.repeat(image, 2, axis=1)
+    assert_same(extract_surf(frozen), extract_surf(image))
+    assert_same(extract_surf(wide[:, ::2]), extract_surf(image))
+
+
+def test_sums_beyond_32_bits_wrap_harmlessly() -> None:
+    """A white image of 17 megapixels sums to more than 2^32; a patch in its far corner is described as on its own."""
+    patch = texture(200, 200)
+    framed = np.full((4200, 4100), 255, np.uint8)
+    framed[-300:-100, -300:-100] = patch
+    small = np.full((400, 400), 255, np.uint8)
+    small[100:300, 100:300] = patch
+    config = SurfConfig(num_octaves=2, hessian_threshold=1000.0)
+    far, near = extract_surf(framed, config), extract_surf(small, config)
+    assert len(near) > 20
+    np.testing.assert_allclose(far.points_img - [3700, 3800], near.points_img, atol=2e-3)
+    np.testing.assert_allclose(far.descriptors, near.descriptors, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"num_octaves": 0}, {"num_layers": 0}, {"num_threads": 0}, {"hessian_threshold": -1.0}, {"num_octaves": 12}]
+)
+def test_nonsense_is_refused(wrong: dict) -> None:
+    with pytest.raises(ValueError, match="SURF"):
+        SurfConfig(**wrong)
