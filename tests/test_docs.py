@@ -1,0 +1,124 @@
+"""Documentation that cannot rot: commands, settings, result keys, tables and public names are written down, and nothing else is."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import topoloc
+from topoloc.cli import COMMANDS, main
+from topoloc.evaluation.metrics import Answer, summarize
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.result import Localization, NotLocalized
+from topoloc.mapping import storage
+from topoloc.places.coarse import NodeScore
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+CLI = (ROOT / "docs" / "cli.md").read_text(encoding="utf-8")
+MAP_FORMAT = (ROOT / "docs" / "map-format.md").read_text(encoding="utf-8")
+PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")])
+
+LOCALIZED = Localization(Rigid3.identity(), np.eye(6), 1.0, 0, [NodeScore(0, 1.0)], 30, 20, {"total": 1.0})
+UNREADABLE = NotLocalized("unreadable", detail="which file, and why")
+
+
+def _section(command: str) -> str:
+    """What docs/cli.md says of one command."""
+    match = re.search(rf"^## topoloc {command}$(.*?)(?=^## |\Z)", CLI, re.MULTILINE | re.DOTALL)
+    assert match, f"docs/cli.md has no section '## topoloc {command}'"
+    return match.group(1)
+
+
+def _settings(command: str, capsys: pytest.CaptureFixture[str]) -> set[str]:
+    """The settings that `topoloc COMMAND --help` lists."""
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    return set(re.findall(r"^\W*(--[a-z][\w.-]*)", capsys.readouterr().out, re.MULTILINE))
+
+
+def _code_blocks(text: str, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_and_setting_is_in_the_docs(command: str, capsys: pytest.CaptureFixture[str]):
+    assert f"topoloc {command}" in README
+    settings = {setting for setting in _settings(command, capsys) if not setting.startswith("--config.")}
+    documented = set(re.findall(r"`(--[a-z][\w-]*)", _section(command)))
+    assert settings - documented == set()
+    assert documented - settings == set(), "documented, but no setting of this command"
+
+
+def test_commands_in_code_blocks_exist(capsys: pytest.CaptureFixture[str]):
+    settings = {command: _settings(command, capsys) for command in COMMANDS}
+    lines = [
+        line for page in PAGES for block in _code_blocks(page.read_text(encoding="utf-8"), "(?:sh|bash)") for line in block.splitlines()
+    ]
+    calls = [line for line in lines if re.match(r"(?:\S*/)?topoloc ", line)]
+    assert len(calls) >= len(COMMANDS)
+    for call in calls:
+        command, *words = call.partition("#")[0].split()[1:]
+        if command.startswith("--"):
+            continue
+        assert command in COMMANDS, call
+        used = {word.partition("=")[0] for word in words if word.startswith("--")}
+        assert used <= settings[command] | {"--help"}, call
+
+
+@pytest.mark.parametrize("reason", ["too_few_matches", "too_few_inliers", "ambiguous", "not_in_map", "jump", "unreadable"])
+def test_every_reason_is_documented(reason: str):
+    assert f"`{reason}`" in _section("localize")
+
+
+def test_result_and_evaluation_keys_are_documented():
+    for key in {**LOCALIZED.to_json("a.png"), **UNREADABLE.to_json("b.png")}:
+        assert f'"{key}"' in _section("localize")
+    answers = [Answer("a.png", LOCALIZED, Rigid3.identity(), 0), Answer("b.png", UNREADABLE, None)]
+    evaluation = summarize(answers)
+    for key in (*evaluation, *evaluation["recall"]):
+        assert f'"{key}"' in _section("evaluate")
+
+
+def test_every_table_and_column_of_the_map_is_documented():
+    with closing(sqlite3.connect(":memory:")) as database:
+        database.executescript(storage._SCHEMA)
+        tables = [name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+        for table in tables:
+            (section,) = re.findall(rf"^### {table}$(.*?)(?=^##|\Z)", MAP_FORMAT, re.MULTILINE | re.DOTALL)
+            columns = [row[1] for row in database.execute(f"PRAGMA table_info({table})")]
+            assert [column for column in columns if f"`{column}`" not in section] == []
+    assert set(re.findall(r"^### (\w+)$", MAP_FORMAT, re.MULTILINE)) == set(tables)
+    assert f"schema version is {storage.SCHEMA_VERSION}" in MAP_FORMAT
+    assert f"0x{storage.APPLICATION_ID:08X}" in MAP_FORMAT
+
+
+@pytest.mark.parametrize("name", [name for name in topoloc.__all__ if name != "__version__"])
+def test_every_public_name_says_what_it_is(name: str):
+    public = getattr(topoloc, name)
+    assert public.__doc__, name
+    assert not public.__doc__.startswith(f"{name}("), f"{name}: a data class without words of its own"
+    methods = [member for key, member in inspect.getmembers(public, inspect.isfunction) if not key.startswith("_")]
+    public_methods = [method for method in methods if method.__qualname__.startswith(f"{name}.")]
+    assert [method.__qualname__ for method in public_methods if not method.__doc__] == []
+
+
+def test_python_examples_compile_and_use_public_names():
+    blocks = [block for page in PAGES for block in _code_blocks(page.read_text(encoding="utf-8"), "python")]
+    assert blocks
+    for block in blocks:
+        compile(block, "example", "exec")
+        assert set(re.findall(r"\btopoloc\.(\w+)", block)) <= set(topoloc.__all__)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page: Path):
+    links = re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8"))
+    local = [link for link in links if "://" not in link]
+    assert [link for link in local if not (page.parent / link).exists()] == []
