@@ -88,30 +88,47 @@ def _detect(integral: Int32[np.ndarray, "h1 w1"], config: SurfConfig) -> Float32
     """Maxima of the Hessian's determinant: rows x, y, size, response."""
     height, width = integral.shape[0] - 1, integral.shape[1] - 1
 
-    def detect(octave: int, first: int, last: int) -> Float32[np.ndarray, "m 4"]:
-        step = 1 << octave
-        edges = _pattern_edges(_filter_sizes(octave, config.num_layers))
-        columns, top, rows = edges, 0, integral
-        if step > 1:
-            top = max((first - 1) * step - int(edges[-1, -1]), 0)
-            rows = split_columns(integral, step, top, min(last * step + int(edges[-1, -1]) + step, height + 1))
-            columns = edges % step * (rows.shape[1] // step) + edges // step
-        return detect_band(rows, top, height, width, edges, columns, step, first, last, np.float32(config.hessian_threshold))
-
     def detect_part(part: int, _: int) -> None:
-        for octave in octaves:
-            num_rows = height >> octave
-            found[octave, part] = detect(octave, num_rows * part // num_parts, num_rows * (part + 1) // num_parts)
+        for octave, edges in octaves.items():
+            step, size = 1 << octave, int(edges[-1, -1])
+            first, last = _borders(height // step, part, num_parts)
+            columns, top, rows = edges, 0, integral
+            if step > 1:
+                top, bottom = max((first - 1) * step - size, 0), min(last * step + size + step, height + 1)
+                rows = scratch[part][: (bottom - top) * split_width(step)].reshape(bottom - top, -1)
+                split_columns(integral, step, top, rows)
+                columns = edges % step * (split_width(step) // step) + edges // step
+            found[octave, part] = detect_band(rows, top, height, width, edges, columns, step, first, last, threshold)
+
+    def split_width(step: int) -> int:
+        return -(-(width + 1) // step) * step
+
+    def largest_split(part_rows: int) -> int:
+        """Numbers in the largest band of reordered sums, of all octaves but the first."""
+        return max(((part_rows + 3 * (1 << o) + 2 * int(e[-1, -1])) * split_width(1 << o) for o, e in octaves.items() if o > 0), default=0)
 
     # Maxima need the layer above theirs, thus the four smallest filters at the least; the first empty octave ends the search.
-    octaves = [o for o in range(config.num_octaves) if _filter_sizes(o, config.num_layers)[2] < min(height, width)]
+    sizes = {octave: _filter_sizes(octave, config.num_layers) for octave in range(config.num_octaves)}
+    octaves = {octave: _pattern_edges(s) for octave, s in sizes.items() if s[2] < min(height, width)}
     if not octaves:
         return np.zeros((0, 4), np.float32)
-    num_parts = config.num_threads
+    num_parts, threshold = config.num_threads, np.float32(config.hessian_threshold)
+    # Allocated here, not in the threads: the allocator gives a helper thread's memory back to the system after each call.
+    scratch = np.empty((num_parts, largest_split(-(-height // num_parts))), np.int32)
     found: dict[tuple[int, int], Float32[np.ndarray, "m 4"]] = {}
     run_in_bands(detect_part, num_parts, num_parts)
     # By octave, then row: the order, and so the ranking of equal responses, does not depend on the number of parts.
     return np.concatenate([found[key] for key in sorted(found)])
+
+
+def _borders(num_rows: int, part: int, num_parts: int) -> tuple[int, int]:
+    """First row and the one after the last of a part."""
+    return num_rows * part // num_parts, num_rows * (part + 1) // num_parts
+
+
+def _part_of(rows: Int64[np.ndarray, " n"], part: int, num_parts: int) -> Int64[np.ndarray, " m"]:
+    first, last = _borders(len(rows), part, num_parts)
+    return rows[first:last]
 
 
 def _on_mask(mask: UInt8[np.ndarray, "h w"], found: Float32[np.ndarray, "m 4"]) -> np.ndarray:
@@ -167,17 +184,18 @@ def _describe(
 
     def prepare_part(part: int, _: int) -> None:
         for level in levels.values():
-            first, last = (len(level.pixels) * p // num_parts for p in (part, part + 1))
+            first, last = _borders(len(level.pixels), part, num_parts)
             smooth_rows(integral, level.box, level.share, level.step, level.pixels, first, last)
         if not config.upright:
-            share = slice(len(points) * part // num_parts, len(points) * (part + 1) // num_parts)
-            orient(integral, points[share], scales[share], angles[share])
+            orient(integral, points, scales, _part_of(downwards, part, num_parts), angles)
 
     def describe_part(part: int, _: int) -> None:
         for k, level in levels.items():
-            rows = np.flatnonzero(level_idx == k)[part::num_parts].copy()
+            rows = _part_of(downwards[level_idx[downwards] == k], part, num_parts)
             describe(level.pixels, level.offset, level.step, points, spacings, directions, rows, descriptors)
 
+    # From the top of the image down, so that a thread finds what it reads in its own core's cache.
+    downwards = np.argsort(points[:, 1], kind="stable")
     run_in_bands(prepare_part, num_parts, num_parts)
     directions = np.full_like(angles, 1.5 * np.pi) if config.upright else angles
     run_in_bands(describe_part, num_parts, num_parts)

@@ -144,18 +144,18 @@ def _dominant_angle(gradients, sectors, first_degree, sums, windows):
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def orient(integral, points, scales, angles):
-    """Fill angles (n,) of the key points at points (n, 2) of scales (n,)."""
+def orient(integral, points, scales, rows, angles):
+    """Fill angles[rows] of the key points at points[rows] (x, y) of scales[rows]."""
     num_samples, num_sectors = ORIENTATION_SAMPLES.shape[1], 360 // SECTOR_DEG
     corners, sectors = np.empty(num_samples, np.int32), np.empty(num_samples, np.int32)
     weights = np.empty(num_samples, np.float32)
     gradients, first_degree = np.empty((2, num_samples), np.float32), np.empty((2, num_samples), np.float32)
     sums = np.empty((2, num_sectors + WINDOW_SECTORS), np.float32)
     windows = np.empty((2, num_sectors), np.float32)
-    for k in range(points.shape[0]):
-        _haar_samples(integral, points[k, 0], points[k, 1], scales[k], corners, weights, gradients)
+    for row in rows:
+        _haar_samples(integral, points[row, 0], points[row, 1], scales[row], corners, weights, gradients)
         _sectors(gradients, sectors, first_degree)
-        angles[k] = _dominant_angle(gradients, sectors, first_degree, sums, windows)
+        angles[row] = _dominant_angle(gradients, sectors, first_degree, sums, windows)
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")

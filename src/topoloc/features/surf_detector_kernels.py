@@ -28,21 +28,18 @@ def integral_image(image):
 
 
 @njit(nogil=True, cache=True)
-def split_columns(integral, step, first, last):
-    """Rows [first, last) of the integral image, columns reordered: first those at 0, step, 2 step, ..., then those at 1, 1 + step, ...
+def split_columns(integral, step, first, split):
+    """Fill `split` with rows of the integral image from `first` on, columns reordered: those at 0, step, 2 step, ..., then 1, 1 + step, ...
 
     What a filter bank sampled at every step-th pixel reads is then contiguous, so that its loops vectorise.
     """
-    width = integral.shape[1]
-    phase_length = (width + step - 1) // step
-    split = np.zeros((last - first, step * phase_length), np.int32)
-    for y in range(last - first):
+    width, phase_length = integral.shape[1], split.shape[1] // step
+    for y in range(split.shape[0]):
         source = integral[first + y]
         for phase in range(step):
             target = split[y, phase * phase_length : (phase + 1) * phase_length]
             for j in range((width - phase + step - 1) // step):
                 target[j] = source[phase + j * step]
-    return split
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
