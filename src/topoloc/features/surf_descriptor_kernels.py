@@ -25,7 +25,13 @@ def _orientation_samples():
 
 
 ORIENTATION_SAMPLES = _orientation_samples()
-PATCH_WEIGHTS = np.outer(_gaussian(PATCH_SIZE, 3.3), _gaussian(PATCH_SIZE, 3.3)).astype(np.float32)
+# Rows and columns of the (21, 21) samples of a patch, one after the other.
+GRID_ROWS, GRID_COLUMNS = np.indices((PATCH_SIZE + 1, PATCH_SIZE + 1)).reshape(2, -1).astype(np.float32)
+# Padded with zeros to whole vectors of eight numbers: what lies beyond a row is read and counts nothing.
+PADDED_SIZE = 24
+PATCH_WEIGHTS = np.pad(np.outer(_gaussian(PATCH_SIZE, 3.3), _gaussian(PATCH_SIZE, 3.3)), ((0, 0), (0, PADDED_SIZE - PATCH_SIZE))).astype(
+    np.float32
+)
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
@@ -117,7 +123,7 @@ def _sectors(gradients, sectors, first_degree):
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
-def _dominant_angle(gradients, sectors, first_degree, sums, windows):
+def _dominant_angle(gradients, sectors, first_degree, sums, threes, windows):
     """The direction of the longest sum of gradients within any window of 60 degrees (Bay et al. 2008, 4.1).
 
     Windows are centred on multiples of 5 degrees and open, 59 whole degrees wide: twelve sectors less the first degree.
@@ -131,9 +137,10 @@ def _dominant_angle(gradients, sectors, first_degree, sums, windows):
             windows[axis, sectors[k]] -= first_degree[axis, k]
         for sector in range(WINDOW_SECTORS):
             sums[axis, num_sectors + sector] = sums[axis, sector]
-        for offset in range(WINDOW_SECTORS):
-            for first in range(num_sectors):
-                windows[axis, first] += sums[axis, first + offset]
+        for first in range(threes.shape[0]):
+            threes[first] = sums[axis, first] + sums[axis, first + 1] + sums[axis, first + 2]
+        for first in range(num_sectors):
+            windows[axis, first] += threes[first] + threes[first + 3] + threes[first + 6] + threes[first + 9]
     best, best_x, best_y = np.float32(-1.0), np.float32(0.0), np.float32(0.0)
     for first in range(num_sectors):
         x, y = windows[0, first], windows[1, first]
@@ -151,32 +158,30 @@ def orient(integral, points, scales, rows, angles):
     weights = np.empty(num_samples, np.float32)
     gradients, first_degree = np.empty((2, num_samples), np.float32), np.empty((2, num_samples), np.float32)
     sums = np.empty((2, num_sectors + WINDOW_SECTORS), np.float32)
+    threes = np.empty(num_sectors + WINDOW_SECTORS - 3, np.float32)
     windows = np.empty((2, num_sectors), np.float32)
     for row in rows:
         _haar_samples(integral, points[row, 0], points[row, 1], scales[row], corners, weights, gradients)
         _sectors(gradients, sectors, first_degree)
-        angles[row] = _dominant_angle(gradients, sectors, first_degree, sums, windows)
+        angles[row] = _dominant_angle(gradients, sectors, first_degree, sums, threes, windows)
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
 def _sample_patch(level, origin_x, origin_y, step_x, step_y, indices, fractions, patch):
     """Bilinear samples of `level` on the grid origin + column * (step_x, step_y) + row * (-step_y, step_x), clamped to the image."""
-    side = PATCH_SIZE + 1
     stride = np.int32(level.shape[1])
     max_x, max_y = np.float32(level.shape[1]) - np.float32(1.001), np.float32(level.shape[0]) - np.float32(1.001)
-    for row in range(side):
-        row_x, row_y = origin_x - row * step_y, origin_y + row * step_x
-        for column in range(side):
-            x = min(max(row_x + np.float32(column) * step_x, np.float32(0.0)), max_x)
-            y = min(max(row_y + np.float32(column) * step_y, np.float32(0.0)), max_y)
-            left, top = np.int32(x), np.int32(y)
-            k = row * side + column
-            fractions[0, k] = x - np.float32(left)
-            fractions[1, k] = y - np.float32(top)
-            indices[k] = np.int32(top * stride + left)
+    for k in range(indices.shape[0]):
+        x = origin_x + GRID_COLUMNS[k] * step_x - GRID_ROWS[k] * step_y
+        y = origin_y + GRID_COLUMNS[k] * step_y + GRID_ROWS[k] * step_x
+        x, y = min(max(x, np.float32(0.0)), max_x), min(max(y, np.float32(0.0)), max_y)
+        left, top = np.int32(x), np.int32(y)
+        fractions[0, k] = x - np.float32(left)
+        fractions[1, k] = y - np.float32(top)
+        indices[k] = np.int32(top * stride + left)
     flat = level.ravel()
     right, below, diagonal = flat[1:], flat[stride:], flat[stride + 1 :]
-    for k in range(side * side):
+    for k in range(indices.shape[0]):
         i = np.uintp(indices[k])
         fraction = fractions[0, k]
         upper = flat[i] + fraction * (right[i] - flat[i])
@@ -193,8 +198,8 @@ def _describe_patch(patch, sums, descriptor):
     for cell_y in range(4):
         sums[:] = 0
         for y in range(cell_y * cell, cell_y * cell + cell):
-            upper, lower, weights = patch[y * side : y * side + side], patch[y * side + side : y * side + 2 * side], PATCH_WEIGHTS[y]
-            for x in range(PATCH_SIZE):
+            upper, lower, weights = patch[y * side :], patch[y * side + side :], PATCH_WEIGHTS[y]
+            for x in range(PADDED_SIZE):
                 falling = (lower[x + 1] - upper[x]) * weights[x]
                 rising = (upper[x + 1] - lower[x]) * weights[x]
                 dx, dy = falling + rising, falling - rising
@@ -220,8 +225,8 @@ def describe(level, offset, level_step, points, spacings, angles, rows, descript
     side = PATCH_SIZE + 1
     indices = np.empty(side * side, np.int32)
     fractions = np.empty((2, side * side), np.float32)
-    patch = np.empty(side * side, np.float32)
-    sums = np.empty((4, PATCH_SIZE), np.float32)
+    patch = np.zeros(side * side + PADDED_SIZE, np.float32)
+    sums = np.empty((4, PADDED_SIZE), np.float32)
     per_pixel = 1.0 / level_step
     for row in rows:
         step_x = np.cos(angles[row]) * spacings[row] * per_pixel
