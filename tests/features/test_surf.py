@@ -175,8 +175,8 @@ def test_mask() -> None:
     assert_same(extract_surf(image, mask=np.full_like(image, 255)), everywhere)
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 300), (300, 1), (8, 8), (26, 26), (28, 28), (33, 70), (40, 500)])
-def test_small_images(shape: tuple[int, int]) -> None:
+@pytest.mark.parametrize("shape", [(1, 1), (1, 300), (300, 1), (8, 8), (26, 26), (28, 28), (33, 70), (40, 500), (36, 66000)])
+def test_small_and_narrow_images(shape: tuple[int, int]) -> None:
     image = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
     features = extract_surf(image, SurfConfig(hessian_threshold=0.0, num_threads=3))
     assert features.descriptors.shape == (len(features), 64)

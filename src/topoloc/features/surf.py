@@ -16,7 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Int32, Int64, UInt8
+from jaxtyping import Bool, Float32, Int32, Int64, UInt8
 
 from topoloc.features.bands import run_in_bands
 from topoloc.features.features import Features
@@ -60,8 +60,10 @@ def extract_surf(
 
     Where `mask` is 0 nothing is found: at least half of the filter of a key point must lie on non-zero mask. Upright
     key points have angle 0; their windows are read as OpenCV's are, turned by 270 degrees. The result is the same for any
-    number of threads.
+    number of threads. Raises ValueError if the mask is of another size than the image.
     """
+    if mask is not None and mask.shape != image.shape:
+        raise ValueError(f"SURF: mask of {mask.shape} for an image of {image.shape}")
     integral = integral_image(np.ascontiguousarray(image))
     found = _detect(integral, config)
     if mask is not None:
@@ -88,6 +90,12 @@ def _detect(integral: Int32[np.ndarray, "h1 w1"], config: SurfConfig) -> Float32
     """Maxima of the Hessian's determinant: rows x, y, size, response."""
     height, width = integral.shape[0] - 1, integral.shape[1] - 1
 
+    # A maximum needs filters below and above its own: an octave whose third does not fit into the image holds none.
+    sizes = {octave: _filter_sizes(octave, config.num_layers) for octave in range(config.num_octaves)}
+    octaves = {octave: _pattern_edges(s) for octave, s in sizes.items() if s[2] < min(height, width)}
+    if not octaves:
+        return np.zeros((0, 4), np.float32)
+
     def detect_part(part: int, _: int) -> None:
         for octave, edges in octaves.items():
             step, size = 1 << octave, int(edges[-1, -1])
@@ -107,11 +115,6 @@ def _detect(integral: Int32[np.ndarray, "h1 w1"], config: SurfConfig) -> Float32
         """Numbers in the largest band of reordered sums, of all octaves but the first."""
         return max(((part_rows + 3 * (1 << o) + 2 * int(e[-1, -1])) * split_width(1 << o) for o, e in octaves.items() if o > 0), default=0)
 
-    # Maxima need the layer above theirs, thus the four smallest filters at the least; the first empty octave ends the search.
-    sizes = {octave: _filter_sizes(octave, config.num_layers) for octave in range(config.num_octaves)}
-    octaves = {octave: _pattern_edges(s) for octave, s in sizes.items() if s[2] < min(height, width)}
-    if not octaves:
-        return np.zeros((0, 4), np.float32)
     num_parts, threshold = config.num_threads, np.float32(config.hessian_threshold)
     # Allocated here, not in the threads: the allocator gives a helper thread's memory back to the system after each call.
     scratch = np.empty((num_parts, largest_split(-(-height // num_parts))), np.int32)
@@ -131,7 +134,7 @@ def _part_of(rows: Int64[np.ndarray, " n"], part: int, num_parts: int) -> Int64[
     return rows[first:last]
 
 
-def _on_mask(mask: UInt8[np.ndarray, "h w"], found: Float32[np.ndarray, "m 4"]) -> np.ndarray:
+def _on_mask(mask: UInt8[np.ndarray, "h w"], found: Float32[np.ndarray, "m 4"]) -> Bool[np.ndarray, " m"]:
     """Which filters lie with at least half of their area on the mask."""
     counts = integral_image((mask > 0).astype(np.uint8))
     half = found[:, 2:3] / 2

@@ -29,9 +29,8 @@ ORIENTATION_SAMPLES = _orientation_samples()
 GRID_ROWS, GRID_COLUMNS = np.indices((PATCH_SIZE + 1, PATCH_SIZE + 1)).reshape(2, -1).astype(np.float32)
 # Padded with zeros to whole vectors of eight numbers: what lies beyond a row is read and counts nothing.
 PADDED_SIZE = 24
-PATCH_WEIGHTS = np.pad(np.outer(_gaussian(PATCH_SIZE, 3.3), _gaussian(PATCH_SIZE, 3.3)), ((0, 0), (0, PADDED_SIZE - PATCH_SIZE))).astype(
-    np.float32
-)
+PATCH_WEIGHTS = np.zeros((PATCH_SIZE, PADDED_SIZE), np.float32)
+PATCH_WEIGHTS[:, :PATCH_SIZE] = np.outer(_gaussian(PATCH_SIZE, 3.3), _gaussian(PATCH_SIZE, 3.3))
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
@@ -170,12 +169,13 @@ def orient(integral, points, scales, rows, angles):
 def _sample_patch(level, origin_x, origin_y, step_x, step_y, indices, fractions, patch):
     """Bilinear samples of `level` on the grid origin + column * (step_x, step_y) + row * (-step_y, step_x), clamped to the image."""
     stride = np.int32(level.shape[1])
-    max_x, max_y = np.float32(level.shape[1]) - np.float32(1.001), np.float32(level.shape[0]) - np.float32(1.001)
+    max_left, max_top = np.int32(level.shape[1] - 2), np.int32(level.shape[0] - 2)
+    max_x, max_y = np.float32(level.shape[1] - 1), np.float32(level.shape[0] - 1)
     for k in range(indices.shape[0]):
         x = origin_x + GRID_COLUMNS[k] * step_x - GRID_ROWS[k] * step_y
         y = origin_y + GRID_COLUMNS[k] * step_y + GRID_ROWS[k] * step_x
         x, y = min(max(x, np.float32(0.0)), max_x), min(max(y, np.float32(0.0)), max_y)
-        left, top = np.int32(x), np.int32(y)
+        left, top = min(np.int32(x), max_left), min(np.int32(y), max_top)
         fractions[0, k] = x - np.float32(left)
         fractions[1, k] = y - np.float32(top)
         indices[k] = np.int32(top * stride + left)
