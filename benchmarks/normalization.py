@@ -19,8 +19,6 @@ from typing import Literal
 import cv2
 import numpy as np
 import tyro
-from rich.console import Console
-from rich.table import Table
 
 from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.features import Features
@@ -170,7 +168,8 @@ def judge(pair: Pair, features_map: Features, features_query: Features) -> tuple
 
 def main(args: Args) -> None:
     pairs = [make_pair(args, number) for number in range(len(PAIRS))]
-    table = Table("variant", *pairs[0].queries, title=f"{len(pairs)} pairs: geometric mean of right matches / precision / good poses")
+    print(f"{len(pairs)} pairs: geometric mean of right matches / precision / good poses")
+    print(" " * 30, *(f"{light:>18s}" for light in pairs[0].queries))
     results: dict[str, dict[str, dict[str, float]]] = {}
     for name, extract in VARIANTS.items():
         of_map = [extract(pair.mapped.grey) for pair in pairs]
@@ -180,8 +179,8 @@ def main(args: Args) -> None:
             mean = float(np.expm1(np.log1p(right).mean()))
             result = {"right_matches": mean, "precision": float(right.sum() / max(total.sum(), 1)), "good_poses": int(good.sum())}
             results.setdefault(name, {})[light] = result
-        table.add_row(name, *(f"{r['right_matches']:.0f} / {r['precision']:.2f} / {r['good_poses']}" for r in results[name].values()))
-    Console(width=140).print(table)
+        cells = (f"{r['right_matches']:.0f} / {r['precision']:.2f} / {r['good_poses']}" for r in results[name].values())
+        print(f"{name:30s}", *(f"{cell:>18s}" for cell in cells), flush=True)
     if args.json is not None:
         args.json.write_text(json.dumps(results, indent=1))
 
