@@ -57,7 +57,9 @@ class Command:
         topomap.save(target)
         info = describe_map(topomap, target)
         if self.json != "-":
-            print(f"{target}: {info['num_nodes']} nodes, {info['num_points']} points, {info['bytes'] / 1e6:.2f} MB, {info['length_m']:.1f} m mapped")
+            print(
+                f"{target}: {info['num_nodes']} nodes, {info['num_points']} points, {info['bytes'] / 1e6:.2f} MB, {info['length_m']:.1f} m mapped"
+            )
         write_json(self.json, info)
         return 0
 

@@ -62,6 +62,8 @@ def _print(info: dict[str, Any]) -> None:
     table.add_row("recordings", ", ".join(info["recordings"]))
     table.add_row("coarse localizers", ", ".join(info["coarse"]))
     nodes, features = info["config"].get("nodes", {}), info["config"].get("features", {})
-    table.add_row("Eq. 1", f"D_thresh {nodes.get('d_thresh', float('nan')):.3g} m, lambda {nodes.get('lambda_rot', float('nan')):.3g} m/rad")
+    table.add_row(
+        "Eq. 1", f"D_thresh {nodes.get('d_thresh', float('nan')):.3g} m, lambda {nodes.get('lambda_rot', float('nan')):.3g} m/rad"
+    )
     table.add_row("features", ", ".join(f"{key} {value}" for key, value in features.items() if isinstance(value, str)))
     Console().print(table)

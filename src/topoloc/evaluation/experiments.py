@@ -11,7 +11,7 @@ from topoloc.evaluation.metrics import Answer
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.mapping.nodes import node_distances
+from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.sequences.frame import StereoFrame, StereoSequence
 
 
@@ -30,7 +30,7 @@ def answer_queries(
         TrajectoryError: the recording holds no truth.
         CalibrationError: it holds no camera.
     """
-    nodes = [summary.world_from_cam for summary in localizer.topomap.summaries]
+    nodes = NodePoses.of([summary.world_from_cam for summary in localizer.topomap.summaries])
     lambda_rot = float(localizer.topomap.config["nodes"]["lambda_rot"])
     frames = [i for i, pose in enumerate(sequence.poses) if pose is not None]
     if not frames:

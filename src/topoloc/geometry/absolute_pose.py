@@ -86,12 +86,14 @@ def estimate_absolute_pose(
     *,
     point_covariances: Float[np.ndarray, "n 3 3"] | None = None,
     priorities: Float[np.ndarray, " n"] | None = None,
+    start: Rigid3 | None = None,
 ) -> AbsolutePose | None:
     """cam_from_world from n matches of pixels with world points (metres); None where no pose follows from them.
 
     Args:
         point_covariances: of the world points, in the world frame (m^2); exact points without it.
         priorities: larger is likelier right; RANSAC tries these first (not with OpenCV).
+        start: a pose that is nearly right already: it is refined, and no other one is sought.
 
     Matches with a value that is not finite are outliers. The same input gives the same bytes.
     """
@@ -114,8 +116,11 @@ def estimate_absolute_pose(
     )
     if not _spans_a_plane(matches.points_world) or not _spans_a_plane(np.insert(matches.normalized, 2, 0.0, axis=1)):
         return None
-    solve = _solve_with_opencv if config.method == "opencv" else _solve_with_poselib
-    cam_from_world = solve(matches, camera, config, priorities is not None)
+    if start is not None:
+        cam_from_world = _refine_on_inliers(start, matches, camera, config)
+    else:
+        solve = _solve_with_opencv if config.method == "opencv" else _solve_with_poselib
+        cam_from_world = solve(matches, camera, config, priorities is not None)
     if cam_from_world is None:
         return None
     return _with_evidence(cam_from_world, matches, camera, config, order, len(points_img))
@@ -163,7 +168,10 @@ def _solve_with_poselib(matches: _Matches, camera: Camera, config: AbsolutePoseC
     matrix = np.asarray(pose.Rt, dtype=np.float64)
     if not np.isfinite(matrix).all():
         return None
-    cam_from_world = Rigid3(matrix[:, :3].copy(), matrix[:, 3].copy())
+    return _refine_on_inliers(Rigid3(matrix[:, :3].copy(), matrix[:, 3].copy()), matches, camera, config)
+
+
+def _refine_on_inliers(cam_from_world: Rigid3, matches: _Matches, camera: Camera, config: AbsolutePoseConfig) -> Rigid3 | None:
     for _ in range(2):  # the second time with the inliers of the first
         inliers = _select_inliers(cam_from_world, matches, _reprojection_errors(cam_from_world, matches, camera), config)
         if not _spans_a_plane(matches.points_world[inliers]):

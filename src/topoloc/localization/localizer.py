@@ -12,19 +12,22 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import UInt8
 
 from topoloc.errors import EmptyMapError, MapError, QueryError
-from topoloc.features.extraction import FeatureConfig, extract_features
+from topoloc.features.extraction import FeatureConfig, extract_normalized, normalize_image
 from topoloc.features.features import Features, Matches
 from topoloc.features.matching import MatchingConfig, match_pooled
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, covariance_of_inverse, estimate_absolute_pose
 from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.guided import GuidedConfig, match_guided
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.stages import StageClock
+from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.places.coarse import Image, NodeScore, open_coarse
+from topoloc.sequences.pictures import grey_image
 
 NODES_IN_MEMORY = 256
 
@@ -38,9 +41,23 @@ class LocalizerConfig:
     num_candidates: int = 5
     """Nodes whose points are pooled; 1 is the paper's single node."""
     matching: MatchingConfig = field(default_factory=MatchingConfig)
+    guided: GuidedConfig = field(default_factory=GuidedConfig)
     pose: AbsolutePoseConfig = field(default_factory=AbsolutePoseConfig)
     min_matches: int = 8
     min_inliers: int = 12
+
+
+@dataclass(frozen=True, eq=False)
+class _Attempt:
+    """A pose sought in a part of the map."""
+
+    local_map: LocalMap
+    matches: Matches
+    pose: AbsolutePose | None
+
+    @property
+    def num_inliers(self) -> int:
+        return int(self.pose.inliers.sum()) if self.pose else 0
 
 
 class Localizer:
@@ -61,6 +78,8 @@ class Localizer:
             raise MapError(f"the map has no coarse localizer {self.config.coarse!r} (it has: {available})")
         self._coarse = open_coarse(topomap.coarse_models[self.config.coarse])
         self._feature_config = FeatureConfig(**topomap.config["features"])
+        self._node_poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
+        self._lambda_rot = float(topomap.config["nodes"]["lambda_rot"])
         self._local_maps: OrderedDict[int, LocalMap] = OrderedDict()
 
     def localize(self, image: Image, camera: Camera) -> Localization | NotLocalized:
@@ -75,43 +94,50 @@ class Localizer:
         clock = StageClock()
         features = self._extract(image, clock)
         candidates = self._rank_nodes(image, features, clock)
-        local_map, matches = self._match(features, candidates, clock)
-        if len(matches) < self.config.min_matches:
-            return NotLocalized("too_few_matches", candidates, len(matches), 0, clock.times_ms())
-        pose = self._estimate_pose(features, local_map, matches, camera, clock)
-        num_inliers = int(pose.inliers.sum()) if pose else 0
-        if pose is None or num_inliers < self.config.min_inliers:
-            return NotLocalized("too_few_inliers", candidates, len(matches), num_inliers, clock.times_ms())
-        node_id = int(np.bincount(local_map.node_ids[matches.train_idx[pose.inliers]]).argmax())
-        return Localization(
-            world_from_cam=pose.cam_from_world.inverse(),
-            covariance=covariance_of_inverse(pose.cam_from_world, pose.covariance),
-            probability=1.0,
-            node_id=node_id,
-            candidates=candidates,
-            num_matches=len(matches),
-            num_inliers=num_inliers,
-            times_ms=clock.times_ms(),
-        )
+        first = self._localize_in(self._pooled([c.node_id for c in candidates]), features, camera, clock)
+        final = self._localize_around(first, features, camera, clock) if first.pose else first
+        return self._judge(final, candidates, clock)
 
     def _extract(self, image: Image, clock: StageClock) -> Features:
+        """Patch normalisation, then the local features."""
+        grey = grey_image(image)
+        with clock.stage("patch_normalization"):
+            normalized = normalize_image(grey, self._feature_config)
         with clock.stage("features"):
-            return extract_features(_grey(image), self._feature_config)
+            return extract_normalized(normalized, self._feature_config)
 
     def _rank_nodes(self, image: Image, features: Features, clock: StageClock) -> list[NodeScore]:
+        """The coarse step: which nodes may this be?"""
         with clock.stage("coarse"):
             return self._coarse.rank(image, features, self.config.num_candidates)
 
-    def _match(self, features: Features, candidates: list[NodeScore], clock: StageClock) -> tuple[LocalMap, Matches]:
+    def _localize_in(self, local_map: LocalMap, features: Features, camera: Camera, clock: StageClock) -> _Attempt:
+        """The fine step: match with the candidates' points, then robust PnP."""
         with clock.stage("matching"):
-            local_map = LocalMap.pooled([self._local_map(c.node_id) for c in candidates])
             matches = match_pooled(
                 features.descriptors, local_map.descriptors, local_map.points_world, local_map.radii, self.config.matching
             )
-            return local_map, matches
+        if len(matches) < self.config.min_matches:
+            return _Attempt(local_map, matches, None)
+        return _Attempt(local_map, matches, self._estimate_pose(local_map, matches, features, camera, None, clock))
+
+    def _localize_around(self, first: _Attempt, features: Features, camera: Camera, clock: StageClock) -> _Attempt:
+        """Once more with the nodes nearest to the pose found, each point sought where it must be seen."""
+        if self.config.guided.num_nodes == 0 or first.num_inliers < self.config.min_inliers:
+            return first
+        assert first.pose is not None
+        with clock.stage("matching"):
+            cam_from_world = first.pose.cam_from_world
+            distances = node_distances(cam_from_world.inverse(), self._node_poses, self._lambda_rot)
+            nearest = np.argsort(distances, kind="stable")[: self.config.guided.num_nodes]
+            local_map = self._pooled([int(i) for i in nearest])
+            matches = match_guided(features, local_map, cam_from_world, camera, self.config.guided)
+        pose = self._estimate_pose(local_map, matches, features, camera, cam_from_world, clock)
+        guided = _Attempt(local_map, matches, pose)
+        return guided if guided.num_inliers >= first.num_inliers // 2 else first
 
     def _estimate_pose(
-        self, features: Features, local_map: LocalMap, matches: Matches, camera: Camera, clock: StageClock
+        self, local_map: LocalMap, matches: Matches, features: Features, camera: Camera, start: Rigid3 | None, clock: StageClock
     ) -> AbsolutePose | None:
         with clock.stage("pnp"):
             return estimate_absolute_pose(
@@ -120,8 +146,29 @@ class Localizer:
                 camera,
                 self.config.pose,
                 point_covariances=local_map.covariances[matches.train_idx],
-                priorities=-matches.distances.astype(np.float64),
+                start=start,
             )
+
+    def _judge(self, attempt: _Attempt, candidates: list[NodeScore], clock: StageClock) -> Localization | NotLocalized:
+        num_matches, num_inliers, pose = len(attempt.matches), attempt.num_inliers, attempt.pose
+        if num_matches < self.config.min_matches:
+            return NotLocalized("too_few_matches", candidates, num_matches, 0, clock.times_ms())
+        if pose is None or num_inliers < self.config.min_inliers:
+            return NotLocalized("too_few_inliers", candidates, num_matches, num_inliers, clock.times_ms())
+        node_ids = attempt.local_map.node_ids[attempt.matches.train_idx[pose.inliers]]
+        return Localization(
+            world_from_cam=pose.cam_from_world.inverse(),
+            covariance=covariance_of_inverse(pose.cam_from_world, pose.covariance),
+            probability=1.0,
+            node_id=int(np.bincount(node_ids).argmax()),
+            candidates=candidates,
+            num_matches=num_matches,
+            num_inliers=num_inliers,
+            times_ms=clock.times_ms(),
+        )
+
+    def _pooled(self, node_ids: list[int]) -> LocalMap:
+        return LocalMap.pooled([self._local_map(node_id) for node_id in node_ids])
 
     def _local_map(self, node_id: int) -> LocalMap:
         if node_id not in self._local_maps:
@@ -130,9 +177,3 @@ class Localizer:
                 self._local_maps.popitem(last=False)
         self._local_maps.move_to_end(node_id)
         return self._local_maps[node_id]
-
-
-def _grey(image: Image) -> UInt8[np.ndarray, "h w"]:
-    from topoloc.mapping.views import grey_of
-
-    return grey_of(image)

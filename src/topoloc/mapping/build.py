@@ -19,7 +19,7 @@ from topoloc.features.features import Features
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.landmarks import LandmarkConfig, Observations, observe_points, refine_points
 from topoloc.mapping.node_points import NodePointsConfig, keypoint_sigmas, locate_points
-from topoloc.mapping.nodes import NodeConfig, node_distances, place_nodes
+from topoloc.mapping.nodes import NodeConfig, NodePoses, node_distances, place_nodes
 from topoloc.mapping.topomap import Edge, NodeSummary, PlaceImage, TopoMetricMap, TopoNode
 from topoloc.mapping.views import MappingView, mapping_view
 from topoloc.places.vlad import SurfVlad, VladConfig, learn_words, vlad
@@ -77,7 +77,9 @@ class _NodeDraft:
     observations: list[Observations]
 
 
-def build_map(sequences: StereoSequence | Sequence[StereoSequence], config: BuildConfig | None = None, progress: Progress | None = None) -> TopoMetricMap:
+def build_map(
+    sequences: StereoSequence | Sequence[StereoSequence], config: BuildConfig | None = None, progress: Progress | None = None
+) -> TopoMetricMap:
     """Build a topo-metric map from one or several recordings of one place whose poses share one world.
 
     Raises:
@@ -130,7 +132,7 @@ def _resolve_node_config(frames: list[_MappingFrame], config: BuildConfig) -> No
 
 def _draft_nodes(frames: list[_MappingFrame], node_config: NodeConfig, config: BuildConfig, progress: Progress) -> list[_NodeDraft]:
     """The trajectory discretised by Eq. 1; a picture with too few points (dark, blurred, blank) becomes no node."""
-    frame_idx = place_nodes([frame.world_from_cam for frame in frames], node_config).node_frame_idx
+    frame_idx = place_nodes([frame.world_from_cam for frame in frames], node_config)
     drafts: list[_NodeDraft] = []
     for done, i in enumerate(frame_idx):
         draft = _draft_node(frames[i], config)
@@ -157,13 +159,13 @@ def _visit_all_images(
     coarse localizer with it."""
     assert node_config.lambda_rot is not None
     words = learn_words(np.concatenate([draft.features.descriptors for draft in drafts]), config.vlad)
-    world_from_nodes = [draft.world_from_cam for draft in drafts]
+    node_poses = NodePoses.of([draft.world_from_cam for draft in drafts])
     images: list[PlaceImage] = []
     vlads = []
     for done, frame in enumerate(frames):
         view = frame.view(with_depth=False)
         features = extract_features(view.grey, config.features)
-        nearest = np.argsort(node_distances(view.world_from_cam, world_from_nodes, node_config.lambda_rot), kind="stable")
+        nearest = np.argsort(node_distances(view.world_from_cam, node_poses, node_config.lambda_rot), kind="stable")
         for node_id in nearest[: config.landmarks.nodes_per_image]:
             _observe(drafts[node_id], frame, view, features, config)
         vlads.append(vlad(features.descriptors, words))

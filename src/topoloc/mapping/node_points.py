@@ -75,7 +75,9 @@ def keypoint_sigmas(features: Features, config: NodePointsConfig) -> Float[np.nd
     return np.maximum(config.sigma_scale * SCALES_PER_SIZE * features.sizes_px.astype(np.float64), 0.3)
 
 
-def _from_stereo(features: Features, view: MappingView, config: NodePointsConfig) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+def _from_stereo(
+    features: Features, view: MappingView, config: NodePointsConfig
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     assert view.right_grey is not None and view.rig is not None
     # Nearer than a quarter of the picture's width in disparity nothing is seen well by both cameras.
     max_disparity = max(16, view.camera.width // 4)
@@ -94,7 +96,9 @@ def _from_stereo(features: Features, view: MappingView, config: NodePointsConfig
     return points_cam, sigma_z
 
 
-def _from_depth(features: Features, view: MappingView, config: NodePointsConfig) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+def _from_depth(
+    features: Features, view: MappingView, config: NodePointsConfig
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     assert view.depth is not None
     depth = _smooth_depth(view.depth, features.points_img, config.max_depth_step)
     points_cam = points_from_depth(features.points_img.astype(np.float64), depth, view.camera)

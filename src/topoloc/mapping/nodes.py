@@ -38,38 +38,35 @@ class NodeConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class NodeAssignment:
-    """`node_frame_idx[i]` is the frame that became node i; `node_ids[k]` the node nearest to frame k."""
+class NodePoses:
+    """The poses (world_from_cam) of all nodes, stacked."""
 
-    node_frame_idx: Int[np.ndarray, " nodes"]
-    node_ids: Int[np.ndarray, " frames"]
+    centres: Float[np.ndarray, "nodes 3"]
+    rotations: Float[np.ndarray, "nodes 3 3"]
+
+    @staticmethod
+    def of(world_from_nodes: list[Rigid3]) -> NodePoses:
+        return NodePoses(np.array([p.translation for p in world_from_nodes]), np.array([p.rotation for p in world_from_nodes]))
 
 
-def node_distances(world_from_cam: Rigid3, world_from_nodes: list[Rigid3], lambda_rot: float) -> Float[np.ndarray, " nodes"]:
+def node_distances(world_from_cam: Rigid3, nodes: NodePoses, lambda_rot: float) -> Float[np.ndarray, " nodes"]:
     """D_total of Eq. 1 (metres) between a camera and each node."""
-    centres = np.array([pose.translation for pose in world_from_nodes])
-    rotations = np.array([pose.rotation for pose in world_from_nodes])
-    d_translation = np.linalg.norm(centres - world_from_cam.translation, axis=1)
-    traces = np.einsum("nij,ij->n", rotations, world_from_cam.rotation)
+    d_translation = np.linalg.norm(nodes.centres - world_from_cam.translation, axis=1)
+    traces = np.einsum("nij,ij->n", nodes.rotations, world_from_cam.rotation)
     d_rot = np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0))
     return d_translation + lambda_rot * d_rot
 
 
-def place_nodes(world_from_cams: list[Rigid3], config: NodeConfig) -> NodeAssignment:
-    """Walk along the trajectory and place a node wherever Eq. 1 holds; then label every frame with its nearest node.
+def place_nodes(world_from_cams: list[Rigid3], config: NodeConfig) -> Int[np.ndarray, " nodes"]:
+    """Walk along the trajectory and place a node wherever Eq. 1 holds: the frames that become nodes.
 
     `config` must be resolved.
     """
     assert config.d_thresh is not None and config.lambda_rot is not None, "resolve the configuration first"
-    node_frame_idx: list[int] = []
+    poses = NodePoses.of(world_from_cams)
+    frame_idx = [0]
     for k, world_from_cam in enumerate(world_from_cams):
-        nodes = [world_from_cams[i] for i in node_frame_idx]
-        if not nodes or node_distances(world_from_cam, nodes, config.lambda_rot).min() > config.d_thresh:
-            node_frame_idx.append(k)
-    node_ids = label_frames(world_from_cams, [world_from_cams[i] for i in node_frame_idx], config.lambda_rot)
-    return NodeAssignment(np.array(node_frame_idx), node_ids)
-
-
-def label_frames(world_from_cams: list[Rigid3], world_from_nodes: list[Rigid3], lambda_rot: float) -> Int[np.ndarray, " frames"]:
-    """The node nearest to each frame by the distance of Eq. 1."""
-    return np.array([int(np.argmin(node_distances(pose, world_from_nodes, lambda_rot))) for pose in world_from_cams])
+        nodes = NodePoses(poses.centres[frame_idx], poses.rotations[frame_idx])
+        if node_distances(world_from_cam, nodes, config.lambda_rot).min() > config.d_thresh:
+            frame_idx.append(k)
+    return np.array(frame_idx)

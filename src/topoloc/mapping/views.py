@@ -14,6 +14,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import Rectification, StereoRig, rectify
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.frame import DepthImage, Image, StereoFrame
+from topoloc.sequences.pictures import grey_image
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,30 +51,25 @@ def mapping_view(frame: StereoFrame, with_depth: bool = True) -> MappingView:
         return _stereo_view(frame, frame.right if with_depth else None, frame.rig, frame.world_from_cam)
     if frame.depth is not None:
         depth = registered_depth(frame.depth, frame.camera) if with_depth else None
-        return MappingView(frame.image, grey_of(frame.image), frame.camera, frame.world_from_cam, depth=depth)
+        return MappingView(frame.image, grey_image(frame.image), frame.camera, frame.world_from_cam, depth=depth)
     raise RecordingError(f"{frame.name}: a map needs stereo pairs or depth images, this recording has single pictures only")
 
 
 def _stereo_view(frame: StereoFrame, right: Image | None, rig: StereoRig, world_from_left: Rigid3) -> MappingView:
-    right_grey = None if right is None else grey_of(right)
+    right_grey = None if right is None else grey_image(right)
     if rig.is_rectified:
-        return MappingView(frame.image, grey_of(frame.image), rig.left, world_from_left, right_grey, rig)
+        return MappingView(frame.image, grey_image(frame.image), rig.left, world_from_left, right_grey, rig)
     r = _rectification(rig)
     picture = cv2.remap(frame.image, r.left_map, None, cv2.INTER_LINEAR)
     if right_grey is not None:
         right_grey = cv2.remap(right_grey, r.right_map, None, cv2.INTER_LINEAR)
     world_from_rectified = world_from_left @ r.rectified_from_left.inverse()
-    return MappingView(picture, grey_of(picture), r.rig.left, world_from_rectified, right_grey, r.rig)
+    return MappingView(picture, grey_image(picture), r.rig.left, world_from_rectified, right_grey, r.rig)
 
 
 @lru_cache(maxsize=4)
 def _rectification(rig: StereoRig) -> Rectification:
     return rectify(rig)
-
-
-def grey_of(image: Image) -> UInt8[np.ndarray, "h w"]:
-    """The picture in grey levels (Rec. 601 weights)."""
-    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
 
 
 def registered_depth(depth_image: DepthImage, camera: Camera) -> Float32[np.ndarray, "h w"]:

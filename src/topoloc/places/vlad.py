@@ -50,7 +50,9 @@ class SurfVlad:
         self._index = PlaceIndex(vectors, node_ids)
 
     @staticmethod
-    def fit(words: Float32[np.ndarray, "k d"], vlads: Float32[np.ndarray, "n kd"], node_ids: Int[np.ndarray, " n"], config: VladConfig) -> SurfVlad:
+    def fit(
+        words: Float32[np.ndarray, "k d"], vlads: Float32[np.ndarray, "n kd"], node_ids: Int[np.ndarray, " n"], config: VladConfig
+    ) -> SurfVlad:
         """From the vocabulary (`learn_words`), the `vlad` of each mapping image and the node it belongs to."""
         mean, projection = _learn_whitening(vlads, config.dimension)
         return SurfVlad(words, mean, projection, _project(vlads, mean, projection), node_ids, config)
@@ -120,6 +122,8 @@ def _learn_whitening(raw: Float32[np.ndarray, "n kd"], dimension: int) -> tuple[
     return mean.astype(np.float32), np.ascontiguousarray((axes / softened).T, np.float32)
 
 
-def _project(raw: Float32[np.ndarray, "n kd"], mean: Float32[np.ndarray, " kd"], projection: Float32[np.ndarray, "p kd"]) -> Float32[np.ndarray, "n p"]:
+def _project(
+    raw: Float32[np.ndarray, "n kd"], mean: Float32[np.ndarray, " kd"], projection: Float32[np.ndarray, "p kd"]
+) -> Float32[np.ndarray, "n p"]:
     projected = (raw - mean) @ projection.T
     return np.ascontiguousarray(projected / np.maximum(np.linalg.norm(projected, axis=1, keepdims=True), 1e-6), np.float32)
