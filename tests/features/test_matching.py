@@ -49,13 +49,24 @@ def test_exact_is_the_textbook(seed, num_query, num_train, size, ratio, mutual):
     np.testing.assert_allclose(matches.distances, exact, atol=1e-3)
 
 
-@pytest.mark.parametrize("num_query", [255, 256, 257, 700])
+@pytest.mark.parametrize("num_query", [1, 31, 32, 33, 700])
 def test_more_queries_than_fit_one_block(num_query):
     train = random_descriptors(0, 1000)
     order = np.random.default_rng(1).permutation(1000)[:num_query]
     matches = match_features(blurred(train[order], 2), train, MatchingConfig())
     assert np.array_equal(matches.query_idx, np.arange(num_query))
     assert np.array_equal(matches.train_idx, order)
+
+
+def test_same_matches_for_any_number_of_threads():
+    train = random_descriptors(0, 500)
+    query = np.concatenate([blurred(train[:300], 1, 0.1), random_descriptors(2, 41)])
+    alone = match_features(query, train, MatchingConfig(), num_threads=1)
+    for num_threads in (2, 3, 200):
+        several = match_features(query, train, MatchingConfig(), num_threads=num_threads)
+        assert np.array_equal(several.query_idx, alone.query_idx)
+        assert np.array_equal(several.train_idx, alone.train_idx)
+        assert np.array_equal(several.distances, alone.distances)
 
 
 def test_ratio_zero_takes_every_nearest_neighbour():

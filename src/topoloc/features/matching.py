@@ -13,10 +13,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
+from topoloc.features.bands import run_in_bands
 from topoloc.features.features import Matches
-from topoloc.features.matching_kernels import find_unrivalled
+from topoloc.features.matching_kernels import GROUP, TILE, find_unrivalled, multiply
 
-_ROWS_AT_ONCE = 256  # their products are read again while they are still in the cache
+_ROWS_AT_ONCE = 32  # a multiple of GROUP; their products are read again while they are still in the cache
 _FLANN_KDTREE = 1
 _FLANN_NEIGHBOURS = 8  # of these the nearest that is no twin is the rival
 _NO_POINTS = np.zeros((0, 3), np.float32)
@@ -41,9 +42,10 @@ def match_features(
     query_descriptors: Float32[np.ndarray, "n d"],
     train_descriptors: Float32[np.ndarray, "m d"],
     config: MatchingConfig,
+    num_threads: int = 2,
 ) -> Matches:
     """Matches between two images, at most one for a query feature, in the order of the query features."""
-    return _match(query_descriptors, train_descriptors, _NO_POINTS, _NO_RADII, config)
+    return _match(query_descriptors, train_descriptors, _NO_POINTS, _NO_RADII, config, num_threads)
 
 
 def match_pooled(
@@ -52,6 +54,7 @@ def match_pooled(
     train_points_world: Float[np.ndarray, "m 3"],
     train_radii: Float[np.ndarray, " m"],
     config: MatchingConfig,
+    num_threads: int = 2,
 ) -> Matches:
     """Matches between an image and the features of several map nodes thrown together.
 
@@ -59,7 +62,7 @@ def match_pooled(
     test: features whose points lie within the larger of their two `train_radii` (metres: what the depth error allows) are twins.
     """
     points, radii = train_points_world.astype(np.float32), train_radii.astype(np.float32)
-    return _match(query_descriptors, train_descriptors, points, radii, config)
+    return _match(query_descriptors, train_descriptors, points, radii, config, num_threads)
 
 
 def _match(
@@ -68,18 +71,19 @@ def _match(
     points: Float32[np.ndarray, "p 3"],
     radii: Float32[np.ndarray, " p"],
     config: MatchingConfig,
+    num_threads: int,
 ) -> Matches:
     if len(query) == 0 or len(train) == 0:
         return Matches(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros(0, np.float32))
     if config.method == "exact":
-        train_idx, products = _nearest(query, train, config.ratio, points, radii)
+        train_idx, products = _nearest(query, train, config.ratio, points, radii, num_threads)
     else:
         train_idx, products = _nearest_flann(query, train, points, radii, config)
     query_idx = np.flatnonzero(train_idx >= 0).astype(np.int32)
     if config.mutual and len(query_idx):
         # Only the columns that won are asked back: far cheaper than column maxima of the whole table.
         asked, of_asked = np.unique(train_idx[query_idx], return_inverse=True)
-        back_idx, _ = _nearest(train[asked], query, 0.0, _NO_POINTS, _NO_RADII)
+        back_idx, _ = _nearest(train[asked], query, 0.0, _NO_POINTS, _NO_RADII, num_threads)
         query_idx = query_idx[back_idx[of_asked] == query_idx]
     distances = np.sqrt(np.maximum(2.0 - 2.0 * products[query_idx], 0.0)).astype(np.float32)
     return Matches(query_idx, train_idx[query_idx], distances)
@@ -91,17 +95,34 @@ def _nearest(
     ratio: float,
     points: Float32[np.ndarray, "p 3"],
     radii: Float32[np.ndarray, " p"],
+    num_threads: int,
 ) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
     """The nearest train row of each query row, -1 where the ratio test fails, and their scalar product."""
-    nearest_idx, products = np.empty(len(query), np.int32), np.empty(len(query), np.float32)
-    table = np.empty((min(_ROWS_AT_ONCE, len(query)), len(train)), np.float32)
-    for start in range(0, len(query), _ROWS_AT_ONCE):
-        rows = slice(start, min(start + _ROWS_AT_ONCE, len(query)))
-        block = table[: rows.stop - start]
-        np.matmul(query[rows], train.T, out=block)
-        np.max(block, axis=1, out=products[rows])
-        find_unrivalled(block, products[rows], ratio, points, radii, nearest_idx[rows])
-    return nearest_idx, products
+    packed = _packed(train)
+    padded = np.zeros((-(-len(query) // GROUP) * GROUP, GROUP * packed.shape[1]), np.float32)
+    padded[: len(query), : query.shape[1]] = query
+    nearest_idx, products = np.empty(len(padded), np.int32), np.empty(len(padded), np.float32)
+
+    def run(first_group: int, last_group: int) -> None:
+        table = np.empty((_ROWS_AT_ONCE, TILE * len(packed)), np.float32)
+        for start in range(GROUP * first_group, GROUP * last_group, _ROWS_AT_ONCE):
+            rows = slice(start, min(start + _ROWS_AT_ONCE, GROUP * last_group))
+            multiply(padded[rows], packed, table)
+            block = table[: rows.stop - start, : len(train)]
+            np.max(block, axis=1, out=products[rows])
+            find_unrivalled(block, products[rows], ratio, points, radii, nearest_idx[rows])
+
+    run_in_bands(run, len(padded) // GROUP, num_threads)
+    return nearest_idx[: len(query)], products[: len(query)]
+
+
+def _packed(train: Float32[np.ndarray, "m d"]) -> Float32[np.ndarray, "tiles groups width"]:
+    """Row t of a tile's group k: components 4k .. 4k + 3 of its descriptors, one component of all of them after the other."""
+    num_tiles, num_groups = -(-len(train) // TILE), -(-train.shape[1] // GROUP)
+    padded = np.zeros((num_tiles * TILE, num_groups * GROUP), np.float32)
+    padded[: len(train), : train.shape[1]] = train
+    tiles = padded.reshape(num_tiles, TILE, num_groups, GROUP).transpose(0, 2, 3, 1)
+    return np.ascontiguousarray(tiles).reshape(num_tiles, num_groups, GROUP * TILE)
 
 
 def _nearest_flann(
