@@ -15,9 +15,9 @@ from jaxtyping import Float, Float32, Int32
 
 from topoloc.features.bands import run_in_bands
 from topoloc.features.features import Matches
-from topoloc.features.matching_kernels import GROUP, TILE, find_unrivalled, multiply
+from topoloc.features.matching_kernels import GROUP, ROWS, TILE, find_unrivalled, multiply
 
-_ROWS_AT_ONCE = 32  # a multiple of GROUP; their products are read again while they are still in the cache
+_ROWS_AT_ONCE = 32  # a multiple of ROWS; their products are read again while they are still in the cache
 _FLANN_KDTREE = 1
 _FLANN_NEIGHBOURS = 8  # of these the nearest that is no twin is the rival
 _NO_POINTS = np.zeros((0, 3), np.float32)
@@ -99,20 +99,20 @@ def _nearest(
 ) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
     """The nearest train row of each query row, -1 where the ratio test fails, and their scalar product."""
     packed = _packed(train)
-    padded = np.zeros((-(-len(query) // GROUP) * GROUP, GROUP * packed.shape[1]), np.float32)
+    padded = np.zeros((-(-len(query) // ROWS) * ROWS, GROUP * packed.shape[1]), np.float32)
     padded[: len(query), : query.shape[1]] = query
     nearest_idx, products = np.empty(len(padded), np.int32), np.empty(len(padded), np.float32)
 
-    def run(first_group: int, last_group: int) -> None:
+    def run(first_pair: int, last_pair: int) -> None:
         table = np.empty((_ROWS_AT_ONCE, TILE * len(packed)), np.float32)
-        for start in range(GROUP * first_group, GROUP * last_group, _ROWS_AT_ONCE):
-            rows = slice(start, min(start + _ROWS_AT_ONCE, GROUP * last_group))
+        for start in range(ROWS * first_pair, ROWS * last_pair, _ROWS_AT_ONCE):
+            rows = slice(start, min(start + _ROWS_AT_ONCE, ROWS * last_pair))
             multiply(padded[rows], packed, table)
             block = table[: rows.stop - start, : len(train)]
             np.max(block, axis=1, out=products[rows])
             find_unrivalled(block, products[rows], ratio, points, radii, nearest_idx[rows])
 
-    run_in_bands(run, len(padded) // GROUP, num_threads)
+    run_in_bands(run, len(padded) // ROWS, num_threads)
     return nearest_idx[: len(query)], products[: len(query)]
 
 

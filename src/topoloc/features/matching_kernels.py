@@ -9,29 +9,26 @@ from numba import njit
 
 CHUNK = 256
 TILE = 64  # columns of a block of train descriptors, which stays in the first-level cache
-GROUP = 4  # query rows, and components, that are worked on together
+ROWS = 2  # query rows worked on together, and components: what the registers hold
+GROUP = 4
 
 
 @njit(nogil=True, cache=True, fastmath={"contract"})
 def multiply(query, packed, out):
-    """out[i, j] = query[i] . train[j]; the rows of `query` are a multiple of GROUP, `packed` is made by `matching._packed`."""
-    sums = np.empty(GROUP * TILE, np.float32)
+    """out[i, j] = query[i] . train[j]; the rows of `query` are a multiple of ROWS, `packed` is made by `matching._packed`."""
+    sums = np.empty(ROWS * TILE, np.float32)
     for tile in range(packed.shape[0]):
-        for i in range(0, query.shape[0] - GROUP + 1, GROUP):
+        for i in range(0, query.shape[0] - ROWS + 1, ROWS):
             sums[:] = np.float32(0.0)
             for k in range(packed.shape[1]):
                 t = packed[tile, k]
                 a0, a1, a2, a3 = query[i, 4 * k], query[i, 4 * k + 1], query[i, 4 * k + 2], query[i, 4 * k + 3]
                 b0, b1, b2, b3 = query[i + 1, 4 * k], query[i + 1, 4 * k + 1], query[i + 1, 4 * k + 2], query[i + 1, 4 * k + 3]
-                c0, c1, c2, c3 = query[i + 2, 4 * k], query[i + 2, 4 * k + 1], query[i + 2, 4 * k + 2], query[i + 2, 4 * k + 3]
-                d0, d1, d2, d3 = query[i + 3, 4 * k], query[i + 3, 4 * k + 1], query[i + 3, 4 * k + 2], query[i + 3, 4 * k + 3]
                 for j in range(TILE):
                     t0, t1, t2, t3 = t[j], t[TILE + j], t[2 * TILE + j], t[3 * TILE + j]
                     sums[j] = sums[j] + a0 * t0 + a1 * t1 + a2 * t2 + a3 * t3
                     sums[TILE + j] = sums[TILE + j] + b0 * t0 + b1 * t1 + b2 * t2 + b3 * t3
-                    sums[2 * TILE + j] = sums[2 * TILE + j] + c0 * t0 + c1 * t1 + c2 * t2 + c3 * t3
-                    sums[3 * TILE + j] = sums[3 * TILE + j] + d0 * t0 + d1 * t1 + d2 * t2 + d3 * t3
-            for row in range(GROUP):
+            for row in range(ROWS):
                 for j in range(TILE):
                     out[i + row, tile * TILE + j] = sums[row * TILE + j]
 
