@@ -69,6 +69,17 @@ def test_same_matches_for_any_number_of_threads():
         assert np.array_equal(several.distances, alone.distances)
 
 
+def test_broken_descriptors_match_nothing():
+    query, train = random_descriptors(0, 6), random_descriptors(1, 9)
+    query[2] = np.nan
+    assert 2 not in match_features(query, train, MatchingConfig(ratio=0.0, mutual=False)).query_idx
+
+
+def test_equal_descriptors_are_matched():
+    train = random_descriptors(0, 400)
+    assert len(match_features(train, train, MatchingConfig())) == 400
+
+
 def test_ratio_zero_takes_every_nearest_neighbour():
     query, train = random_descriptors(0, 50), random_descriptors(1, 30)
     assert len(match_features(query, train, MatchingConfig(ratio=0.0, mutual=False))) == 50

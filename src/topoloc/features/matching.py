@@ -15,7 +15,7 @@ from jaxtyping import Float, Float32, Int32
 
 from topoloc.features.bands import run_in_bands
 from topoloc.features.features import Matches
-from topoloc.features.matching_kernels import GROUP, ROWS, TILE, find_unrivalled, multiply
+from topoloc.features.matching_kernels import GROUP, ROWS, TILE, multiply, reject_rivalled
 
 _ROWS_AT_ONCE = 32  # a multiple of ROWS; their products are read again while they are still in the cache
 _FLANN_KDTREE = 1
@@ -109,8 +109,8 @@ def _nearest(
             rows = slice(start, min(start + _ROWS_AT_ONCE, ROWS * last_pair))
             multiply(padded[rows], packed, table)
             block = table[: rows.stop - start, : len(train)]
-            np.max(block, axis=1, out=products[rows])
-            find_unrivalled(block, products[rows], ratio, points, radii, nearest_idx[rows])
+            nearest_idx[rows] = np.argmax(block, axis=1)
+            reject_rivalled(block, nearest_idx[rows], ratio, points, radii, products[rows])
 
     run_in_bands(run, len(padded) // ROWS, num_threads)
     return nearest_idx[: len(query)], products[: len(query)]

@@ -42,19 +42,23 @@ def _are_twins(points, radii, a, b):
 
 
 @njit(nogil=True, cache=True)
-def find_unrivalled(products, largest, ratio, points, radii, out_idx):
-    """For each row: the column of its largest product (given as `largest`), -1 if a rival comes within the ratio test.
+def reject_rivalled(products, winners, ratio, points, radii, out_product):
+    """Set the winner of each row (the column of its largest product) to -1 if a rival comes within the ratio test, or it is NaN.
 
     Column k belongs to the map point `points[k]`; columns within `radii` of the winner's point are its twins and no rivals.
     No points at all (0, 3): every other column is a rival. A ratio of 0 switches the test off.
     """
     num_columns = products.shape[1]
-    near = np.empty(num_columns, np.int32)
     for row_idx in range(products.shape[0]):
-        row, best = products[row_idx], largest[row_idx]
-        # d1 < ratio * d2 with d^2 = 2 - 2 product; a rival reaches this product. Rounding may lift `best` above 1.
-        limit = min(best, np.float32(1.0 - (1.0 - best) / ratio**2)) if ratio > 0.0 else best
-        num_near, winner = 0, -1
+        row, winner = products[row_idx], winners[row_idx]
+        best = row[winner]
+        out_product[row_idx] = best
+        if np.isnan(best):
+            winners[row_idx] = -1
+        if np.isnan(best) or ratio <= 0.0:
+            continue
+        # d1 < ratio * d2 with d^2 = 2 - 2 product; a rival reaches this product; rounding may lift `best` above 1
+        limit = min(best, np.float32(1.0 - (1.0 - best) / ratio**2))
         for start in range(0, num_columns, CHUNK):
             stop = min(start + CHUNK, num_columns)
             count = np.int32(0)
@@ -63,14 +67,8 @@ def find_unrivalled(products, largest, ratio, points, radii, out_idx):
             if count == 0:
                 continue
             for column in range(start, stop):
-                if row[column] == best and winner < 0:
-                    winner = column
-                elif row[column] >= limit:
-                    near[num_near] = column
-                    num_near += 1
-        if ratio > 0.0:
-            for k in range(num_near):
-                if len(points) == 0 or not _are_twins(points, radii, winner, near[k]):
-                    winner = -1
+                if row[column] >= limit and column != winner and (len(points) == 0 or not _are_twins(points, radii, winner, column)):
+                    winners[row_idx] = -1
                     break
-        out_idx[row_idx] = winner
+            if winners[row_idx] < 0:
+                break
