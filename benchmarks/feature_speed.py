@@ -19,8 +19,8 @@ import tyro
 from topoloc.features.extraction import FeatureConfig, extract_normalized, normalize_image
 from topoloc.features.matching import MatchingConfig, match_features, match_pooled
 from topoloc.features.patch_normalization import PatchNormalizationConfig, patch_normalize
-from topoloc.mapping.views import grey_of
 from topoloc.sequences.open import open_sequence
+from topoloc.sequences.pictures import grey_image
 
 RECORDINGS = {"kitchen": "seven_scenes/kitchen/seq-01", "zed": "zed_lab/session1", "kitti": "kitti/sequences/street1"}
 
@@ -73,7 +73,7 @@ def time_matching(repeats: int, num_query: int = 850, num_train: int = 4000, siz
 
 def main(args: Args) -> None:
     for name, path in RECORDINGS.items():
-        image = grey_of(open_sequence(args.shared / "data" / path)[10].image)
+        image = grey_image(open_sequence(args.shared / "data" / path)[10].image)
         print(f"{name}, {image.shape[1]} x {image.shape[0]}: minimum and median, ms")
         time_extraction(image, args.repeats)
     print("matching 850 with 4000 descriptors of 64 numbers")
