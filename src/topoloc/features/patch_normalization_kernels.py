@@ -17,6 +17,18 @@ def _slide(values, width, out):
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
+def _normalize_row(centre, sums, sums_sq, weight, floor, gain, out):
+    """128 + gain (I - mean) / (sigma + epsilon), numerator and denominator times the window's weight."""
+    for x in range(out.shape[0]):
+        total = np.float64(sums[x])
+        spread = np.sqrt(np.float32(weight * np.float64(sums_sq[x]) - total * total))
+        above_mean = np.float32(weight * (np.float64(centre[x]) - 128.0) - total)
+        denominator = spread + floor
+        value = np.float32(128.5) + (gain * above_mean / denominator if denominator > 0 else np.float32(0.0))
+        out[x] = np.uint8(min(max(value, np.float32(0.0)), np.float32(255.0)))
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
 def normalize_band(padded, out, first_row, last_row, first_box, second_box, epsilon, gain):
     """Rows [first_row, last_row) of `out`, from the image padded on each side by (first_box + second_box) / 2 - 1.
 
@@ -37,8 +49,6 @@ def normalize_band(padded, out, first_row, last_row, first_box, second_box, epsi
     sums_sq = np.zeros(width, np.int32)
     weight = float((first_box * second_box) ** 2)
     radius = height_of_window // 2
-    floor = np.float32(weight * epsilon)
-    scale = np.float32(gain)
     for step in range(last_row - first_row + height_of_window - 1):
         entering = padded[first_row + step]
         if step < first_box:
@@ -70,12 +80,4 @@ def normalize_band(padded, out, first_row, last_row, first_box, second_box, epsi
         _slide(rows_sq, second_box, sums_sq)
         y = first_row + step - height_of_window + 1
         centre = padded[y + radius, radius : radius + width]
-        target = out[y]
-        for x in range(width):
-            total = np.float64(sums[x])
-            spread = np.sqrt(np.float32(weight * np.float64(sums_sq[x]) - total * total))
-            above_mean = np.float32(weight * (np.float64(centre[x]) - 128.0) - total)
-            # N = (I - mean) / (sigma + epsilon), both sides times the window's weight
-            denominator = spread + floor
-            value = np.float32(128.5) + (scale * above_mean / denominator if denominator > 0 else np.float32(0.0))
-            target[x] = np.uint8(min(max(value, np.float32(0.0)), np.float32(255.0)))
+        _normalize_row(centre, sums, sums_sq, weight, np.float32(weight * epsilon), np.float32(gain), out[y])
