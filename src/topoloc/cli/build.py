@@ -25,9 +25,9 @@ class Command:
     format: str | None = None
     """The recordings' format, where it is not recognised by itself."""
     d_thresh: float | None = None
-    """D_thresh of Eq. 1, metres between nodes (default: a quarter of the scene's median depth)."""
+    """D_thresh of Eq. 1, metres between nodes (default: 15 % of the scene's median depth)."""
     lambda_rot: Annotated[float | None, tyro.conf.arg(name="lambda")] = None
-    """lambda of Eq. 1, metres a radian (default: so much that a turn of 25 degrees makes a node)."""
+    """lambda of Eq. 1, metres a radian (default: so much that a turn of 3 degrees makes a node)."""
     coarse: Literal["surf-vlad"] = "surf-vlad"
     """The coarse localizer that the map gets."""
     features: Literal["surf", "sift"] = "surf"

@@ -38,11 +38,11 @@ class BuildConfig:
     points: NodePointsConfig = field(default_factory=NodePointsConfig)
     landmarks: LandmarkConfig = field(default_factory=LandmarkConfig)
     vlad: VladConfig = field(default_factory=VladConfig)
-    max_node_points: int = 900
+    max_node_points: int = 800
     """Features that a node keeps, the strongest ones."""
     min_node_points: int = 20
     """A picture with fewer located features becomes no node."""
-    template_side_px: int = 320
+    template_side_px: int = 240
     """Shorter side of the template picture that a node keeps, at most."""
     place_side_px: int = 160
     """Shorter side of the other mapping images, at most: what the coarse localizers of section III-B are trained with."""

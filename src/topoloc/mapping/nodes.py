@@ -13,12 +13,12 @@ from jaxtyping import Float, Int
 
 from topoloc.geometry.rigid import Rigid3
 
-# D_thresh as a share of the scene's median depth, where the user names none: parallax of one node to the next then
-# stays near a quarter whatever the size of the place (0.5 m in a kitchen, 4 m in a street).
-DEPTH_SHARE = 0.25
-# lambda as a share of D_thresh, where the user names none: a turn of 25 degrees alone makes a node, since with the
-# usual field of view (60 to 90 degrees) more of it loses half of the picture.
-RADIANS_PER_NODE = np.deg2rad(25.0)
+# Where the user names no D_thresh, it is this share of the scene's median depth: the parallax from one node to the next
+# is then the same in a kitchen (0.25 m) and in a street (3 m).
+DEPTH_SHARE = 0.15
+# Where the user names no lambda, a turn by this angle alone makes a node. Nodes are cheap (100 KB) and a query asks only
+# the few around it; the closer they are in view, the more of the map's own error they share with it (docs/journal.md).
+RADIANS_PER_NODE = np.deg2rad(3.0)
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,9 @@ class NodeConfig:
     """Eq. 1 of the paper. What is None follows from the scene: see `resolved`."""
 
     d_thresh: float | None = None
-    """D_thresh, metres: the distance at which a new node is placed (None: a quarter of the scene's median depth)."""
+    """D_thresh, metres: the distance at which a new node is placed (None: 15 % of the scene's median depth)."""
     lambda_rot: float | None = None
-    """lambda, metres a radian: how much rotation counts (None: so much that 25 degrees alone make a node)."""
+    """lambda, metres a radian: how much rotation counts (None: so much that 3 degrees alone make a node)."""
 
     def resolved(self, median_depth: float) -> NodeConfig:
         """The same with every value set, for a scene of this median depth (metres)."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
@@ -35,6 +35,7 @@ class CoarseModel:
     arrays: Mapping[str, np.ndarray]
 
 
+@runtime_checkable
 class CoarseLocalizer(Protocol):
     """Names the nodes that an image may belong to."""
 

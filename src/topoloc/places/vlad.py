@@ -22,9 +22,9 @@ from topoloc.places.neighbours import PlaceIndex
 class VladConfig:
     """Settings of surf-vlad."""
 
-    num_words: int = 64
+    num_words: int = 32
     """Visual words of the vocabulary."""
-    dimension: int = 256
+    dimension: int = 128
     """Length of a place vector after PCA, at most."""
     max_training_descriptors: int = 100_000
     """Descriptors that the vocabulary is learnt from, at most."""
