@@ -29,3 +29,14 @@ def shared() -> Path:
     if not (SHARED / "data").is_dir():
         pytest.skip(f"no recordings at {SHARED} (set TOPOLOC_SHARED)")
     return SHARED
+
+
+@pytest.fixture(scope="session")
+def tiny_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small rendered room as a stereo recording (KITTI-like, 14 pairs of 320x240) with exact truth.tum and a camera.json.
+
+    Not to be written to: all tests share it. `tiny_world` renders more of the same place, or others.
+    """
+    from tiny_world import write_stereo_recording  # after the hook above
+
+    return write_stereo_recording(tmp_path_factory.mktemp("tiny") / "room")
