@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 
 # name -> what `topoloc --help` says of it; the module of the same name holds a dataclass of the settings, `Command`, with `run`
@@ -33,20 +34,32 @@ def main(args: list[str] | None = None) -> int:
 
 
 def _run(name: str, args: list[str]) -> int:
-    import tyro
-
     from topoloc.errors import TopolocError
 
-    module = importlib.import_module(f"topoloc.cli.{name}")
     try:
-        return tyro.cli(module.Command, args=args, prog=f"topoloc {name}", description=COMMANDS[name].capitalize() + ".").run()
+        import tyro
+
+        from topoloc.cli.output import UsageError
+
+        module = importlib.import_module(f"topoloc.cli.{name}")
+        summary = COMMANDS[name]
+        command = tyro.cli(module.Command, args=args, prog=f"topoloc {name}", description=summary[0].upper() + summary[1:])
+        try:
+            return command.run()
+        except UsageError as error:
+            _print_error(f"{error}; `topoloc {name} --help` says more")
+            return 2
     except TopolocError as error:
-        print("error: " + " ".join(str(error).split()), file=sys.stderr)
+        _print_error(str(error))
     except KeyboardInterrupt:
-        print("error: interrupted; no file was changed", file=sys.stderr)
-    except BrokenPipeError:  # the reader of our output went away
-        sys.stderr.close()
+        _print_error("interrupted; every file is as it was or whole")
+    except BrokenPipeError:  # the reader of our output went away; what is still buffered must not complain at exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 1
+
+
+def _print_error(text: str) -> None:
+    print("error: " + " ".join(text.split()), file=sys.stderr)
 
 
 def _help() -> str:

@@ -9,69 +9,95 @@ from typing import Annotated, Literal
 import tyro
 
 from topoloc.cli.info import describe_map
-from topoloc.cli.output import progress_bar, write_json
+from topoloc.cli.output import UsageError, check_outputs, progress_bar, write_json
 from topoloc.errors import TopolocError
 from topoloc.mapping.build import BuildConfig, build_map
+from topoloc.sequences.frame import StereoSequence
+from topoloc.sequences.open import open_sequence
+from topoloc.sequences.trajectory import with_trajectory
 
 
 @dataclass(frozen=True)
 class Command:
     """What `topoloc build` takes."""
 
-    paths: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="SEQ [SEQ ...] MAP")]
+    paths: Annotated[
+        tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="SEQ [SEQ ...] MAP", help_behavior_hint="(required)")
+    ] = ()
     """One or several recordings whose poses share one world, then the map file to write. PATH@0::2 takes every second frame of PATH."""
-    trajectory: tuple[str, ...] = ("truth",)
-    """Where poses come from, one for all recordings or one each: `truth` (what the recording holds) or a TUM or KITTI trajectory file."""
-    format: str | None = None
-    """The recordings' format, where it is not recognised by itself."""
-    d_thresh: float | None = None
-    """D_thresh of Eq. 1, metres between nodes (default: 15 % of the scene's median depth)."""
-    lambda_rot: Annotated[float | None, tyro.conf.arg(name="lambda")] = None
-    """lambda of Eq. 1, metres a radian (default: so much that a turn of 3 degrees makes a node)."""
+    trajectory: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]],
+        tyro.conf.arg(metavar="truth|FILE", help_behavior_hint="(default: truth; once for all recordings or once for each)"),
+    ] = ()
+    """Where poses come from: `truth` (what the recording holds) or a TUM or KITTI trajectory file."""
+    format: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: recognised)")] = None
+    """The recordings' format: kitti, euroc, tum, seven_scenes or folder."""
+    d_thresh: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="(default: from the scene's median depth)")] = None
+    """D_thresh of Eq. 1, metres between nodes."""
+    lambda_rot: Annotated[
+        float | None, tyro.conf.arg(name="lambda", metavar="M/RAD", help_behavior_hint="(default: from an angle that alone makes a node)")
+    ] = None
+    """lambda of Eq. 1, metres a radian."""
     coarse: Literal["surf-vlad"] = "surf-vlad"
     """The coarse localizer that the map gets."""
-    features: Literal["surf", "sift"] = "surf"
+    features: Annotated[Literal["surf", "sift"] | None, tyro.conf.arg(metavar="surf|sift", help_behavior_hint="(default: surf)")] = None
     """Local features of the map, and of every query to it."""
-    json: str | None = None
+    json: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
     """Write what `topoloc info` says of the new map to this file (- for standard output)."""
     config: BuildConfig = field(default_factory=BuildConfig)
 
     def run(self) -> int:
-        if len(self.paths) < 2:
-            raise TopolocError("build takes at least one recording and, last, the map file to write")
-        *recordings, map_path = self.paths
-        target = Path(map_path)
-        if not target.parent.is_dir():
-            raise TopolocError(f"cannot write map {target}: folder {target.parent} does not exist")
-        if target.is_dir():
-            raise TopolocError(f"cannot write map {target}: it is a folder")
+        recordings, target = self._split_paths()
+        check_outputs([str(target), self.json], inputs=[path for path in self.trajectory if path != "truth"])
         sequences = self._open(recordings)
-        nodes = replace(
-            self.config.nodes,
-            d_thresh=self.config.nodes.d_thresh if self.d_thresh is None else self.d_thresh,
-            lambda_rot=self.config.nodes.lambda_rot if self.lambda_rot is None else self.lambda_rot,
-        )
-        config = replace(self.config, nodes=nodes, features=replace(self.config.features, kind=self.features))
         with progress_bar() as progress:
-            topomap = build_map(sequences, config, progress)
+            topomap = build_map(sequences, self._config(), progress)
         topomap.save(target)
         info = describe_map(topomap, target)
         if self.json != "-":
-            print(
-                f"{target}: {info['num_nodes']} nodes, {info['num_points']} points, {info['bytes'] / 1e6:.2f} MB, {info['length_m']:.1f} m mapped"
-            )
+            size = f"{info['num_nodes']} nodes, {info['num_points']} points, {info['bytes'] / 1e6:.2f} MB"
+            print(f"{target}: {size}, {info['length_m']:.1f} m mapped")
         write_json(self.json, info)
         return 0
 
-    def _open(self, recordings: list[str]) -> list:
-        from topoloc.sequences.open import open_sequence
-        from topoloc.sequences.trajectory import with_trajectory
+    def _split_paths(self) -> tuple[list[str], Path]:
+        """The recordings, and the map file to write: never a recording or a file that is no map, as where MAP was forgotten."""
+        if len(self.paths) < 2:
+            raise UsageError("build takes at least one recording and, last, the map file to write")
+        *recordings, last = self.paths
+        target = Path(last)
+        if target.is_dir() or (not target.exists() and Path(last.rpartition("@")[0] or last).exists()):
+            raise UsageError(f"the last argument is the map file to write, but {last} is a recording or folder; was MAP forgotten?")
+        if target.is_file() and _first_bytes(target) not in (b"", b"SQLite"):
+            raise UsageError(f"the last argument is the map file to write, but {last} is a file of another kind; was MAP forgotten?")
+        return recordings, target
 
-        trajectories = self.trajectory * len(recordings) if len(self.trajectory) == 1 else self.trajectory
+    def _config(self) -> BuildConfig:
+        """The short settings where they are given, else those of --config."""
+        nodes, features = self.config.nodes, self.config.features
+        if self.d_thresh is not None:
+            nodes = replace(nodes, d_thresh=self.d_thresh)
+        if self.lambda_rot is not None:
+            nodes = replace(nodes, lambda_rot=self.lambda_rot)
+        if self.features is not None:
+            features = replace(features, kind=self.features)
+        return replace(self.config, nodes=nodes, features=features)
+
+    def _open(self, recordings: list[str]) -> list[StereoSequence]:
+        trajectories = self.trajectory or ("truth",)
+        if len(trajectories) == 1:
+            trajectories *= len(recordings)
         if len(trajectories) != len(recordings):
-            raise TopolocError(f"{len(recordings)} recordings but {len(trajectories)} trajectories")
+            raise UsageError(f"{len(recordings)} recordings but {len(trajectories)} trajectories")
+        if "slam" in trajectories:
+            raise TopolocError("--trajectory slam: SLAM is not in this version yet; give the poses as a TUM or KITTI trajectory file")
         sequences = []
         for path, trajectory in zip(recordings, trajectories, strict=True):
             sequence = open_sequence(path, self.format)
             sequences.append(sequence if trajectory == "truth" else with_trajectory(sequence, Path(trajectory)))
         return sequences
+
+
+def _first_bytes(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(6)

@@ -4,25 +4,27 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
-from topoloc.cli.output import write_json
+from topoloc.cli.output import check_outputs, print_facts, write_json
+from topoloc.errors import EmptyMapError
 
 
 @dataclass(frozen=True)
 class Command:
     """What `topoloc info` takes."""
 
-    map: tyro.conf.Positional[str]
+    map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP")]
     """The map file."""
-    json: str | None = None
+    json: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
     """Write the same as JSON to this file (- for standard output)."""
 
     def run(self) -> int:
         from topoloc.mapping.topomap import TopoMetricMap
 
+        check_outputs([self.json], inputs=[self.map])
         info = describe_map(TopoMetricMap.load(self.map), Path(self.map))
         if self.json != "-":
             _print(info)
@@ -31,9 +33,15 @@ class Command:
 
 
 def describe_map(topomap: Any, path: Path) -> dict[str, Any]:
-    """The facts of a map that evaluations and `info` print: counts, bytes, extent, configuration."""
+    """The facts of a map that evaluations and `info` print: counts, bytes, extent, configuration.
+
+    Raises:
+        EmptyMapError: the map has no node.
+    """
     import numpy as np
 
+    if len(topomap.summaries) == 0:
+        raise EmptyMapError(f"map {path} has no nodes")
     centres = np.array([s.world_from_cam.translation for s in topomap.summaries])
     return {
         "path": str(path),
@@ -50,20 +58,18 @@ def describe_map(topomap: Any, path: Path) -> dict[str, Any]:
 
 
 def _print(info: dict[str, Any]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(show_header=False, box=None)
-    table.add_row("map", info["path"])
-    table.add_row("size", f"{info['bytes'] / 1e6:.2f} MB")
-    table.add_row("nodes", f"{info['num_nodes']}, {info['num_points']} points with 3-D position")
-    table.add_row("place images", str(info["num_place_images"]))
-    table.add_row("mapped", f"{info['length_m']:.1f} m, extent {' x '.join(f'{e:.1f}' for e in info['extent_m'])} m")
-    table.add_row("recordings", ", ".join(info["recordings"]))
-    table.add_row("coarse localizers", ", ".join(info["coarse"]))
     nodes, features = info["config"].get("nodes", {}), info["config"].get("features", {})
-    table.add_row(
-        "Eq. 1", f"D_thresh {nodes.get('d_thresh', float('nan')):.3g} m, lambda {nodes.get('lambda_rot', float('nan')):.3g} m/rad"
+    nan = float("nan")
+    print_facts(
+        [
+            ("map", info["path"]),
+            ("size", f"{info['bytes'] / 1e6:.2f} MB"),
+            ("nodes", f"{info['num_nodes']}, {info['num_points']} points with 3-D position"),
+            ("place images", str(info["num_place_images"])),
+            ("mapped", f"{info['length_m']:.1f} m, extent {' x '.join(f'{e:.1f}' for e in info['extent_m'])} m"),
+            ("recordings", ", ".join(info["recordings"])),
+            ("coarse localizers", ", ".join(info["coarse"])),
+            ("Eq. 1", f"D_thresh {nodes.get('d_thresh', nan):.3g} m, lambda {nodes.get('lambda_rot', nan):.3g} m/rad"),
+            ("features", ", ".join(f"{key} {value}" for key, value in features.items() if isinstance(value, str))),
+        ]
     )
-    table.add_row("features", ", ".join(f"{key} {value}" for key, value in features.items() if isinstance(value, str)))
-    Console().print(table)

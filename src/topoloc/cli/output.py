@@ -1,11 +1,11 @@
-"""What the commands share: progress on a terminal, and JSON results written at once."""
+"""What the commands share: output paths checked before the work, progress on a terminal, results written at once."""
 
 from __future__ import annotations
 
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,13 +13,44 @@ from typing import Any
 from topoloc.errors import TopolocError
 
 
+class UsageError(TopolocError):
+    """The command was called in a way that cannot be meant: exit status 2."""
+
+
+def check_outputs(outputs: Sequence[str | None], inputs: Sequence[str] = ()) -> None:
+    """Hold that the files a command is to write can be written, so that it fails before the work and not after.
+
+    Args:
+        outputs: paths; None and ``-`` are no files.
+        inputs: files that must not be overwritten.
+
+    Raises:
+        TopolocError: the folder is missing or read-only, the path is no regular file, or it is named for two things.
+    """
+    taken = {Path(path).resolve() for path in inputs}
+    for path in (Path(output) for output in outputs if output not in (None, "-")):
+        if not path.parent.is_dir():
+            raise TopolocError(f"cannot write {path}: folder {path.parent} does not exist")
+        if path.is_dir():
+            raise TopolocError(f"cannot write {path}: it is a folder")
+        if path.exists() and not path.is_file():  # a device would be replaced by a file of its name
+            raise TopolocError(f"cannot write {path}: it is no regular file")
+        if not os.access(path.parent, os.W_OK):
+            raise TopolocError(f"cannot write {path}: folder {path.parent} is read-only")
+        if path.resolve() in taken:
+            raise TopolocError(f"cannot write {path}: this file is named for something else, too")
+        taken.add(path.resolve())
+
+
 @contextmanager
 def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
-    """A callable (stage, done, total) that draws one bar a stage on a terminal, and nothing elsewhere."""
+    """A callable (stage, done, total) that draws one bar a stage where stderr is a terminal, and nothing elsewhere."""
+    if not sys.stderr.isatty():
+        yield lambda stage, done, total: None
+        return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    console = Console(stderr=True)
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -27,7 +58,8 @@ def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
         TextColumn("{task.fields[speed]}"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+    # Lines printed meanwhile go above the bar; where stdout is a file they must stay in that file.
+    with Progress(*columns, console=Console(stderr=True), redirect_stdout=sys.stdout.isatty()) as progress:
         tasks: dict[str, Any] = {}
 
         def update(stage: str, done: int, total: int) -> None:
@@ -37,6 +69,13 @@ def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
             progress.update(tasks[stage], completed=done, total=total, speed=f"{speed:.1f}/s" if speed else "")
 
         yield update
+
+
+def print_facts(facts: Sequence[tuple[str, str]]) -> None:
+    """Names and values, one pair a line, the values in one column."""
+    width = max(len(name) for name, _ in facts)
+    for name, value in facts:
+        print(f"{name:<{width}}  {value}".rstrip())
 
 
 def write_text(path: Path, text: str) -> None:

@@ -12,7 +12,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.nodes import NodePoses, node_distances
-from topoloc.sequences.frame import StereoFrame, StereoSequence
+from topoloc.sequences.frame import Image, StereoFrame, StereoSequence
 
 
 def answer_queries(
@@ -41,7 +41,8 @@ def answer_queries(
         assert frame.world_from_cam is not None
         world_from_cam = (map_from_truth or Rigid3.identity()) @ frame.world_from_cam
         nearest = int(np.argmin(node_distances(world_from_cam, nodes, lambda_rot)))
-        answers.append(Answer(frame.name, _localize(localizer, frame), world_from_cam, nearest))
+        result = _localize(localizer, frame)
+        answers.append(Answer(frame.name, result, world_from_cam, nearest, sequence.name, _image_reader(sequence, i)))
         if progress:
             progress(sequence.name, done + 1, len(frames))
     return answers
@@ -53,7 +54,8 @@ def answer_elsewhere(
     """Show the localizer images that were not taken in the map: every pose that it gives is false."""
     answers = []
     for i, name in enumerate(sequence.names):
-        answers.append(Answer(name, _localize(localizer, sequence[i]), None))
+        result = _localize(localizer, sequence[i])
+        answers.append(Answer(name, result, None, None, sequence.name, _image_reader(sequence, i)))
         if progress:
             progress(f"{sequence.name} (elsewhere)", i + 1, len(sequence))
     return answers
@@ -63,3 +65,7 @@ def _localize(localizer: Localizer, frame: StereoFrame) -> Localization | NotLoc
     if frame.camera is None:
         raise CalibrationError(f"{frame.name}: no calibration; put a camera.json into the recording's folder")
     return localizer.localize(frame.image, frame.camera)
+
+
+def _image_reader(sequence: StereoSequence, index: int) -> Callable[[], Image]:
+    return lambda: sequence[index].image

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization, NotLocalized
+from topoloc.sequences.frame import Image
 
 # A query counts as recalled when its pose is within both (metres, degrees), of all queries.
 RECALL_THRESHOLDS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
@@ -19,12 +21,17 @@ MAX_TRANSLATION, MAX_ROTATION_DEG = 0.5, 10.0
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """A query with its result and its truth, which is None for an image from elsewhere: any pose given for that is false."""
+    """A query with its result and its truth, which is None for an image from elsewhere: any pose given for that is false.
+
+    `read_image` reads the picture once more, for who wants to look at it: answers hold no pictures.
+    """
 
     query: str
     result: Localization | NotLocalized
     world_from_cam: Rigid3 | None
     nearest_node_id: int | None = None
+    recording: str = ""
+    read_image: Callable[[], Image] | None = None
 
     @property
     def translation_m(self) -> float:
