@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float, Float32
 
 from topoloc.features.features import Features, Matches
 from topoloc.geometry.camera import Camera
@@ -22,10 +23,14 @@ from topoloc.localization.local_map import LocalMap
 class GuidedConfig:
     """Settings of guided matching."""
 
-    num_nodes: int = 4
+    num_nodes: int = 3
     """Nodes nearest to the first pose (Eq. 1) whose points are sought; 0 keeps the first pose as it is."""
     radius_px: float = 10.0
     """How far from its projection a map point is sought, in an image of 640 pixels' width; grows with the width."""
+    max_scale: float = 1.6
+    """Largest ratio of a key point's size to the one expected, or the other way round."""
+    max_turn: float = 0.6
+    """Largest difference of a key point's orientation from the one expected, radians."""
     min_similarity: float = 0.75
     """Least scalar product of the two descriptors."""
     min_margin: float = 0.03
@@ -34,16 +39,18 @@ class GuidedConfig:
 
 def match_guided(features: Features, local_map: LocalMap, cam_from_world: Rigid3, camera: Camera, config: GuidedConfig) -> Matches:
     """Matches of key points with map points that `cam_from_world` lets expect nearby: one map point a key point, the most similar."""
-    projections = camera.img_from_cam(cam_from_world.apply(local_map.points_world))
-    radius = config.radius_px * max(camera.width / 640.0, 0.5)
+    expected = _expected_key_points(local_map, cam_from_world, camera)
+    seen = np.column_stack([features.points_img, features.sizes_px, np.cos(features.angles), np.sin(features.angles)])
     found, similarities = match_projections(
-        projections,
+        expected,
         local_map.descriptors,
-        features.points_img,
+        seen.astype(np.float32),
         features.descriptors,
         float(camera.width),
         float(camera.height),
-        float(radius),
+        float(config.radius_px * max(camera.width / 640.0, 0.5)),
+        np.float32(config.max_scale),
+        np.float32(np.cos(config.max_turn)),
         np.float32(config.min_similarity),
         np.float32(config.min_margin),
     )
@@ -53,3 +60,32 @@ def match_guided(features: Features, local_map: LocalMap, cam_from_world: Rigid3
     train_idx = train_idx[first]
     distances = np.sqrt(np.maximum(2.0 - 2.0 * similarities[train_idx], 0.0)).astype(np.float32)
     return Matches(query_idx.astype(np.int32), train_idx.astype(np.int32), distances)
+
+
+def count_visible(local_map: LocalMap, cam_from_world: Rigid3, camera: Camera) -> int:
+    """How many map points lie in the camera's view."""
+    return int(np.isfinite(_pixels_in_view(cam_from_world.apply(local_map.points_world), camera)[:, 0]).sum())
+
+
+def _pixels_in_view(points_cam: Float[np.ndarray, "n 3"], camera: Camera) -> Float[np.ndarray, "n 2"]:
+    """Pixels of points, NaN where they are out of view."""
+    pixels = camera.img_from_cam(points_cam)
+    with np.errstate(invalid="ignore"):
+        inside = (pixels >= -0.5).all(axis=1) & (pixels[:, 0] < camera.width - 0.5) & (pixels[:, 1] < camera.height - 0.5)
+    return np.where(inside[:, None], pixels, np.nan)
+
+
+def _expected_key_points(local_map: LocalMap, cam_from_world: Rigid3, camera: Camera) -> Float32[np.ndarray, "n 5"]:
+    """Pixel, size and orientation (cosine, sine) at which each map point must be seen; NaN where it is out of view.
+
+    The surface is taken to face the node's camera; `max_scale` and `max_turn` leave room for its slant.
+    """
+    points_cam = cam_from_world.apply(local_map.points_world)
+    pixels = _pixels_in_view(points_cam, camera)
+    inside = np.isfinite(pixels[:, 0])
+    z = np.where(inside, points_cam[:, 2], 1.0)
+    directions = local_map.directions @ cam_from_world.rotation.T
+    turned = directions[:, :2] - points_cam[:, :2] / z[:, None] * directions[:, 2:]
+    turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-9)
+    expected = np.column_stack([pixels, local_map.sizes * camera.fx / z, turned])
+    return np.where(inside[:, None], expected, np.nan).astype(np.float32)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
@@ -12,13 +12,19 @@ from topoloc.mapping.topomap import TopoNode
 
 @dataclass(frozen=True, eq=False)
 class LocalMap:
-    """Row k: a map point with its descriptor, world position (metres), covariance (m^2), radius of doubt (metres), and node."""
+    """Row k: a map point with its descriptor, world position (metres), covariance (m^2), radius of doubt (metres), and node.
+
+    `sizes` is the diameter (metres) of what the descriptor describes, `directions` the unit vector of its orientation: from
+    these follows how large and how turned a camera elsewhere must see it.
+    """
 
     descriptors: Float32[np.ndarray, "n d"]
     points_world: Float[np.ndarray, "n 3"]
     covariances: Float[np.ndarray, "n 3 3"]
     radii: Float[np.ndarray, " n"]
     node_ids: Int[np.ndarray, " n"]
+    sizes: Float[np.ndarray, " n"]
+    directions: Float[np.ndarray, "n 3"]
 
     @staticmethod
     def of_node(node: TopoNode) -> LocalMap:
@@ -32,15 +38,13 @@ class LocalMap:
         radii = 0.01 + 3.0 * np.sqrt(np.trace(covariances, axis1=1, axis2=2))
         points_world = world_from_cam.apply(node.points_cam.astype(np.float64))
         node_ids = np.full(len(radii), node.summary.node_id)
-        return LocalMap(node.features.descriptors, points_world, covariances, radii, node_ids)
+        f = node.features
+        sizes = f.sizes_px.astype(np.float64) / node.camera.fx * node.points_cam[:, 2]
+        angles = f.angles.astype(np.float64)
+        directions = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))]) @ world_from_cam.rotation.T
+        return LocalMap(f.descriptors, points_world, covariances, radii, node_ids, sizes, directions)
 
     @staticmethod
     def pooled(parts: list[LocalMap]) -> LocalMap:
         """The points of several nodes."""
-        return LocalMap(
-            np.concatenate([p.descriptors for p in parts]),
-            np.concatenate([p.points_world for p in parts]),
-            np.concatenate([p.covariances for p in parts]),
-            np.concatenate([p.radii for p in parts]),
-            np.concatenate([p.node_ids for p in parts]),
-        )
+        return LocalMap(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(LocalMap)))

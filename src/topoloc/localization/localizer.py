@@ -2,8 +2,9 @@
 
 The coarse localizer names the nodes that the image may belong to; the image is patch-normalised and its features are
 matched with those of the nodes; PnP on the matches gives the camera's global pose. Unlike the paper's blind first choice,
-several candidate nodes pool their points (`num_candidates=1` gives the paper's behaviour), and a pose is reported only
-where the evidence for it could not have come about by chance.
+several candidate nodes pool their points; the nodes nearest to the pose so found, whose points are sought where they must
+be seen, make it exact; and it is reported only where the evidence is strong. One candidate and no guided step
+(`num_candidates=1`, `guided.num_nodes=0`) give the paper's own behaviour.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 
 from topoloc.errors import EmptyMapError, MapError, QueryError
@@ -20,10 +22,11 @@ from topoloc.features.matching import MatchingConfig, match_pooled
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, covariance_of_inverse, estimate_absolute_pose
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.guided import GuidedConfig, match_guided
+from topoloc.localization.guided import GuidedConfig, count_visible, match_guided
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.stages import StageClock
+from topoloc.localization.verification import Evidence, VerificationConfig, probability_of
 from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.places.coarse import Image, NodeScore, open_coarse
@@ -38,13 +41,16 @@ class LocalizerConfig:
 
     coarse: str = "surf-vlad"
     """Which of the map's coarse localizers is asked."""
-    num_candidates: int = 5
+    num_candidates: int = 4
     """Nodes whose points are pooled; 1 is the paper's single node."""
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     guided: GuidedConfig = field(default_factory=GuidedConfig)
-    pose: AbsolutePoseConfig = field(default_factory=AbsolutePoseConfig)
+    pose: AbsolutePoseConfig = field(default_factory=lambda: AbsolutePoseConfig(max_reprojection_error_px=8.0))
     min_matches: int = 8
-    min_inliers: int = 12
+    """With fewer first matches no pose is sought."""
+    verification: VerificationConfig = field(default_factory=VerificationConfig)
+    max_side_px: int = 1600
+    """Larger images are reduced to this width or height first: nothing is gained from more, but time and memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,11 +98,12 @@ class Localizer:
         if (camera.width, camera.height) != (width, height):
             raise QueryError(f"the image is {width}x{height}, its camera {camera.width}x{camera.height}")
         clock = StageClock()
+        image, camera = _reduced(image, camera, self.config.max_side_px)
         features = self._extract(image, clock)
         candidates = self._rank_nodes(image, features, clock)
         first = self._localize_in(self._pooled([c.node_id for c in candidates]), features, camera, clock)
-        final = self._localize_around(first, features, camera, clock) if first.pose else first
-        return self._judge(final, candidates, clock)
+        final = self._localize_around(first, features, camera, clock)
+        return self._judge(first, final, camera, candidates, clock)
 
     def _extract(self, image: Image, clock: StageClock) -> Features:
         """Patch normalisation, then the local features."""
@@ -123,18 +130,15 @@ class Localizer:
 
     def _localize_around(self, first: _Attempt, features: Features, camera: Camera, clock: StageClock) -> _Attempt:
         """Once more with the nodes nearest to the pose found, each point sought where it must be seen."""
-        if self.config.guided.num_nodes == 0 or first.num_inliers < self.config.min_inliers:
+        if self.config.guided.num_nodes == 0 or first.pose is None or first.num_inliers < self.config.verification.min_inliers:
             return first
-        assert first.pose is not None
         with clock.stage("matching"):
             cam_from_world = first.pose.cam_from_world
             distances = node_distances(cam_from_world.inverse(), self._node_poses, self._lambda_rot)
             nearest = np.argsort(distances, kind="stable")[: self.config.guided.num_nodes]
             local_map = self._pooled([int(i) for i in nearest])
             matches = match_guided(features, local_map, cam_from_world, camera, self.config.guided)
-        pose = self._estimate_pose(local_map, matches, features, camera, cam_from_world, clock)
-        guided = _Attempt(local_map, matches, pose)
-        return guided if guided.num_inliers >= first.num_inliers // 2 else first
+        return _Attempt(local_map, matches, self._estimate_pose(local_map, matches, features, camera, cam_from_world, clock))
 
     def _estimate_pose(
         self, local_map: LocalMap, matches: Matches, features: Features, camera: Camera, start: Rigid3 | None, clock: StageClock
@@ -149,21 +153,29 @@ class Localizer:
                 start=start,
             )
 
-    def _judge(self, attempt: _Attempt, candidates: list[NodeScore], clock: StageClock) -> Localization | NotLocalized:
-        num_matches, num_inliers, pose = len(attempt.matches), attempt.num_inliers, attempt.pose
-        if num_matches < self.config.min_matches:
-            return NotLocalized("too_few_matches", candidates, num_matches, 0, clock.times_ms())
-        if pose is None or num_inliers < self.config.min_inliers:
-            return NotLocalized("too_few_inliers", candidates, num_matches, num_inliers, clock.times_ms())
-        node_ids = attempt.local_map.node_ids[attempt.matches.train_idx[pose.inliers]]
+    def _judge(
+        self, first: _Attempt, final: _Attempt, camera: Camera, candidates: list[NodeScore], clock: StageClock
+    ) -> Localization | NotLocalized:
+        """A pose is an answer only where the evidence for it is strong."""
+        num_matches, demanded = len(final.matches), self.config.verification
+        if len(first.matches) < self.config.min_matches:
+            return NotLocalized("too_few_matches", candidates, len(first.matches), 0, clock.times_ms())
+        if first.pose is None or final.pose is None or first.num_inliers < demanded.min_inliers or final.num_inliers < demanded.min_found:
+            return NotLocalized("too_few_inliers", candidates, num_matches, final.num_inliers, clock.times_ms())
+        cam_from_world = final.pose.cam_from_world
+        num_visible = count_visible(final.local_map, cam_from_world, camera)
+        probability = probability_of(Evidence(len(first.matches), first.num_inliers, final.num_inliers, num_visible), demanded)
+        if probability < demanded.min_probability:
+            return NotLocalized("not_in_map", candidates, num_matches, final.num_inliers, clock.times_ms())
+        node_ids = final.local_map.node_ids[final.matches.train_idx[final.pose.inliers]]
         return Localization(
-            world_from_cam=pose.cam_from_world.inverse(),
-            covariance=covariance_of_inverse(pose.cam_from_world, pose.covariance),
-            probability=1.0,
+            world_from_cam=cam_from_world.inverse(),
+            covariance=covariance_of_inverse(cam_from_world, final.pose.covariance),
+            probability=probability,
             node_id=int(np.bincount(node_ids).argmax()),
             candidates=candidates,
             num_matches=num_matches,
-            num_inliers=num_inliers,
+            num_inliers=final.num_inliers,
             times_ms=clock.times_ms(),
         )
 
@@ -177,3 +189,13 @@ class Localizer:
                 self._local_maps.popitem(last=False)
         self._local_maps.move_to_end(node_id)
         return self._local_maps[node_id]
+
+
+def _reduced(image: Image, camera: Camera, max_side_px: int) -> tuple[Image, Camera]:
+    """The image with its camera, smaller where a side is longer than `max_side_px`."""
+    height, width = image.shape[:2]
+    scale = max_side_px / max(width, height)
+    if scale >= 1.0:
+        return image, camera
+    width, height = max(1, round(width * scale)), max(1, round(height * scale))
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), camera.rescaled(width, height)

@@ -68,7 +68,7 @@ def _write_database(topomap: TopoMetricMap, path: Path) -> None:
     path.unlink(missing_ok=True)
     database = sqlite3.connect(path)
     try:
-        database.execute("PRAGMA page_size = 16384")
+        database.execute("PRAGMA page_size = 4096")
         database.execute(f"PRAGMA application_id = {APPLICATION_ID}")
         database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
         database.executescript(_SCHEMA)
