@@ -28,7 +28,7 @@ class SiftConfig:
 
 def extract_sift(image: UInt8[np.ndarray, "h w"], config: SiftConfig) -> Features:
     """Key points and 128-d descriptors of a grey image, strongest first."""
-    detector = cv2.SIFT_create(
+    detector = cv2.SIFT_create(  # pyright: ignore[reportAttributeAccessIssue]  # missing in the stubs of OpenCV 5
         nfeatures=config.max_features,
         nOctaveLayers=config.num_octave_layers,
         contrastThreshold=config.contrast_threshold,

@@ -42,7 +42,8 @@ def split_columns(integral, step, first, split):
                 target[j] = source[phase + j * step]
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+# No fastmath: a fused product here rounded differently when compiled in this process and when read from the compiler's cache.
+@njit(nogil=True, cache=True, error_model="numpy")
 def _hessian_row(sums, top, edges, columns, rows, out):
     """Determinants of one row of filters with their upper edge at row `top` of `sums`.
 

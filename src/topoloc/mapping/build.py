@@ -6,16 +6,18 @@ with their 3-D positions. All mapping images, labelled with their node, teach th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import pairwise
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from topoloc.errors import EmptyMapError, TrajectoryError
 from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.features import Features
+from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.landmarks import LandmarkConfig, Observations, observe_points, refine_points
 from topoloc.mapping.node_points import NodePointsConfig, keypoint_sigmas, locate_points
@@ -54,27 +56,39 @@ class _MappingFrame:
 
     sequence: StereoSequence
     index: int
+    name: str
+    t_ns: int
     world_from_cam: Rigid3
 
     def view(self, with_depth: bool = True) -> MappingView:
         return mapping_view(self.sequence[self.index], with_depth)
 
-    @property
-    def name(self) -> str:
-        return self.sequence.names[self.index]
+
+@dataclass(frozen=True, eq=False)
+class _MappingImage:
+    """What the map needs of a frame once its pixels are let go. The pose is that of `camera`, which rectification may have turned."""
+
+    camera: Camera
+    world_from_cam: Rigid3
+    features: Features
+    place_jpeg: bytes
 
 
 @dataclass(eq=False)
 class _NodeDraft:
-    """A node in the making: its points as first measured, and what the other images have seen of them so far."""
+    """A node in the making: its points (features `rows` of its image) as first measured, and what other images saw of them so far."""
 
     frame: _MappingFrame
-    world_from_cam: Rigid3
-    view: MappingView
-    features: Features
+    image: _MappingImage
+    template_jpeg: bytes
+    rows: Int[np.ndarray, " n"]
     points_cam: Float[np.ndarray, "n 3"]
     covariances: Float[np.ndarray, "n 3 3"]
     observations: list[Observations]
+
+    @property
+    def features(self) -> Features:
+        return self.image.features.select(self.rows)
 
 
 def build_map(
@@ -99,7 +113,7 @@ def build_map(
     return TopoMetricMap(
         summaries=[node.summary for node in nodes],
         nodes=nodes,
-        edges=_edges_along([image.node_id for image in place_images]),
+        edges=_edges_along(frames, [image.node_id for image in place_images]),
         place_images=place_images,
         coarse_models={SurfVlad.name: coarse.to_model()},
         config=asdict(config) | {"nodes": asdict(node_config)},
@@ -108,7 +122,8 @@ def build_map(
 
 
 def _posed_frames(sequence: StereoSequence) -> list[_MappingFrame]:
-    frames = [_MappingFrame(sequence, i, pose) for i, pose in enumerate(sequence.poses) if pose is not None]
+    described = enumerate(zip(sequence.names, sequence.t_ns, sequence.poses, strict=True))
+    frames = [_MappingFrame(sequence, i, name, t_ns, pose) for i, (name, t_ns, pose) in described if pose is not None]
     if not frames:
         raise TrajectoryError(f"{sequence.name}: no frame has a pose; give a trajectory (TUM or KITTI rows) of this recording")
     return frames
@@ -136,7 +151,7 @@ def _draft_nodes(frames: list[_MappingFrame], node_config: NodeConfig, config: B
     drafts: list[_NodeDraft] = []
     for done, i in enumerate(frame_idx):
         draft = _draft_node(frames[i], config)
-        if len(draft.features) >= config.min_node_points:
+        if len(draft.rows) >= config.min_node_points:
             drafts.append(draft)
         progress("nodes", done + 1, len(frame_idx))
     if not drafts:
@@ -146,10 +161,16 @@ def _draft_nodes(frames: list[_MappingFrame], node_config: NodeConfig, config: B
 
 def _draft_node(frame: _MappingFrame, config: BuildConfig) -> _NodeDraft:
     view = frame.view()
-    features = extract_features(view.grey, config.features)
-    located = locate_points(features, view, config.points)
+    image = _mapping_image(view, config)
+    located = locate_points(image.features, view, config.points)
     rows = np.flatnonzero(located.valid)
-    return _NodeDraft(frame, view.world_from_cam, view, features.select(rows), located.points_cam[rows], located.covariances[rows], [])
+    template_jpeg = _encode_jpeg(view.picture, config.template_side_px, quality=75)
+    return _NodeDraft(frame, image, template_jpeg, rows, located.points_cam[rows], located.covariances[rows], [])
+
+
+def _mapping_image(view: MappingView, config: BuildConfig) -> _MappingImage:
+    jpeg = _encode_jpeg(view.picture, config.place_side_px, quality=60)
+    return _MappingImage(view.camera, view.world_from_cam, extract_features(view.grey, config.features), jpeg)
 
 
 def _visit_all_images(
@@ -159,30 +180,28 @@ def _visit_all_images(
     coarse localizer with it."""
     assert node_config.lambda_rot is not None
     words = learn_words(np.concatenate([draft.features.descriptors for draft in drafts]), config.vlad)
-    node_poses = NodePoses.of([draft.world_from_cam for draft in drafts])
+    node_poses = NodePoses.of([draft.image.world_from_cam for draft in drafts])
+    drafted = {draft.frame: draft.image for draft in drafts}  # read already
     images: list[PlaceImage] = []
     vlads = []
     for done, frame in enumerate(frames):
-        view = frame.view(with_depth=False)
-        features = extract_features(view.grey, config.features)
-        nearest = np.argsort(node_distances(view.world_from_cam, node_poses, node_config.lambda_rot), kind="stable")
+        image = drafted.get(frame) or _mapping_image(frame.view(with_depth=False), config)
+        nearest = np.argsort(node_distances(image.world_from_cam, node_poses, node_config.lambda_rot), kind="stable")
         for node_id in nearest[: config.landmarks.nodes_per_image]:
-            _observe(drafts[node_id], frame, view, features, config)
-        vlads.append(vlad(features.descriptors, words))
-        jpeg = _encode_jpeg(view.picture, config.place_side_px, quality=60)
-        images.append(PlaceImage(frame.sequence.name, frame.name, int(nearest[0]), view.world_from_cam, jpeg))
+            if drafts[node_id].frame is not frame:
+                _observe(drafts[node_id], image, config)
+        vlads.append(vlad(image.features.descriptors, words))
+        images.append(PlaceImage(frame.sequence.name, frame.name, int(nearest[0]), image.world_from_cam, image.place_jpeg))
         progress("images", done + 1, len(frames))
     node_ids = np.array([image.node_id for image in images])
     return images, SurfVlad.fit(words, np.stack(vlads), node_ids, config.vlad)
 
 
-def _observe(draft: _NodeDraft, frame: _MappingFrame, view: MappingView, features: Features, config: BuildConfig) -> None:
-    if frame is draft.frame:
-        return
-    cam_from_node = view.world_from_cam.inverse() @ draft.world_from_cam
-    sigmas_px = keypoint_sigmas(features, config.points)
+def _observe(draft: _NodeDraft, image: _MappingImage, config: BuildConfig) -> None:
+    cam_from_node = image.world_from_cam.inverse() @ draft.image.world_from_cam
+    sigmas_px = keypoint_sigmas(image.features, config.points)
     seen = observe_points(
-        draft.features, draft.points_cam, draft.covariances, features, sigmas_px, view.camera, cam_from_node, config.landmarks
+        draft.features, draft.points_cam, draft.covariances, image.features, sigmas_px, image.camera, cam_from_node, config.landmarks
     )
     draft.observations.append(seen)
 
@@ -193,31 +212,27 @@ def _finish_node(node_id: int, draft: _NodeDraft, config: BuildConfig) -> TopoNo
     rows = np.flatnonzero(refined.agrees)
     rows = np.sort(rows[np.argsort(-np.minimum(refined.num_observations[rows], 2), kind="stable")][: config.max_node_points])
     sqrt_covs = np.linalg.cholesky(refined.covariances[rows])[:, *np.tril_indices(3)]
-    sequence, index = draft.frame.sequence, draft.frame.index
+    frame, image = draft.frame, draft.image
     return TopoNode(
-        NodeSummary(node_id, sequence.name, draft.frame.name, sequence.t_ns[index], draft.world_from_cam, len(rows)),
-        draft.view.camera,
+        NodeSummary(node_id, frame.sequence.name, frame.name, frame.t_ns, image.world_from_cam, len(rows)),
+        image.camera,
         draft.features.select(rows),
         refined.points_cam[rows].astype(np.float32),
         sqrt_covs.astype(np.float32),
-        _encode_jpeg(draft.view.picture, config.template_side_px, quality=75),
+        draft.template_jpeg,
     )
 
 
-def _edges_along(node_ids: Iterable[int]) -> list[Edge]:
-    """An edge wherever the robot went from one node to another."""
-    visited = list(node_ids)
-    steps = {(a, b) for a, b in zip(visited, visited[1:], strict=False) if a != b}
-    return [Edge(a, b) for a, b in sorted(steps)]
+def _edges_along(frames: list[_MappingFrame], node_ids: list[int]) -> list[Edge]:
+    """An edge wherever a recording went from one node to another."""
+    steps = pairwise(zip(frames, node_ids, strict=True))
+    edges = {(source, target) for (a, source), (b, target) in steps if a.sequence is b.sequence and source != target}
+    return [Edge(source, target) for source, target in sorted(edges)]
 
 
 def _trajectory_length(frames: list[_MappingFrame]) -> float:
-    steps = [
-        float(np.linalg.norm(b.world_from_cam.translation - a.world_from_cam.translation))
-        for a, b in zip(frames, frames[1:], strict=False)
-        if a.sequence is b.sequence
-    ]
-    return sum(steps)
+    steps = [b.world_from_cam.translation - a.world_from_cam.translation for a, b in pairwise(frames) if a.sequence is b.sequence]
+    return float(sum(np.linalg.norm(step) for step in steps))
 
 
 def _encode_jpeg(picture: Image, side_px: int, quality: int) -> bytes:

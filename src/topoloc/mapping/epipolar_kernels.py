@@ -50,7 +50,7 @@ def _normalized_patch(image, x, y, half, patch):
 def _correlations(patch, half, image, x, y, shift_sign, num_disparities, strip, scores):
     """NCC of `patch` (centre (x, y) in its own picture) with `image` at x + shift_sign * d for d = 0 .. num_disparities - 1."""
     side = 2 * half + 1
-    height, width = image.shape
+    width = image.shape[1]
     length = num_disparities + side - 1
     start = x - half if shift_sign > 0 else x - half - (num_disparities - 1)
     for j in range(side):
@@ -76,7 +76,7 @@ def _correlations(patch, half, image, x, y, shift_sign, num_disparities, strip, 
 
 
 @njit(**_OPTIONS)
-def _refine_disparity(patch, norm, half, right, x, y, disparity, num_iterations):
+def _refine_disparity(patch, half, right, x, y, disparity, num_iterations):
     """Gauss-Newton on the disparity with gain and offset eliminated; returns (disparity, standard deviation in pixels)."""
     side = 2 * half + 1
     width = right.shape[1]
@@ -157,7 +157,7 @@ def match_along_rows(left, right, points, half, max_disparity, min_score, max_ra
                 second = scores[d]
         if second > max_ratio * scores[best]:
             continue
-        disparity, sigma = _refine_disparity(patch, norm, half, right, x, y, np.float32(best), 8)
+        disparity, sigma = _refine_disparity(patch, half, right, x, y, np.float32(best), 8)
         xr = x - disparity
         if not np.isfinite(sigma) or abs(disparity - best) > 1.5 or xr < half or xr >= width - half - 1:
             continue

@@ -78,7 +78,8 @@ def keypoint_sigmas(features: Features, config: NodePointsConfig) -> Float[np.nd
 def _from_stereo(
     features: Features, view: MappingView, config: NodePointsConfig
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-    assert view.right_grey is not None and view.rig is not None
+    assert view.right_grey is not None
+    assert view.rig is not None
     # Nearer than a quarter of the picture's width in disparity nothing is seen well by both cameras.
     max_disparity = max(16, view.camera.width // 4)
     disparity, sigma = match_along_rows(

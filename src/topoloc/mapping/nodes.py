@@ -62,7 +62,8 @@ def place_nodes(world_from_cams: list[Rigid3], config: NodeConfig) -> Int[np.nda
 
     `config` must be resolved.
     """
-    assert config.d_thresh is not None and config.lambda_rot is not None, "resolve the configuration first"
+    assert config.d_thresh is not None, "resolve the configuration first"
+    assert config.lambda_rot is not None, "resolve the configuration first"
     poses = NodePoses.of(world_from_cams)
     frame_idx = [0]
     for k, world_from_cam in enumerate(world_from_cams):

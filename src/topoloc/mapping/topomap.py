@@ -36,9 +36,9 @@ class TopoNode:
     """One topological node: "a single template node image, its global SE(3) pose and a point cloud
     comprising of 2D SURF features and their 3D positions".
 
-    `features.points_img` are pixels of `camera` (undistorted); row k of `points_cam` (metres, the node's camera frame)
-    is the position of feature k, with covariance ``L @ L.T`` for the lower triangular L in row k of `point_sqrt_covs`
-    (xx, yx, yy, zx, zy, zz; metres). `template_jpeg` is the node's picture, encoded, possibly smaller than `camera`.
+    `features.points_img` are pixels of `camera` (of a stereo pair: the rectified left one); row k of `points_cam` (metres,
+    the node's camera frame) is the position of feature k, with covariance ``L @ L.T`` for the lower triangular L in row k
+    of `point_sqrt_covs` (xx, yx, yy, zx, zy, zz; metres). `template_jpeg` is the node's picture, encoded, possibly smaller than `camera`.
     """
 
     summary: NodeSummary

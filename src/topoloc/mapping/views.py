@@ -7,12 +7,13 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 from topoloc.errors import CalibrationError, RecordingError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import Rectification, StereoRig, rectify
 from topoloc.geometry.rigid import Rigid3
+from topoloc.mapping.registration_kernels import back_project, keep_nearest
 from topoloc.sequences.frame import DepthImage, Image, StereoFrame
 from topoloc.sequences.pictures import grey_image
 
@@ -60,11 +61,16 @@ def _stereo_view(frame: StereoFrame, right: Image | None, rig: StereoRig, world_
     if rig.is_rectified:
         return MappingView(frame.image, grey_image(frame.image), rig.left, world_from_left, right_grey, rig)
     r = _rectification(rig)
-    picture = cv2.remap(frame.image, r.left_map, None, cv2.INTER_LINEAR)
+    picture = _remapped(frame.image, r.left_map)
     if right_grey is not None:
-        right_grey = cv2.remap(right_grey, r.right_map, None, cv2.INTER_LINEAR)
+        right_grey = _remapped(right_grey, r.right_map)
     world_from_rectified = world_from_left @ r.rectified_from_left.inverse()
     return MappingView(picture, grey_image(picture), r.rig.left, world_from_rectified, right_grey, r.rig)
+
+
+def _remapped(picture: Image, pixel_map: Float32[np.ndarray, "h w 2"]) -> Image:
+    # None is right here, whatever the stubs say: OpenCV 5 takes an empty second map for a map.
+    return cv2.remap(picture, pixel_map, None, cv2.INTER_LINEAR)  # pyright: ignore[reportCallIssue, reportArgumentType]
 
 
 @lru_cache(maxsize=4)
@@ -77,16 +83,17 @@ def registered_depth(depth_image: DepthImage, camera: Camera) -> Float32[np.ndar
     identity = np.allclose(depth_image.cam_from_depth.matrix(), np.eye(4), atol=1e-9)
     if identity and depth_image.camera == camera:
         return depth_image.depth
-    rows, columns = np.nonzero(depth_image.depth > 0)  # NaN compares false
-    depth = depth_image.depth[rows, columns].astype(np.float64)
-    pixels = np.stack([columns, rows], axis=1).astype(np.float64)
-    normalized = depth_image.camera.normalized_from_img(pixels)
-    points = depth_image.cam_from_depth.apply(np.column_stack([normalized * depth[:, None], depth]))
-    target = np.rint(camera.img_from_cam(points))
-    inside = (target >= 0).all(axis=1) & (target[:, 0] < camera.width) & (target[:, 1] < camera.height)
-    flat = (target[inside, 1] * camera.width + target[inside, 0]).astype(np.int64)
-    z = points[inside, 2].astype(np.float32)
-    order = np.argsort(-z, kind="stable")  # far to near, so that the nearest is written last
-    registered = np.full(camera.width * camera.height, np.nan, np.float32)
-    registered[flat[order]] = z[order]
-    return registered.reshape(camera.height, camera.width)
+    height, width = depth_image.depth.shape
+    pose, points = depth_image.cam_from_depth, np.empty((height * width, 3))
+    normalized = _normalized_pixels(depth_image.camera, width, height)
+    points = points[: back_project(depth_image.depth, normalized, pose.rotation, pose.translation, points)]
+    registered = np.full((camera.height, camera.width), np.nan, np.float32)
+    keep_nearest(camera.img_from_cam(points), points, registered)
+    return registered
+
+
+@lru_cache(maxsize=4)
+def _normalized_pixels(camera: Camera, width: int, height: int) -> Float[np.ndarray, "n 2"]:
+    """Every pixel of a picture, row by row, on the plane z = 1."""
+    columns, rows = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    return camera.normalized_from_img(np.column_stack([columns.ravel(), rows.ravel()]))
