@@ -1,12 +1,12 @@
-"""Nearest neighbours among place vectors, by FAISS, and the nodes they vote for."""
+"""Nearest neighbours among place vectors, and the nodes they vote for."""
 
 from __future__ import annotations
 
-import faiss
 import numpy as np
 from jaxtyping import Float32, Int
 
 from topoloc.places.coarse import NodeScore
+from topoloc.places.place_kernels import multiply_rows
 
 
 class PlaceIndex:
@@ -18,17 +18,14 @@ class PlaceIndex:
     """
 
     def __init__(self, vectors: Float32[np.ndarray, "n d"], node_ids: Int[np.ndarray, " n"]) -> None:
+        self._vectors = np.ascontiguousarray(vectors)
         self._node_ids = node_ids
-        self._index = faiss.IndexFlatIP(vectors.shape[1])
-        self._index.add(np.ascontiguousarray(vectors))  # pyright: ignore[reportCallIssue]
 
     def rank_nodes(self, vector: Float32[np.ndarray, " d"], num_candidates: int) -> list[NodeScore]:
-        """The nodes of the nearest images, each once, with the similarity of its best image."""
-        num_images = min(len(self._node_ids), 16 * num_candidates)
-        similarities, rows = self._index.search(vector[None], num_images)  # pyright: ignore[reportCallIssue]
-        best: dict[int, float] = {}
-        for similarity, row in zip(similarities[0], rows[0], strict=True):
-            best.setdefault(int(self._node_ids[row]), float(similarity))
-            if len(best) == num_candidates:
-                break
-        return [NodeScore(node_id, score) for node_id, score in best.items()]
+        """The nodes of the nearest images, each once, with the similarity of its best image; of equal ones the earlier image's."""
+        similarities = np.empty(len(self._vectors), np.float32)
+        multiply_rows(self._vectors, np.ascontiguousarray(vector), similarities)
+        order = np.argsort(-similarities, kind="stable")
+        _, first = np.unique(self._node_ids[order], return_index=True)
+        best = order[np.sort(first)[:num_candidates]]
+        return [NodeScore(int(self._node_ids[row]), float(similarities[row])) for row in best]

@@ -16,6 +16,7 @@ from jaxtyping import Float32, Int
 from topoloc.features.features import Features
 from topoloc.places.coarse import CoarseModel, Image, NodeScore
 from topoloc.places.neighbours import PlaceIndex
+from topoloc.places.place_kernels import add_residuals, multiply_rows
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,9 @@ class SurfVlad:
 
     def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
         """See `CoarseLocalizer.rank`; the picture itself is not looked at."""
-        vector = _project(vlad(features.descriptors, self._words)[None], self._mean, self._projection)[0]
+        vector = np.empty(len(self._projection), np.float32)
+        multiply_rows(self._projection, vlad(features.descriptors, self._words) - self._mean, vector)
+        vector /= max(float(np.linalg.norm(vector)), 1e-6)
         return self._index.rank_nodes(vector, num_candidates)
 
     def to_model(self) -> CoarseModel:
@@ -79,15 +82,9 @@ class SurfVlad:
 def vlad(descriptors: Float32[np.ndarray, "n d"], words: Float32[np.ndarray, "k d"]) -> Float32[np.ndarray, " kd"]:
     """VLAD of unit-length descriptors over `words`; zero for an image without features."""
     sums = np.zeros(words.shape, np.float32)
-    if len(descriptors):
-        # nearest word of a unit vector: |d - w|^2 = 1 - 2 d.w + |w|^2
-        nearest = np.argmax(descriptors @ words.T - 0.5 * np.sum(words**2, axis=1), axis=1)
-        residuals = descriptors - words[nearest]
-        residuals /= np.maximum(np.linalg.norm(residuals, axis=1, keepdims=True), 1e-6)
-        order = np.argsort(nearest, kind="stable")
-        present, starts = np.unique(nearest[order], return_index=True)
-        sums[present] = np.add.reduceat(residuals[order], starts, axis=0)
-        sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-6)
+    half_squares = 0.5 * np.sum(words**2, axis=1)
+    add_residuals(np.ascontiguousarray(descriptors), np.ascontiguousarray(words), half_squares, sums)
+    sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-6)
     flat = sums.reshape(-1)
     return flat / max(float(np.linalg.norm(flat)), 1e-6)
 
@@ -112,12 +109,15 @@ def _learn_whitening(raw: Float32[np.ndarray, "n kd"], dimension: int) -> tuple[
     """
     mean = raw.mean(axis=0)
     centred = raw - mean
-    eigenvalues, coefficients = np.linalg.eigh(centred @ centred.T)  # the small side: images, not dimensions
-    keep = [i for i in np.argsort(-eigenvalues)[:dimension] if eigenvalues[i] > 1e-6 * max(eigenvalues.max(), 1e-12)]
-    if not keep:  # one image, or all alike
+    by_image = len(raw) < raw.shape[1]  # whichever is smaller: the products of images, or those of dimensions
+    eigenvalues, vectors = np.linalg.eigh(centred @ centred.T if by_image else centred.T @ centred)
+    order = np.argsort(-eigenvalues, kind="stable")[:dimension]
+    # Vectors are of unit length: below a millionth of that is rounding.
+    keep = order[eigenvalues[order] > 1e-6 * max(float(eigenvalues.max()), len(raw) * 1e-6)]
+    if len(keep) == 0:  # one image, or all alike
         direction = mean / max(float(np.linalg.norm(mean)), 1e-6)
         return np.zeros_like(mean), direction[None].astype(np.float32)
-    axes = centred.T @ coefficients[:, keep] / np.sqrt(eigenvalues[keep])
+    axes = centred.T @ vectors[:, keep] / np.sqrt(eigenvalues[keep]) if by_image else vectors[:, keep]
     softened = np.sqrt(eigenvalues[keep] + eigenvalues[keep].mean())
     return mean.astype(np.float32), np.ascontiguousarray((axes / softened).T, np.float32)
 

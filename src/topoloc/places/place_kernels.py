@@ -1,0 +1,46 @@
+"""Numba kernels of place vectors: sums of residuals, and products of stored rows with one vector.
+
+BLAS and FAISS would start threads for these products, which take a fraction of a millisecond: waking them costs more than
+they save, and on a busy machine many times more.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+_FAST = {"reassoc", "contract", "arcp"}
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def _dot(a, b):
+    total = np.float32(0)
+    for i in range(len(a)):
+        total += a[i] * b[i]
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def add_residuals(descriptors, words, half_squares, sums):
+    """Add each descriptor's unit residual from its nearest word to that word's row of `sums`; half_squares = |word|^2 / 2."""
+    residual = np.empty(words.shape[1], np.float32)
+    for n in range(len(descriptors)):
+        descriptor = descriptors[n]
+        nearest, best = 0, np.float32(-np.inf)
+        for k in range(len(words)):
+            score = _dot(descriptor, words[k]) - half_squares[k]  # of |d - w|^2, all that differs from word to word
+            if score > best:
+                nearest, best = k, score
+        word, total = words[nearest], sums[nearest]
+        for i in range(len(residual)):
+            residual[i] = descriptor[i] - word[i]
+        scale = np.float32(1) / max(np.sqrt(_dot(residual, residual)), np.float32(1e-6))
+        for i in range(len(residual)):
+            total[i] += residual[i] * scale
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def multiply_rows(rows, vector, products):
+    """products[k] = rows[k] . vector."""
+    for k in range(len(rows)):
+        products[k] = _dot(rows[k], vector)
