@@ -88,6 +88,8 @@ def _read_rigid(path: Path) -> Rigid3:
         return Rigid3.from_matrix(np.array(matrix, dtype=np.float64))
     except (ValueError, TypeError):
         raise TrajectoryError(f"{path}: one 4x4 matrix is needed") from None
+    except TrajectoryError as error:
+        raise TrajectoryError(f"{path}: {error}") from None
 
 
 def _print(evaluation: dict[str, Any]) -> None:

@@ -1,0 +1,41 @@
+"""The rendered room of `tiny_world` as a map, and pictures of it that the map has not seen; each made once a test run."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from tiny_world import CAMERA, path_pose, render, room, tum_line
+from topoloc.geometry.rigid import Rigid3
+from topoloc.mapping.build import build_map
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.sequences.open import open_sequence
+
+
+@cache
+def built_room(recording: Path) -> TopoMetricMap:
+    """The map of the recording `tiny_recording`."""
+    return build_map(open_sequence(recording))
+
+
+@cache
+def unseen_views(seed: int = 0, step: float = 1.5) -> list[tuple[np.ndarray, Rigid3]]:
+    """Grey pictures of CAMERA taken between the frames of the recording, with world_from_cam; another seed is another world."""
+    panels = room(seed)
+    indices = np.arange(0.5, 13.0, step)
+    return [(render(panels, path_pose(index), noise_seed=900 + k)[0], path_pose(index)) for k, index in enumerate(indices)]
+
+
+def write_pictures(folder: Path, views: list[tuple[np.ndarray, Rigid3]]) -> Path:
+    """The views as a folder of pictures with camera.json, times and truth; returns `folder`."""
+    folder.mkdir(parents=True)
+    for number, (picture, _) in enumerate(views):
+        assert cv2.imwrite(str(folder / f"view{number:02d}.png"), picture)
+    (folder / "camera.json").write_text(json.dumps(CAMERA.to_json()))
+    (folder / "times.txt").write_text("".join(f"{number / 10:.9f}\n" for number in range(len(views))))
+    (folder / "truth.tum").write_text("".join(tum_line(number, pose) + "\n" for number, (_, pose) in enumerate(views)))
+    return folder

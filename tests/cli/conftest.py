@@ -1,0 +1,56 @@
+"""A map file and query pictures of the rendered room, and how a failing command must look."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from built_room import built_room, unseen_views, write_pictures
+from topoloc.cli import main
+
+
+@pytest.fixture(scope="session")
+def room_map(tiny_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The map of `tiny_recording`; not to be written to."""
+    path = tmp_path_factory.mktemp("map") / "room.topo"
+    built_room(tiny_recording).save(path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def queries(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of pictures of the room, with calibration and truth; not to be written to."""
+    return write_pictures(tmp_path_factory.mktemp("queries") / "unseen", unseen_views())
+
+
+@pytest.fixture(scope="session")
+def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Pictures of another world."""
+    return write_pictures(tmp_path_factory.mktemp("queries") / "elsewhere", unseen_views(seed=1, step=4.0))
+
+
+@pytest.fixture
+def recording(tiny_recording: Path, tmp_path: Path) -> Path:
+    """A copy of `tiny_recording`, to be broken."""
+    return Path(shutil.copytree(tiny_recording, tmp_path / "recording"))
+
+
+@pytest.fixture
+def complaint(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., str]:
+    """Runs a command that must fail: its one line on stderr. No file may appear, change size or go."""
+
+    def run(*args: object, status: int = 1) -> str:
+        before = {path: path.stat().st_size for path in tmp_path.rglob("*")}
+        capfd.readouterr()
+        assert main([str(arg) for arg in args]) == status
+        printed = capfd.readouterr()
+        assert printed.err.startswith("error: ")
+        assert printed.err.count("\n") == 1
+        assert "Traceback" not in printed.err
+        assert {path: path.stat().st_size for path in tmp_path.rglob("*")} == before
+        return printed.err
+
+    return run
