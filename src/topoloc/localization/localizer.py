@@ -46,6 +46,9 @@ class LocalizerConfig:
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     guided: GuidedConfig = field(default_factory=GuidedConfig)
     pose: AbsolutePoseConfig = field(default_factory=lambda: AbsolutePoseConfig(max_reprojection_error_px=8.0))
+    num_first_features: int = 500
+    """The image's strongest features are matched first; the rest only where these give fewer inliers than the next number."""
+    num_clear_inliers: int = 40
     min_matches: int = 8
     """With fewer first matches no pose is sought."""
     verification: VerificationConfig = field(default_factory=VerificationConfig)
@@ -101,7 +104,7 @@ class Localizer:
         image, camera = _reduced(image, camera, self.config.max_side_px)
         features = self._extract(image, clock)
         candidates = self._rank_nodes(image, features, clock)
-        first = self._localize_in(self._pooled([c.node_id for c in candidates]), features, camera, clock)
+        first = self._localize_among(candidates, features, camera, clock)
         final = self._localize_around(first, features, camera, clock)
         return self._judge(first, final, camera, candidates, clock)
 
@@ -117,6 +120,16 @@ class Localizer:
         """The coarse step: which nodes may this be?"""
         with clock.stage("coarse"):
             return self._coarse.rank(image, features, self.config.num_candidates)
+
+    def _localize_among(self, candidates: list[NodeScore], features: Features, camera: Camera, clock: StageClock) -> _Attempt:
+        """The candidates' points together. The strongest features are nearly always enough; all are tried where they are not."""
+        local_map = self._pooled([candidate.node_id for candidate in candidates])
+        attempt = self._localize_in(
+            local_map, features.select(np.arange(min(len(features), self.config.num_first_features))), camera, clock
+        )
+        if attempt.num_inliers < self.config.num_clear_inliers and len(features) > self.config.num_first_features:
+            attempt = self._localize_in(local_map, features, camera, clock)
+        return attempt
 
     def _localize_in(self, local_map: LocalMap, features: Features, camera: Camera, clock: StageClock) -> _Attempt:
         """The fine step: match with the candidates' points, then robust PnP."""

@@ -18,7 +18,7 @@ from topoloc.geometry.rigid import Rigid3
 DEPTH_SHARE = 0.15
 # Where the user names no lambda, a turn by this angle alone makes a node. Nodes are cheap (100 KB) and a query asks only
 # the few around it; the closer they are in view, the more of the map's own error they share with it (docs/journal.md).
-RADIANS_PER_NODE = np.deg2rad(3.0)
+RADIANS_PER_NODE = np.deg2rad(2.0)
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class NodeConfig:
     d_thresh: float | None = None
     """D_thresh, metres: the distance at which a new node is placed (None: 15 % of the scene's median depth)."""
     lambda_rot: float | None = None
-    """lambda, metres a radian: how much rotation counts (None: so much that 3 degrees alone make a node)."""
+    """lambda, metres a radian: how much rotation counts (None: so much that 2 degrees alone make a node)."""
 
     def resolved(self, median_depth: float) -> NodeConfig:
         """The same with every value set, for a scene of this median depth (metres)."""

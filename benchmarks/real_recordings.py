@@ -1,0 +1,187 @@
+"""The spine's figures on real recordings: accuracy, darkened queries, images from elsewhere, milliseconds, bytes.
+
+    python benchmarks/real_recordings.py [--shared ../shared] [--json FILE]
+
+Each map is built with the default settings but for D_thresh = 0.5 m indoors. `d` in the table is the share localized of
+the same queries darkened to a third, with a gradient across the picture, gamma 0.6 and sensor noise of 4 grey levels
+(`d2`: gamma 1 / 0.6, far darker). Images from elsewhere: the queries of the other places, and noise, lettering, shapes,
+repeated patterns.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.localizer import Localizer
+from topoloc.mapping.build import BuildConfig, build_map
+from topoloc.mapping.nodes import NodeConfig
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.sequences.frame import StereoFrame
+from topoloc.sequences.open import open_sequence
+
+
+@dataclass(frozen=True)
+class Place:
+    """A map, and queries to it."""
+
+    name: str
+    mapping: str
+    queries: str
+    d_thresh: float | None = None
+    map_from_truth: str | None = None
+
+
+PLACES = (
+    Place("kitchen, 60 of 100 frames map", "seven_scenes/kitchen@0-59/100", "seven_scenes/kitchen@60-99/100", 0.5),
+    Place("kitchen, 30 of 50 frames map", "seven_scenes/kitchen@0-29/50", "seven_scenes/kitchen@30-49/50", 0.5),
+    Place("ZED lab, session 1 / 2", "zed_lab/session1", "zed_lab/session2@0:99", 0.5, "zed_lab/session1_from_session2.json"),
+    Place("KITTI street 1, even / odd", "kitti/sequences/street1@0::2", "kitti/sequences/street1@1::2"),
+    Place("KITTI street 2, even / odd", "kitti/sequences/street2@0::2", "kitti/sequences/street2@1::2"),
+)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--shared", type=Path, default=Path(os.environ.get("TOPOLOC_SHARED", "../shared")))
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    data = arguments.shared / "data"
+    queries = {place.name: list(open_sequence(data / place.queries)) for place in PLACES}
+    drawn = drawn_pictures(100)
+    rows = []
+    for place in PLACES:
+        row = measure(place, data, queries, drawn)
+        rows.append(row)
+        print(json.dumps(row), flush=True)
+    print("\n" + table(rows))
+    print(f"peak memory of this process: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB (it holds all queries)")
+    if arguments.json:
+        arguments.json.write_text(json.dumps(rows, indent=1))
+
+
+def measure(place: Place, data: Path, queries: dict[str, list[StereoFrame]], drawn: list[np.ndarray]) -> dict[str, Any]:
+    topomap = build_map(open_sequence(data / place.mapping), BuildConfig(nodes=NodeConfig(d_thresh=place.d_thresh)))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "place.topo"
+        topomap.save(path)
+        num_bytes = path.stat().st_size
+        localizer = Localizer(TopoMetricMap.load(path))
+        world_from_truth = read_rigid(data / place.map_from_truth) if place.map_from_truth else Rigid3.identity()
+        frames = queries[place.name]
+        for frame in frames[:5]:  # warm-up
+            ask(localizer, frame)
+        results = [ask(localizer, frame) for frame in frames]
+        errors = [
+            (result.world_from_cam.inverse() @ world_from_truth @ frame.world_from_cam)
+            for result, frame in zip(results, frames, strict=True)
+            if result.localized and frame.world_from_cam is not None
+        ]
+        dark = {gamma: np.mean([ask(localizer, frame, darkened(frame.image, gamma, i)).localized for i, frame in enumerate(frames)]) for gamma in (0.6, 1 / 0.6)}
+        others = [frame for name, other in queries.items() if name[:5] != place.name[:5] for frame in other]
+        camera = Camera.pinhole(640, 480, 525.0, 525.0, 319.5, 239.5)
+        elsewhere = [ask(localizer, frame).localized for frame in others] + [localizer.localize(image, camera).localized for image in drawn]
+    stages = results[0].times_ms if results else {}
+    return {
+        "place": place.name,
+        "nodes": len(topomap.summaries),
+        "kB_per_node": round(num_bytes / len(topomap.summaries) / 1e3, 1),
+        "queries": len(frames),
+        "localized_percent": round(100 * float(np.mean([r.localized for r in results])), 1),
+        "median_cm": round(100 * float(np.median([np.linalg.norm(e.translation) for e in errors])), 2),
+        "median_deg": round(float(np.rad2deg(np.median([e.angle() for e in errors]))), 3),
+        "dark_percent": round(100 * float(dark[0.6]), 1),
+        "darker_percent": round(100 * float(dark[1 / 0.6]), 1),
+        "elsewhere": len(elsewhere),
+        "accepted": int(np.sum(elsewhere)),
+        "median_ms": {stage: round(float(np.median([r.times_ms.get(stage, 0.0) for r in results])), 2) for stage in stages},
+    }
+
+
+def ask(localizer: Localizer, frame: StereoFrame, image: np.ndarray | None = None) -> Any:
+    assert frame.camera is not None
+    return localizer.localize(frame.image if image is None else image, frame.camera)
+
+
+def darkened(image: np.ndarray, gamma: float, seed: int) -> np.ndarray:
+    """A third of the light, less of it to the right, another response, and noise."""
+    rng = np.random.default_rng(seed)
+    gradient = np.linspace(1.0, 0.3, image.shape[1])[None, :]
+    light = image / 255.0 / 3.0 * (gradient if image.ndim == 2 else gradient[..., None])
+    return np.clip(255.0 * light**gamma + rng.normal(0.0, 4.0, image.shape), 0, 255).astype(np.uint8)
+
+
+def drawn_pictures(num: int) -> list[np.ndarray]:
+    """Noise, clouds, lettering, shapes and wallpaper, 640x480."""
+    rng = np.random.default_rng(0)
+    makers = (_noise, _clouds, _lettering, _shapes, _wallpaper)
+    return [np.clip(makers[i % len(makers)](rng), 0, 255).astype(np.uint8) for i in range(num)]
+
+
+def _noise(rng: np.random.Generator) -> np.ndarray:
+    return rng.normal(128, rng.uniform(10, 60), (480, 640))
+
+
+def _clouds(rng: np.random.Generator) -> np.ndarray:
+    step = int(rng.integers(2, 9))
+    return cv2.resize(rng.normal(128, 60, (480 // step, 640 // step)), (640, 480), interpolation=cv2.INTER_CUBIC)
+
+
+def _lettering(rng: np.random.Generator) -> np.ndarray:
+    picture = np.full((480, 640), int(rng.uniform(100, 255)), np.uint8)
+    for _ in range(60):
+        word = "".join(chr(letter) for letter in rng.integers(65, 90, 8))
+        place = (int(rng.integers(-50, 640)), int(rng.integers(0, 480)))
+        cv2.putText(picture, word, place, cv2.FONT_HERSHEY_SIMPLEX, float(rng.uniform(0.4, 3)), int(rng.uniform(0, 255)), int(rng.integers(1, 6)))
+    return picture
+
+
+def _shapes(rng: np.random.Generator) -> np.ndarray:
+    picture = np.full((480, 640), 200, np.uint8)
+    for _ in range(120):
+        x, y, size, level = int(rng.integers(0, 640)), int(rng.integers(0, 480)), int(rng.integers(3, 120)), int(rng.uniform(0, 255))
+        if rng.random() < 0.5:
+            cv2.circle(picture, (x, y), size // 2 + 1, level, -1)
+        else:
+            cv2.rectangle(picture, (x, y), (x + size, y + int(rng.integers(3, 120))), level, -1)
+    return picture
+
+
+def _wallpaper(rng: np.random.Generator) -> np.ndarray:
+    side = int(rng.integers(30, 160))
+    tile = cv2.resize(rng.normal(128, 50, (40, 40)), (side, side))
+    return np.tile(tile, (480 // side + 1, 640 // side + 1))[:480, :640]
+
+
+def read_rigid(path: Path) -> Rigid3:
+    (matrix,) = [value for value in json.loads(path.read_text()).values() if isinstance(value, list)]
+    return Rigid3.from_matrix(np.array(matrix))
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    lines = [
+        "| recording | nodes | kB a node | localized | median error | darkened: localized | from elsewhere: accepted | ms a query |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for r in rows:
+        lines.append(
+            f"| {r['place']} | {r['nodes']} | {r['kB_per_node']:.0f} | {r['localized_percent']:g} % of {r['queries']} |"
+            f" {r['median_cm']:.2f} cm, {r['median_deg']:.3f} deg | {r['dark_percent']:g} % ({r['darker_percent']:g} %) |"
+            f" {r['accepted']} of {r['elsewhere']} | {r['median_ms']['total']:.0f} |"
+        )
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
