@@ -49,12 +49,11 @@ _STYLE: dict[Any, Any] = {
 
 
 def draw_map(answers: Sequence[Answer], topomap: TopoMetricMap) -> str:
-    """The map from above, along the two axes of largest extent: nodes, true and estimated positions, a line from one to the other."""
+    """The map from above, its longer side across: nodes, true and estimated positions, a line from one to the other."""
     centres = np.array([s.world_from_cam.translation for s in topomap.summaries])
     truths = [a.world_from_cam.translation for a in answers if a.world_from_cam is not None]
     known = np.concatenate([centres, np.array(truths).reshape(-1, 3)])
-    extent = np.ptp(known, axis=0)
-    across, up = sorted(int(axis) for axis in np.argsort(-extent, kind="stable")[:2])
+    across, up, is_mirrored = _horizontal_axes(known, np.array([s.world_from_cam.rotation[:, 1] for s in topomap.summaries]))
     axes_idx = [across, up]
     low, high = _frame(known[:, axes_idx])
     width, height = high - low
@@ -64,6 +63,8 @@ def draw_map(answers: Sequence[Answer], topomap: TopoMetricMap) -> str:
         _draw_nodes(axes, topomap, axes_idx, float(max(width, height)))
         num_outside = _draw_positions(axes, answers, axes_idx, low, high)
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel=f"{'xyz'[across]} (m)", ylabel=f"{'xyz'[up]} (m)", aspect="equal")
+        if is_mirrored:
+            axes.invert_yaxis()
         if num_outside:
             axes.set_title(f"{num_outside} false position{'s' if num_outside > 1 else ''} outside of the picture", color=BAD)
         figure.legend(loc="outside lower center", ncols=6, handletextpad=0.4, columnspacing=1.6)
@@ -81,7 +82,7 @@ def draw_error_curves(answers: Sequence[Answer]) -> str:
         _draw_curve(left, scale * np.array([a.translation_m for a in with_truth]), f"translation error ({unit.strip()})", unit)
         _draw_curve(right, np.array([a.rotation_deg for a in with_truth]), "rotation error (degrees)", "°")
         left.set(ylim=(0.0, 1.03), ylabel="queries within this error")
-        left.yaxis.set_major_formatter(PercentFormatter(1.0))
+        left.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
         return _svg(figure, "cumulative error curves")
 
 
@@ -109,8 +110,9 @@ def draw_errors_along(answers: Sequence[Answer]) -> str:
             axes.set_title(f"{title} error")
             for start in starts:
                 axes.axvline(start - 0.5, color=GREY, linewidth=0.8, linestyle=":")
-            marks = numbers[lost]
-            axes.plot(marks, np.ones(len(marks)), "|", color=BAD, transform=axes.get_xaxis_transform(), clip_on=False, markersize=8)
+            if lost.any():  # an empty line, not clipped, would upset the layout
+                marks = numbers[lost]
+                axes.plot(marks, np.ones(len(marks)), "|", color=BAD, transform=axes.get_xaxis_transform(), clip_on=False, markersize=8)
         panels[-1].set(xlabel="query" + (" (red marks: no pose)" if lost.any() else ""), xlim=(-0.5, max(len(numbers) - 0.5, 0.5)))
         return _svg(figure, "errors along the sequence")
 
@@ -141,6 +143,19 @@ def draw_stage_times(answers: Sequence[Answer]) -> str:
         axes.tick_params(axis="y", length=0, labelcolor=INK)
         axes.set(xlabel="ms a query", xlim=(0.0, 1.15 * max([*highs, *medians, 1e-3])))
         return _svg(figure, "times of the stages")
+
+
+def _horizontal_axes(points: Float[np.ndarray, "n 3"], downs: Float[np.ndarray, "m 3"]) -> tuple[int, int, bool]:
+    """The world's axes to draw across and up, and whether the latter must point down so that the map is not seen from below.
+
+    The vertical is the axis that the cameras' y agrees on; where they agree on none, that of least extent.
+    """
+    down = downs.mean(axis=0)
+    extent = np.ptp(points, axis=0)
+    vertical = int(np.argmax(np.abs(down))) if np.abs(down).max() > 0.7 else int(np.argmin(extent))
+    across, up = sorted((axis for axis in range(3) if axis != vertical), key=lambda axis: -extent[axis])
+    towards_viewer = np.cross(np.eye(3)[across], np.eye(3)[up])
+    return across, up, bool(towards_viewer @ down > 0)
 
 
 def _frame(points: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:

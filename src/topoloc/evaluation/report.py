@@ -92,7 +92,9 @@ def _cards(e: dict[str, Any]) -> str:
         cards.append(("", f"{e['median_rotation_deg']:.2f}°", "median rotation error"))
     if not e["num_queries"]:
         cards.append(("", str(e["num_elsewhere"]), "images from elsewhere"))
-    cards.append(("bad" if e["false_accepts"] else "good", str(e["false_accepts"]), "false accepts"))
+    cards.append(
+        ("bad" if e["false_accepts"] else "good", str(e["false_accepts"]), "false accept" if e["false_accepts"] == 1 else "false accepts")
+    )
     if "total" in e["median_times_ms"]:
         cards.append(("", f"{e['median_times_ms']['total']:.0f} ms", "a query, median"))
     return (
@@ -135,9 +137,7 @@ def _table(rows: list[tuple[str, str]]) -> str:
 
 
 def _map_section(answers: list[Answer], topomap: TopoMetricMap) -> str:
-    text = (
-        "Seen along the axis of least extent. A tick at a node shows where its camera looked; lines lead from true to estimated positions."
-    )
+    text = "Seen from above. A tick at a node shows where its camera looked; lines lead from true to estimated positions."
     return _section("The map from above", text, draw_map(answers, topomap))
 
 
@@ -175,10 +175,11 @@ def _query(answer: Answer, topomap: TopoMetricMap) -> str:
         evidence += f", probability {result.probability:.2f}, its own standard deviation {_length(sigma)}"
     if answer.nearest_node_id is not None and answer.nearest_node_id != node_id:
         evidence += f"; nearest to the truth is node {answer.nearest_node_id}"
+    kind = "good" if result.localized and not answer.is_false_accept else "bad"
     title = escape(f"{answer.recording}/{answer.query}" if answer.recording else answer.query)
     return (
         f'<article><div class="pictures">{_picture(_query_jpeg(answer), "query")}{template}</div>'
-        f'<div class="facts"><b>{title}</b><p class="verdict">{_verdict(answer)}</p><p>{evidence}</p></div></article>'
+        f'<div class="facts"><b>{title}</b><p class="{kind}">{_verdict(answer)}</p><p>{evidence}</p></div></article>'
     )
 
 

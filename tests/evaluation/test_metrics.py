@@ -1,0 +1,63 @@
+"""Numbers of evaluations whose answers are known."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from hand_made import answer, elsewhere, lost
+
+from topoloc.evaluation.metrics import summarize
+
+ANSWERS = [
+    answer("a", 0.0, error_m=0.01, error_deg=0.1),
+    answer("b", 0.5, error_m=0.03, error_deg=3.0),
+    answer("c", 1.0, error_m=0.2, error_deg=1.0, first_candidate=1),
+    answer("d", 1.5, error_m=0.04, error_deg=11.0),
+    answer("e", 2.0, error_m=0.6, error_deg=0.5),
+    lost("f", 2.5),
+    lost("g", 3.0, "not_in_map"),
+    lost("h", 3.5),
+]
+
+
+def test_errors_are_those_put_in():
+    assert ANSWERS[1].translation_m == pytest.approx(0.03)
+    assert ANSWERS[1].rotation_deg == pytest.approx(3.0)
+    assert [a.is_false_accept for a in ANSWERS] == [False, False, False, True, True, False, False, False]
+
+
+def test_counts_medians_and_recall():
+    evaluation = summarize(ANSWERS)
+    assert (evaluation["num_queries"], evaluation["num_localized"]) == (8, 5)
+    assert evaluation["median_translation_m"] == pytest.approx(0.04)
+    assert evaluation["median_rotation_deg"] == pytest.approx(1.0)
+    assert evaluation["recall"] == {"0.05m_5deg": 2 / 8, "0.25m_2deg": 2 / 8, "0.5m_5deg": 3 / 8, "5m_10deg": 4 / 8}
+    assert evaluation["topological_accuracy"] == 4 / 8
+    assert evaluation["false_accepts"] == 2
+    assert evaluation["not_localized"] == {"not_in_map": 1, "too_few_inliers": 2}
+    assert evaluation["num_elsewhere"] == 0
+
+
+def test_poses_for_images_from_elsewhere_are_false_and_nothing_else_changes():
+    before = summarize(ANSWERS)
+    evaluation = summarize([*ANSWERS, elsewhere("moon", accepted=True), elsewhere("mars", accepted=False)])
+    assert evaluation["num_elsewhere"] == 2
+    assert evaluation["false_accepts"] == before["false_accepts"] + 1
+    for key in ("num_queries", "num_localized", "median_translation_m", "recall", "topological_accuracy"):
+        assert evaluation[key] == before[key]
+
+
+def test_times_are_medians_over_all_queries():
+    evaluation = summarize([elsewhere("x", accepted=False), elsewhere("y", accepted=False), lost("f", 0.0)])
+    assert evaluation["median_times_ms"]["features"] == 30.0
+    assert evaluation["median_times_ms"]["total"] == 41.0
+    assert evaluation["median_times_ms"]["pnp"] == 0.0  # two of three never came so far
+
+
+@pytest.mark.parametrize("answers", [[lost("f", 0.0)], [elsewhere("moon", accepted=False)]], ids=["none localized", "no truth"])
+def test_what_is_not_known_is_null_and_never_nan(answers: list):
+    evaluation = summarize(answers)
+    assert evaluation["median_translation_m"] is None
+    assert evaluation["median_rotation_deg"] is None
+    json.dumps(evaluation, allow_nan=False)
