@@ -1,0 +1,134 @@
+"""Localizing single pictures in a map of a rendered room, whose true poses are exact."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from built_room import built_room, unseen_views
+from tiny_world import CAMERA
+from topoloc.errors import EmptyMapError, MapError, QueryError
+from topoloc.geometry.alignment import rotation_error, translation_error
+from topoloc.geometry.camera import Camera
+from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.result import Localization, NotLocalized
+from topoloc.mapping.topomap import TopoMetricMap
+
+PICTURE, TRUTH = unseen_views()[2]
+
+
+@pytest.fixture(scope="module")
+def localizer(tiny_recording: Path) -> Localizer:
+    return Localizer(built_room(tiny_recording))
+
+
+def _facts(result: Localization | NotLocalized) -> dict:
+    return {key: value for key, value in result.to_json("").items() if key != "times_ms"}
+
+
+def test_unseen_pictures_of_the_place_are_localized_within_two_centimetres(localizer: Localizer):
+    results = [(localizer.localize(picture, CAMERA), truth) for picture, truth in unseen_views()]
+    within = [
+        isinstance(result, Localization)
+        and translation_error(result.world_from_cam, truth) < 0.02
+        and rotation_error(result.world_from_cam, truth) < np.deg2rad(0.5)
+        for result, truth in results
+    ]
+    assert np.mean(within) >= 0.95
+
+
+def test_a_localization_says_what_it_stands_on(localizer: Localizer):
+    result = localizer.localize(PICTURE, CAMERA)
+    assert isinstance(result, Localization)
+    assert 12 <= result.num_inliers <= result.num_matches
+    assert 0.5 < result.probability <= 1.0
+    assert len({candidate.node_id for candidate in result.candidates}) == len(result.candidates) == localizer.config.num_candidates
+    scores = [candidate.score for candidate in result.candidates]
+    assert scores == sorted(scores, reverse=True)
+    node = localizer.topomap.summaries[result.node_id].world_from_cam
+    assert translation_error(node, TRUTH) < 0.6
+    assert result.times_ms.keys() >= {"patch_normalization", "features", "coarse", "matching", "pnp", "total"}
+    assert sum(ms for stage, ms in result.times_ms.items() if stage != "total") <= result.times_ms["total"]
+
+
+def test_the_covariance_is_one_and_of_the_size_of_the_errors(localizer: Localizer):
+    distances = []
+    for picture, truth in unseen_views():
+        result = localizer.localize(picture, CAMERA)
+        assert isinstance(result, Localization)
+        np.testing.assert_allclose(result.covariance, result.covariance.T, rtol=1e-9, atol=1e-18)
+        assert np.linalg.eigvalsh(result.covariance).min() > 0
+        xi = (truth @ result.world_from_cam.inverse()).log()  # the left perturbation that leads to the truth
+        distances.append(float(xi @ np.linalg.solve(result.covariance, xi)))
+    assert 0.05 < np.median(distances) < 30.0  # chi-square of six degrees: median 5.3
+
+
+def test_the_same_picture_gets_the_same_answer_also_from_a_fresh_localizer(localizer: Localizer):
+    first = _facts(localizer.localize(PICTURE, CAMERA))
+    assert _facts(localizer.localize(PICTURE, CAMERA)) == first
+    assert _facts(Localizer(localizer.topomap).localize(PICTURE, CAMERA)) == first
+
+
+def test_grey_and_the_same_grey_in_three_channels_get_the_same_answer(localizer: Localizer):
+    rgb = np.repeat(PICTURE[:, :, None], 3, axis=2)
+    assert _facts(localizer.localize(rgb, CAMERA)) == _facts(localizer.localize(PICTURE, CAMERA))
+
+
+def test_a_map_from_its_file_answers_as_the_one_in_memory(localizer: Localizer, tmp_path: Path):
+    localizer.topomap.save(tmp_path / "room.topo")
+    stored = Localizer(TopoMetricMap.load(tmp_path / "room.topo"))
+    one, other = localizer.localize(PICTURE, CAMERA), stored.localize(PICTURE, CAMERA)
+    assert isinstance(one, Localization)
+    assert isinstance(other, Localization)
+    assert translation_error(one.world_from_cam, other.world_from_cam) < 0.005
+
+
+@pytest.mark.parametrize("num_candidates", [1, 100])
+def test_any_number_of_candidates(num_candidates: int, localizer: Localizer):
+    result = Localizer(localizer.topomap, LocalizerConfig(num_candidates=num_candidates)).localize(PICTURE, CAMERA)
+    assert isinstance(result, Localization)
+    assert len(result.candidates) == min(num_candidates, len(localizer.topomap.nodes))
+    assert translation_error(result.world_from_cam, TRUTH) < 0.02
+
+
+@pytest.mark.parametrize(
+    "picture",
+    [
+        np.random.default_rng(0).integers(0, 256, (240, 320), dtype=np.uint8),
+        np.random.default_rng(1).integers(0, 256, (240, 320, 3), dtype=np.uint8),
+        np.zeros((240, 320), np.uint8),
+        *(picture for picture, _ in unseen_views(seed=1, step=4.0)),
+    ],
+    ids=["grey noise", "coloured noise", "black", "other world 0", "other world 1", "other world 2", "other world 3"],
+)
+def test_what_is_not_the_place_is_not_localized(picture: np.ndarray, localizer: Localizer):
+    result = localizer.localize(picture, CAMERA)
+    assert isinstance(result, NotLocalized)
+    assert result.reason in ("too_few_matches", "too_few_inliers", "not_in_map")
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 400), (400, 1), (7, 5)], ids=str)
+def test_tiny_pictures_are_not_localized(size: tuple[int, int], localizer: Localizer):
+    width, height = size
+    picture = np.random.default_rng(2).integers(0, 256, (height, width), dtype=np.uint8)
+    assert isinstance(localizer.localize(picture, Camera.pinhole(width, height, 260.0, 260.0, 0.0, 0.0)), NotLocalized)
+
+
+def test_a_camera_of_another_size_is_an_error(localizer: Localizer):
+    with pytest.raises(QueryError, match="the image is 320x240, its camera 640x480"):
+        localizer.localize(PICTURE, CAMERA.rescaled(640, 480))
+
+
+def test_a_map_without_nodes_cannot_be_asked(localizer: Localizer):
+    with pytest.raises(EmptyMapError, match="no nodes"):
+        Localizer(replace(localizer.topomap, summaries=[], nodes=[]))
+
+
+def test_an_unknown_coarse_localizer_names_those_there_are(localizer: Localizer):
+    with pytest.raises(MapError, match=r"'netvlad' \(it has: surf-vlad\)"):
+        Localizer(localizer.topomap, LocalizerConfig(coarse="netvlad"))
+    with pytest.raises(MapError, match="it has: none"):
+        Localizer(replace(localizer.topomap, coarse_models={}))

@@ -1,0 +1,59 @@
+"""The JSON of a query's result, key by key as the interface fixes it."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+
+from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.localization.result import Localization, NotLocalized
+from topoloc.places.coarse import NodeScore
+
+POSE = Rigid3(exp_so3(np.array([0.1, -0.2, 0.3])), np.array([1.0, -2.0, 0.5]))
+CANDIDATES = [NodeScore(17, 0.812345), NodeScore(3, 0.4)]
+TIMES_MS = {"features": 30.12345, "total": 60.0}
+
+
+def test_a_localization_as_json():
+    line = Localization(POSE, np.diag(np.arange(1.0, 7.0)), 0.98, 17, CANDIDATES, 212, 158, TIMES_MS).to_json("a.png")
+    assert set(line) == {
+        *("query", "localized", "world_from_cam", "covariance", "probability", "node"),
+        *("candidates", "num_matches", "num_inliers", "times_ms"),
+    }
+    assert line["query"] == "a.png"
+    assert line["localized"] is True
+    assert (line["node"], line["num_matches"], line["num_inliers"], line["probability"]) == (17, 212, 158, 0.98)
+    assert line["candidates"] == [[17, 0.8123], [3, 0.4]]
+    assert line["times_ms"] == {"features": 30.123, "total": 60.0}
+    assert line == json.loads(json.dumps(line, allow_nan=False))
+
+
+def test_the_pose_survives_json_to_the_last_digit():
+    line = json.loads(json.dumps(Localization(POSE, np.eye(6), 1.0, 0, [], 1, 1).to_json("a.png")))
+    pose = line["world_from_cam"]
+    assert pose["translation"] == [1.0, -2.0, 0.5]
+    again = Rigid3.from_quat_wxyz(np.array(pose["quat_wxyz"]), np.array(pose["translation"]))
+    np.testing.assert_allclose(again.matrix(), POSE.matrix(), atol=1e-15)
+    np.testing.assert_array_equal(line["covariance"], np.eye(6))
+
+
+def test_a_refusal_as_json_never_holds_a_pose():
+    line = NotLocalized("too_few_matches", CANDIDATES, 3, 0, TIMES_MS).to_json("wall.jpg")
+    assert set(line) == {"query", "localized", "reason", "candidates", "num_matches", "num_inliers", "times_ms"}
+    assert line["localized"] is False
+    assert line["reason"] == "too_few_matches"
+    assert json.loads(json.dumps(line)) == line
+
+
+def test_detail_is_there_only_where_there_is_more_to_say():
+    assert NotLocalized("unreadable", detail="a.png: the file is empty").to_json("a.png")["detail"] == "a.png: the file is empty"
+    assert NotLocalized("unreadable").to_json("a.png") == {
+        "query": "a.png",
+        "localized": False,
+        "reason": "unreadable",
+        "candidates": [],
+        "num_matches": 0,
+        "num_inliers": 0,
+        "times_ms": {},
+    }
