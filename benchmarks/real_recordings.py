@@ -88,7 +88,10 @@ def measure(place: Place, data: Path, queries: dict[str, list[StereoFrame]], dra
             for result, frame in zip(results, frames, strict=True)
             if result.localized and frame.world_from_cam is not None
         ]
-        dark = {gamma: np.mean([ask(localizer, frame, darkened(frame.image, gamma, i)).localized for i, frame in enumerate(frames)]) for gamma in (0.6, 1 / 0.6)}
+        dark = {
+            gamma: np.mean([ask(localizer, frame, darkened(frame.image, gamma, i)).localized for i, frame in enumerate(frames)])
+            for gamma in (0.6, 1 / 0.6)
+        }
         others = [frame for name, other in queries.items() if name[:5] != place.name[:5] for frame in other]
         camera = Camera.pinhole(640, 480, 525.0, 525.0, 319.5, 239.5)
         elsewhere = [ask(localizer, frame).localized for frame in others] + [localizer.localize(image, camera).localized for image in drawn]
@@ -143,7 +146,9 @@ def _lettering(rng: np.random.Generator) -> np.ndarray:
     for _ in range(60):
         word = "".join(chr(letter) for letter in rng.integers(65, 90, 8))
         place = (int(rng.integers(-50, 640)), int(rng.integers(0, 480)))
-        cv2.putText(picture, word, place, cv2.FONT_HERSHEY_SIMPLEX, float(rng.uniform(0.4, 3)), int(rng.uniform(0, 255)), int(rng.integers(1, 6)))
+        cv2.putText(
+            picture, word, place, cv2.FONT_HERSHEY_SIMPLEX, float(rng.uniform(0.4, 3)), int(rng.uniform(0, 255)), int(rng.integers(1, 6))
+        )
     return picture
 
 

@@ -177,7 +177,8 @@ class Localizer:
             return NotLocalized("too_few_inliers", candidates, num_matches, final.num_inliers, clock.times_ms())
         cam_from_world = final.pose.cam_from_world
         num_visible = count_visible(final.local_map, cam_from_world, camera)
-        probability = probability_of(Evidence(len(first.matches), first.num_inliers, final.num_inliers, num_visible), demanded)
+        evidence = Evidence(len(first.matches), first.num_inliers, final.num_inliers, num_visible)
+        probability = probability_of(evidence, demanded)
         if probability < demanded.min_probability:
             return NotLocalized("not_in_map", candidates, num_matches, final.num_inliers, clock.times_ms())
         node_ids = final.local_map.node_ids[final.matches.train_idx[final.pose.inliers]]
@@ -190,6 +191,7 @@ class Localizer:
             num_matches=num_matches,
             num_inliers=final.num_inliers,
             times_ms=clock.times_ms(),
+            evidence=evidence,
         )
 
     def _pooled(self, node_ids: list[int]) -> LocalMap:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.verification import Evidence
 from topoloc.places.coarse import NodeScore
 
 Reason = Literal["too_few_matches", "too_few_inliers", "ambiguous", "not_in_map", "jump", "unreadable"]
@@ -19,7 +20,7 @@ class Localization:
     """The image was taken at `world_from_cam`.
 
     `covariance` (6, 6) is that of the left perturbation of world_from_cam, order (translation, rotation), metres and
-    radians. `probability` is that of the pose being right. `node_id` is the node that most inliers come from; `times_ms`
+    radians. `probability` is that of the pose being right, weighed from `evidence`. `node_id` is the node that most inliers come from; `times_ms`
     the milliseconds of each stage.
     """
 
@@ -31,6 +32,7 @@ class Localization:
     num_matches: int
     num_inliers: int
     times_ms: dict[str, float] = field(default_factory=dict)
+    evidence: Evidence | None = None
 
     @property
     def localized(self) -> Literal[True]:
