@@ -47,10 +47,8 @@ def main() -> None:
     for place in places:
         here = names == place.name
         accepted = x[here] @ fit(x[~here], y[~here]) > 0
-        wrong, lost = np.count_nonzero(accepted & ~y[here]), np.count_nonzero(~accepted & y[here])
-        print(
-            f"fitted without {place.name}: accepts {wrong} of {np.count_nonzero(~y[here])} wrong, loses {lost} of {np.count_nonzero(y[here])} right"
-        )
+        wrong, lost, num_right = np.sum(accepted & ~y[here]), np.sum(~accepted & y[here]), np.sum(y[here])
+        print(f"fitted without {place.name}: accepts {wrong} of {np.sum(~y[here])} wrong, loses {lost} of {num_right} right")
 
 
 def poses(place: Place, data: Path, queries: dict[str, list[StereoFrame]]) -> list[tuple[list[float], bool]]:

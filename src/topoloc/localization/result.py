@@ -20,8 +20,8 @@ class Localization:
     """The image was taken at `world_from_cam`.
 
     `covariance` (6, 6) is that of the left perturbation of world_from_cam, order (translation, rotation), metres and
-    radians. `probability` is that of the pose being right, weighed from `evidence`. `node_id` is the node that most inliers come from; `times_ms`
-    the milliseconds of each stage.
+    radians. `probability` is that of the pose being right, weighed from `evidence`. `node_id` is the node that most
+    inliers come from; `times_ms` the milliseconds of each stage.
     """
 
     world_from_cam: Rigid3

@@ -11,8 +11,10 @@ import json
 import os
 import sqlite3
 import threading
+import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
@@ -53,6 +55,8 @@ def save_map(topomap: TopoMetricMap, path: Path) -> None:
     Raises:
         MapError: the folder does not exist or cannot be written, or the disk is full; nothing is left behind.
     """
+    if path.is_dir():
+        raise MapError(f"cannot write map {path}: it is a folder")
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         _write_database(topomap, temporary)
@@ -61,7 +65,8 @@ def save_map(topomap: TopoMetricMap, path: Path) -> None:
         raise MapError(f"cannot write map {path}: {error}") from error
     finally:
         for leftover in (temporary, temporary.with_name(temporary.name + "-journal")):
-            leftover.unlink(missing_ok=True)
+            with suppress(OSError):  # not there, or its folder is no folder: the error that led here says more
+                leftover.unlink()
 
 
 def _write_database(topomap: TopoMetricMap, path: Path) -> None:
@@ -125,6 +130,11 @@ def open_map(path: Path) -> TopoMetricMap:
         )
 
 
+# What SQLite, JSON, NumPy, its zip container and the types of this house say about bytes that are not what they should be.
+_NUMPY_FILE_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, OSError)
+_DAMAGE = (*_NUMPY_FILE_ERRORS, sqlite3.Error, ValueError, LookupError, TypeError, ArithmeticError, TopolocError)
+
+
 class _MapFile:
     """The open database; one reader at a time, since a query server may call from several threads."""
 
@@ -133,17 +143,18 @@ class _MapFile:
         self.lock = threading.RLock()
         _check_header(path)
         # The file is never changed in place, so SQLite needs no locks on it (and works on read-only media).
-        self.database = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True, check_same_thread=False)
+        with self.reading():
+            self.database = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True, check_same_thread=False)
 
     @contextmanager
     def reading(self) -> Iterator[None]:
         try:
             with self.lock:
                 yield
-        except TopolocError:
+        except MapError:
             raise
-        except (sqlite3.Error, ValueError, KeyError, TypeError) as error:
-            raise MapError(f"map {self.path} is damaged: {error}") from error
+        except _DAMAGE as error:
+            raise MapError(f"map {self.path} is damaged: {' '.join(str(error).split())}") from error
 
     def count(self, table: str) -> int:
         with self.reading():
@@ -156,9 +167,7 @@ class _MapFile:
             " JOIN node_templates USING (node_id) WHERE node_id = ?"
         )
         with self.reading():
-            row = self.database.execute(query, (node_id,)).fetchone()
-            if row is None:
-                raise MapError(f"map {self.path} is damaged: node {node_id} is missing")
+            row = self._one_row(query, node_id, f"node {node_id}")
             recording, name, t_ns, pose, num_points, camera, descriptor_size, *blobs, jpeg = row
             points_img = np.frombuffer(blobs[0], "<f4").reshape(num_points, 2)
             sizes, angles, responses = np.ascontiguousarray(np.frombuffer(blobs[1], "<f4").reshape(num_points, 3).T)
@@ -176,8 +185,14 @@ class _MapFile:
     def read_place_image(self, row_id: int) -> PlaceImage:
         with self.reading():
             query = "SELECT recording, name, node_id, world_from_cam, jpeg FROM place_images WHERE image_id = ?"
-            recording, name, node_id, pose, jpeg = self.database.execute(query, (row_id + 1,)).fetchone()
+            recording, name, node_id, pose, jpeg = self._one_row(query, row_id + 1, f"place image {row_id}")
             return PlaceImage(recording, name, node_id, _pose_from_bytes(pose), jpeg)
+
+    def _one_row(self, query: str, key: int, what: str) -> tuple:
+        row = self.database.execute(query, (key,)).fetchone()
+        if row is None:
+            raise MapError(f"map {self.path} is damaged: {what} is missing")
+        return row
 
 
 class _StoredRows(Sequence[T]):
@@ -274,6 +289,8 @@ def _pose_bytes(world_from_cam: Rigid3) -> bytes:
 
 def _pose_from_bytes(data: bytes) -> Rigid3:
     matrix = np.frombuffer(data, "<f8").reshape(3, 4)
+    if not np.isfinite(matrix).all():
+        raise ValueError("a pose that is not finite")
     return Rigid3(matrix[:, :3].copy(), matrix[:, 3].copy())
 
 
