@@ -1,0 +1,16 @@
+"""A map of the rendered room, built once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import topoloc
+from topoloc.mapping.topomap import TopoMetricMap
+
+
+@pytest.fixture(scope="session")
+def tiny_map(tiny_recording: Path) -> TopoMetricMap:
+    """Of every other pair of the recording; in memory."""
+    return topoloc.build_map(topoloc.open_sequence(f"{tiny_recording}@0::2"))
