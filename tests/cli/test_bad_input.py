@@ -142,6 +142,23 @@ def test_ctrl_c_in_mid_build(recording: Path, tmp_path: Path, complaint: Complai
     assert complaint("build", recording, target) == "error: interrupted; every file is as it was or whole\n"
 
 
+def test_ctrl_c_in_mid_evaluation(room_map: Path, queries: Path, tmp_path: Path, complaint: Complaint, monkeypatch: pytest.MonkeyPatch):
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("topoloc.cli.evaluate.answer_queries", interrupted)
+    files = ["--json", tmp_path / "a.json", "--report", tmp_path / "a.html"]
+    assert "interrupted" in complaint("evaluate", room_map, queries, *files)
+
+
+def test_ctrl_c_in_a_compiled_function_is_no_bug(recording: Path, tmp_path: Path, complaint: Complaint, monkeypatch: pytest.MonkeyPatch):
+    def interrupted(*_: object, **__: object) -> None:
+        raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
+
+    monkeypatch.setattr("topoloc.cli.build.build_map", interrupted)
+    assert "interrupted" in complaint("build", recording, tmp_path / "room.topo")
+
+
 def test_slam_is_not_here_yet(recording: Path, tmp_path: Path, complaint: Complaint):
     assert "SLAM is not in this version yet" in complaint("build", "--trajectory", "slam", recording, tmp_path / "room.topo")
 
@@ -211,9 +228,11 @@ def test_a_map_from_truth_that_is_no_transform(content: str, room_map: Path, que
 
 
 def test_bugs_are_not_hidden(room_map: Path, monkeypatch: pytest.MonkeyPatch):
-    def bug(*_: object) -> None:
-        raise ZeroDivisionError
+    for kind in (ZeroDivisionError, SystemError):
 
-    monkeypatch.setattr("topoloc.cli.info.describe_map", bug)
-    with pytest.raises(ZeroDivisionError):
-        main(["info", str(room_map)])
+        def bug(*_: object, kind: type[Exception] = kind) -> None:
+            raise kind
+
+        monkeypatch.setattr("topoloc.cli.info.describe_map", bug)
+        with pytest.raises(kind):
+            main(["info", str(room_map)])

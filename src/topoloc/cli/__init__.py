@@ -39,13 +39,14 @@ def _run(name: str, args: list[str]) -> int:
     try:
         import tyro
 
-        from topoloc.cli.output import UsageError
+        from topoloc.cli.output import UsageError, interruptible
 
         module = importlib.import_module(f"topoloc.cli.{name}")
         summary = COMMANDS[name]
         command = tyro.cli(module.Command, args=args, prog=f"topoloc {name}", description=summary[0].upper() + summary[1:])
         try:
-            return command.run()
+            with interruptible():
+                return command.run()
         except UsageError as error:
             _print_error(f"{error}; `topoloc {name} --help` says more")
             return 2

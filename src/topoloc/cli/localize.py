@@ -12,7 +12,7 @@ from typing import Annotated
 
 import tyro
 
-from topoloc.cli.output import UsageError, check_outputs, progress_bar, write_text
+from topoloc.cli.output import UsageError, check_outputs, interruptible, progress_bar, write_text
 from topoloc.errors import CalibrationError, QueryError, TopolocError, UnreadableImageError
 from topoloc.geometry.camera import Camera
 from topoloc.localization.localizer import Localizer, LocalizerConfig
@@ -69,7 +69,7 @@ class Command:
         answers: list[_Answer] = []
         total = sum(map(len, sequences))
         try:
-            with progress_bar() as progress:
+            with interruptible(), progress_bar() as progress:
                 for answer in self._answers(localizer, sequences, camera):
                     answers.append(answer)
                     as_json = self.json == "-"

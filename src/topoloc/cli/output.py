@@ -43,6 +43,20 @@ def check_outputs(outputs: Sequence[str | None], inputs: Sequence[str] = ()) -> 
 
 
 @contextmanager
+def interruptible() -> Iterator[None]:
+    """Ctrl-C inside a compiled function comes out of it as a SystemError; here it becomes the KeyboardInterrupt that it was."""
+    try:
+        yield
+    except SystemError as error:
+        cause: BaseException | None = error
+        while cause is not None:
+            if isinstance(cause, KeyboardInterrupt):
+                raise KeyboardInterrupt from error
+            cause = cause.__cause__ or cause.__context__
+        raise
+
+
+@contextmanager
 def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
     """A callable (stage, done, total) that draws one bar a stage where stderr is a terminal, and nothing elsewhere."""
     if not sys.stderr.isatty():
