@@ -55,7 +55,7 @@ def save_map(topomap: TopoMetricMap, path: Path) -> None:
     Raises:
         MapError: the folder does not exist or cannot be written, or the disk is full; nothing is left behind.
     """
-    if path.is_dir():
+    if os.path.isdir(path):  # Path.is_dir raises for names that are too long
         raise MapError(f"cannot write map {path}: it is a folder")
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:

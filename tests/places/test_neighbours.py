@@ -1,0 +1,35 @@
+"""Search among place vectors, and the nodes it names."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from topoloc.places.neighbours import PlaceIndex
+
+
+def unit(array: np.ndarray) -> np.ndarray:
+    return (array / np.linalg.norm(array, axis=-1, keepdims=True)).astype(np.float32)
+
+
+@settings(deadline=None)  # the first call compiles
+@given(st.integers(1, 60), st.integers(1, 12), st.integers(1, 70), st.integers(0, 2**32 - 1))
+def test_ranking_is_that_of_each_nodes_best_image(num_images: int, num_nodes: int, num_candidates: int, seed: int):
+    rng = np.random.default_rng(seed)
+    vectors, node_ids = unit(rng.standard_normal((num_images, 16))), rng.integers(0, num_nodes, num_images)
+    query = unit(rng.standard_normal(16))
+    ranking = PlaceIndex(vectors, node_ids).rank_nodes(query, num_candidates)
+    similarities = vectors.astype(np.float64) @ query
+    best = {int(node): similarities[node_ids == node].max() for node in np.unique(node_ids)}
+    assert len(ranking) == min(num_candidates, len(best))
+    assert [score.score for score in ranking] == pytest.approx(sorted(best.values(), reverse=True)[: len(ranking)], abs=1e-5)
+    assert [score.score for score in ranking] == pytest.approx([best[score.node_id] for score in ranking], abs=1e-5)
+
+
+def test_a_node_of_many_images_does_not_hide_the_others():
+    vectors = unit(np.vstack([np.ones((500, 8)), np.eye(8)]))
+    node_ids = np.concatenate([np.zeros(500, np.int64), np.arange(1, 9)])
+    ranking = PlaceIndex(vectors, node_ids).rank_nodes(unit(np.ones(8)), 5)
+    assert [score.node_id for score in ranking] == [0, 1, 2, 3, 4]
