@@ -78,9 +78,7 @@ def main() -> None:
         made_up_map(num_nodes).save(path)
         print(f"write      {time.perf_counter() - start:8.2f} s")
         num_bytes = path.stat().st_size
-        print(
-            f"size       {num_bytes / 1e6:8.1f} MB for {num_nodes} nodes of {NUM_POINTS} points: {num_bytes / num_nodes / 1e3:.1f} KB a node"
-        )
+        print(f"size       {num_bytes / 1e6:8.1f} MB, {num_bytes / num_nodes / 1e3:.1f} KB a node of {NUM_POINTS} points")
         print(f"open       {shortest_ms(lambda: TopoMetricMap.load(path)):8.2f} ms")
         print(f"localizer  {shortest_ms(lambda: Localizer(TopoMetricMap.load(path))):8.2f} ms, opening included")
         topomap = TopoMetricMap.load(path)
