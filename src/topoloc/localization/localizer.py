@@ -206,7 +206,7 @@ class Localizer:
         return self._local_maps[node_id]
 
 
-def _reduced(image: Image, camera: Camera, max_side_px: int) -> tuple[Image, Camera]:
+def _reduced(image: Image, camera: Camera, max_side_px: int) -> tuple[np.ndarray, Camera]:
     """The image with its camera, smaller where a side is longer than `max_side_px`."""
     height, width = image.shape[:2]
     scale = max_side_px / max(width, height)
