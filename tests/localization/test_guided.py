@@ -1,0 +1,99 @@
+"""Guided matching on map points and key points made by hand, and the weighing of evidence."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from topoloc.features.features import Features
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.localization.guided import GuidedConfig, count_visible, match_guided
+from topoloc.localization.local_map import LocalMap
+from topoloc.localization.verification import Evidence, VerificationConfig, probability_of
+from topoloc.mapping.topomap import NodeSummary, TopoNode
+
+CAMERA = Camera.pinhole(640, 480, 500.0, 500.0, 320.0, 240.0)
+NUM_POINTS = 200
+
+
+def _node(rng: np.random.Generator) -> TopoNode:
+    """A node at the origin of the world with points on a wall and beside it, each with a descriptor of its own."""
+    pixels = rng.uniform([40, 40], [600, 440], (NUM_POINTS, 2))
+    depth = rng.uniform(2.0, 4.0, NUM_POINTS)
+    points_cam = np.column_stack([CAMERA.normalized_from_img(pixels) * depth[:, None], depth]).astype(np.float32)
+    descriptors = rng.normal(size=(NUM_POINTS, 64)).astype(np.float32)
+    descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+    angles, sizes = rng.uniform(0, 6.2, NUM_POINTS).astype(np.float32), rng.uniform(10, 40, NUM_POINTS).astype(np.float32)
+    features = Features(pixels.astype(np.float32), sizes, angles, np.ones(NUM_POINTS, np.float32), descriptors)
+    root = np.tile(np.array([0.005, 0, 0.005, 0, 0, 0.02], np.float32), (NUM_POINTS, 1))
+    return TopoNode(NodeSummary(0, "made", "0", 0, Rigid3.identity(), NUM_POINTS), CAMERA, features, points_cam, root, b"")
+
+
+def _seen(node: TopoNode, cam_from_world: Rigid3, shift_px: float = 0.0, turn: float = 0.0, scale: float = 1.0) -> Features:
+    """The node's points as a camera elsewhere sees them, a camera rolled by the rotation about its axis."""
+    points = cam_from_world.apply(node.points_cam.astype(np.float64))
+    roll = np.arctan2(cam_from_world.rotation[1, 0], cam_from_world.rotation[0, 0])
+    f = node.features
+    sizes = f.sizes_px * (node.points_cam[:, 2] / points[:, 2]) * scale
+    pixels = CAMERA.img_from_cam(points) + np.array([shift_px, 0.0])
+    return Features(
+        pixels.astype(np.float32), sizes.astype(np.float32), (f.angles + roll + turn).astype(np.float32), f.responses, f.descriptors
+    )
+
+
+POSES = [
+    Rigid3(np.eye(3), np.array([0.1, -0.05, 0.3])),
+    Rigid3(exp_so3(np.array([0.0, 0.0, np.pi / 2])), np.zeros(3)),  # rolled onto its side
+]
+
+
+@pytest.mark.parametrize("cam_from_world", POSES)
+def test_every_point_in_view_is_matched_with_itself(cam_from_world: Rigid3):
+    node = _node(np.random.default_rng(0))
+    local_map = LocalMap.of_node(node)
+    matches = match_guided(_seen(node, cam_from_world), local_map, cam_from_world, CAMERA, GuidedConfig())
+    num_visible = count_visible(local_map, cam_from_world, CAMERA)
+    assert num_visible > 100
+    assert len(matches) > 0.95 * num_visible
+    assert np.array_equal(matches.query_idx, matches.train_idx)
+
+
+@pytest.mark.parametrize("wrong", [{"shift_px": 25.0}, {"turn": 1.2}, {"scale": 2.0}])
+def test_what_is_elsewhere_or_turned_or_of_another_size_is_no_match(wrong: dict[str, float]):
+    node = _node(np.random.default_rng(1))
+    matches = match_guided(_seen(node, POSES[0], **wrong), LocalMap.of_node(node), POSES[0], CAMERA, GuidedConfig())
+    assert len(matches) < 0.03 * NUM_POINTS
+
+
+def test_a_key_point_is_matched_once_though_two_nodes_hold_it():
+    node = _node(np.random.default_rng(2))
+    twice = LocalMap.pooled([LocalMap.of_node(node), LocalMap.of_node(node)])
+    matches = match_guided(_seen(node, POSES[0]), twice, POSES[0], CAMERA, GuidedConfig())
+    assert len(set(matches.query_idx.tolist())) == len(matches) > 100
+
+
+def test_nothing_is_visible_behind_the_camera():
+    local_map = LocalMap.of_node(_node(np.random.default_rng(3)))
+    backwards = Rigid3(exp_so3(np.array([0.0, np.pi, 0.0])), np.zeros(3))
+    assert count_visible(local_map, backwards, CAMERA) == 0
+
+
+counts = st.integers(0, 2000)
+
+
+@given(counts, counts, counts, counts)
+def test_more_found_is_never_less_probable(num_matches: int, num_inliers: int, num_found: int, num_visible: int):
+    config = VerificationConfig()
+    weak = probability_of(Evidence(num_matches, num_inliers, num_found, num_visible), config)
+    strong = probability_of(Evidence(num_matches, num_inliers, num_found + 1, num_visible), config)
+    fewer_missing = probability_of(Evidence(num_matches, num_inliers, num_found, num_visible + 50), config)
+    assert 0.0 <= fewer_missing <= weak <= strong <= 1.0
+
+
+def test_many_found_of_very_many_that_should_be_is_still_improbable():
+    """What peers accept: scores of inliers, though nearly all that the pose predicts is missing."""
+    assert probability_of(Evidence(num_matches=40, num_inliers=6, num_found=70, num_visible=2000), VerificationConfig()) < 0.5
+    assert probability_of(Evidence(num_matches=150, num_inliers=90, num_found=300, num_visible=1700), VerificationConfig()) > 0.95
