@@ -120,10 +120,11 @@ def _decode(path: Path) -> np.ndarray:
 @contextmanager
 def _opencv_silent() -> Iterator[None]:
     """No OpenCV messages on stderr: types that are checked only by decoding make it write there about every broken file."""
+    logging = getattr(cv2.utils, "logging", cv2)  # OpenCV 4 has these functions in its own name space
     with _LOG_LEVEL_LOCK:
-        level = cv2.utils.logging.getLogLevel()
-        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        level = logging.getLogLevel()
+        logging.setLogLevel(0)
         try:
             yield
         finally:
-            cv2.utils.logging.setLogLevel(level)
+            logging.setLogLevel(level)
