@@ -9,8 +9,9 @@ from concurrent.futures import ThreadPoolExecutor
 
 
 @functools.cache
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="bands")
+def _pool(process_id: int) -> ThreadPoolExecutor:
+    """The threads of this process; a forked child inherits the pool but not its threads, and would wait for them forever."""
+    return ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix=f"bands-{process_id}")
 
 
 def run_in_bands(run: Callable[[int, int], object], num_rows: int, num_threads: int) -> None:
@@ -20,7 +21,8 @@ def run_in_bands(run: Callable[[int, int], object], num_rows: int, num_threads: 
     """
     num_bands = max(1, min(num_threads, num_rows))
     borders = [num_rows * band // num_bands for band in range(num_bands + 1)]
-    others = [_pool().submit(run, borders[band], borders[band + 1]) for band in range(1, num_bands)]
+    pool = _pool(os.getpid())
+    others = [pool.submit(run, borders[band], borders[band + 1]) for band in range(1, num_bands)]
     run(0, borders[1])
     for other in others:
         other.result()
