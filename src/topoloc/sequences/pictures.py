@@ -11,6 +11,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -120,7 +121,7 @@ def _decode(path: Path) -> np.ndarray:
 @contextmanager
 def _opencv_silent() -> Iterator[None]:
     """No OpenCV messages on stderr: types that are checked only by decoding make it write there about every broken file."""
-    logging = getattr(cv2.utils, "logging", cv2)  # OpenCV 4 has these functions in its own name space
+    logging: Any = getattr(cv2.utils, "logging", cv2)  # OpenCV 4 has these functions in its own name space
     with _LOG_LEVEL_LOCK:
         level = logging.getLogLevel()
         logging.setLogLevel(0)
