@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_recordings import assert_same_pose, kitti_row, pose, tum_line
 
-from topoloc.errors import TrajectoryError
+from topoloc.errors import TopolocError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.open import open_sequence
 from topoloc.sequences.trajectory import Trajectory, poses_at, read_trajectory, with_trajectory, write_kitti, write_tum
@@ -62,7 +62,7 @@ def test_writing_replaces_the_file_or_leaves_it(tmp_path: Path):
     assert path.read_text() == "old"
     write_tum(path, Trajectory([pose(0)], [7]))
     assert read_trajectory(path).t_ns == [7]
-    with pytest.raises(TrajectoryError, match="cannot be written"):
+    with pytest.raises(TopolocError, match="cannot write"):
         write_kitti(tmp_path / "nowhere" / "a.txt", Trajectory([pose(0)]))
 
 

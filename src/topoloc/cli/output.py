@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from topoloc.errors import TopolocError
+from topoloc.sequences.atomic import write_text
 
 
 class UsageError(TopolocError):
@@ -90,18 +91,6 @@ def print_facts(facts: Sequence[tuple[str, str]]) -> None:
     width = max(len(name) for name, _ in facts)
     for name, value in facts:
         print(f"{name:<{width}}  {value}".rstrip())
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a result file at once or not at all. Raises TopolocError."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, path)
-    except OSError as error:
-        raise TopolocError(f"cannot write {path}: {error.strerror}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def write_json(path: str | None, data: Any) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-import os
 from collections.abc import Sequence
 from html import escape
 from importlib import resources
@@ -14,11 +13,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from topoloc.errors import TopolocError, UnreadableImageError
+from topoloc.errors import UnreadableImageError
 from topoloc.evaluation.figures import draw_error_curves, draw_errors_along, draw_map, draw_stage_times
 from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION, Answer
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.sequences.atomic import write_text
 from topoloc.sequences.frame import Image
 
 NUM_WORST = 6
@@ -34,15 +34,7 @@ def write_report(path: Path, evaluation: dict[str, Any], answers: list[Answer], 
     Raises:
         TopolocError: the file cannot be written.
     """
-    page = _page(evaluation, answers, topomap)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_text(page, encoding="utf-8")
-        os.replace(part, path)
-    except OSError as error:
-        raise TopolocError(f"cannot write {path}: {error.strerror}") from error
-    finally:
-        part.unlink(missing_ok=True)
+    write_text(path, _page(evaluation, answers, topomap))
 
 
 def worst_queries(answers: Sequence[Answer], count: int = NUM_WORST) -> list[Answer]:

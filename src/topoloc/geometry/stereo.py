@@ -60,6 +60,18 @@ def points_from_depth(points_img: Float[np.ndarray, "n 2"], depth: Float[np.ndar
     return np.column_stack([camera.normalized_from_img(points_img) * z[:, None], z])
 
 
+def depth_sigmas_of_disparity(
+    depth: Float[np.ndarray, " n"], sigma_disparity_px: Float[np.ndarray, " n"], rig: StereoRig
+) -> Float[np.ndarray, " n"]:
+    """Standard deviation (m) of stereo depth (m), to first order: ``z^2 / (f b)`` times that of the disparity."""
+    return depth**2 / (rig.left.fx * rig.baseline) * sigma_disparity_px
+
+
+def depth_sigmas(depth: Float[np.ndarray, " n"], noise: DepthNoise) -> Float[np.ndarray, " n"]:
+    """Standard deviation (m) of measured depth (m)."""
+    return noise.constant + noise.quadratic * (depth - noise.offset) ** 2
+
+
 def covariances_from_disparity(
     points_cam: Float[np.ndarray, "n 3"], rig: StereoRig, noise: StereoNoise | None = None
 ) -> Float[np.ndarray, "n 3 3"]:
@@ -69,7 +81,7 @@ def covariances_from_disparity(
     power of depth (Matthies and Shafer, *Error modeling in stereo navigation*, 1987).
     """
     noise = noise or StereoNoise()
-    sigma_z = points_cam[:, 2] ** 2 / (rig.left.fx * rig.baseline) * noise.sigma_disparity_px
+    sigma_z = depth_sigmas_of_disparity(points_cam[:, 2], np.full(len(points_cam), noise.sigma_disparity_px), rig)
     return ray_covariances(points_cam, sigma_z, rig.left, np.full(len(points_cam), noise.sigma_px))
 
 
@@ -78,7 +90,7 @@ def covariances_from_depth(
 ) -> Float[np.ndarray, "n 3 3"]:
     """Covariances (m^2) of points of the camera frame that a depth sensor measured, to first order."""
     noise = noise or DepthNoise()
-    sigma_z = noise.constant + noise.quadratic * (points_cam[:, 2] - noise.offset) ** 2
+    sigma_z = depth_sigmas(points_cam[:, 2], noise)
     return ray_covariances(points_cam, sigma_z, camera, np.full(len(points_cam), noise.sigma_px))
 
 

@@ -39,7 +39,7 @@ class Localization:
         return True
 
     def to_json(self, query: str) -> dict[str, Any]:
-        """One line of the result file, see docs/results.md."""
+        """One line of the result file, see docs/cli.md."""
         pose = {"translation": self.world_from_cam.translation.tolist(), "quat_wxyz": self.world_from_cam.quat_wxyz().tolist()}
         return {
             "query": query,
@@ -68,7 +68,7 @@ class NotLocalized:
         return False
 
     def to_json(self, query: str) -> dict[str, Any]:
-        """One line of the result file, see docs/results.md."""
+        """One line of the result file, see docs/cli.md."""
         line = {"query": query, "localized": False, "reason": self.reason, **_evidence_json(self)}
         return line | ({"detail": self.detail} if self.detail else {})
 

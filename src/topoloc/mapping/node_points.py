@@ -17,7 +17,14 @@ from jaxtyping import Bool, Float
 
 from topoloc.errors import RecordingError
 from topoloc.features.features import Features
-from topoloc.geometry.stereo import DepthNoise, points_from_depth, points_from_disparity, ray_covariances
+from topoloc.geometry.stereo import (
+    DepthNoise,
+    depth_sigmas,
+    depth_sigmas_of_disparity,
+    points_from_depth,
+    points_from_disparity,
+    ray_covariances,
+)
 from topoloc.mapping.epipolar_kernels import match_along_rows
 from topoloc.mapping.views import MappingView
 
@@ -93,8 +100,7 @@ def _from_stereo(
     )
     sigma = np.hypot(sigma.astype(np.float64), config.min_sigma_disparity_px)
     points_cam = points_from_disparity(features.points_img.astype(np.float64), disparity.astype(np.float64), view.rig)
-    sigma_z = points_cam[:, 2] ** 2 / (view.rig.left.fx * view.rig.baseline) * sigma
-    return points_cam, sigma_z
+    return points_cam, depth_sigmas_of_disparity(points_cam[:, 2], sigma, view.rig)
 
 
 def _from_depth(
@@ -103,9 +109,7 @@ def _from_depth(
     assert view.depth is not None
     depth = _smooth_depth(view.depth, features.points_img, config.max_depth_step)
     points_cam = points_from_depth(features.points_img.astype(np.float64), depth, view.camera)
-    noise = DepthNoise()
-    sigma_z = noise.constant + noise.quadratic * (points_cam[:, 2] - noise.offset) ** 2
-    return points_cam, sigma_z
+    return points_cam, depth_sigmas(points_cam[:, 2], DepthNoise())
 
 
 def _smooth_depth(depth: np.ndarray, points_img: np.ndarray, max_step: float) -> Float[np.ndarray, " n"]:

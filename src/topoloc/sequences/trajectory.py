@@ -8,7 +8,6 @@ Both are world_from_cam, in metres.
 from __future__ import annotations
 
 import bisect
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
@@ -18,6 +17,7 @@ import numpy as np
 
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.rigid import Rigid3
+from topoloc.sequences.atomic import write_text
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.recording import SequenceView
 from topoloc.sequences.text_rows import NANOSECONDS, parse_times, read_rows
@@ -76,7 +76,8 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
     """Write a TUM file, atomically.
 
     Raises:
-        TrajectoryError: the trajectory has no times, or the file cannot be written.
+        TrajectoryError: the trajectory has no times.
+        TopolocError: the file cannot be written.
     """
     if trajectory.t_ns is None:
         raise TrajectoryError(f"{path}: a TUM file needs times, and these poses have none")
@@ -84,17 +85,17 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
     for t_ns, pose in zip(trajectory.t_ns, trajectory.world_from_cam, strict=True):
         w, x, y, z = pose.quat_wxyz()
         lines.append(" ".join([f"{Decimal(t_ns).scaleb(-9):.9f}", *(f"{value:.12g}" for value in (*pose.translation, x, y, z, w))]))
-    _write_atomically(path, lines)
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def write_kitti(path: Path, trajectory: Trajectory) -> None:
     """Write KITTI rows, atomically.
 
     Raises:
-        TrajectoryError: the file cannot be written.
+        TopolocError: the file cannot be written.
     """
     rows = (pose.matrix()[:3].ravel() for pose in trajectory.world_from_cam)
-    _write_atomically(path, [" ".join(f"{value:.12e}" for value in row) for row in rows])
+    write_text(path, "\n".join([" ".join(f"{value:.12e}" for value in row) for row in rows]) + "\n")
 
 
 def poses_at(trajectory: Trajectory, t_ns: Sequence[int], max_gap: float = 0.2) -> list[Rigid3 | None]:
@@ -172,13 +173,3 @@ def _pose(path: Path, line: int, make: Callable[[], Rigid3]) -> Rigid3:
         return make()
     except TrajectoryError as error:
         raise TrajectoryError(f"{path}, line {line}: {error}") from None
-
-
-def _write_atomically(path: Path, lines: list[str]) -> None:
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
-        os.replace(part, path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise TrajectoryError(f"{path}: cannot be written ({error.strerror})") from None
