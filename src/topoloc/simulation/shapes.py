@@ -1,0 +1,108 @@
+"""Meshes to build places from: panels, boxes, prisms, tubes; moved, turned and joined."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float64
+
+from topoloc.simulation.scene import Mesh
+
+Vector = Sequence[float] | Float64[np.ndarray, "3"]
+
+
+def panel(corner: Vector, across: Vector, down: Vector, repeat: tuple[float, float] = (1.0, 1.0)) -> Mesh:
+    """A parallelogram seen by who looks at it with `across` to the right and `down` downwards; `corner` is its top left.
+
+    Args:
+        repeat: how often the picture is repeated across and down.
+    """
+    origin, x, y = (np.asarray(v, dtype=np.float64) for v in (corner, across, down))
+    vertices = np.stack([origin, origin + y, origin + x + y, origin + x])
+    uv = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 1.0], [1.0, 0.0]]) * np.asarray(repeat)
+    return Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]], np.int32), uv)
+
+
+def box(low: Vector, high: Vector, texels: float | None = None, faces: str = "nsewtb") -> Mesh:
+    """An axis-aligned box. Each face carries the whole picture, upright on the four sides.
+
+    Args:
+        texels: repeats of the picture per metre instead, the same on all faces.
+        faces: which of north (+y), south (-y), east (+x), west (-x), top and bottom there are.
+    """
+    x0, y0, z0 = (float(v) for v in low)
+    x1, y1, z1 = (float(v) for v in high)
+    w, d, h = x1 - x0, y1 - y0, z1 - z0
+    sides = {
+        "n": ((x1, y1, z1), (-w, 0, 0), (0, 0, -h)),
+        "s": ((x0, y0, z1), (w, 0, 0), (0, 0, -h)),
+        "e": ((x1, y0, z1), (0, d, 0), (0, 0, -h)),
+        "w": ((x0, y1, z1), (0, -d, 0), (0, 0, -h)),
+        "t": ((x0, y1, z1), (w, 0, 0), (0, -d, 0)),
+        "b": ((x0, y0, z0), (w, 0, 0), (0, d, 0)),
+    }
+    panels = []
+    for face in faces:
+        corner, across, down = sides[face]
+        repeat = (1.0, 1.0) if texels is None else (texels * float(np.linalg.norm(across)), texels * float(np.linalg.norm(down)))
+        panels.append(panel(corner, across, down, repeat))
+    return join(panels)
+
+
+def prism(outline: Sequence[Sequence[float]] | Float64[np.ndarray, "n 2"], low: float, high: float, texels: float | None = None) -> Mesh:
+    """A convex outline (x, y), counter-clockwise from above, raised from z `low` to `high`; the picture goes round the sides."""
+    corners = np.asarray(outline, dtype=np.float64)
+    around = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1))])
+    scale_u, scale_v = (1.0 / around[-1], 1.0) if texels is None else (texels, texels * (high - low))
+    walls = []
+    for i in range(len(corners)):
+        a, b = corners[i], corners[(i + 1) % len(corners)]
+        wall = panel((*a, high), (*(b - a), 0.0), (0.0, 0.0, low - high))
+        u0, u1 = around[i] * scale_u, around[i + 1] * scale_u
+        walls.append(Mesh(wall.vertices, wall.faces, np.array([[u0, 0.0], [u0, scale_v], [u1, scale_v], [u1, 0.0]])))
+    fan = np.array([[0, i, i + 1] for i in range(1, len(corners) - 1)], np.int32)
+    size = np.maximum(np.ptp(corners, axis=0), 1e-9)
+    uv = (corners - corners.min(axis=0)) / size if texels is None else corners * texels
+    top = Mesh(np.column_stack([corners, np.full(len(corners), high)]), fan, uv)
+    bottom = Mesh(np.column_stack([corners, np.full(len(corners), low)]), fan[:, ::-1].copy(), uv)
+    return join([*walls, top, bottom])
+
+
+def cylinder(centre: Sequence[float], radius: float, low: float, high: float, num_sides: int = 16) -> Mesh:
+    """An upright cylinder of `num_sides` flat sides around (x, y)."""
+    angles = np.arange(num_sides) * (2 * np.pi / num_sides)
+    return prism(np.asarray(centre) + radius * np.column_stack([np.cos(angles), np.sin(angles)]), low, high)
+
+
+def tube(start: Vector, end: Vector, radius: float, num_sides: int = 8) -> Mesh:
+    """A rod from one point to another, without caps; the picture goes round it."""
+    a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
+    along = (b - a) / np.linalg.norm(b - a)
+    side = np.cross(along, [0.0, 0.0, 1.0] if abs(along[2]) < 0.9 else [1.0, 0.0, 0.0])
+    side /= np.linalg.norm(side)
+    angles = np.arange(num_sides + 1) * (2 * np.pi / num_sides)
+    ring = radius * (np.outer(np.cos(angles), side) + np.outer(np.sin(angles), np.cross(along, side)))
+    n = num_sides + 1
+    i = np.arange(num_sides)
+    faces = np.concatenate([np.column_stack([i, i + 1, n + i + 1]), np.column_stack([i, n + i + 1, n + i])])
+    u = np.linspace(0.0, 1.0, n)
+    uv = np.concatenate([np.column_stack([u, np.ones(n)]), np.column_stack([u, np.zeros(n)])])
+    return Mesh(np.concatenate([a + ring, b + ring]), faces.astype(np.int32), uv)
+
+
+def join(meshes: Sequence[Mesh]) -> Mesh:
+    """Several meshes as one."""
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    return Mesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.faces + np.int32(start) for mesh, start in zip(meshes, starts, strict=False)]).astype(np.int32),
+        np.concatenate([mesh.uv for mesh in meshes]),
+    )
+
+
+def placed(mesh: Mesh, at: Vector, yaw: float = 0.0) -> Mesh:
+    """The mesh turned about the z axis by `yaw` (radians, counter-clockwise from above), then moved by `at`."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return Mesh(mesh.vertices @ rotation.T + np.asarray(at, dtype=np.float64), mesh.faces, mesh.uv)
