@@ -1,13 +1,15 @@
-"""Meshes to build places from: panels, boxes, prisms, tubes; moved, turned and joined."""
+"""Meshes to build places from: panels, boxes, prisms, tubes, turned shapes; moved, turned and joined."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float64
 
-from topoloc.simulation.scene import Mesh
+from topoloc.simulation.scene import Mesh, Surface
 
 Vector = Sequence[float] | Float64[np.ndarray, "3"]
 
@@ -106,3 +108,38 @@ def placed(mesh: Mesh, at: Vector, yaw: float = 0.0) -> Mesh:
     c, s = np.cos(yaw), np.sin(yaw)
     rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     return Mesh(mesh.vertices @ rotation.T + np.asarray(at, dtype=np.float64), mesh.faces, mesh.uv)
+
+
+def lathe(profile: Sequence[tuple[float, float]], num_sides: int = 16) -> Mesh:
+    """A profile of (radius, z), from below to above on the outside, turned about the z axis; the picture goes round it once."""
+    rings = np.asarray(profile, dtype=np.float64)
+    angles = np.linspace(0.0, 2 * np.pi, num_sides + 1)
+    circle = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(num_sides + 1)])
+    vertices = np.concatenate([radius * circle + [0.0, 0.0, z] for radius, z in rings])
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(rings, axis=0), axis=1))])
+    u = np.linspace(0.0, 1.0, num_sides + 1)
+    uv = np.concatenate([np.column_stack([u, np.full(num_sides + 1, 1.0 - a / along[-1])]) for a in along])
+    i = np.arange(num_sides)
+    faces = []
+    for ring in range(len(rings) - 1):
+        a, b = ring * (num_sides + 1), (ring + 1) * (num_sides + 1)
+        faces += [np.column_stack([a + i, a + i + 1, b + i + 1]), np.column_stack([a + i, b + i + 1, b + i])]
+    return Mesh(vertices, np.concatenate(faces).astype(np.int32), uv)
+
+
+def bent_tube(points: Sequence[Vector], radius: float, num_sides: int = 6) -> Mesh:
+    """A cable or pipe through the points."""
+    return join([tube(a, b, radius, num_sides) for a, b in itertools.pairwise(points)])
+
+
+def turned(mesh: Mesh, axis: Vector, angle: float) -> Mesh:
+    """The mesh turned about an axis through the origin (right-handed, radians)."""
+    x, y, z = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    rotation = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
+    return Mesh(mesh.vertices @ rotation.T, mesh.faces, mesh.uv)
+
+
+def surfaces_placed(surfaces: Sequence[Surface], at: Vector, yaw: float = 0.0) -> list[Surface]:
+    """A thing of several surfaces put where it stands, as `placed` does it."""
+    return [replace(surface, mesh=placed(surface.mesh, at, yaw)) for surface in surfaces]
