@@ -28,9 +28,9 @@ from topoloc.features.surf import SurfConfig, extract_surf
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.rigid import Rigid3
-from topoloc.mapping.node_points import NodePointsConfig, locate_points
 from topoloc.mapping.views import MappingView, mapping_view
 from topoloc.sequences.open import open_sequence
+from topoloc.slam.metric_points import MetricPointsConfig, locate_points
 
 KITCHEN, ZED = "seven_scenes/kitchen/seq-01", "zed_lab/session{}"
 # recording and frame of the map picture, of the query
@@ -145,7 +145,7 @@ def make_pair(args: Args, number: int) -> Pair:
 
 def matched(features_map: Features, features_query: Features, mapped: MappingView) -> tuple[np.ndarray, np.ndarray]:
     """Map points (metres, the map picture's camera frame) and the query's pixels that they are matched with."""
-    located = locate_points(features_map, mapped, NodePointsConfig())
+    located = locate_points(features_map, mapped, MetricPointsConfig())
     rows = np.flatnonzero(located.valid)
     matches = match_features(features_query.descriptors, features_map.descriptors[rows], MatchingConfig())
     return located.points_cam[rows[matches.train_idx]], features_query.points_img[matches.query_idx].astype(np.float64)

@@ -20,9 +20,9 @@ import tyro
 from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.matching import MatchingConfig, match_features, match_pooled
 from topoloc.geometry.absolute_pose import estimate_absolute_pose
-from topoloc.mapping.node_points import NodePointsConfig, locate_points
 from topoloc.mapping.views import mapping_view
 from topoloc.sequences.open import open_sequence
+from topoloc.slam.metric_points import MetricPointsConfig, locate_points
 
 Rule = Callable[[np.ndarray, "Pool", float], tuple[np.ndarray, np.ndarray]]
 
@@ -88,7 +88,7 @@ def main(args: Args) -> None:
     for node_id in range(0, len(sequence), 10):
         view = mapping_view(sequence[node_id])
         features = extract_features(view.grey, config)
-        located = locate_points(features, view, NodePointsConfig())
+        located = locate_points(features, view, MetricPointsConfig())
         rows = np.flatnonzero(located.valid)
         sigmas = np.sqrt(np.trace(located.covariances[rows], axis1=1, axis2=2))
         points_world = view.world_from_cam.apply(located.points_cam[rows])

@@ -20,12 +20,12 @@ from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.landmarks import LandmarkConfig, Observations, observe_points, refine_points
-from topoloc.mapping.node_points import NodePointsConfig, keypoint_sigmas, locate_points
 from topoloc.mapping.nodes import NodeConfig, NodePoses, node_distances, place_nodes
 from topoloc.mapping.topomap import Edge, NodeSummary, PlaceImage, TopoMetricMap, TopoNode
 from topoloc.mapping.views import MappingView, mapping_view
 from topoloc.places.vlad import SurfVlad, VladConfig, learn_words, vlad
 from topoloc.sequences.frame import Image, StereoSequence
+from topoloc.slam.metric_points import MetricPointsConfig, keypoint_sigmas, locate_points
 
 Progress = Callable[[str, int, int], None]
 """Called with a stage's name, steps done and steps in all."""
@@ -37,7 +37,7 @@ class BuildConfig:
 
     nodes: NodeConfig = field(default_factory=NodeConfig)
     features: FeatureConfig = field(default_factory=FeatureConfig)
-    points: NodePointsConfig = field(default_factory=NodePointsConfig)
+    points: MetricPointsConfig = field(default_factory=MetricPointsConfig)
     landmarks: LandmarkConfig = field(default_factory=LandmarkConfig)
     vlad: VladConfig = field(default_factory=VladConfig)
     max_node_points: int = 800

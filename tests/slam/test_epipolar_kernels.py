@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from topoloc.mapping.epipolar_kernels import match_along_rows
-from topoloc.mapping.node_points import NodePointsConfig
+from topoloc.slam.epipolar_kernels import match_along_rows
+from topoloc.slam.metric_points import MetricPointsConfig
 
 WIDTH, HEIGHT = 320, 200
 
@@ -65,7 +65,7 @@ def test_disparity_is_unbiased_and_as_precise_as_it_says(plane: tuple[float, flo
     if plane[1:] == (0.0, 0.0):
         assert 0.5 < in_sigmas < 2.0
     else:  # a slanted window fits no other one exactly, which its own residuals show in part only: this is what the floor is for
-        assert 1.4826 * np.median(np.abs(errors / np.hypot(sigmas[found], NodePointsConfig().min_sigma_disparity_px))) < 1.0
+        assert 1.4826 * np.median(np.abs(errors / np.hypot(sigmas[found], MetricPointsConfig().min_sigma_disparity_px))) < 1.0
 
 
 def test_no_fraction_of_a_pixel_is_preferred():

@@ -12,22 +12,23 @@ from topoloc.errors import RecordingError
 from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.features import Features
 from topoloc.geometry.rig import StereoRig
-from topoloc.mapping.node_points import NodePoints, NodePointsConfig, keypoint_sigmas, locate_points
-from topoloc.mapping.views import MappingView
+from topoloc.geometry.rigid import Rigid3
+from topoloc.sequences.frame_view import FrameView
+from topoloc.slam.metric_points import MetricPoints, MetricPointsConfig, keypoint_sigmas, locate_points
 
-CONFIG = NodePointsConfig()
+CONFIG = MetricPointsConfig()
 
 
 @pytest.fixture(scope="module")
-def room_view() -> tuple[MappingView, np.ndarray]:
+def room_view() -> tuple[FrameView, np.ndarray]:
     """Left and right picture of the room, and the exact depth."""
     panels, pose = tiny_world.room(), tiny_world.path_pose(4)
     (left, depth), (right, _) = (tiny_world.render(panels, p, noise_seed=k) for k, p in enumerate((pose, tiny_world.right_pose(pose))))
     rig = StereoRig.rectified(tiny_world.CAMERA, tiny_world.BASELINE)
-    return MappingView(left, left, tiny_world.CAMERA, pose, right, rig), depth
+    return FrameView(left, left, tiny_world.CAMERA, Rigid3.identity(), right, rig), depth
 
 
-def depth_view(view: MappingView, depth: np.ndarray) -> MappingView:
+def depth_view(view: FrameView, depth: np.ndarray) -> FrameView:
     return replace(view, right_grey=None, rig=None, depth=depth.astype(np.float32))
 
 
@@ -36,12 +37,12 @@ def true_depths(features: Features, depth: np.ndarray) -> np.ndarray:
     return depth[rows, columns]
 
 
-def depth_errors_in_sigmas(located: NodePoints, truth: np.ndarray) -> np.ndarray:
+def depth_errors_in_sigmas(located: MetricPoints, truth: np.ndarray) -> np.ndarray:
     rows = located.valid & np.isfinite(truth)
     return (located.points_cam[rows, 2] - truth[rows]) / np.sqrt(located.covariances[rows, 2, 2])
 
 
-def test_stereo_points_lie_where_they_are_seen(room_view: tuple[MappingView, np.ndarray]):
+def test_stereo_points_lie_where_they_are_seen(room_view: tuple[FrameView, np.ndarray]):
     view, depth = room_view
     features = extract_features(view.grey, FeatureConfig())
     located = locate_points(features, view, CONFIG)
@@ -53,7 +54,7 @@ def test_stereo_points_lie_where_they_are_seen(room_view: tuple[MappingView, np.
     np.testing.assert_allclose(reprojected, features.points_img[located.valid], atol=1e-3)
 
 
-def test_depth_points_lie_where_they_are_seen(room_view: tuple[MappingView, np.ndarray]):
+def test_depth_points_lie_where_they_are_seen(room_view: tuple[FrameView, np.ndarray]):
     view, depth = room_view
     features = extract_features(view.grey, FeatureConfig())
     located = locate_points(features, depth_view(view, depth), CONFIG)
@@ -62,7 +63,7 @@ def test_depth_points_lie_where_they_are_seen(room_view: tuple[MappingView, np.n
     assert np.quantile(np.abs(errors), 0.95) < 2.0
 
 
-def test_covariances_are_positive_definite_and_largest_along_the_ray(room_view: tuple[MappingView, np.ndarray]):
+def test_covariances_are_positive_definite_and_largest_along_the_ray(room_view: tuple[FrameView, np.ndarray]):
     view, _ = room_view
     located = locate_points(extract_features(view.grey, FeatureConfig()), view, CONFIG)
     values, vectors = np.linalg.eigh(located.covariances[located.valid])
@@ -72,7 +73,7 @@ def test_covariances_are_positive_definite_and_largest_along_the_ray(room_view: 
     assert np.median(along) > 0.99
 
 
-def test_uncertain_depth_is_dropped(room_view: tuple[MappingView, np.ndarray]):
+def test_uncertain_depth_is_dropped(room_view: tuple[FrameView, np.ndarray]):
     view, _ = room_view
     assert view.rig is not None
     features = extract_features(view.grey, FeatureConfig())
@@ -89,7 +90,7 @@ def points_at(points_img: list[tuple[float, float]]) -> Features:
     return Features(np.array(points_img, np.float32).reshape(n, 2), same, 0 * same, same, np.ones((n, 64), np.float32))
 
 
-def test_depth_beside_a_jump_or_unknown_is_dropped(room_view: tuple[MappingView, np.ndarray]):
+def test_depth_beside_a_jump_or_unknown_is_dropped(room_view: tuple[FrameView, np.ndarray]):
     depth = np.full((240, 320), 2.0)
     depth[:, 160:] = 3.0
     depth[100:140, 40:80] = np.nan
@@ -99,13 +100,13 @@ def test_depth_beside_a_jump_or_unknown_is_dropped(room_view: tuple[MappingView,
     assert located.points_cam[0, 2] == pytest.approx(2.0)
 
 
-def test_no_features_give_no_points(room_view: tuple[MappingView, np.ndarray]):
+def test_no_features_give_no_points(room_view: tuple[FrameView, np.ndarray]):
     view, depth = room_view
     for one in (view, depth_view(view, depth)):
         assert locate_points(Features.empty(64), one, CONFIG).points_cam.shape == (0, 3)
 
 
-def test_a_single_picture_has_no_points(room_view: tuple[MappingView, np.ndarray]):
+def test_a_single_picture_has_no_points(room_view: tuple[FrameView, np.ndarray]):
     with pytest.raises(RecordingError, match="a stereo pair or a depth image"):
         locate_points(Features.empty(64), replace(room_view[0], right_grey=None, rig=None), CONFIG)
 

@@ -1,10 +1,10 @@
-"""3-D positions of a node's features, with their covariance: from a rectified stereo pair or from depth.
+"""3-D positions of a frame's features, with their covariance: from a rectified stereo pair or from depth.
 
 What is dropped, and why:
 
 * points that the other camera does not see distinctly, and depths beside a jump in depth: the position would be that of
   another surface, an outlier that lies on the right ray and so deceives the robust estimator;
-* points whose depth is uncertain by more than a share of itself: as the query moves away from the node they slide along
+* points whose depth is uncertain by more than a share of itself: as the query moves away from the map's node they slide along
   their ray by more than the inlier threshold, and their first-order covariance is no longer true.
 """
 
@@ -25,15 +25,15 @@ from topoloc.geometry.stereo import (
     points_from_disparity,
     ray_covariances,
 )
-from topoloc.mapping.epipolar_kernels import match_along_rows
-from topoloc.mapping.views import MappingView
+from topoloc.sequences.frame_view import FrameView
+from topoloc.slam.epipolar_kernels import match_along_rows
 
 # SURF and SIFT describe a neighbourhood of 20 s and 12 sigma; both report sizes of about 7.5 scales across.
 SCALES_PER_SIZE = 1.2 / 9.0
 
 
 @dataclass(frozen=True)
-class NodePointsConfig:
+class MetricPointsConfig:
     """How features get their 3-D position."""
 
     max_relative_sigma: float = 0.3
@@ -53,7 +53,7 @@ class NodePointsConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class NodePoints:
+class MetricPoints:
     """Row k belongs to feature k; `points_cam` in metres, rows of NaN where `valid` is False."""
 
     points_cam: Float[np.ndarray, "n 3"]
@@ -61,29 +61,29 @@ class NodePoints:
     valid: Bool[np.ndarray, " n"]
 
 
-def locate_points(features: Features, view: MappingView, config: NodePointsConfig) -> NodePoints:
-    """The 3-D positions (node's camera frame) of `features`, which were found in `view.grey`."""
+def locate_points(features: Features, view: FrameView, config: MetricPointsConfig) -> MetricPoints:
+    """The 3-D positions (camera frame of the view) of `features`, which were found in `view.grey`."""
     if view.right_grey is not None and view.rig is not None:
         points_cam, sigma_z = _from_stereo(features, view, config)
     elif view.depth is not None:
         points_cam, sigma_z = _from_depth(features, view, config)
     else:
-        raise RecordingError("a node needs a stereo pair or a depth image")
+        raise RecordingError("3-D positions need a stereo pair or a depth image")
     with np.errstate(invalid="ignore"):
         valid = np.isfinite(points_cam).all(axis=1) & (sigma_z < config.max_relative_sigma * points_cam[:, 2])
     sigma_px = keypoint_sigmas(features, config)
     covariances = np.full((len(features), 3, 3), np.nan)
     covariances[valid] = ray_covariances(points_cam[valid], sigma_z[valid], view.camera, sigma_px[valid])
-    return NodePoints(np.where(valid[:, None], points_cam, np.nan), covariances, valid)
+    return MetricPoints(np.where(valid[:, None], points_cam, np.nan), covariances, valid)
 
 
-def keypoint_sigmas(features: Features, config: NodePointsConfig) -> Float[np.ndarray, " n"]:
+def keypoint_sigmas(features: Features, config: MetricPointsConfig) -> Float[np.ndarray, " n"]:
     """Standard deviation (pixels) of where a key point is: it grows with the scale it was found at."""
     return np.maximum(config.sigma_scale * SCALES_PER_SIZE * features.sizes_px.astype(np.float64), 0.3)
 
 
 def _from_stereo(
-    features: Features, view: MappingView, config: NodePointsConfig
+    features: Features, view: FrameView, config: MetricPointsConfig
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     assert view.right_grey is not None
     assert view.rig is not None
@@ -104,7 +104,7 @@ def _from_stereo(
 
 
 def _from_depth(
-    features: Features, view: MappingView, config: NodePointsConfig
+    features: Features, view: FrameView, config: MetricPointsConfig
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     assert view.depth is not None
     depth = _smooth_depth(view.depth, features.points_img, config.max_depth_step)

@@ -1,0 +1,96 @@
+"""A frame made ready for measuring: the picture that features are taken from, its camera, and where depth comes from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from topoloc.errors import CalibrationError, RecordingError
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rig import Rectification, StereoRig, rectify
+from topoloc.geometry.rigid import Rigid3
+from topoloc.sequences.frame import DepthImage, Image, StereoFrame
+from topoloc.sequences.pictures import grey_image
+from topoloc.sequences.registration_kernels import back_project, keep_nearest
+
+
+@dataclass(frozen=True, eq=False)
+class FrameView:
+    """`picture` is what a person would look at, `grey` what features are taken from; both seen by `camera`.
+
+    Stereo pairs are rectified: `right_grey` and the rectified `rig` are there. RGB-D frames have `depth`, in metres and
+    pixels of `camera`, NaN where unknown. `view_from_cam` is how rectification turned the frame's camera.
+    """
+
+    picture: Image
+    grey: UInt8[np.ndarray, "h w"]
+    camera: Camera
+    view_from_cam: Rigid3
+    right_grey: UInt8[np.ndarray, "h w"] | None = None
+    rig: StereoRig | None = None
+    depth: Float32[np.ndarray, "h w"] | None = None
+
+
+def frame_view(frame: StereoFrame, with_depth: bool = True) -> FrameView:
+    """Rectify a stereo pair, or bring depth into the picture's camera.
+
+    Without `with_depth` only the picture itself is made ready.
+
+    Raises:
+        CalibrationError: the frame has no camera.
+        RecordingError: the frame has neither a right picture nor depth.
+    """
+    if frame.camera is None:
+        raise CalibrationError(f"{frame.name}: no calibration; put a camera.json into the recording's folder")
+    if frame.right is not None and frame.rig is not None:
+        return _stereo_view(frame.image, frame.right if with_depth else None, frame.rig)
+    if frame.depth is not None:
+        depth = registered_depth(frame.depth, frame.camera) if with_depth else None
+        return FrameView(frame.image, grey_image(frame.image), frame.camera, Rigid3.identity(), depth=depth)
+    raise RecordingError(f"{frame.name}: stereo pairs or depth images are needed, this recording has single pictures only")
+
+
+def _stereo_view(image: Image, right: Image | None, rig: StereoRig) -> FrameView:
+    right_grey = None if right is None else grey_image(right)
+    if rig.is_rectified:
+        return FrameView(image, grey_image(image), rig.left, Rigid3.identity(), right_grey, rig)
+    r = _rectification(rig)
+    picture = _remapped(image, r.left_map)
+    if right_grey is not None:
+        right_grey = _remapped(right_grey, r.right_map)
+    return FrameView(picture, grey_image(picture), r.rig.left, r.rectified_from_left, right_grey, r.rig)
+
+
+def _remapped(picture: Image, pixel_map: Float32[np.ndarray, "h w 2"]) -> Image:
+    # None is right here, whatever the stubs say: OpenCV 5 takes an empty second map for a map.
+    return cv2.remap(picture, pixel_map, None, cv2.INTER_LINEAR)  # pyright: ignore[reportCallIssue, reportArgumentType]
+
+
+@lru_cache(maxsize=4)
+def _rectification(rig: StereoRig) -> Rectification:
+    return rectify(rig)
+
+
+def registered_depth(depth_image: DepthImage, camera: Camera) -> Float32[np.ndarray, "h w"]:
+    """Depth as `camera` sees it: every pixel moved to where `camera` images it, the nearest surface winning."""
+    identity = np.allclose(depth_image.cam_from_depth.matrix(), np.eye(4), atol=1e-9)
+    if identity and depth_image.camera == camera:
+        return depth_image.depth
+    height, width = depth_image.depth.shape
+    pose, points = depth_image.cam_from_depth, np.empty((height * width, 3))
+    normalized = _normalized_pixels(depth_image.camera, width, height)
+    points = points[: back_project(depth_image.depth, normalized, pose.rotation, pose.translation, points)]
+    registered = np.full((camera.height, camera.width), np.nan, np.float32)
+    keep_nearest(camera.img_from_cam(points), points, registered)
+    return registered
+
+
+@lru_cache(maxsize=4)
+def _normalized_pixels(camera: Camera, width: int, height: int) -> Float[np.ndarray, "n 2"]:
+    """Every pixel of a picture, row by row, on the plane z = 1."""
+    columns, rows = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    return camera.normalized_from_img(np.column_stack([columns.ravel(), rows.ravel()]))
