@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 from hand_made import answer, elsewhere, lost
@@ -61,3 +62,15 @@ def test_what_is_not_known_is_null_and_never_nan(answers: list):
     assert evaluation["median_translation_m"] is None
     assert evaluation["median_rotation_deg"] is None
     json.dumps(evaluation, allow_nan=False)
+
+
+def test_each_recording_is_judged_alone_too():
+    night = [replace(a, recording="night") for a in ANSWERS[:2]]
+    evaluation = summarize([*ANSWERS, *night, elsewhere("moon", accepted=True)])
+    rows = evaluation["recordings"]
+    assert [row["name"] for row in rows] == ["walk", "night", "moon"]
+    for row, answers in zip(rows, (ANSWERS, night), strict=False):
+        alone = summarize(answers)
+        assert {key: value for key, value in row.items() if key != "name"} == {k: v for k, v in alone.items() if k != "recordings"}
+    assert (rows[2]["num_queries"], rows[2]["num_elsewhere"], rows[2]["false_accepts"]) == (0, 1, 1)
+    assert sum(row["num_queries"] for row in rows) == evaluation["num_queries"]

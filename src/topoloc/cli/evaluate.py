@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,12 +13,14 @@ import tyro
 
 from topoloc.cli.info import describe_map
 from topoloc.cli.output import UsageError, check_outputs, print_facts, progress_bar, write_json
+from topoloc.cli.recordings_table import print_recordings
 from topoloc.errors import TrajectoryError
 from topoloc.evaluation.experiments import answer_elsewhere, answer_queries
 from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION, Answer, summarize
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import open_sequence
 
 
@@ -55,12 +58,13 @@ class Command:
         sequences = [open_sequence(path, self.format) for path in self.sequences]
         others = [open_sequence(path, self.format) for path in self.elsewhere]
         localizer = Localizer(topomap, replace(self.config, coarse=self.coarse or self.config.coarse))
+        labels = _labels([*self.sequences, *self.elsewhere], [*sequences, *others])
         answers: list[Answer] = []
         with progress_bar() as progress:
-            for sequence in sequences:
-                answers += answer_queries(localizer, sequence, map_from_truth, progress)
-            for sequence in others:
-                answers += answer_elsewhere(localizer, sequence, progress)
+            for sequence, label in zip(sequences, labels, strict=False):
+                answers += answer_queries(localizer, sequence, map_from_truth, progress, label)
+            for sequence, label in zip(others, labels[len(sequences) :], strict=True):
+                answers += answer_elsewhere(localizer, sequence, progress, label)
         evaluation = summarize(answers) | {"map": info}
         if self.json != "-":
             _print(evaluation)
@@ -72,6 +76,12 @@ class Command:
             if self.json != "-":
                 print(f"report: {self.report}")
         return 0
+
+
+def _labels(paths: Sequence[str], sequences: Sequence[StereoSequence]) -> list[str]:
+    """The recordings' names; where two have one name, the ends of their paths, or all of them."""
+    choices = ([sequence.name for sequence in sequences], [Path(path).name for path in paths])
+    return next((names for names in choices if len(set(names)) == len(names)), list(paths))
 
 
 def _read_rigid(path: Path) -> Rigid3:
@@ -94,6 +104,9 @@ def _read_rigid(path: Path) -> Rigid3:
 
 def _print(evaluation: dict[str, Any]) -> None:
     e = evaluation
+    if len(e["recordings"]) > 1:
+        print_recordings(e)
+        print()
     facts = []
     if e["num_queries"]:
         facts.append(("localized", f"{e['num_localized']} of {e['num_queries']} ({100 * e['num_localized'] / e['num_queries']:.1f} %)"))

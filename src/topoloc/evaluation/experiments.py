@@ -20,11 +20,13 @@ def answer_queries(
     sequence: StereoSequence,
     map_from_truth: Rigid3 | None = None,
     progress: Callable[[str, int, int], None] | None = None,
+    label: str | None = None,
 ) -> list[Answer]:
     """Localize every frame whose pose is known; only the left (or colour) picture is shown to the localizer.
 
     Args:
         map_from_truth: the recording's world given in the map's, where the two differ.
+        label: what the answers call the recording, by default its name.
 
     Raises:
         TrajectoryError: the recording holds no truth.
@@ -35,6 +37,7 @@ def answer_queries(
     frames = [i for i, pose in enumerate(sequence.poses) if pose is not None]
     if not frames:
         raise TrajectoryError(f"{sequence.name}: no frame has a known pose to judge against")
+    label = label or sequence.name
     answers = []
     for done, i in enumerate(frames):
         frame = sequence[i]
@@ -42,22 +45,31 @@ def answer_queries(
         world_from_cam = (map_from_truth or Rigid3.identity()) @ frame.world_from_cam
         nearest = int(np.argmin(node_distances(world_from_cam, nodes, lambda_rot)))
         result = _localize(localizer, frame)
-        answers.append(Answer(frame.name, result, world_from_cam, nearest, sequence.name, _image_reader(sequence, i)))
+        answers.append(Answer(frame.name, result, world_from_cam, nearest, label, _image_reader(sequence, i), frame.camera))
         if progress:
-            progress(sequence.name, done + 1, len(frames))
+            progress(label, done + 1, len(frames))
     return answers
 
 
 def answer_elsewhere(
-    localizer: Localizer, sequence: StereoSequence, progress: Callable[[str, int, int], None] | None = None
+    localizer: Localizer,
+    sequence: StereoSequence,
+    progress: Callable[[str, int, int], None] | None = None,
+    label: str | None = None,
 ) -> list[Answer]:
-    """Show the localizer images that were not taken in the map: every pose that it gives is false."""
+    """Show the localizer images that were not taken in the map: every pose that it gives is false.
+
+    Raises:
+        CalibrationError: the recording holds no camera.
+    """
+    label = label or sequence.name
     answers = []
     for i, name in enumerate(sequence.names):
-        result = _localize(localizer, sequence[i])
-        answers.append(Answer(name, result, None, None, sequence.name, _image_reader(sequence, i)))
+        frame = sequence[i]
+        result = _localize(localizer, frame)
+        answers.append(Answer(name, result, None, None, label, _image_reader(sequence, i), frame.camera))
         if progress:
-            progress(f"{sequence.name} (elsewhere)", i + 1, len(sequence))
+            progress(f"{label} (elsewhere)", i + 1, len(sequence))
     return answers
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from topoloc.geometry.alignment import rotation_error, translation_error
+from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.sequences.frame import Image
@@ -23,7 +24,7 @@ MAX_TRANSLATION, MAX_ROTATION_DEG = 0.5, 10.0
 class Answer:
     """A query with its result and its truth, which is None for an image from elsewhere: any pose given for that is false.
 
-    `read_image` reads the picture once more, for who wants to look at it: answers hold no pictures.
+    `read_image` reads the picture once more, for who wants to look at it: answers hold no pictures. `camera` is what it was taken with.
     """
 
     query: str
@@ -32,6 +33,7 @@ class Answer:
     nearest_node_id: int | None = None
     recording: str = ""
     read_image: Callable[[], Image] | None = None
+    camera: Camera | None = None
 
     @property
     def translation_m(self) -> float:
@@ -54,8 +56,24 @@ class Answer:
         return self.world_from_cam is None or self.translation_m > MAX_TRANSLATION or self.rotation_deg > MAX_ROTATION_DEG
 
 
+def by_recording(answers: Sequence[Answer]) -> dict[str, list[Answer]]:
+    """The answers of each recording, in the order in which the recordings were asked first."""
+    groups: dict[str, list[Answer]] = {}
+    for answer in answers:
+        groups.setdefault(answer.recording, []).append(answer)
+    return groups
+
+
 def summarize(answers: list[Answer]) -> dict[str, Any]:
-    """The evaluation as JSON: counts, medians over what was localized, recall over all queries that have a truth."""
+    """The evaluation as JSON, of all answers together and, under "recordings", of each recording alone.
+
+    Counts, medians over what was localized, recall over all queries that have a truth.
+    """
+    rows = [{"name": name} | _summary(group) for name, group in by_recording(answers).items()]
+    return _summary(answers) | {"recordings": rows}
+
+
+def _summary(answers: list[Answer]) -> dict[str, Any]:
     with_truth = [a for a in answers if a.world_from_cam is not None]
     translation = np.array([a.translation_m for a in with_truth])
     rotation = np.array([a.rotation_deg for a in with_truth])

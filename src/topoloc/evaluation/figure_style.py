@@ -1,0 +1,49 @@
+"""What the figures of a report share: colours, type, and the way from a matplotlib figure to SVG text inside a page."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib
+from matplotlib.figure import Figure
+
+INK, GREY, NODE, ERROR, BAD = "#1f2a37", "#6b7786", "#9db2ca", "#f0a202", "#d1345b"
+# One colour a recording, told apart also by people who see no red or no green; none is near ERROR or BAD.
+RECORDING_COLOURS = ("#0f8b8d", "#5b4fc7", "#b5651d", "#2f6db5", "#6a7f10", "#9c3f97", "#3d4b5c", "#12724a")
+# Beyond so many marks a figure's points become one picture inside it: a page must stay small whatever the number of queries.
+MAX_MARKS = 2000
+STYLE: dict[Any, Any] = {
+    "svg.fonttype": "path",
+    "font.size": 9.0,
+    "text.color": INK,
+    "axes.labelcolor": GREY,
+    "axes.edgecolor": "#cfd6de",
+    "axes.grid": True,
+    "grid.color": "#eef1f4",
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "xtick.color": GREY,
+    "ytick.color": GREY,
+    "axes.titlesize": 9.5,
+    "axes.titlelocation": "left",
+    "legend.frameon": False,
+}
+
+
+def recording_colours(names: Sequence[str]) -> dict[str, str]:
+    """A colour for each recording, the same in all figures of a page; they come round again after the last."""
+    return {name: RECORDING_COLOURS[i % len(RECORDING_COLOURS)] for i, name in enumerate(names)}
+
+
+def svg_text(figure: Figure, title: str) -> str:
+    """The figure as an `svg` element without a header; names inside are made from the title, so that figures on one page do not mix."""
+    buffer = io.StringIO()
+    with matplotlib.rc_context({"svg.hashsalt": title}):
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    text = buffer.getvalue()
+    text = re.sub(r'<g id="[^"]*"', "<g", text[text.index("<svg") :])
+    return text.replace("<svg ", f'<svg role="img" aria-label="{title}" ', 1)
