@@ -6,11 +6,13 @@ picture is drawn for, where it has a scale.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.simulation.lettering import to_bytes
+from topoloc.simulation.lettering import PAPER, to_bytes
 from topoloc.simulation.noise import fractal_noise, smooth_noise
 from topoloc.simulation.scene import Color, Material, Picture
 
@@ -216,3 +218,39 @@ def bulb(on: bool, radiance: float = 12.0) -> Material:
 def _shaded(tint: Color, shade: Float[np.ndarray, "h w"]) -> Picture:
     """A colour made lighter and darker by a factor a pixel."""
     return np.clip(shade[..., None] * np.asarray(tint) * 255 + 0.5, 0, 255).astype(np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class Finishes:
+    """The materials that a room's furniture shares: one shop delivered it all, and few materials make a fast renderer."""
+
+    board: Material
+    veneer: Material
+    metal: Material
+    dark_metal: Material
+    chrome: Material
+    black: Material
+    grey: Material
+    ivory: Material
+    rubber: Material
+    cover: Material
+    paper: Material
+
+
+def finishes_of(rng: np.random.Generator) -> Finishes:
+    """Another office's furniture for every generator."""
+    tones = (BEECH, OAK, WALNUT)
+    covers = ((0.16, 0.2, 0.32), (0.35, 0.12, 0.12), (0.14, 0.15, 0.16), (0.16, 0.3, 0.26))
+    return Finishes(
+        board=laminate(rng),
+        veneer=wood(rng, tones[int(rng.integers(0, 3))]),
+        metal=painted_metal(rng),
+        dark_metal=painted_metal(rng, (0.3, 0.31, 0.33)),
+        chrome=chrome(),
+        black=plastic(),
+        grey=plastic((0.5, 0.51, 0.53), 0.35),
+        ivory=plastic((0.84, 0.82, 0.76), 0.3),
+        rubber=rubber(),
+        cover=fabric(rng, covers[int(rng.integers(0, 4))]),
+        paper=Material("matt", PAPER),
+    )
