@@ -1,0 +1,131 @@
+"""The recordings of `topoloc demo`: the lab by day for the map, and what the map is asked about.
+
+They are made by this code, and shipped in the folder `lab_demo` beside it, so that the demo needs no renderer.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import radians
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from topoloc.errors import TopolocError
+from topoloc.geometry.camera import Camera
+from topoloc.sequences.atomic import write_bytes, write_text
+from topoloc.simulation.conditions import find_condition
+from topoloc.simulation.noise import fractal_noise, rng_of
+from topoloc.simulation.recorder import ZED, RecordConfig, record
+from topoloc.simulation.routes import RouteConfig
+from topoloc.simulation.worlds import find_world
+
+Role = Literal["map", "queries", "elsewhere"]
+
+SHIPPED = Path(__file__).parent / "lab_demo"
+JPEG_QUALITY = 80
+# A lens 1.4 times as long as the mapping camera's, on a sensor of another size.
+TELE = Camera.pinhole(800, 600, 665.0, 665.0, 399.5, 299.5)
+
+
+@dataclass(frozen=True)
+class DemoRecording:
+    """One recording of the demo: the folder's name, what it is for, and how it is made."""
+
+    name: str
+    role: Role
+    world: str
+    condition: str
+    config: RecordConfig
+
+
+# Sparse frames, since each is to be shipped; whoever asks sways more than whoever maps.
+_MAPPING = RouteConfig(spacing=0.16, corner_radius=find_world("lab").corner_radius, max_turn=radians(12.0))
+_ASKING = replace(_MAPPING, spacing=0.26, lateral=0.08, wobble=1.3, shake=0.5)
+
+
+def _mapping(name: str, route: RouteConfig) -> DemoRecording:
+    return DemoRecording(name, "map", "lab", "day", RecordConfig(route=route, jpeg=JPEG_QUALITY))
+
+
+def _asking(name: str, condition: str, arrangement: int, route: RouteConfig, camera: Camera = ZED) -> DemoRecording:
+    config = RecordConfig(arrangement=arrangement, route=route, camera=camera, baseline=None, jpeg=JPEG_QUALITY)
+    return DemoRecording(name, "queries", "lab", condition, config)
+
+
+def _elsewhere(name: str, condition: str, num_frames: int) -> DemoRecording:
+    """Single pictures from all round another world."""
+    world = find_world(name)
+    walk = replace(world.route(), spacing=world.spacing * 40, max_turn=radians(90.0), num_frames=num_frames, seed=9)
+    return DemoRecording(name, "elsewhere", name, condition, RecordConfig(route=walk, baseline=None, jpeg=JPEG_QUALITY))
+
+
+RECORDINGS = (
+    _mapping("map_lap1", replace(_MAPPING, seed=1)),
+    _mapping("map_lap2", replace(_MAPPING, seed=2, lateral=0.15, start=0.08)),
+    _asking("day", "day", 0, replace(_ASKING, seed=3)),
+    _asking("night", "night", 1, replace(_ASKING, seed=4)),
+    _asking("other_camera", "day", 1, replace(_ASKING, seed=5, spacing=0.45, max_turn=radians(22.0)), TELE),
+    _elsewhere("corridor", "day", 8),
+    _elsewhere("street", "cloudy", 8),
+)
+
+
+def render_recordings(
+    folder: Path, progress: Callable[[str, int, int], None] = lambda stage, done, total: None, processes: int = 1
+) -> None:
+    """Render all of the demo's recordings into `folder`; what was begun before goes on where it stopped.
+
+    Raises:
+        MissingExtraError: Mitsuba is not installed.
+        TopolocError: the folder cannot be written, or holds something else.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise TopolocError(f"cannot write {folder}: {error.strerror}") from error
+    for recording in RECORDINGS:
+        stage = f"rendering {recording.name.replace('_', ' ')}"
+        record(
+            find_world(recording.world),
+            find_condition(recording.condition),
+            folder / recording.name,
+            recording.config,
+            progress=lambda _, done, total, stage=stage: progress(stage, done, total),
+            processes=processes,
+        )
+
+
+def missing_recordings(folder: Path) -> list[str]:
+    """The names of the demo's recordings that are not in `folder`."""
+    return [recording.name for recording in RECORDINGS if not (folder / recording.name).is_dir()]
+
+
+def draw_pictures_of_nothing(folder: Path) -> None:
+    """Pictures that show no place at all, with a camera.json: black, white, noise of one pixel and of clouds, stripes.
+
+    Raises:
+        TopolocError: the folder cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise TopolocError(f"cannot write {folder}: {error.strerror}") from error
+    for name, picture in _pictures_of_nothing().items():
+        write_bytes(folder / f"{name}.png", cv2.imencode(".png", picture)[1].tobytes())
+    write_text(folder / "camera.json", json.dumps(ZED.to_json()) + "\n")
+
+
+def _pictures_of_nothing() -> dict[str, UInt8[np.ndarray, "h w"]]:
+    shape = (ZED.height, ZED.width)
+    rng = rng_of(0, "nothing")
+    clouds = 128.0 + 45.0 * fractal_noise(rng, shape, 60.0)
+    stripes = 128.0 + 90.0 * np.sin(np.arange(ZED.width) / 5.0)[None, :].repeat(ZED.height, axis=0)
+    levels = {"clouds": clouds, "noise": rng.normal(128.0, 40.0, shape), "stripes": stripes}
+    drawn = {name: np.clip(picture, 0.0, 255.0).astype(np.uint8) for name, picture in levels.items()}
+    return {"black": np.zeros(shape, np.uint8), "white": np.full(shape, 255, np.uint8), **drawn}
