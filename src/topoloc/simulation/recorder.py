@@ -31,6 +31,8 @@ Progress = Callable[[str, int, int], None]
 ZED = Camera.pinhole(640, 400, 380.0, 380.0, 319.5, 199.5)
 """Size and field of view (80 degrees) of a ZED camera's pictures as they are used for localization."""
 
+_FEW_FRAMES = 20
+
 
 @dataclass(frozen=True)
 class RecordConfig:
@@ -87,7 +89,7 @@ def record(
     out: Path,
     config: RecordConfig,
     progress: Progress = lambda stage, done, total: None,
-    processes: int = 1,
+    processes: int | None = None,
     overwrite: bool = False,
 ) -> Recorded:
     """Render a recording into the folder `out`. One that was interrupted goes on where it stopped.
@@ -97,7 +99,7 @@ def record(
 
     Args:
         progress: called with ("frames", done, total).
-        processes: each renders frames of its own. It has no influence on the pictures.
+        processes: each renders frames of its own; None chooses. They have no influence on the pictures.
         overwrite: remove a recording of other settings that lies there.
 
     Raises:
@@ -112,8 +114,8 @@ def record(
     done = route.num_frames - len(missing)
     progress("frames", done, route.num_frames)
     job = _Job(world, condition, config, layout, variant)
-    in_turn = _render_here(job, missing) if min(processes, len(missing)) <= 1 else _render_in_processes(job, missing, processes)
-    for _ in in_turn:
+    num = min(len(missing), processes or _num_processes(len(missing)))
+    for _ in _render_here(job, missing) if num <= 1 else _render_in_processes(job, missing, num):
         done += 1
         progress("frames", done, route.num_frames)
     return Recorded(route.num_frames, len(missing), route.length)
@@ -130,6 +132,11 @@ class _Job:
     variant: str
 
 
+def _num_processes(num_frames: int) -> int:
+    """One for a few frames, as each process has to build the world first; else two, so that one renders while the other stores."""
+    return min(2, os.cpu_count() or 1) if num_frames > _FEW_FRAMES else 1
+
+
 def _render_here(job: _Job, frames: list[int]) -> Iterator[int]:
     if not frames:
         return
@@ -141,7 +148,7 @@ def _render_here(job: _Job, frames: list[int]) -> Iterator[int]:
 
 def _render_in_processes(job: _Job, frames: list[int], num: int) -> Iterator[int]:
     # Not forked: a child of a process in which Mitsuba's threads run would wait for them for ever.
-    with ProcessPoolExecutor(min(num, len(frames)), get_context("spawn"), initializer=_start, initargs=(job,)) as pool:
+    with ProcessPoolExecutor(num, get_context("spawn"), initializer=_start, initargs=(job,)) as pool:
         try:
             with _children_ignore_interrupts():
                 futures: list[Future[int]] = [pool.submit(_render_one, index) for index in frames]

@@ -33,7 +33,7 @@ class RouteConfig:
         laps: times round; a part of a lap is allowed.
         length: metres along the line instead of `laps`.
         num_frames: stop after so many frames.
-        spacing: metres between frames on the straight; in bends frames come closer, as people slow down there.
+        spacing: metres between frames on the straight; in bends frames come closer, as everybody slows down there.
         speed: metres a second on the straight; with `spacing` it gives the frame rate.
         start: metres along the line from its first corner to the first frame.
         lateral: metres to the left of the line, in the direction of travel.
@@ -43,7 +43,7 @@ class RouteConfig:
         wobble: size of the sway, 1 is natural, 0 none.
         shake: size of the faster tremble of a hand-held camera, 1 is natural, 0 none.
         corner_radius: smallest radius of the bends, metres.
-        max_turn: about how far the direction turns from one frame to the next, radians.
+        turn_rate: radians a second that the direction turns at most, about: who turns slows down.
         seed: another seed is another walk on the same line.
     """
 
@@ -60,12 +60,12 @@ class RouteConfig:
     wobble: float = 1.0
     shake: float = 0.0
     corner_radius: float = 0.5
-    max_turn: float = float(np.radians(6.0))
+    turn_rate: float = float(np.radians(40.0))
     seed: int = 0
 
     def __post_init__(self) -> None:
         positive = {"laps": self.laps, "spacing": self.spacing, "speed": self.speed, "corner radius": self.corner_radius}
-        positive |= {"turn between frames": self.max_turn, "length": self.length, "number of frames": self.num_frames}
+        positive |= {"turn rate": self.turn_rate, "length": self.length, "number of frames": self.num_frames}
         for name, value in positive.items():
             if value is not None and not 0 < value < np.inf:
                 raise TopolocError(f"route: the {name} must be positive, not {value:g}")
@@ -172,7 +172,7 @@ def plan_route(loop: tuple[tuple[float, float], ...], camera_height: float, conf
     ahead = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0)
     yaw = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
     yaw = np.append(yaw, yaw[0] + 2 * np.pi * round((yaw[-1] - yaw[0]) / (2 * np.pi)))
-    effort = np.hypot(steps, np.diff(yaw) * config.spacing / config.max_turn)
+    effort = np.hypot(steps, np.diff(yaw) * config.speed / config.turn_rate)
     travelled, paced = (np.concatenate([[0.0], np.cumsum(part)]) for part in (steps, effort))
     bare = Route(config, camera_height, closed, yaw, travelled, paced, 1, _waves(config))
     total = config.laps * paced[-1]
