@@ -14,20 +14,28 @@ from jaxtyping import Float32
 from topoloc.simulation.scene import Color, Material, Mesh, Picture, Scene, Sky
 from topoloc.simulation.shapes import join
 
+KIND, TINT = "face_kind", "face_tint"
+"""Attributes of every mesh, for `first_hits`: the kind of its material, and a metal's mean colour."""
+MATT, POLISHED, METAL, GLASS, LIGHT = range(5)
+_KINDS = {"matt": MATT, "polished": POLISHED, "metal": METAL, "glass": GLASS, "light": LIGHT}
+_LAMP_PIECE = 4.0
 _SMOOTHEST = 0.02  # below it a rough surface is as good as a mirror, and slower
 
 
-def load_scene(scene: Scene) -> Any:
-    """The scene with its surfaces and lights, without camera and integrator, in Mitsuba's current variant."""
+def load_scene(scene: Scene, lamps: list[tuple[Material, Mesh]]) -> Any:
+    """The scene with its surfaces and lights, without camera and integrator, in Mitsuba's current variant.
+
+    Args:
+        lamps: what gives light, in pieces as from `lamp_pieces`; `lamp_name` says what Mitsuba calls each.
+    """
     import mitsuba as mi
 
     parts: dict[str, Any] = {"type": "scene"}
-    for index, (material, mesh) in enumerate(meshes_by_material(scene)):
-        parts[f"mesh{index:04d}"] = _mitsuba_mesh(f"mesh{index:04d}", mesh, material)
+    dark = [entry for entry in meshes_by_material(scene) if not _shines(entry[0])]
+    for index, (material, mesh) in enumerate([*lamps, *dark]):
+        parts[lamp_name(index)] = _mitsuba_mesh(lamp_name(index), mesh, material)
     if scene.sky is not None:
         parts |= _sky(scene.sky)
-    elif not any(surface.material.kind == "light" for surface in scene.surfaces):
-        parts["dark"] = {"type": "constant", "radiance": 0.0}
     return mi.load_dict(parts)
 
 
@@ -39,20 +47,51 @@ def meshes_by_material(scene: Scene) -> list[tuple[Material, Mesh]]:
     return [(material, join(meshes)) for material, meshes in groups.values()]
 
 
+def lamp_pieces(scene: Scene) -> list[tuple[Material, Mesh]]:
+    """All lamps, cut up into pieces of a few metres: one mesh for all lamps of a street would be asked for its light as one."""
+    lamps = [entry for entry in meshes_by_material(scene) if _shines(entry[0])]
+    return [(material, piece) for material, mesh in lamps for piece in pieces(mesh, _LAMP_PIECE)]
+
+
+def pieces(mesh: Mesh, size: float) -> list[Mesh]:
+    """The mesh cut up by a grid of cells of `size` metres in which the middles of its faces lie; no face is cut."""
+    cells = np.floor(mesh.vertices[mesh.faces].mean(axis=1) / size).astype(np.int64)
+    _, group = np.unique(cells, axis=0, return_inverse=True)
+    parts = []
+    for index in range(int(group.max()) + 1):
+        faces = mesh.faces[group.ravel() == index]
+        used, renumbered = np.unique(faces, return_inverse=True)
+        parts.append(Mesh(mesh.vertices[used], renumbered.reshape(-1, 3).astype(np.int32), mesh.uv[used]))
+    return parts
+
+
+def radiance_of(material: Material) -> Float32[np.ndarray, "*shape 3"]:
+    """Light that a lamp or screen gives, as its colour is: one value or a picture."""
+    return linear_from_srgb(material.color) * np.float32(material.radiance)
+
+
+def lamp_name(index: int) -> str:
+    """What Mitsuba calls the mesh of one of `lamp_pieces`."""
+    return f"mesh{index:05d}"
+
+
 def _mitsuba_mesh(name: str, mesh: Mesh, material: Material) -> Any:
     import mitsuba as mi
 
     properties = mi.Properties()
     properties["face_normals"] = True
     properties["bsdf"] = mi.load_dict(_bsdf(material))
-    if material.kind == "light":
-        properties["emitter"] = mi.load_dict(_emitter(material, mesh))
+    if _shines(material):
+        properties["emitter"] = mi.load_dict(_emitter(material))
     result = mi.Mesh(name, len(mesh.vertices), len(mesh.faces), has_vertex_texcoords=True, props=properties)
     parameters = mi.traverse(result)
     parameters["vertex_positions"] = np.ascontiguousarray(mesh.vertices, np.float32).ravel()
     parameters["faces"] = np.ascontiguousarray(mesh.faces, np.uint32).ravel()
     parameters["vertex_texcoords"] = np.ascontiguousarray(mesh.uv, np.float32).ravel()
     parameters.update()
+    tint = linear_from_srgb(material.color).reshape(-1, 3).mean(axis=0)
+    result.add_attribute(KIND, 1, np.full(len(mesh.faces), _KINDS[material.kind], np.float32))
+    result.add_attribute(TINT, 3, np.tile(tint, len(mesh.faces)))
     return result
 
 
@@ -79,13 +118,14 @@ def _bsdf(material: Material) -> dict[str, Any]:
     return {"type": "mask", "opacity": _bitmap(material.opacity[:, :, None].astype(np.float32) / 255.0), "bsdf": both}
 
 
-def _emitter(material: Material, mesh: Mesh) -> dict[str, Any]:
-    linear = linear_from_srgb(material.color) * np.float32(material.radiance)
+def _emitter(material: Material) -> dict[str, Any]:
+    linear = radiance_of(material)
     radiance = {"type": "rgb", "value": linear.tolist()} if linear.ndim == 1 else _bitmap(linear)
-    corners = mesh.vertices[mesh.faces]
-    area = 0.5 * float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum())
-    power = area * float(linear.mean())
-    return {"type": "area", "radiance": radiance, "sampling_weight": max(power, 1e-6)}
+    return {"type": "area", "radiance": radiance}
+
+
+def _shines(material: Material) -> bool:
+    return material.kind == "light" and material.radiance > 0.0
 
 
 def _sky(sky: Sky) -> dict[str, Any]:

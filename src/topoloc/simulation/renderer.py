@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 
 from topoloc.errors import CalibrationError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.simulation.first_hits import FirstHits, find_first_hits
+from topoloc.simulation.light_choice import LightChoice
+from topoloc.simulation.light_filter import LightFilterConfig, filter_light
 from topoloc.simulation.mitsuba_scene import load_scene
 from topoloc.simulation.scene import Scene
 from topoloc.simulation.variant import use_best_variant
@@ -17,15 +21,23 @@ from topoloc.simulation.variant import use_best_variant
 
 @dataclass(frozen=True)
 class RenderConfig:
-    """How much work goes into a picture."""
+    """How much work goes into a picture.
 
-    samples: int = 16
-    bounces: int = 4
+    Attributes:
+        samples: light paths a pixel; half of them go into each of two pictures, from whose difference the noise is known.
+        albedo_samples: rays a pixel for colours, edges, screens and sky.
+        bounces: how often light is reflected on its way from a lamp to the camera.
+    """
+
+    samples: int = 8
+    albedo_samples: int = 8
+    bounces: int = 3
+    light_filter: LightFilterConfig = field(default_factory=LightFilterConfig)
 
     @staticmethod
     def draft() -> RenderConfig:
-        """About ten times faster."""
-        return RenderConfig(samples=2, bounces=3)
+        """About ten times faster, with blotches in the light and rougher edges."""
+        return RenderConfig(samples=2, albedo_samples=2, bounces=2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,51 +45,127 @@ class Rendering:
     """What one camera sees."""
 
     radiance: Float32[np.ndarray, "h w 3"]
-    """Linear light."""
+    """Linear light: red, green, blue."""
     depth: Float32[np.ndarray, "h w"]
-    """Metres along the camera's z axis at the pixel centres; NaN in the sky."""
+    """Metres along the camera's z axis at the pixel centres; NaN in the sky. Through glass it is that of the pane."""
 
 
 class Renderer:
-    """A world loaded once, for many pictures."""
+    """A world loaded once, for many pictures.
+
+    The same seed gives the same bytes, in every process with the same variant of Mitsuba.
+
+    Raises:
+        MissingExtraError: Mitsuba is not installed.
+    """
 
     def __init__(self, scene: Scene, config: RenderConfig | None = None) -> None:
         self._config = config or RenderConfig()
         use_best_variant()
-        self._scene = load_scene(scene)
+        import mitsuba
+
+        self._haze = scene.haze
+        self._lights = LightChoice(scene)
+        self._scene = load_scene(scene, self._lights.lamps)
+        self._parameters = mitsuba.traverse(self._scene)
+        self._integrator = _integrator(scene, self._config)
 
     def render(self, camera: Camera, world_from_cam: Rigid3, seed: int) -> Rendering:
-        """One picture."""
+        """What `camera` sees from a pose.
+
+        Raises:
+            CalibrationError: a camera with distortion, or whose pixels are not square.
+        """
+        if camera.is_distorted or abs(camera.fx / camera.fy - 1.0) > 1e-6:
+            raise CalibrationError(
+                f"only cameras without distortion and with square pixels are rendered, not {camera.model} {camera.params}"
+            )
+        shape = (camera.height, camera.width)
+        centres = self._first_hits(camera, world_from_cam, (0.0, 0.0))
+        albedo, emission, clear = self._colours(camera, world_from_cam)
+        for name, weight in self._lights.weights(self._scene, world_from_cam.translation, centres).items():
+            self._parameters[name] = weight
+        self._parameters.update()
+        radiance = self._trace(camera, world_from_cam, seed)
+        normal, position = centres.normal.reshape(*shape, 3), centres.position.reshape(*shape, 3)
+        light = filter_light(radiance, albedo, normal, position, centres.mirror.reshape(shape), self._config.light_filter)
+        picture = albedo * light + emission
+        if self._haze is not None:
+            picture = clear[:, :, None] * picture + (1.0 - clear[:, :, None]) * np.array(self._haze.radiance, np.float32)
+        along = _directions_cam(camera, (0.0, 0.0))[:, 2]
+        depth = np.where(np.isfinite(centres.distance), centres.distance * along, np.nan).astype(np.float32)
+        return Rendering(picture, depth.reshape(shape))
+
+    def _first_hits(self, camera: Camera, world_from_cam: Rigid3, offset_px: tuple[float, float]) -> FirstHits:
+        directions_world = _directions_cam(camera, offset_px) @ world_from_cam.rotation.T
+        haze_range = self._haze.range if self._haze is not None else np.inf
+        return find_first_hits(self._scene, world_from_cam.translation, directions_world, haze_range)
+
+    def _colours(
+        self, camera: Camera, world_from_cam: Rigid3
+    ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
+        """Albedo, emission and clearness of the air, averaged over each pixel."""
+        num, pixels = self._config.albedo_samples, camera.width * camera.height
+        albedo, emission, clear = np.zeros((pixels, 3), np.float32), np.zeros((pixels, 3), np.float32), np.zeros(pixels, np.float32)
+        for k in range(num):
+            # The golden ratio's lattice: for any number of samples both coordinates fill their range evenly.
+            offset_px = ((k + 0.5) / num - 0.5, (0.5 + k * _GOLDEN) % 1.0 - 0.5)
+            hits = self._first_hits(camera, world_from_cam, offset_px)
+            albedo += hits.albedo
+            emission += hits.emission
+            clear += hits.clear
+        shape = (camera.height, camera.width)
+        return (albedo / num).reshape(*shape, 3), (emission / num).reshape(*shape, 3), (clear / num).reshape(shape)
+
+    def _trace(
+        self, camera: Camera, world_from_cam: Rigid3, seed: int
+    ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w 3"]]:
+        """What surfaces send back, twice, with independent noise."""
         import mitsuba as mi
 
-        path = mi.load_dict({"type": "path", "max_depth": self._config.bounces + 1})
-        radiance = mi.render(self._scene, sensor=_sensor(camera, world_from_cam), integrator=path, spp=self._config.samples, seed=seed)
-        depths = mi.load_dict({"type": "aov", "aovs": "d:depth"})
-        distance = mi.render(self._scene, sensor=_sensor(camera, world_from_cam, centred=True), integrator=depths, spp=1, seed=seed)
-        grid = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1).reshape(-1, 2)
-        along = camera.rays_from_img(grid.astype(np.float64))[:, 2].reshape(camera.height, camera.width)
-        depth = np.asarray(distance, np.float64)[:, :, -1] * along
-        depth[depth == 0.0] = np.nan
-        return Rendering(np.array(radiance, np.float32)[:, :, :3], depth.astype(np.float32))
+        half = max(1, self._config.samples // 2)
+        sensor = _sensor(camera, world_from_cam, half)
+        first, second = (
+            np.array(mi.render(self._scene, sensor=sensor, integrator=self._integrator, spp=half, seed=(2 * seed + k) % 2**32), np.float32)
+            for k in (0, 1)
+        )
+        return first[:, :, :3], second[:, :, :3]
 
 
-def _sensor(camera: Camera, world_from_cam: Rigid3, centred: bool = False):  # noqa: ANN202
+_GOLDEN = 0.6180339887498949
+
+
+def _directions_cam(camera: Camera, offset_px: tuple[float, float]) -> Float64[np.ndarray, "n 3"]:
+    """Unit directions through all pixels, row by row, each at the same offset from its centre."""
+    x, y = np.meshgrid(np.arange(camera.width) + offset_px[0], np.arange(camera.height) + offset_px[1])
+    return camera.rays_from_img(np.column_stack([x.ravel(), y.ravel()]))
+
+
+def _integrator(scene: Scene, config: RenderConfig) -> Any:
     import mitsuba as mi
 
-    if camera.is_distorted or abs(camera.fx / camera.fy - 1.0) > 1e-9:
-        raise CalibrationError(f"only undistorted cameras with square pixels can be rendered, not {camera.model} {camera.params}")
-    # Mitsuba's cameras look along +z with x to the left and y up.
-    to_world = world_from_cam.matrix() @ np.diag([-1.0, -1.0, 1.0, 1.0])
+    # Only this one lets light through panes and between leaves on its way from a lamp, but it takes half as long again.
+    see_through = any(surface.material.kind == "glass" or surface.material.opacity is not None for surface in scene.surfaces)
+    kind = "volpath" if see_through else "path"
+    return mi.load_dict({"type": kind, "max_depth": config.bounces + 1, "rr_depth": 100, "hide_emitters": True})
+
+
+def _sensor(camera: Camera, world_from_cam: Rigid3, samples: int) -> Any:
+    import mitsuba as mi
+
+    film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "pixel_format": "rgb", "rfilter": {"type": "box"}}
     sensor = {
         "type": "perspective",
         "fov_axis": "x",
         "fov": float(np.degrees(2.0 * np.arctan(camera.width / (2.0 * camera.fx)))),
-        "principal_point_offset_x": -((camera.cx + 0.5) / camera.width - 0.5),
-        "principal_point_offset_y": -((camera.cy + 0.5) / camera.height - 0.5),
+        # Mitsuba counts from the image's border, in image sizes, and moves the picture where we move its centre.
+        "principal_point_offset_x": 0.5 - (camera.cx + 0.5) / camera.width,
+        "principal_point_offset_y": 0.5 - (camera.cy + 0.5) / camera.height,
         "near_clip": 0.01,
         "far_clip": 10000.0,
-        "to_world": mi.ScalarTransform4f(to_world),
-        "film": {"type": "hdrfilm", "width": camera.width, "height": camera.height, "pixel_format": "rgb", "rfilter": {"type": "box"}},
-        "sampler": {"type": "stratified", "jitter": False, "sample_count": 1} if centred else {"type": "independent"},
+        # Its cameras look along +z as ours do, but have x to the left and y up.
+        "to_world": mi.ScalarTransform4f(world_from_cam.matrix() @ np.diag([-1.0, -1.0, 1.0, 1.0])),
+        "film": film,
+        "sampler": {"type": "multijitter", "sample_count": samples},
     }
     return mi.load_dict(sensor)
