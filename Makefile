@@ -1,3 +1,4 @@
+# make demo      maps a rendered room by day, asks it by day and by night, writes topoloc-demo/report.html; installs the core if nothing is there
 # make install   the program with all its extras and the tests' tools, into .venv, at the versions of constraints.txt
 # make test      all checks: ruff, import contract, types, tests; installs into .venv only what these need
 # make lint      the same without the tests
@@ -6,13 +7,17 @@
 
 VENV := .venv
 BIN := $(VENV)/bin
+OUT := topoloc-demo
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check install --constraint constraints.txt
 CANDIDATES := $(PYTHON) python3.13 python3.12 python3.11 python3
 # Without a look at the network for a newer pyright; its node comes from the package index.
 PYRIGHT := PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright
 
-.PHONY: install test lint clean
+.PHONY: demo install test lint clean
 .DELETE_ON_ERROR:
+
+demo: $(VENV)/installed-core
+	@$(BIN)/topoloc demo --out $(OUT)
 
 install: $(VENV)/installed-all
 
@@ -25,13 +30,18 @@ lint: $(VENV)/installed-test
 	@$(BIN)/lint-imports --no-logo > $(VENV)/lint-imports.txt || { cat $(VENV)/lint-imports.txt; exit 1; }
 	@$(PYRIGHT)
 
-$(VENV)/installed-test: EXTRAS = test
-$(VENV)/installed-all: EXTRAS = all,test
-$(VENV)/installed-test $(VENV)/installed-all: pyproject.toml constraints.txt $(BIN)/python
-	@echo "installing topoloc[$(EXTRAS)] into $(VENV) ..."
+# What each kind of installation brings; one that brings more has brought the others, too.
+$(VENV)/installed-core: EXTRAS :=
+$(VENV)/installed-core: BRINGS := core
+$(VENV)/installed-test: EXTRAS := [sim,test]
+$(VENV)/installed-test: BRINGS := core test
+$(VENV)/installed-all: EXTRAS := [all,test]
+$(VENV)/installed-all: BRINGS := core test all
+$(VENV)/installed-core $(VENV)/installed-test $(VENV)/installed-all: pyproject.toml constraints.txt $(BIN)/python
+	@echo "installing topoloc$(EXTRAS) into $(VENV) ..."
 	@$(PIP) hatchling editables
-	@$(PIP) --no-build-isolation --editable '.[$(EXTRAS)]'
-	@touch $@ $(VENV)/installed-test
+	@$(PIP) --no-build-isolation --editable '.$(EXTRAS)'
+	@touch $(BRINGS:%=$(VENV)/installed-%)
 
 $(BIN)/python:
 	@for python in $(CANDIDATES); do \
@@ -44,5 +54,5 @@ $(BIN)/python:
 	exit 1
 
 clean:
-	@rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	@rm -rf $(VENV) topoloc-demo build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -64,11 +64,11 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return programs
 
 
-def test_the_wheel_holds_every_module_and_the_licence(wheel: Path):
+def test_the_wheel_holds_every_module_what_they_read_and_the_licence(wheel: Path):
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
-    modules = {path.relative_to(ROOT / "src").as_posix() for path in (ROOT / "src" / "topoloc").rglob("*.py")}
-    assert modules <= names
+    files = {path for path in (ROOT / "src" / "topoloc").rglob("*") if path.is_file() and path.parent.name != "__pycache__"}
+    assert {path.relative_to(ROOT / "src").as_posix() for path in files} <= names
     assert {name.split("/")[0] for name in names} == {"topoloc", f"topoloc-{topoloc.__version__}.dist-info"}
     assert any(name.endswith("/LICENSE") for name in names)
 
