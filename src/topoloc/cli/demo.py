@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from typing import Annotated, Any
 import tyro
 
 from topoloc.cli.info import describe_map
-from topoloc.cli.output import UsageError, check_outputs, progress_bar, write_json
+from topoloc.cli.output import UsageError, check_outputs, interruptible, progress_bar, write_json
 from topoloc.cli.recordings_table import print_recordings
 from topoloc.errors import TopolocError
 from topoloc.evaluation.experiments import answer_elsewhere, answer_queries
@@ -30,7 +29,6 @@ from topoloc.simulation.lab_demo import RECORDINGS, SHIPPED, Role, draw_pictures
 
 Progress = Callable[[str, int, int], None]
 ELSEWHERE = "elsewhere"
-_PROCESSES = 2
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,11 @@ class Command:
         """The folder of the recordings, rendered now if that is asked for."""
         if self.render:
             folder = Path(self.recordings) if self.recordings else out / "recordings"
-            render_recordings(folder, progress, min(_PROCESSES, os.cpu_count() or 1))
+            try:
+                with interruptible():
+                    render_recordings(folder, progress)
+            except KeyboardInterrupt:
+                raise TopolocError(f"interrupted; the same command goes on from what is in {folder}") from None
             return folder
         folder = Path(self.recordings) if self.recordings else SHIPPED
         if self.recordings and not folder.is_dir():

@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from math import radians
 from pathlib import Path
 from typing import Literal
 
@@ -45,7 +44,7 @@ class DemoRecording:
 
 
 # Sparse frames, since each is to be shipped; whoever asks sways more than whoever maps.
-_MAPPING = RouteConfig(spacing=0.16, corner_radius=find_world("lab").corner_radius, max_turn=radians(12.0))
+_MAPPING = RouteConfig(spacing=0.16, corner_radius=find_world("lab").corner_radius)
 _ASKING = replace(_MAPPING, spacing=0.26, lateral=0.08, wobble=1.3, shake=0.5)
 
 
@@ -58,10 +57,9 @@ def _asking(name: str, condition: str, arrangement: int, route: RouteConfig, cam
     return DemoRecording(name, "queries", "lab", condition, config)
 
 
-def _elsewhere(name: str, condition: str, num_frames: int) -> DemoRecording:
+def _elsewhere(name: str, condition: str, spacing: float, num_frames: int) -> DemoRecording:
     """Single pictures from all round another world."""
-    world = find_world(name)
-    walk = replace(world.route(), spacing=world.spacing * 40, max_turn=radians(90.0), num_frames=num_frames, seed=9)
+    walk = replace(find_world(name).route(), spacing=spacing, num_frames=num_frames, seed=9)
     return DemoRecording(name, "elsewhere", name, condition, RecordConfig(route=walk, baseline=None, jpeg=JPEG_QUALITY))
 
 
@@ -70,15 +68,13 @@ RECORDINGS = (
     _mapping("map_lap2", replace(_MAPPING, seed=2, lateral=0.15, start=0.08)),
     _asking("day", "day", 0, replace(_ASKING, seed=3)),
     _asking("night", "night", 1, replace(_ASKING, seed=4)),
-    _asking("other_camera", "day", 1, replace(_ASKING, seed=5, spacing=0.45, max_turn=radians(22.0)), TELE),
-    _elsewhere("corridor", "day", 8),
-    _elsewhere("street", "cloudy", 8),
+    _asking("other_camera", "day", 1, replace(_ASKING, seed=5, spacing=0.45), TELE),
+    _elsewhere("corridor", "day", 9.0, 8),
+    _elsewhere("street", "cloudy", 90.0, 8),
 )
 
 
-def render_recordings(
-    folder: Path, progress: Callable[[str, int, int], None] = lambda stage, done, total: None, processes: int = 1
-) -> None:
+def render_recordings(folder: Path, progress: Callable[[str, int, int], None] = lambda stage, done, total: None) -> None:
     """Render all of the demo's recordings into `folder`; what was begun before goes on where it stopped.
 
     Raises:
@@ -97,7 +93,6 @@ def render_recordings(
             folder / recording.name,
             recording.config,
             progress=lambda _, done, total, stage=stage: progress(stage, done, total),
-            processes=processes,
         )
 
 
