@@ -27,9 +27,20 @@ from topoloc.simulation.desktop_things import (
     telephone,
 )
 from topoloc.simulation.furniture import bookshelf, carton_box, coat_rack, crate, cupboard, desk, door, office_chair, radiator, waste_bin
-from topoloc.simulation.interiors import Finishes, finishes_of, laminated, printed
-from topoloc.simulation.lab_shell import CEILING_LAMPS, LENGTH, SILL, WIDTH, shell, window_sky
-from topoloc.simulation.lab_things import computer_case, floor_lamp, mesh_cables, oscilloscope, quadcopter, robot_arm, tool_wall, toolbox, tripod, wall_board
+from topoloc.simulation.interiors import Finishes, finishes_of, plastic, printed
+from topoloc.simulation.lab_shell import CEILING_LAMPS, DARK, LENGTH, SILL, WIDTH, light_shafts, shell, sky_above
+from topoloc.simulation.lab_things import (
+    computer_case,
+    floor_lamp,
+    mesh_cables,
+    oscilloscope,
+    quadcopter,
+    robot_arm,
+    tool_wall,
+    toolbox,
+    tripod,
+    wall_board,
+)
 from topoloc.simulation.noise import rng_of
 from topoloc.simulation.pictures import photograph
 from topoloc.simulation.prints import calendar, door_sign, exit_sign, notice, notice_board, poster
@@ -38,14 +49,11 @@ from topoloc.simulation.shapes import lathe, panel, placed, surfaces_placed
 
 LOOP: tuple[tuple[float, float], ...] = ((1.25, 1.3), (3.75, 1.3), (3.75, 2.85), (1.25, 2.85))
 CAMERA_HEIGHT = 1.4
-MOVABLE = frozenset(
-    "chair mug papers carton bin keyboard mouse bottle toolbox tripod quadcopter instrument".split() + ["book stack", "robot arm"]
-)
+_MOVED = "chair, mug, papers, carton, bin, keyboard, mouse, bottle, toolbox, tripod, quadcopter, instrument, book stack, robot arm"
+MOVABLE = frozenset(_MOVED.split(", "))
 """Names of what another arrangement puts elsewhere."""
 
 _DESK_TOP = 0.74
-_DARK = 0.05
-"""Share of daylight below which people put on the lamps of their desks rather than those of the ceiling."""
 _DESKS = ((1.15, 0.37), (2.75, 0.37))
 _TABLE, _BENCH = (2.5, 2.07), (2.5, 3.66)
 
@@ -56,6 +64,7 @@ def build(seed: int, condition: Condition, arrangement: int = 0) -> Scene:
     lit = _lit(seed, condition)
     move = rng_of(seed, f"arrangement/{arrangement}")
     surfaces = shell(seed, finishes, frozenset(k for k in lit if k < len(CEILING_LAMPS)))
+    surfaces += light_shafts(condition, seed)
     surfaces += _walls(seed, finishes)
     surfaces += _built_in(seed, finishes)
     for k, at in enumerate(_DESKS):
@@ -64,19 +73,19 @@ def build(seed: int, condition: Condition, arrangement: int = 0) -> Scene:
     surfaces += surfaces_placed(_table(seed, finishes, move), (*_TABLE, 0.0))
     surfaces += surfaces_placed(floor_lamp(finishes, len(CEILING_LAMPS) + 3 in lit), (0.42, 3.68, 0.0))
     surfaces += _on_the_floor(seed, finishes, move)
-    return Scene(tuple(surfaces), window_sky(condition, seed))
+    return Scene(tuple(surfaces), sky_above(condition, seed))
 
 
 def _lit(seed: int, condition: Condition) -> frozenset[int]:
     """Which lamps are on: first those of the ceiling, then those of the two desks, of the bench, and the one on the floor."""
     rng = rng_of(seed, "lamps")
     ceiling, others = rng.permutation(len(CEILING_LAMPS)), len(CEILING_LAMPS) + rng.permutation(4)
-    order = [*others, *ceiling] if condition.daylight < _DARK else [*ceiling, *others]
+    order = [*others, *ceiling] if condition.daylight < DARK else [*ceiling, *others]
     return frozenset(int(k) for k in order[: round(condition.lamps * len(order))])
 
 
 def _screen_on(seed: int, condition: Condition, name: str) -> bool:
-    return bool(rng_of(seed, f"{name} on {condition.daylight < _DARK}").uniform() < 0.7)
+    return bool(rng_of(seed, f"{name} on {condition.daylight < DARK}").uniform() < 0.7)
 
 
 def _strewn(parts: list[Surface], at: tuple[float, float, float], move: np.random.Generator, spread: float, turn: float) -> list[Surface]:
@@ -156,7 +165,7 @@ def _on_the_floor(seed: int, finishes: Finishes, move: np.random.Generator) -> l
     parts += _strewn(waste_bin(finishes), (1.98, 0.5, 0.0), move, 0.03, 1.0)
     parts += _strewn(carton_box(rng, (0.5, 0.3, 0.3)), (4.3, 0.23, 1.95), move, 0.03, 0.1)
     parts += _strewn(quadcopter(finishes), (0.25, 2.5, 2.0), move, 0.02, 0.4)
-    return parts + _strewn(tripod(finishes), (4.55, 2.62, 0.0) if move.uniform() < 0.0 else (0.55, 2.95, 0.0), move, 0.03, 1.0)
+    return parts + _strewn(tripod(finishes), (0.55, 2.95, 0.0), move, 0.03, 1.0)
 
 
 def _built_in(seed: int, finishes: Finishes) -> list[Surface]:
@@ -172,7 +181,9 @@ def _built_in(seed: int, finishes: Finishes) -> list[Surface]:
     for x in rng.choice([0.7, 1.3, 2.2, 2.8, 3.6, 4.3], 3, replace=False):
         parts += surfaces_placed(potted_plant(rng, rng.uniform(0.25, 0.45)), (float(x), WIDTH + 0.06, SILL + 0.025))
     red = lathe([(0.0, 0.15), (0.07, 0.16), (0.075, 0.2), (0.075, 0.5), (0.03, 0.58), (0.02, 0.64), (0.0, 0.65)], 18)
-    parts.append(Surface("extinguisher", placed(red, (LENGTH - 0.09, 3.68, 0.25)), laminated(notice(rng, (100, 200)) // 3 + np.uint8([120, 0, 0]))))
+    parts.append(
+        Surface("extinguisher", placed(red, (LENGTH - 0.09, 3.68, 0.25)), plastic((0.62, 0.05, 0.05), 0.15))
+    )
     return parts
 
 
@@ -194,8 +205,8 @@ def _walls(seed: int, finishes: Finishes) -> list[Surface]:
     parts.append(_pinned(exit_sign(), 0.3, (LENGTH - 0.001, 3.0, 2.18), -pi / 2))
     parts += surfaces_placed(tool_wall(rng, finishes, 0.7), (0.001, 3.15, 1.15), pi / 2)
     parts.append(_pinned(notice_board(rng, (420, 420)), 0.5, (0.001, 0.45, 1.25), pi / 2))
-    for k in range(3):
-        parts.append(_pinned(notice(rng), 0.21, (LENGTH - 0.001, 2.42 - 0.02 * k, 1.9 - 0.31 * k) if k < 1 else (0.3 + 1.48 * k, WIDTH - 0.001, 1.5), -pi / 2 if k < 1 else 0.0))
+    parts.append(_pinned(notice(rng), 0.21, (LENGTH - 0.001, 2.42, 1.75), -pi / 2))
+    parts += [_pinned(notice(rng), 0.21, (x, WIDTH - 0.001, 1.5), 0.0) for x in (1.76, 3.24)]
     return parts
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from math import pi
 
 import numpy as np
+from jaxtyping import Float64
 
 from topoloc.simulation.conditions import CONDITIONS, Condition
 from topoloc.simulation.interiors import (
@@ -15,11 +16,9 @@ from topoloc.simulation.interiors import (
     ceiling_tiles,
     linoleum,
     plaster,
-    printed,
 )
-from topoloc.simulation.lettering import blank
-from topoloc.simulation.noise import fractal_noise, rng_of
-from topoloc.simulation.scene import Material, Mesh, Picture, Sky, Surface
+from topoloc.simulation.noise import rng_of
+from topoloc.simulation.scene import Material, Mesh, Sky, Surface
 from topoloc.simulation.shapes import box, join, lathe, panel, placed, tube
 from topoloc.simulation.skies import sky_of
 
@@ -30,29 +29,70 @@ WINDOWS = ((0.45, 1.6), (1.92, 3.07), (3.4, 4.55))
 """From and to, x; all in the north wall, y = WIDTH."""
 CEILING_LAMPS = ((1.2, 0.6), (3.6, 0.6), (1.2, 2.4), (3.6, 2.4))
 """Corners (x, y) of the lamps, which take one tile each."""
+DARK = 0.05
+"""Share of a clear noon's daylight below which people need lamps."""
 _TILE = 0.6
+_SCREENED = 0.1
+"""Share of the sun's light that comes through the sun-screening film of the windows, which lets the sky's light through."""
 
 
 def shell(seed: int, finishes: Finishes, lit: frozenset[int]) -> list[Surface]:
     """Everything that is built in; `lit` are the indices of the ceiling lamps that are on."""
-    return [*_faces(seed), *_window_front(seed, finishes), *_blinds(seed, finishes), *_ceiling_lamps(finishes, lit), *_fittings(finishes), _opposite(seed)]
+    return [*_faces(seed), *_window_front(seed, finishes), *_blinds(seed, finishes), *_ceiling_lamps(finishes, lit), *_fittings(finishes)]
 
 
-def window_sky(condition: Condition, seed: int) -> Sky:
-    """The sky, turned so that the sun, where it shines, comes through the windows at a slant of the seed's."""
-    sky = sky_of(condition, seed)
-    to_sun = sky_of(CONDITIONS["day"], seed).sun_direction
-    assert to_sun is not None
-    aim = pi / 2 + rng_of(seed, "window front").choice([-1, 1]) * rng_of(seed, "slant").uniform(0.35, 0.85)
-    num_columns = sky.radiance.shape[1]
-    columns = round((aim - np.arctan2(to_sun[1], to_sun[0])) / (2 * pi) * num_columns)
-    angle = columns * 2 * pi / num_columns
-    radiance = np.ascontiguousarray(np.roll(sky.radiance, columns, axis=1))
-    if sky.sun_direction is None:
-        return Sky(radiance)
-    c, s = np.cos(angle), np.sin(angle)
-    turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ sky.sun_direction
-    return Sky(radiance, turned, sky.sun_irradiance)
+def sky_above(condition: Condition, seed: int) -> Sky:
+    """The sun, where it shines, and a patch of sky around it; all else that shines in is on the shafts of `light_shafts`."""
+    to_sun = _to_sun(seed)
+    rows, columns = 64, 128
+    polar, azimuth = np.meshgrid((np.arange(rows) + 0.5) * pi / rows, np.arange(columns) * 2 * pi / columns, indexing="ij")
+    directions = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1)
+    patch = (directions @ to_sun > np.cos(0.35))[..., None] * _outdoors(condition)
+    if not condition.sun:
+        return Sky(patch.astype(np.float32))
+    r, g, b = sky_of(condition, seed).sun_irradiance
+    return Sky(patch.astype(np.float32), to_sun, (_SCREENED * r, _SCREENED * g, _SCREENED * b))
+
+
+def light_shafts(condition: Condition, seed: int) -> list[Surface]:
+    """What shines in through the windows: a shaft outside of each, along the direction of the sun, its walls as bright as the outdoors.
+
+    A room lit by the sky through its windows is the noisiest picture there is: of a hundred paths towards the sky three find the
+    window. The walls of a shaft that is parallel to the sun's rays keep none of them out, and nearly every path finds them.
+    By day they are as overexposed as what would be outside; by night they are as dark.
+    """
+    to_sun = _to_sun(seed)
+    along = to_sun * (3.0 / to_sun[1])
+    y, up = WIDTH + REVEAL, np.array([0.0, 0.0, LINTEL - SILL])
+    above, below = [], []
+    for x0, x1 in WINDOWS:
+        low, right = np.array([x0, y, SILL]), np.array([x1 - x0, 0.0, 0.0])
+        below.append(panel(low, along, right))
+        above.append(panel(low + up + along, -along, right))
+        above.append(panel(low + up, along, -up))
+        above.append(panel(low + right + up + along, -along, -up))
+    r, g, b = (_outdoors(condition) / max(_outdoors(condition).max(), 1e-9)).tolist()
+    sky = Material("light", (r**0.4545, g**0.4545, b**0.4545), radiance=float(_outdoors(condition).max()))
+    land = Material("light", (r**0.4545, g**0.4545, b**0.4545), radiance=0.5 * float(_outdoors(condition).max()))
+    return [Surface("outdoors", join(above), sky), Surface("outdoors", join(below), land)]
+
+
+def _to_sun(seed: int) -> Float64[np.ndarray, "3"]:
+    """The direction of the sun over this room: its height is that of the seed's sky; it comes through the windows at a slant."""
+    noon = sky_of(CONDITIONS["day"], seed).sun_direction
+    assert noon is not None
+    rng = rng_of(seed, "window front")
+    azimuth = pi / 2 + float(rng.choice([-1, 1])) * rng.uniform(0.35, 0.85)
+    level = float(np.hypot(noon[0], noon[1]))
+    return np.array([level * np.cos(azimuth), level * np.sin(azimuth), noon[2]])
+
+
+def _outdoors(condition: Condition) -> Float64[np.ndarray, "3"]:
+    """Mean radiance of what is outside: blue before sunrise, white by day, a town's glow by night."""
+    if condition.daylight <= 0.0:
+        return np.array([2.5e-4, 2e-4, 1.6e-4])
+    blue = np.array([0.5, 0.75, 1.3]) if condition.daylight < DARK else np.array([0.9, 1.0, 1.12])
+    return condition.daylight * blue
 
 
 def _faces(seed: int) -> list[Surface]:
@@ -115,13 +155,21 @@ def _blinds(seed: int, finishes: Finishes) -> list[Surface]:
     order = rng.permutation(3)
     x0, x1 = WINDOWS[int(order[0])]
     low = SILL + rng.uniform(0.1, 0.6)
-    slats = [panel((x0 + 0.07, WIDTH + 0.11, z + 0.012), (x1 - x0 - 0.14, 0, 0), (0, 0.03, -0.024)) for z in np.arange(low, LINTEL - 0.05, 0.036)]
+    slats = [
+        panel((x0 + 0.07, WIDTH + 0.11, z + 0.012), (x1 - x0 - 0.14, 0, 0), (0, 0.03, -0.024)) for z in np.arange(low, LINTEL - 0.05, 0.036)
+    ]
     cords = [tube((x, WIDTH + 0.125, low), (x, WIDTH + 0.125, LINTEL), 0.002, 4) for x in (x0 + 0.25, x1 - 0.25)]
-    cords += [box((x0 + 0.06, WIDTH + 0.1, LINTEL - 0.05), (x1 - 0.06, WIDTH + 0.15, LINTEL)), box((x0 + 0.07, WIDTH + 0.11, low - 0.03), (x1 - 0.07, WIDTH + 0.14, low - 0.01))]
+    cords += [
+        box((x0 + 0.06, WIDTH + 0.1, LINTEL - 0.05), (x1 - 0.06, WIDTH + 0.15, LINTEL)),
+        box((x0 + 0.07, WIDTH + 0.11, low - 0.03), (x1 - 0.07, WIDTH + 0.14, low - 0.01)),
+    ]
     x0, x1 = WINDOWS[int(order[1])]
     end = LINTEL - rng.uniform(0.25, 0.7)
     cloth = panel((x0 + 0.03, WIDTH + 0.08, LINTEL), (x1 - x0 - 0.06, 0, 0), (0, 0, end - LINTEL))
-    roll = [tube((x0 + 0.03, WIDTH + 0.06, LINTEL - 0.03), (x1 - 0.03, WIDTH + 0.06, LINTEL - 0.03), 0.028, 10), box((x0 + 0.03, WIDTH + 0.072, end - 0.02), (x1 - 0.03, WIDTH + 0.088, end))]
+    roll = [
+        tube((x0 + 0.03, WIDTH + 0.06, LINTEL - 0.03), (x1 - 0.03, WIDTH + 0.06, LINTEL - 0.03), 0.028, 10),
+        box((x0 + 0.03, WIDTH + 0.072, end - 0.02), (x1 - 0.03, WIDTH + 0.088, end)),
+    ]
     return [
         Surface("blind", join(slats), Material("matt", (0.8, 0.8, 0.76))),
         Surface("blind", join([*cords, *roll]), finishes.grey),
@@ -144,7 +192,9 @@ def _fittings(finishes: Finishes) -> list[Surface]:
     """A cable duct with sockets, heating pipes, a smoke detector, switches, an air conditioner."""
     duct = box((0.0, 0.0, 0.86), (3.9, 0.06, 0.97), faces="netbw")
     sockets = [box((x - 0.04, 0.06, 0.875), (x + 0.04, 0.066, 0.955)) for x in (0.6, 0.72, 1.7, 2.2, 2.32, 3.3)]
-    holes = [box((x + s - 0.006, 0.0655, 0.907), (x + s + 0.006, 0.067, 0.92)) for x in (0.6, 0.72, 1.7, 2.2, 2.32, 3.3) for s in (-0.012, 0.012)]
+    holes = [
+        box((x + s - 0.006, 0.0655, 0.907), (x + s + 0.006, 0.067, 0.92)) for x in (0.6, 0.72, 1.7, 2.2, 2.32, 3.3) for s in (-0.012, 0.012)
+    ]
     pipes = [tube((0.03, 0.06, z), (4.97, 0.06, z), 0.02, 10) for z in (2.62, 2.7)]
     clamps = [box((x, 0.0, 2.58), (x + 0.02, 0.085, 2.74)) for x in (0.8, 2.2, 3.6)]
     detector = placed(lathe([(0.0, -0.045), (0.03, -0.045), (0.045, -0.03), (0.055, -0.028), (0.055, 0.0)], 18), (2.7, 1.95, HEIGHT))
@@ -156,23 +206,3 @@ def _fittings(finishes: Finishes) -> list[Surface]:
         Surface("fittings", join([*holes, *slits]), finishes.rubber),
         Surface("pipes", join([*pipes, *clamps]), finishes.metal),
     ]
-
-
-def _opposite(seed: int) -> Surface:
-    """The building across the yard, 11 m away."""
-    rng = rng_of(seed, "opposite")
-    wall = panel((-9.0, WIDTH + 11.0, 5.0), (23.0, 0, 0), (0, 0, -11.0))
-    return Surface("outside", wall, printed(_building(rng, (440, 920))))
-
-
-def _building(rng: np.random.Generator, size: tuple[int, int]) -> Picture:
-    brick = np.array([0.55, 0.38, 0.3]) if rng.uniform() < 0.5 else np.array([0.68, 0.64, 0.55])
-    picture = (np.clip(brick * (1 + 0.05 * fractal_noise(rng, size, 20))[..., None], 0, 1) * 255).astype(np.uint8)
-    picture[::3] = (picture[::3] * 0.93).astype(np.uint8)
-    for top in range(40, size[0] - 60, 125):
-        for left in range(30, size[1] - 60, 84):
-            picture[top - 4 : top + 74, left - 4 : left + 50] = 205
-            picture[top : top + 70, left : left + 46] = blank((70, 46), (0.17, 0.2, 0.24))
-            picture[top : top + int(rng.integers(0, 45)), left : left + 46] = 170
-            picture[top : top + 70, left + 21 : left + 24] = 205
-    return picture

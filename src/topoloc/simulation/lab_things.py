@@ -169,7 +169,12 @@ def mesh_cables(rng: np.random.Generator, start: tuple[float, float, float], end
     for _ in range(num):
         t = np.linspace(0, 1, 9)[:, None]
         slack = rng.uniform(0.05, 0.25)
-        points = np.array(start) * (1 - t) + np.array(end) * t + rng.normal(0, 0.02, 3) * np.sin(pi * t) - np.array([0, 0, slack]) * 4 * t * (1 - t)
+        points = (
+            np.array(start) * (1 - t)
+            + np.array(end) * t
+            + rng.normal(0, 0.02, 3) * np.sin(pi * t)
+            - np.array([0, 0, slack]) * 4 * t * (1 - t)
+        )
         points[:, 2] = np.maximum(points[:, 2], 0.006)
         cables.append(bent_tube(list(points), 0.0045, 6))
     return join(cables)
