@@ -6,6 +6,7 @@ Repeated doors, long bare walls, a polished floor, windows from floor to ceiling
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -260,19 +261,16 @@ def _ceiling_lamps(seed: int, condition: Condition, fittings: Fittings) -> list[
 
 
 def _lit_lamps(seed: int, condition: Condition) -> set[int]:
-    """Which lamps burn. They are switched in circuits of two neighbours; by day those far from the windows, later any."""
+    """Which lamps burn: spread over the loop, by day away from the windows; of all of them, two are broken."""
     sites = _lamp_sites()
+    rng = rng_of(seed, f"corridor/lit lamps/{condition.name}")
     wanted = round(condition.lamps * len(sites))
-    rng = rng_of(seed, f"corridor/circuits/{condition.name}")
     if wanted >= len(sites):
-        broken = rng_of(seed, "corridor/broken lamps").choice(len(sites), 2, replace=False)
-        return set(range(len(sites))) - {int(number) for number in broken}
-    circuits = [(i, i + 1) for i in range(0, len(sites), 2)]
-    rank = rng.random(len(circuits))
-    if condition.daylight > 0.05:
-        rank += [1.0 if _by_windows(*sites[circuit[0]][:2]) else 0.0 for circuit in circuits]
-    order = [number for index in np.argsort(rank) for number in circuits[int(index)]]
-    return set(order[:wanted])
+        return set(range(len(sites))) - {int(number) for number in rng.choice(len(sites), 2, replace=False)}
+    by_day = condition.daylight > 0.05
+    useful = [number for number, (x, y, _) in enumerate(sites) if not (by_day and _by_windows(x, y))]
+    bounds = np.linspace(0, len(useful), min(wanted, len(useful)) + 1).round().astype(int)
+    return {useful[int(rng.integers(low, high))] for low, high in pairwise(bounds.tolist())}
 
 
 def _by_windows(x: float, y: float) -> bool:

@@ -65,7 +65,7 @@ def _front(rng: np.random.Generator, front: _Face, cladding: Color, seed: int, n
         top_left = np.asarray(corner) + np.asarray(right) * wide * (column + 0.22) - np.array([0.0, 0.0, (row + 0.18) * _STOREY]) + outward
         panes.append(panel(top_left, np.asarray(right) * wide * 0.56, (0.0, 0.0, -0.5 * _STOREY)))
     if panes:
-        surfaces.append(solid(f"lit windows {number}", Material("light", _lit_window(), radiance=0.15), *panes))
+        surfaces.append(solid(f"lit windows {number}", Material("light", _lit_window(), radiance=0.05), *panes))
     return surfaces
 
 

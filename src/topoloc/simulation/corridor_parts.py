@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from topoloc.simulation import interiors, prints
@@ -200,14 +201,14 @@ def hung_sign(picture: Picture, lit: bool, fittings: Fittings, size: tuple[float
     return [solid("hung sign", fittings.white, body, *rods), Surface("hung sign face", join(faces), material)]
 
 
-def ceiling_lamp(on: bool, warmth: float, fittings: Fittings, size: tuple[float, float] = (1.2, 0.3)) -> list[Surface]:
-    """A lamp let into the ceiling around the origin; `warmth` in [0, 1] is the colour of its light."""
+def ceiling_lamp(on: bool, warmth: float, fittings: Fittings, size: tuple[float, float] = (1.2, 0.26)) -> list[Surface]:
+    """A flat lamp under the ceiling around the origin, whose sides shine too; `warmth` in [0, 1] is the colour of its light."""
     x, y = size[0] / 2, size[1] / 2
-    cover = panel((-x, -y, HEIGHT - 0.012), (2 * x, 0.0, 0.0), (0.0, 2 * y, 0.0))
-    edges = [box((-x - 0.02, s * y - 0.012, HEIGHT - 0.025), (x + 0.02, s * y + 0.012, HEIGHT)) for s in (-1, 1)]
-    edges += [box((s * x - 0.012, -y, HEIGHT - 0.025), (s * x + 0.012, y, HEIGHT)) for s in (-1, 1)]
+    cover = box((-x, -y, HEIGHT - 0.065), (x, y, HEIGHT - 0.015), faces="nsewb")
+    plate = box((-x - 0.015, -y - 0.015, HEIGHT - 0.015), (x + 0.015, y + 0.015, HEIGHT), faces="nsewb")
+    caps = [box((s * x - 0.01, -y - 0.005, HEIGHT - 0.07), (s * x + 0.01, y + 0.005, HEIGHT - 0.01)) for s in (-1, 1)]
     color = (1.0, 0.985 - 0.06 * warmth, 0.96 - 0.14 * warmth)
-    return [Surface("lamp cover", cover, interiors.ceiling_lamp(on, color=color)), solid("lamp frame", fittings.white, *edges)]
+    return [Surface("lamp cover", cover, interiors.ceiling_lamp(on, color=color)), solid("lamp frame", fittings.white, plate, *caps)]
 
 
 def pillar(material: Material) -> Surface:
@@ -253,14 +254,16 @@ def pipes(length: float) -> list[Mesh]:
 
 
 def _fire_sign() -> Picture:
-    """White flame and extinguisher on red, as the standard has it, simplified."""
-    picture = np.full((64, 64, 3), (190, 22, 20), np.uint8)
-    picture[24:56, 14:28] = 245
-    picture[18:24, 18:24] = 245
-    picture[20:24, 24:34] = 245
-    for row in range(16, 56):
-        half = round(9 * np.sin((row - 14) / 44 * np.pi) ** 0.6)
-        picture[row, 44 - half : 44 + half] = 245
+    """An extinguisher and a flame, white on red."""
+    picture = np.full((96, 96, 3), (190, 22, 20), np.uint8)
+    white = (245, 245, 245)
+    cv2.rectangle(picture, (4, 4), (91, 91), white, 2)
+    cv2.rectangle(picture, (24, 38), (44, 84), white, -1)
+    cv2.rectangle(picture, (31, 24), (37, 38), white, -1)
+    cv2.line(picture, (34, 25), (50, 20), white, 4, cv2.LINE_AA)
+    cv2.ellipse(picture, (34, 40), (18, 16), 0.0, 180.0, 262.0, white, 3, cv2.LINE_AA)
+    flame = [(66, 84), (56, 72), (58, 56), (63, 62), (66, 42), (74, 54), (76, 50), (82, 68), (76, 82)]
+    cv2.fillPoly(picture, [np.array(flame, np.int32)], white, cv2.LINE_AA)
     return picture
 
 
