@@ -44,12 +44,14 @@ def box(low: Vector, high: Vector, texels: float | None = None, faces: str = "ns
         "t": ((x0, y1, z1), (w, 0, 0), (0, -d, 0)),
         "b": ((x0, y0, z0), (w, 0, 0), (0, d, 0)),
     }
-    panels = []
-    for face in faces:
-        corner, across, down = sides[face]
-        repeat = (1.0, 1.0) if texels is None else (texels * float(np.linalg.norm(across)), texels * float(np.linalg.norm(down)))
-        panels.append(panel(corner, across, down, repeat))
-    return join(panels)
+    origin, across, down = np.array([sides[face] for face in faces], dtype=np.float64).transpose(1, 0, 2)
+    vertices = np.stack([origin, origin + down, origin + across + down, origin + across], axis=1).reshape(-1, 3)
+    repeat = np.ones((len(faces), 2))
+    if texels is not None:
+        repeat = texels * np.column_stack([np.linalg.norm(across, axis=1), np.linalg.norm(down, axis=1)])
+    uv = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 1.0], [1.0, 0.0]])[None] * repeat[:, None]
+    triangles = 4 * np.arange(len(faces))[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])
+    return Mesh(vertices, triangles.reshape(-1, 3).astype(np.int32), uv.reshape(-1, 2))
 
 
 def prism(outline: Sequence[Sequence[float]] | Float64[np.ndarray, "n 2"], low: float, high: float, texels: float | None = None) -> Mesh:
