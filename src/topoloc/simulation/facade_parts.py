@@ -6,6 +6,7 @@ In a front's own frame x runs to the right and z up, seen from the street, and y
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -40,13 +41,17 @@ def wall_uv(corners: Float64[np.ndarray, "n 4 3"], shift: float) -> Float64[np.n
     return np.stack([(corners[..., 0] + shift + 0.37 * corners[..., 1]) / width, 1.0 - corners[..., 2] / height], axis=-1)
 
 
-def wall(width: float, z: Span, columns: Sequence[Span], rows: Sequence[Span], blind: Bool[np.ndarray, "r c"], shift: float) -> tuple[Mesh, Openings]:
+def wall(
+    width: float, z: Span, columns: Sequence[Span], rows: Sequence[Span], blind: Bool[np.ndarray, "r c"], shift: float
+) -> tuple[Mesh, Openings]:
     """A wall from z[0] to z[1] with openings where columns and rows cross, except the blind ones; and these openings."""
     xs = np.unique(np.concatenate([[0.0, width], np.ravel(columns)]))
     zs = np.unique(np.concatenate([z, np.ravel(rows)]))
-    holes = np.array([[c[0], c[1], r[0], r[1]] for i, r in enumerate(rows) for j, c in enumerate(columns) if not blind[i, j]]).reshape(-1, 4)
+    holes = np.array([[c[0], c[1], r[0], r[1]] for i, r in enumerate(rows) for j, c in enumerate(columns) if not blind[i, j]]).reshape(
+        -1, 4
+    )
     pieces = []
-    for x0, x1 in zip(xs[:-1], xs[1:], strict=True):
+    for x0, x1 in pairwise(xs.tolist()):
         free = [z[0]]
         inside = holes[(holes[:, 0] <= x0 + 1e-9) & (holes[:, 1] >= x1 - 1e-9)]
         for low, high in inside[np.argsort(inside[:, 2]), 2:]:
@@ -159,5 +164,5 @@ def side_walls(width: float, depth: float, height: float, which: str) -> list[Me
     for side in which:
         mesh = made[side]
         # The wall's foot, where its picture is damp, belongs on the ground.
-        result.append(Mesh(mesh.vertices, mesh.faces, mesh.uv + [0.0, 1.0 - uv_height]))
+        result.append(Mesh(mesh.vertices, mesh.faces, mesh.uv + np.array([0.0, 1.0 - uv_height])))
     return result

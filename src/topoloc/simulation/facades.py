@@ -129,7 +129,9 @@ def _ground_floor(
     wide = 3.2 if style.ground == "workshop" else 1.15
     columns = [(float(x - style.window[0] / 2), float(x + style.window[0] / 2)) for i, x in enumerate(middles) if i != door_bay]
     rows = [(1.3, 2.8)] if style.ground == "homes" else [(2.1, 3.0)]
-    low, openings = wall(width, (0.0, 3.7), [*columns, (door - wide / 2, door + wide / 2)], rows, np.zeros((1, len(columns) + 1), bool), shift)
+    low, openings = wall(
+        width, (0.0, 3.7), [*columns, (door - wide / 2, door + wide / 2)], rows, np.zeros((1, len(columns) + 1), bool), shift
+    )
     # The wall function makes a window of the door's column; the door itself stands before it, in a porch of the trim's material.
     openings = openings[:-1]
     high = 2.9 if style.ground == "homes" else 3.1
@@ -160,7 +162,9 @@ def _shop(width: float, pier: Material, trim: Material, shift: float, rng: np.ra
     parts += [("frame", frames(openings, 0.3, (1, 0), 0.07), kit.iron if rng.uniform() < 0.6 else kit.steel)]
     door = openings[int(rng.integers(0, num))]
     leaf = np.array([[door[0] + 0.1, door[0] + 1.15, 0.05, 2.3]])
-    parts += [("door", join([bands(surrounds(leaf, 0.08), 0.02, 0.25), bands(np.array([[leaf[0, 0], leaf[0, 1], 0.05, 0.5]]), 0.01)]), kit.iron)]
+    parts += [
+        ("door", join([bands(surrounds(leaf, 0.08), 0.02, 0.25), bands(np.array([[leaf[0, 0], leaf[0, 1], 0.05, 0.5]]), 0.01)]), kit.iron)
+    ]
     first = 0.4
     while first < width - 3.0:
         long = min(float(rng.uniform(3.5, 5.5)), width - first - 0.3)
@@ -175,7 +179,9 @@ def _shop(width: float, pier: Material, trim: Material, shift: float, rng: np.ra
     return parts
 
 
-def _balconies(columns: list[tuple[float, float]], floors: list[float], style: Style, rng: np.random.Generator, kit: StreetMaterials) -> Parts:
+def _balconies(
+    columns: list[tuple[float, float]], floors: list[float], style: Style, rng: np.random.Generator, kit: StreetMaterials
+) -> Parts:
     slabs, rails = [], []
     chosen = rng.uniform(size=len(columns)) < style.balconies
     for j in np.flatnonzero(chosen).tolist():
@@ -186,7 +192,9 @@ def _balconies(columns: list[tuple[float, float]], floors: list[float], style: S
     return [("balcony", join(slabs), kit.concrete), ("railing", join(rails), kit.iron)] if slabs else []
 
 
-def _roof(style: Style, width: float, depth: float, height: float, material: Material, rng: np.random.Generator, kit: StreetMaterials) -> Parts:
+def _roof(
+    style: Style, width: float, depth: float, height: float, material: Material, rng: np.random.Generator, kit: StreetMaterials
+) -> Parts:
     pipe = tube((width - 0.15, -0.1, 0.0), (width - 0.15, -0.1, height - 0.2), 0.05, 6)
     if style.flat:
         parapet = bands(np.array([[0.0, width, height, height + 0.5]]), 0.03, 0.25)
@@ -201,7 +209,12 @@ def _roof(style: Style, width: float, depth: float, height: float, material: Mat
         stacks.append(box((x, depth / 2 - 0.4, height), (x + 0.9, depth / 2 + 0.3, top), texels=0.08))
         pots += [cylinder((x + d, depth / 2), 0.1, top, top + 0.35, 6) for d in (0.25, 0.65)]
     roof = kit.roofs[int(rng.integers(0, len(kit.roofs)))]
-    parts: Parts = [("roof", tiles, roof), ("wall", ends, material), ("chimney", join(stacks), kit.bricks[0]), ("chimney", join(pots), kit.roofs[0])]
+    parts: Parts = [
+        ("roof", tiles, roof),
+        ("wall", ends, material),
+        ("chimney", join(stacks), kit.bricks[0]),
+        ("chimney", join(pots), kit.roofs[0]),
+    ]
     gutter = tube((0.0, -0.5, height - rise * 0.9 / depth), (width, -0.5, height - rise * 0.9 / depth), 0.07, 6)
     parts += [("pipe", join([pipe, gutter]), kit.steel)]
     if rng.uniform() < 0.6:
@@ -232,7 +245,10 @@ def office(width: float, depth: float, sides: str, rng: np.random.Generator, kit
     dark = np.array([[0.0, width, 4.0 + step * k, 4.0 + step * k + 0.9] for k in range(num_floors)])
     parts = _split_panes("window", np.array(spans), 0.06, ROOMS, kit.panes, rng, kit.lit * 0.4)
     parts += _split_panes("display window", np.array(lobby), 0.3, SHOPS, kit.shops, rng, kit.lit * 0.8)
-    parts += [("panel", bands(dark, 0.0, 0.1), kit.curtain_wall), ("trim", bands(np.array([[0.0, width, 3.5, 4.0], [0.0, width, height, height + 0.6]]), 0.1, 0.4), kit.trims[2])]
+    parts += [
+        ("panel", bands(dark, 0.0, 0.1), kit.curtain_wall),
+        ("trim", bands(np.array([[0.0, width, 3.5, 4.0], [0.0, width, height, height + 0.6]]), 0.1, 0.4), kit.trims[2]),
+    ]
     mullions = np.array([[x - 0.03, x + 0.03, 4.0, height] for x in xs])
     posts = np.array([[x - 0.06, x + 0.06, 0.0, 3.5] for x in xs[::2]])
     parts += [("mullion", join([bands(mullions, 0.07, 0.06), bands(posts, 0.0, 0.35)]), kit.steel)]

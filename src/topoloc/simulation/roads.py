@@ -7,6 +7,8 @@ from above), and `offset`, metres to the right of it (outwards).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -27,9 +29,8 @@ PAVEMENT = 5.85, 8.7
 KERB = 0.12
 _LONG, _SHORT, _ARC = 2 * (HALF_LENGTH - RADIUS), 2 * (HALF_WIDTH - RADIUS), RADIUS * np.pi / 2
 LENGTH = 2 * (_LONG + _SHORT) + 4 * _ARC
-SIDES = ((0.0, _LONG), (_LONG + _ARC, _LONG + _ARC + _SHORT)) + tuple(
-    (start + LENGTH / 2, end + LENGTH / 2) for start, end in ((0.0, _LONG), (_LONG + _ARC, _LONG + _ARC + _SHORT))
-)
+_HALF = ((0.0, _LONG), (_LONG + _ARC, _LONG + _ARC + _SHORT))
+SIDES = tuple((half + start, half + end) for half in (0.0, LENGTH / 2) for start, end in _HALF)
 """Stations where each of the four straight stretches begins and ends."""
 _TEXEL = 0.016
 _TILE_PX = (round(2 * HALF_ROAD / _TEXEL), 1000)
@@ -74,14 +75,15 @@ def sweep(stations: Float64[np.ndarray, "n"], u: Float64[np.ndarray, "n"], profi
     return Mesh(vertices.reshape(-1, 3), faces.astype(np.int32), uv.reshape(-1, 2))
 
 
-def tiles() -> list[tuple[float, float]]:
+@cache
+def tiles() -> tuple[tuple[float, float], ...]:
     """The stretches of street that carry one picture of asphalt each: about 16 m, an arc is one."""
     result = []
     for (start, end), following in zip(SIDES, [*(side[0] for side in SIDES[1:]), LENGTH], strict=True):
         cuts = np.linspace(start, end, round((end - start) / 16.0) + 1)
-        result += [(float(a), float(b)) for a, b in zip(cuts[:-1], cuts[1:], strict=True)]
+        result += list(pairwise(cuts.tolist()))
         result.append((end, float(following)))
-    return result
+    return tuple(result)
 
 
 def crossings(seed: int) -> list[int]:
@@ -152,7 +154,7 @@ def _edges(rng: np.random.Generator, wet: bool) -> list[Surface]:
 def _asphalt(rng: np.random.Generator, kind: str) -> Picture:
     """One picture of the whole width, left kerb on top; 16 m."""
     h, w = _TILE_PX
-    value = 1.0 + 0.13 * smooth_noise(rng, (h, w), 0.6) + 0.05 * smooth_noise(rng, (h, w), 2.0) + 0.05 * blotches(rng, (h, w), 90)
+    value = 1.0 + 0.075 * smooth_noise(rng, (h, w), 0.6) + 0.02 * smooth_noise(rng, (h, w), 2.0) + 0.05 * blotches(rng, (h, w), 90)
     offsets = (np.arange(h) + 0.5) * _TEXEL - HALF_ROAD
     for lane in (-LANE / 2, LANE / 2):
         value *= 1.0 - 0.10 * np.exp(-(((offsets - lane) / 0.3) ** 2))[:, None] * (1.0 + 0.4 * blotches(rng, (h, w), 60))
@@ -225,7 +227,7 @@ def _markings(kind: str) -> np.ndarray:
             middle = 8.0
             stripe(middle - 1.6, middle + 1.2, centre - 0.08, centre + 0.08)
             tip = np.array([[middle + way * 2.3, centre], [middle + way * 1.0, centre - 0.42], [middle + way * 1.0, centre + 0.42]])
-            cv2.fillPoly(paint, [np.round((tip + [0.0, HALF_ROAD]) / _TEXEL).astype(np.int32)], 1.0)
+            cv2.fillPoly(paint, [np.round((tip + np.array([0.0, HALF_ROAD])) / _TEXEL).astype(np.int32)], 1.0)
     return cv2.GaussianBlur(paint, (0, 0), 0.6)[..., None]
 
 

@@ -5,6 +5,7 @@ Traffic keeps to the right and the loop is driven counter-clockwise, seen from a
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import isfinite
 
 import numpy as np
@@ -12,7 +13,21 @@ import numpy as np
 from topoloc.simulation.conditions import Condition
 from topoloc.simulation.facades import set_at
 from topoloc.simulation.noise import rng_of
-from topoloc.simulation.roads import HALF_LENGTH, HALF_WIDTH, KERB, LANE, LENGTH, PAVEMENT, RADIUS, SIDES, centre_line, crossings, position, roads, tiles
+from topoloc.simulation.roads import (
+    HALF_LENGTH,
+    HALF_WIDTH,
+    KERB,
+    LANE,
+    LENGTH,
+    PAVEMENT,
+    RADIUS,
+    SIDES,
+    centre_line,
+    crossings,
+    position,
+    roads,
+    tiles,
+)
 from topoloc.simulation.scene import Haze, Mesh, Scene, Sky, Surface
 from topoloc.simulation.shapes import tube
 from topoloc.simulation.skies import sky_of
@@ -60,9 +75,10 @@ def build(seed: int, condition: Condition, arrangement: int = 0) -> Scene:
     things = furniture_materials(rng_of(seed, "street/furniture"))
     surfaces = roads(seed, condition.wet)
     surfaces += fronts(seed, kit, things)
-    surfaces += _pavements(seed, kit, things)
+    kept = _kept_free(seed)
+    surfaces += _pavements(seed, kept, kit, things)
     surfaces += _corners(seed, kit, things, surfaces)
-    surfaces += _cars(seed, arrangement) + _bins(seed, arrangement, kit, things)
+    surfaces += _cars(seed, kept, arrangement) + _bins(seed, kept, arrangement, kit, things)
     sky = sky_of(condition, seed)
     haze = Haze(condition.visibility, _horizon(sky)) if isfinite(condition.visibility) else None
     return Scene(tuple(surfaces), sky, haze)
@@ -81,24 +97,27 @@ def _beside(surfaces: list[Surface], station: float, offset: float, height: floa
     return set_at(surfaces, (x, y, height), yaw if offset > 0 else yaw + np.pi)
 
 
-def _zebra_stations(seed: int) -> list[tuple[float, float]]:
-    return [tiles()[i] for i in crossings(seed)]
+@dataclass(frozen=True)
+class _KeptFree:
+    """Where no car may stand: stations of zebra crossings, from and to; stations and sides (+1 is right) of bus stops."""
+
+    zebras: tuple[tuple[float, float], ...]
+    bus_stops: tuple[tuple[float, float], ...]
+
+    def allows(self, station: float, side: float, margin: float) -> bool:
+        """Whether a thing within `margin` metres of a station disturbs neither."""
+        at_zebra = any(start - margin < station < end + margin for start, end in self.zebras)
+        return not at_zebra and not any(side == way and abs(station - stop) < 7.0 + margin for stop, way in self.bus_stops)
 
 
-def _bus_stations(seed: int) -> list[tuple[float, float]]:
-    """Stations and sides (+1 is right) of the bus stops."""
+def _kept_free(seed: int) -> _KeptFree:
     rng = rng_of(seed, "bus stops")
-    longs = (SIDES[0], SIDES[2])
-    return [(start + (end - start) * float(rng.uniform(0.2, 0.8)), side) for start, end in longs for side in (1.0, -1.0)]
+    stops = [(start + (end - start) * float(rng.uniform(0.2, 0.8)), side) for start, end in (SIDES[0], SIDES[2]) for side in (1.0, -1.0)]
+    made = tiles()
+    return _KeptFree(tuple(made[i] for i in crossings(seed)), tuple(stops))
 
 
-def _free(seed: int, station: float, side: float, margin: float) -> bool:
-    at_zebra = any(start - margin < station < end + margin for start, end in _zebra_stations(seed))
-    at_bus = any(side == way and abs(station - stop) < 7.0 + margin for stop, way in _bus_stations(seed))
-    return not (at_zebra or at_bus)
-
-
-def _pavements(seed: int, kit: StreetMaterials, things: FurnitureMaterials) -> list[Surface]:
+def _pavements(seed: int, kept: _KeptFree, kit: StreetMaterials, things: FurnitureMaterials) -> list[Surface]:
     """Lamps, trees, signs and the rest along the kerbs, shelters, traffic lights at crossings, wires overhead."""
     rng = rng_of(seed, "pavements")
     edge = PAVEMENT[0] + 0.45
@@ -115,17 +134,19 @@ def _pavements(seed: int, kit: StreetMaterials, things: FurnitureMaterials) -> l
                 count += 1
                 if k % 6 == (0 if side > 0 else 3):
                     result += _beside(lamp_post(bool(lamp_luck < kit.lit), kit), station, side * edge)
-                elif not _free(seed, station, side, -2.0):
+                elif not kept.allows(station, side, -2.0):
                     continue
                 elif leafy and k % 2:
-                    result += _beside(tree(own, kit, float(own.uniform(5.5, 8.5)), float(own.uniform(1.7, 2.4)), 1600), station, side * (edge + 0.3))
+                    result += _beside(
+                        tree(own, kit, float(own.uniform(5.5, 8.5)), float(own.uniform(1.7, 2.4))), station, side * (edge + 0.3)
+                    )
                 elif luck < 0.17:
                     result += _beside(traffic_sign(own, kit, things), station, side * edge)
                 elif luck < 0.42:
                     result += _beside(small_thing(own, kit, things), station, side * (edge + 0.1))
-    for station, side in _bus_stations(seed):
+    for station, side in kept.bus_stops:
         result += _beside(bus_stop(rng, kit, things), station, side * 7.5)
-    for start, end in _zebra_stations(seed):
+    for start, end in kept.zebras:
         middle = (start + end) / 2
         result += _beside(traffic_light(kit, things), middle + 3.2, edge) + _beside(traffic_light(kit, things), middle - 3.2, -edge)
     return result + _wires(rng, kit)
@@ -155,11 +176,11 @@ def _corners(seed: int, kit: StreetMaterials, things: FurnitureMaterials, made: 
         result.append(Surface("pavement", Mesh(vertices, faces, outline / [8.0, 2.85]), paving))
         middle = end + RADIUS * np.pi / 4
         result += _beside(advertising_pillar(rng, kit, things), middle, 10.3)
-        result += _beside(tree(rng, kit, 7.0, 2.2, 1800), middle - 4.0, 7.2) + _beside(tree(rng, kit, 6.5, 2.0, 1800), middle + 4.0, 7.2)
+        result += _beside(tree(rng, kit, 7.0, 2.2), middle - 4.0, 7.2) + _beside(tree(rng, kit, 6.5, 2.0), middle + 4.0, 7.2)
     return result
 
 
-def _cars(seed: int, arrangement: int) -> list[Surface]:
+def _cars(seed: int, kept: _KeptFree, arrangement: int) -> list[Surface]:
     """Both edges of the street full of parked cars, with gaps; each heads the way its side drives."""
     kit = car_materials(rng_of(seed, "car materials"))
     rng = rng_of(seed, f"cars/{arrangement}")
@@ -172,20 +193,20 @@ def _cars(seed: int, arrangement: int) -> list[Surface]:
                 paint, plate = int(rng.integers(0, len(PAINTS))), int(rng.integers(0, 24))
                 crowd = float(np.clip(crowd + rng.normal(0.0, 0.2), 0.25, 0.85))
                 offset, askew = side * (4.68 + float(rng.uniform(-0.06, 0.08))), float(rng.normal(0.0, 0.015))
-                if rng.uniform() < crowd and _free(seed, station, side, 0.0):
+                if rng.uniform() < crowd and kept.allows(station, side, 0.0):
                     x, y, yaw = position(station, offset)
                     result += parked(car(shape, paint, plate, kit), (x, y, -0.015), yaw + askew + (0.0 if side > 0 else np.pi))
                 station += 5.4 + float(rng.exponential(0.5))
     return result
 
 
-def _bins(seed: int, arrangement: int, kit: StreetMaterials, things: FurnitureMaterials) -> list[Surface]:
+def _bins(seed: int, kept: _KeptFree, arrangement: int, kit: StreetMaterials, things: FurnitureMaterials) -> list[Surface]:
     rng = rng_of(seed, f"bins/{arrangement}")
     result = []
     for _ in range(45):
         start, end = SIDES[int(rng.choice(4, p=[0.42, 0.08, 0.42, 0.08]))]
         station, side = float(rng.uniform(start + 3, end - 5)), float(rng.choice([-1.0, 1.0]))
         for k in range(int(rng.integers(1, 4))):
-            if _free(seed, station, side, 0.0):
+            if kept.allows(station, side, 0.0):
                 result += _beside(bin_of(rng, kit, things), station + 0.7 * k, side * 8.05)
     return result

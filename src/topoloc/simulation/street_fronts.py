@@ -39,7 +39,11 @@ def fronts(seed: int, kit: StreetMaterials, things: FurnitureMaterials) -> list[
     for index, ((x, y), yaw, length) in enumerate(rows):
         pieces = _row(seed, index, length, kit, things)
         result += set_at(pieces, (x, y, _FOOT), yaw)
-    corners = [box((sx * (_IN[0] - 0.25) - 0.4, sy * (_IN[1] - 0.25) - 0.4, 0), (sx * (_IN[0] - 0.25) + 0.4, sy * (_IN[1] - 0.25) + 0.4, 11)) for sx in (-1, 1) for sy in (-1, 1)]
+    corners = [
+        box((sx * (_IN[0] - 0.25) - 0.4, sy * (_IN[1] - 0.25) - 0.4, 0), (sx * (_IN[0] - 0.25) + 0.4, sy * (_IN[1] - 0.25) + 0.4, 11))
+        for sx in (-1, 1)
+        for sy in (-1, 1)
+    ]
     result.append(Surface("corner", join(corners), kit.stones[0]))
     return result + _behind(rng_of(seed, "skyline"), kit)
 
@@ -101,9 +105,15 @@ def _gap(rng: np.random.Generator, width: float, kit: StreetMaterials, things: F
         result += [Surface("garage", garage, kit.plasters[0]), Surface("gate", join(gates), kit.fence)]
     if kind < 3:
         for _ in range(int(rng.integers(1, 3))):
-            result += set_at(tree(rng, kit, float(rng.uniform(5.5, 10.0)), 2.4, 1800), (float(rng.uniform(2.2, width - 2.2)), float(rng.uniform(4.5, 11.0)), 0.0), 0.0)
+            result += set_at(
+                tree(rng, kit, float(rng.uniform(5.5, 10.0)), 2.4),
+                (float(rng.uniform(2.2, width - 2.2)), float(rng.uniform(4.5, 11.0)), 0.0),
+                0.0,
+            )
         for _ in range(int(rng.integers(2, 6))):
-            result += set_at(bush(rng, float(rng.uniform(0.5, 1.1)), kit), (float(rng.uniform(1, width - 1)), float(rng.uniform(1.6, 8.0)), 0.0), 0.0)
+            result += set_at(
+                bush(rng, float(rng.uniform(0.5, 1.1)), kit), (float(rng.uniform(1, width - 1)), float(rng.uniform(1.6, 8.0)), 0.0), 0.0
+            )
     elif rng.uniform() < 0.6:
         result += [Surface("poster", panel((0.05, 4.0 + 2 * k, 2.4), (0, -1.4, 0), (0, 0, -2.0)), things.posters[k]) for k in range(2)]
     return result
@@ -125,13 +135,16 @@ def _behind(rng: np.random.Generator, kit: StreetMaterials) -> list[Surface]:
         result.append(Surface("skyline", join(meshes), Material("matt", _far_front(rng))))
     for _ in range(14):
         at = (float(rng.uniform(-_IN[0] + 20, _IN[0] - 20)), float(rng.uniform(-8.0, 8.0)), -0.05)
-        result += set_at(tree(rng, kit, float(rng.uniform(10.0, 15.0)), 3.6, 1500), at, 0.0)
+        result += set_at(tree(rng, kit, float(rng.uniform(10.0, 15.0)), 3.6), at, 0.0)
     return result
 
 
 def _far_front(rng: np.random.Generator) -> Picture:
     """12 m of a front as it is seen from far, windows and all."""
-    picture = colored((0.7, 0.66, 0.58) if rng.uniform() < 0.6 else (0.55, 0.42, 0.36), 1.0 + 0.04 * blotches(rng, (240, 240), 60) + 0.02 * smooth_noise(rng, (240, 240), 1))
+    picture = colored(
+        (0.7, 0.66, 0.58) if rng.uniform() < 0.6 else (0.55, 0.42, 0.36),
+        1.0 + 0.04 * blotches(rng, (240, 240), 60) + 0.02 * smooth_noise(rng, (240, 240), 1),
+    )
     for row in range(4):
         for column in range(4):
             x, y = 60 * column + 18, 60 * row + 14

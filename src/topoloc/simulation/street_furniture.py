@@ -127,7 +127,13 @@ def traffic_light(kit: StreetMaterials, things: FurnitureMaterials) -> list[Surf
 
 def advertising_pillar(rng: np.random.Generator, kit: StreetMaterials, things: FurnitureMaterials) -> list[Surface]:
     """A round pillar pasted with posters, under a small roof."""
-    result = [Surface("pillar", join([cylinder((0, 0), 0.62, 0.0, 0.45), cylinder((0, 0), 0.6, 2.75, 3.0), cylinder((0, 0), 0.72, 3.0, 3.15)]), kit.concrete)]
+    result = [
+        Surface(
+            "pillar",
+            join([cylinder((0, 0), 0.62, 0.0, 0.45), cylinder((0, 0), 0.6, 2.75, 3.0), cylinder((0, 0), 0.72, 3.0, 3.15)]),
+            kit.concrete,
+        )
+    ]
     edges = np.linspace(0.0, 2 * np.pi, 25)
     order = rng.permutation(len(things.posters))
     for k in range(6):
@@ -171,11 +177,16 @@ def small_thing(rng: np.random.Generator, kit: StreetMaterials, things: Furnitur
         parts = [box((-0.25, -0.2, 0.5), (0.25, 0.2, 1.3)), tube((0, 0, 0), (0, 0, 0.5), 0.06)]
         return [Surface("post box", join(parts), things.yellow), Surface("post box", box((-0.15, 0.2, 1.15), (0.15, 0.21, 1.19)), kit.iron)]
     if kind == 1:
-        return [Surface("cabinet", box((-0.6, -0.2, 0.0), (0.6, 0.2, 1.15)), kit.concrete), Surface("poster", panel((0.3, 0.21, 1.0), (-0.5, 0, 0), (0, 0, -0.6)), things.posters[0])]
+        return [
+            Surface("cabinet", box((-0.6, -0.2, 0.0), (0.6, 0.2, 1.15)), kit.concrete),
+            Surface("poster", panel((0.3, 0.21, 1.0), (-0.5, 0, 0), (0, 0, -0.6)), things.posters[0]),
+        ]
     if kind == 2:
         return [Surface("litter basket", join([cylinder((0, 0), 0.22, 0.35, 0.95, 10), tube((0, 0, 0), (0, 0, 1.2), 0.03)]), things.green)]
     if kind == 3:
-        seats = [box((-0.8, y, 0.45), (0.8, y + 0.1, 0.49)) for y in (-0.2, -0.07, 0.06)] + [box((-0.8, -0.3, z), (0.8, -0.26, z + 0.1)) for z in (0.62, 0.78)]
+        seats = [box((-0.8, y, 0.45), (0.8, y + 0.1, 0.49)) for y in (-0.2, -0.07, 0.06)] + [
+            box((-0.8, -0.3, z), (0.8, -0.26, z + 0.1)) for z in (0.62, 0.78)
+        ]
         legs = [box((x, -0.3, 0.0), (x + 0.06, 0.16, 0.45)) for x in (-0.65, 0.6)]
         return [Surface("bench", join(seats), things.wood), Surface("bench", join(legs), kit.iron)]
     return [Surface("bollard", join([cylinder((x, 0.0), 0.07, 0.0, 0.95, 8) for x in (-1.5, 0.0, 1.5)]), kit.iron)]

@@ -13,7 +13,8 @@ from topoloc.simulation.street_textures import ashlar, bark, blotches, brickwork
 from topoloc.simulation.windows import displays, rooms, signs
 
 _PLASTERS: tuple[Color, ...] = (
-    (0.88, 0.85, 0.76), (0.86, 0.76, 0.56), (0.83, 0.66, 0.55), (0.8, 0.8, 0.79), (0.9, 0.9, 0.88), (0.72, 0.78, 0.72), (0.68, 0.72, 0.77), (0.7, 0.5, 0.42),
+    (0.88, 0.85, 0.76), (0.86, 0.76, 0.56), (0.83, 0.66, 0.55), (0.8, 0.8, 0.79), (0.9, 0.9, 0.88),
+    (0.72, 0.78, 0.72), (0.68, 0.72, 0.77), (0.7, 0.5, 0.42),
 )  # fmt: skip
 _DAYLIT = 0.1
 """Share of a clear noon above which lamps outside are off, and those in rooms do not show."""
@@ -61,8 +62,13 @@ def street_materials(seed: int, condition: Condition) -> StreetMaterials:
         bricks=tuple(bricks),
         stones=tuple(stones),
         roofs=tuple(Material("matt", roof_tiles(rng, tone)) for tone in ((0.6, 0.3, 0.22), (0.45, 0.27, 0.22), (0.33, 0.34, 0.37))),
-        trims=tuple(Material("matt", tone) for tone in ((0.9, 0.9, 0.88), (0.76, 0.7, 0.6), (0.45, 0.46, 0.47), (0.2, 0.24, 0.22), (0.4, 0.26, 0.18))),
-        doors=tuple(Material("polished", planks(rng, tone, 8), roughness=0.2) for tone in ((0.42, 0.24, 0.14), (0.14, 0.26, 0.2), (0.2, 0.22, 0.34))),
+        trims=tuple(
+            Material("matt", tone)
+            for tone in ((0.9, 0.9, 0.88), (0.76, 0.7, 0.6), (0.45, 0.46, 0.47), (0.2, 0.24, 0.22), (0.4, 0.26, 0.18))
+        ),
+        doors=tuple(
+            Material("polished", planks(rng, tone, 8), roughness=0.2) for tone in ((0.42, 0.24, 0.14), (0.14, 0.26, 0.2), (0.2, 0.22, 0.34))
+        ),
         panes=_behind_glass(room, 0.33, 0.12),
         shops=_behind_glass(display, 0.55, 0.3),
         boards=(Material("matt", board), Material("light", board, radiance=0.35)),

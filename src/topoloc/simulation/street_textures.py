@@ -35,7 +35,9 @@ def weathering(rng: np.random.Generator, size: tuple[int, int]) -> Field:
     h, w = size
     streaks = cv2.GaussianBlur(np.repeat(smooth_noise(rng, (8, w), 1.5)[:1], h, axis=0), (0, 0), 1.0)
     depth = np.clip(blotches(rng, size, 60), 0, 2)
-    foot = np.exp(-(h - 1 - np.arange(h, dtype=np.float32)) / (h * 0.05))[:, None] * (0.5 + 0.5 * np.clip(blotches(rng, size, 40) + 0.5, 0, 1))
+    foot = np.exp(-(h - 1 - np.arange(h, dtype=np.float32)) / (h * 0.05))[:, None] * (
+        0.5 + 0.5 * np.clip(blotches(rng, size, 40) + 0.5, 0, 1)
+    )
     return 1.0 + 0.035 * blotches(rng, size, 90) - 0.05 * np.clip(streaks, 0, 2) * depth - 0.22 * foot
 
 
@@ -45,7 +47,13 @@ def plaster(rng: np.random.Generator, color: Color) -> Picture:
     value = weathering(rng, size) + 0.018 * smooth_noise(rng, size, 0.8)
     for _ in range(rng.integers(2, 6)):
         y, x = int(rng.integers(0, size[0])), int(rng.integers(0, size[1]))
-        cv2.rectangle(value, (x, y), (x + int(rng.integers(20, 110)), y + int(rng.integers(15, 80))), float(value[y, x]) * float(rng.uniform(0.93, 1.06)), -1)
+        cv2.rectangle(
+            value,
+            (x, y),
+            (x + int(rng.integers(20, 110)), y + int(rng.integers(15, 80))),
+            float(value[y, x]) * float(rng.uniform(0.93, 1.06)),
+            -1,
+        )
     value += 0.01 * smooth_noise(rng, size, 1.2)
     for _ in range(rng.integers(4, 9)):
         cv2.polylines(value, [crack(rng, size, 90)], False, 0.72, 1, cv2.LINE_AA)
@@ -58,7 +66,8 @@ def plaster(rng: np.random.Generator, color: Color) -> Picture:
 def crack(rng: np.random.Generator, size: tuple[int, int], length: int) -> np.ndarray:
     """A line that wanders, as points (x, y) for OpenCV to draw."""
     start = rng.uniform([0, 0], [size[1], size[0]])
-    turns = np.cumsum(rng.normal(0, 0.35, length)) + rng.uniform(0, 2 * np.pi)
+    wander = np.cumsum(rng.normal(0, 0.35, length))
+    turns = rng.uniform(0, 2 * np.pi) + 0.9 * np.tanh(wander - wander.mean()) + rng.normal(0, 0.3, length)
     return np.round(start + np.cumsum(2.5 * np.column_stack([np.cos(turns), np.sin(turns)]), axis=0)).astype(np.int32)
 
 
@@ -67,7 +76,9 @@ def brickwork(rng: np.random.Generator, color: Color, joint: Color) -> Picture:
     h, w = WALL_SIZE
     picture = colored(joint, 1.0 + 0.05 * smooth_noise(rng, (h, w), 1.0))
     course, length = 4, 11
-    shades = rng.normal(1.0, 0.10, (h // course, w // length + 1)) * np.where(rng.uniform(size=(h // course, w // length + 1)) < 0.06, 0.7, 1.0)
+    shades = rng.normal(1.0, 0.10, (h // course, w // length + 1)) * np.where(
+        rng.uniform(size=(h // course, w // length + 1)) < 0.06, 0.7, 1.0
+    )
     for row in range(h // course):
         shift = (length // 2) * (row % 2)
         columns = ((np.arange(w) + shift) % w) // length

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -51,7 +53,8 @@ SHAPES = (
     ),
 )  # fmt: skip
 PAINTS: tuple[Color, ...] = (
-    (0.88, 0.88, 0.87), (0.66, 0.67, 0.68), (0.34, 0.35, 0.37), (0.08, 0.08, 0.09), (0.12, 0.2, 0.42), (0.55, 0.08, 0.09), (0.2, 0.3, 0.24), (0.72, 0.62, 0.42),
+    (0.88, 0.88, 0.87), (0.66, 0.67, 0.68), (0.34, 0.35, 0.37), (0.08, 0.08, 0.09), (0.12, 0.2, 0.42),
+    (0.55, 0.08, 0.09), (0.2, 0.3, 0.24), (0.72, 0.62, 0.42),
 )  # fmt: skip
 _PLATES = 24
 
@@ -94,20 +97,31 @@ def car_materials(rng: np.random.Generator) -> CarMaterials:
 
 def car(shape: CarShape, paint: int, plate: int, kit: CarMaterials) -> list[Surface]:
     """A car with its front towards +x, its middle at the origin, wheels on z = 0."""
+    result = []
+    for name, mesh in _meshes(shape):
+        material = kit.paints[paint] if name == "body" else getattr(kit, name)
+        if name == "plates":
+            mesh = Mesh(mesh.vertices, mesh.faces, (mesh.uv + np.array([0.0, plate])) / np.array([1.0, _PLATES]))
+        result.append(Surface(f"parked car {name}", mesh, material))
+    return result
+
+
+@cache
+def _meshes(shape: CarShape) -> tuple[tuple[str, Mesh], ...]:
+    """The parts of a car by the names that their materials have in CarMaterials."""
     belt_x, belt_z = np.array(shape.belt).T
     stations = np.unique(np.round(np.concatenate([belt_x, np.linspace(0.15, shape.length - 0.12, 12), *_arch_ends(shape)]), 3))
     half = _half_width(shape, stations)
-    body = _body(shape, stations, half, np.interp(stations, belt_x, belt_z))
     cabin, glass = _cabin(shape)
     parts = [
-        ("body", join([body, *cabin]), kit.paints[paint]),
-        ("glass", join(glass), kit.glass),
-        *_wheels(shape, kit),
-        *_ends(shape, plate, kit),
+        ("body", join([_body(shape, stations, half, np.interp(stations, belt_x, belt_z)), *cabin])),
+        ("glass", join(glass)),
+        *_wheels(shape),
+        *_ends(shape),
     ]
     turned = np.array([[-1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0]])
-    centre = [shape.length / 2, 0.0, 0.0]
-    return [Surface(f"parked car {name}", Mesh((mesh.vertices - centre) @ turned, mesh.faces, mesh.uv), what) for name, mesh, what in parts]
+    centre = np.array([shape.length / 2, 0.0, 0.0])
+    return tuple((name, Mesh((mesh.vertices - centre) @ turned, mesh.faces, mesh.uv)) for name, mesh in parts)
 
 
 def _arch_ends(shape: CarShape) -> list[Float64[np.ndarray, "k"]]:
@@ -154,7 +168,7 @@ def _cabin(shape: CarShape) -> tuple[list[Mesh], list[Mesh]]:
         if is_pane:
             cabin.append(_rim(sheet))
     cuts = np.unique(np.concatenate([roof_x, *[[p - 0.05, p + 0.05] for p in shape.pillars]]))
-    for x0, x1 in zip(cuts[:-1], cuts[1:], strict=True):
+    for x0, x1 in pairwise(cuts.tolist()):
         middle = (x0 + x1) / 2
         is_pane = middle < shape.blind_from and not any(abs(middle - p) < 0.05 for p in shape.pillars)
         for side in (-1.0, 1.0):
@@ -165,11 +179,11 @@ def _cabin(shape: CarShape) -> tuple[list[Mesh], list[Mesh]]:
                 corners += [(x, side * foot, line), (x, side * (foot + (top - foot) * share), height)]
             mesh = Mesh(np.array(corners), np.array([[0, 1, 3], [0, 3, 2]], np.int32), np.zeros((4, 2)))
             (glass if is_pane else cabin).append(mesh)
-    rail = 0.035
+    drop = np.array([0.0, 0.02, -0.07])  # the strip of paint between the roof and the side windows
     for side in (-1.0, 1.0):
         for i in range(len(roof_x) - 1):
             a, b = np.array([roof_x[i], side * upper[i], roof_z[i]]), np.array([roof_x[i + 1], side * upper[i + 1], roof_z[i + 1]])
-            cabin.append(Mesh(np.array([a, b, b + [0, side * 0.02, -rail * 2], a + [0, side * 0.02, -rail * 2]]), _TWO, np.zeros((4, 2))))
+            cabin.append(Mesh(np.array([a, b, b + drop * [1, side, 1], a + drop * [1, side, 1]]), _TWO, np.zeros((4, 2))))
     return cabin, glass
 
 
@@ -193,7 +207,7 @@ def _rim(sheet: Mesh) -> Mesh:
     return join(strips)
 
 
-def _wheels(shape: CarShape, kit: CarMaterials) -> list[tuple[str, Mesh, Material]]:
+def _wheels(shape: CarShape) -> list[tuple[str, Mesh]]:
     tyres, rims, wells = [], [], []
     r, angles = shape.tyre, np.linspace(0.0, 2 * np.pi, 19)
     for axle in shape.wheels:
@@ -203,37 +217,43 @@ def _wheels(shape: CarShape, kit: CarMaterials) -> list[tuple[str, Mesh, Materia
             for radius_in, radius_out, y0, y1, into in (
                 (r, r, back, out, tyres), (0.62 * r, r, out, out, tyres), (0.25 * r, 0.62 * r, out - side * 0.05, out - side * 0.01, rims),
             ):  # fmt: skip
-                rings = [np.column_stack([axle + q * np.cos(angles), np.full(19, y), r + q * np.sin(angles)]) for q, y in ((radius_in, y0), (radius_out, y1))]
+                rings = [
+                    np.column_stack([axle + q * np.cos(angles), np.full(19, y), r + q * np.sin(angles)])
+                    for q, y in ((radius_in, y0), (radius_out, y1))
+                ]
                 i = np.arange(18)
                 keep = i if into is tyres else i[i % 3 != 0]
                 faces = np.concatenate([np.column_stack([keep, keep + 1, keep + 20]), np.column_stack([keep, keep + 20, keep + 19])])
                 into.append(Mesh(np.concatenate(rings), faces.astype(np.int32), np.zeros((38, 2))))
-    return [("tyre", join(tyres), kit.rubber), ("rim", join(rims), kit.rim), ("wheel well", join(wells), kit.trim)]
+    return [("rubber", join(tyres)), ("rim", join(rims)), ("trim", join(wells))]
 
 
-def _ends(shape: CarShape, plate: int, kit: CarMaterials) -> list[tuple[str, Mesh, Material]]:
+def _ends(shape: CarShape) -> list[tuple[str, Mesh]]:
     """Lamps, grille, bumpers' dark strips, mirrors, handles and number plates."""
     wide, long, belt = shape.width / 2, shape.length, shape.belt
     nose, tail = belt[0][1], belt[-1][1]
-    head = [box((-0.015, s * wide * 0.72 - 0.2, nose - 0.17), (0.22, s * wide * 0.72 + 0.2, nose - 0.01)) for s in (-1.0, 1.0)]
-    rear = [box((long - 0.22, s * wide * 0.74 - 0.17, tail - 0.25), (long + 0.015, s * wide * 0.74 + 0.17, tail - 0.05)) for s in (-1.0, 1.0)]
+    head = [box((-0.012, s * wide * 0.56 - 0.19, nose - 0.16), (0.1, s * wide * 0.56 + 0.19, nose - 0.03)) for s in (-1.0, 1.0)]
+    rear = [box((long - 0.1, s * wide * 0.6 - 0.14, tail - 0.24), (long + 0.01, s * wide * 0.6 + 0.14, tail - 0.07)) for s in (-1.0, 1.0)]
     dark = [
-        box((-0.02, -wide * 0.4, nose - 0.16), (0.1, wide * 0.4, nose - 0.05)),
+        box((-0.02, -wide * 0.3, nose - 0.16), (0.1, wide * 0.3, nose - 0.05)),
         box((-0.02, -wide * 0.7, 0.24), (0.1, wide * 0.7, 0.36)),
         box((long - 0.1, -wide * 0.7, 0.24), (long + 0.02, wide * 0.7, 0.38)),
         box((0.5, -wide + 0.06, 0.17), (long - 0.4, wide - 0.06, 0.22)),
     ]
     mirror_x = shape.roof[0][0] + 0.45
     for s in (-1.0, 1.0):
-        dark.append(box((mirror_x, min(s * wide, s * (wide + 0.16)), belt[2][1]), (mirror_x + 0.1, max(s * wide, s * (wide + 0.16)), belt[2][1] + 0.14)))
+        dark.append(
+            box(
+                (mirror_x, min(s * wide, s * (wide + 0.16)), belt[2][1]),
+                (mirror_x + 0.1, max(s * wide, s * (wide + 0.16)), belt[2][1] + 0.14),
+            )
+        )
         for x in (shape.pillars[0] + 0.12, shape.pillars[0] - 0.85, *shape.pillars[1:]):
             seam = min(s * wide, s * (wide + 0.004))
             dark.append(box((x, seam, 0.3), (x + 0.012, seam + 0.004, belt[2][1])))
             dark.append(box((x + 0.06, seam - 0.012, belt[2][1] - 0.14), (x + 0.22, seam + 0.016, belt[2][1] - 0.11)))
-    v = (plate % _PLATES) / _PLATES
     fronts = [panel((-0.03, 0.26, 0.52), (0, -0.52, 0), (0, 0, -0.11)), panel((long + 0.03, -0.26, 0.66), (0, 0.52, 0), (0, 0, -0.11))]
-    plates = join([Mesh(p.vertices, p.faces, p.uv * [1.0, 1.0 / _PLATES] + [0.0, v]) for p in fronts])
-    return [("headlamp", join(head), kit.headlamp), ("tail lamp", join(rear), kit.tail), ("trim", join(dark), kit.trim), ("plate", plates, kit.plates)]
+    return [("headlamp", join(head)), ("tail", join(rear)), ("trim", join(dark)), ("plates", join(fronts))]
 
 
 def parked(surfaces: list[Surface], at: tuple[float, float, float], yaw: float) -> list[Surface]:
