@@ -6,7 +6,6 @@ Repeated doors, long bare walls, a polished floor, windows from floor to ceiling
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from topoloc.simulation import corridor_things as things
 from topoloc.simulation import interiors, prints
 from topoloc.simulation.conditions import Condition
 from topoloc.simulation.corridor_finishes import linoleum_floor, wall_paint
+from topoloc.simulation.corridor_lamps import ceiling_lamps
 from topoloc.simulation.corridor_outdoors import outdoors
 from topoloc.simulation.corridor_parts import Fittings
 from topoloc.simulation.corridor_plan import (
@@ -22,6 +22,7 @@ from topoloc.simulation.corridor_plan import (
     EAST,
     HEIGHT,
     LENGTH,
+    LOOP,
     NORTH,
     SOUTH,
     WEST,
@@ -40,12 +41,6 @@ from topoloc.simulation.scene import Color, Material, Scene, Surface
 from topoloc.simulation.shapes import panel
 from topoloc.simulation.skies import sky_of
 
-LOOP = (
-    (WEST / 2, SOUTH / 2),
-    (LENGTH - EAST / 2, SOUTH / 2),
-    (LENGTH - EAST / 2, WIDTH - NORTH / 2),
-    (WEST / 2, WIDTH - NORTH / 2),
-)
 CAMERA_HEIGHT = 1.4
 MOVABLE = "movable "
 """How the names of all surfaces begin that `arrangement` moves."""
@@ -69,7 +64,7 @@ def build(seed: int, condition: Condition, arrangement: int = 0) -> Scene:
             surfaces += on_wall(wall, opening.left, _in_opening(seed, condition, arrangement, f"{wall.name}/{number}", opening, fittings))
         surfaces += _put_up(seed, wall, fittings)
     surfaces += _fixtures(seed, walls, fittings)
-    surfaces += _ceiling_lamps(seed, condition, fittings)
+    surfaces += ceiling_lamps(seed, condition, fittings)
     surfaces += _movables(seed, arrangement, walls, fittings)
     surfaces += outdoors(seed, condition)
     return Scene(tuple(surfaces), sky_of(condition, seed))
@@ -239,42 +234,6 @@ def _fixtures(seed: int, walls: dict[str, Wall], fittings: Fittings) -> list[Sur
         detector = parts.smoke_detector(fittings) if rng.random() < 0.6 else None
         surfaces += shifted([detector] if detector else parts.air_vent(fittings), (x, y, 0.0))
     return surfaces
-
-
-def _lamp_sites() -> list[tuple[float, float, bool]]:
-    """Places (x, y) of the ceiling lamps in the order of the loop, and whether they lie along x."""
-    (x0, y0), (x1, _), (_, y1), _ = LOOP
-    south = [(float(x), y0, True) for x in np.linspace(2.2, 22.8, 8)]
-    east = [(x1, float(y), False) for y in np.linspace(4.0, 14.2, 4)]
-    north = [(float(x), y1, True) for x in np.linspace(22.8, 2.2, 8)]
-    west = [(x0, float(y), False) for y in np.linspace(14.2, 4.0, 4)]
-    return south + east + north + west
-
-
-def _ceiling_lamps(seed: int, condition: Condition, fittings: Fittings) -> list[Surface]:
-    lit, warmth = _lit_lamps(seed, condition), rng_of(seed, "corridor/lamps").uniform(0.0, 1.0, len(_lamp_sites()))
-    surfaces = []
-    for number, (x, y, lengthwise) in enumerate(_lamp_sites()):
-        lamp = parts.ceiling_lamp(number in lit, float(warmth[number]), fittings)
-        surfaces += shifted(lamp, (x, y, 0.0), 0.0 if lengthwise else np.pi / 2)
-    return surfaces
-
-
-def _lit_lamps(seed: int, condition: Condition) -> set[int]:
-    """Which lamps burn: spread over the loop, by day away from the windows; of all of them, two are broken."""
-    sites = _lamp_sites()
-    rng = rng_of(seed, f"corridor/lit lamps/{condition.name}")
-    wanted = round(condition.lamps * len(sites))
-    if wanted >= len(sites):
-        return set(range(len(sites))) - {int(number) for number in rng.choice(len(sites), 2, replace=False)}
-    by_day = condition.daylight > 0.05
-    useful = [number for number, (x, y, _) in enumerate(sites) if not (by_day and _by_windows(x, y))]
-    bounds = np.linspace(0, len(useful), min(wanted, len(useful)) + 1).round().astype(int)
-    return {useful[int(rng.integers(low, high))] for low, high in pairwise(bounds.tolist())}
-
-
-def _by_windows(x: float, y: float) -> bool:
-    return (y < SOUTH and 5.0 < x < 17.0) or (x > LENGTH - EAST and 4.0 < y < 13.5)
 
 
 _SITES = (

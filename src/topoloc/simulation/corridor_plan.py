@@ -18,6 +18,13 @@ from topoloc.simulation.shapes import Vector, box, join, placed
 LENGTH, WIDTH, HEIGHT = 25.0, 18.0, 2.8
 SOUTH, EAST, NORTH, WEST = 2.4, 2.2, 2.2, 2.4
 """Width of the four wings."""
+LOOP = (
+    (WEST / 2, SOUTH / 2),
+    (LENGTH - EAST / 2, SOUTH / 2),
+    (LENGTH - EAST / 2, WIDTH - NORTH / 2),
+    (WEST / 2, WIDTH - NORTH / 2),
+)
+"""Corners of the centre line."""
 DOOR_WIDTH, DOOR_HEIGHT = 1.06, 2.12
 WALL_THICKNESS = 0.16
 
