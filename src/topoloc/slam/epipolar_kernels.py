@@ -47,32 +47,47 @@ def _normalized_patch(image, x, y, half, patch):
 
 
 @njit(**_OPTIONS)
-def _correlations(patch, half, image, x, y, shift_sign, num_disparities, strip, scores):
+def _correlations(patch, half, image, x, y, shift_sign, num_disparities, strip, sums, scores):
     """NCC of `patch` (centre (x, y) in its own picture) with `image` at x + shift_sign * d for d = 0 .. num_disparities - 1."""
     side = 2 * half + 1
     width = image.shape[1]
     length = num_disparities + side - 1
     start = x - half if shift_sign > 0 else x - half - (num_disparities - 1)
+    # All samples of a strip lie at the same fraction of a pixel. Slices that are walked through from 0 on: only of these
+    # does the compiler make vectors.
+    first, top = int(np.floor(start)), int(np.floor(y)) - half
+    fx, fy = np.float32(start - np.floor(start)), np.float32(y - np.floor(y))
+    begin, end = max(0, -first), min(length, width - 1 - first)
+    scores[:num_disparities] = np.float32(-1)
+    if end - begin < side:
+        return
+    columns, squares = sums[0, begin:end], sums[1, begin:end]
+    columns[:], squares[:] = 0.0, 0.0
     for j in range(side):
-        yy = y + j - half
-        for k in range(length):
-            xx = start + k
-            if xx < 0 or xx >= width - 1:
-                strip[j, k] = np.nan
-            else:
-                strip[j, k] = _sample(image, xx, yy)
-    for d in range(num_disparities):
-        first = d if shift_sign > 0 else num_disparities - 1 - d
-        dot, total, squares = np.float32(0), np.float32(0), np.float32(0)
+        upper, lower = image[top + j, first + begin : first + end + 1], image[top + j + 1, first + begin : first + end + 1]
+        row = strip[j, begin:end]
+        for k in range(len(row)):
+            value = (1 - fy) * (upper[k] * (1 - fx) + upper[k + 1] * fx) + fy * (lower[k] * (1 - fx) + lower[k + 1] * fx)
+            row[k] = value
+            columns[k] += value
+            squares[k] += value * value
+    num = end - begin - side + 1  # windows that lie inside
+    dots, totals, norms = sums[2, :num], sums[3, :num], sums[4, :num]
+    dots[:], totals[:], norms[:] = 0.0, 0.0, 0.0
+    for i in range(side):
+        of_columns, of_squares = columns[i : i + num], squares[i : i + num]
+        for k in range(num):
+            totals[k] += of_columns[k]
+            norms[k] += of_squares[k]
         for j in range(side):
-            for i in range(side):
-                value = strip[j, first + i]
-                dot += patch[j, i] * value
-                total += value
-                squares += value * value
-        variance = squares - total * total / (side * side)
-        # NaN (outside of the picture) compares false, and so scores as no match
-        scores[d] = dot / np.sqrt(variance) if variance > 1.0 else np.float32(-1)
+            factor, row = patch[j, i], strip[j, begin + i : begin + i + num]
+            for k in range(num):
+                dots[k] += factor * row[k]
+    for k in range(num):
+        variance = norms[k] - totals[k] * totals[k] / np.float32(side * side)
+        if variance > 1.0:
+            d = begin + k if shift_sign > 0 else num_disparities - 1 - begin - k
+            scores[d] = dots[k] / np.sqrt(variance)
 
 
 @njit(**_OPTIONS)
@@ -124,48 +139,61 @@ def _refine_disparity(patch, half, right, x, y, disparity, num_iterations):
 
 
 @njit(**_OPTIONS)
+def _match_point(left, right, x, y, half, low, num_disparities, min_score, max_ratio, patch, back, strip, sums, scores):
+    """(disparity, sigma) of one point, sought among low .. low + num_disparities - 1; NaN as `match_along_rows` says."""
+    height, width = left.shape
+    side = 2 * half + 1
+    nothing = np.float32(np.nan), np.float32(np.nan)
+    if x < half or y < half or x >= width - half - 1 or y >= height - half - 1:
+        return nothing
+    if _normalized_patch(left, x, y, half, patch) < 2.0 * side:  # standard deviation of less than two grey levels
+        return nothing
+    _correlations(patch, half, right, x - low, y, -1, num_disparities, strip, sums, scores)
+    best = int(np.argmax(scores[:num_disparities]))
+    if not scores[best] >= min_score:
+        return nothing
+    second = np.float32(-1)
+    for d in range(num_disparities):
+        if abs(d - best) > 2 and scores[d] > second:
+            second = scores[d]
+    if second > max_ratio * scores[best]:
+        return nothing
+    disparity, sigma = _refine_disparity(patch, half, right, x, y, np.float32(low + best), 8)
+    xr = x - disparity
+    if not np.isfinite(sigma) or abs(disparity - low - best) > 1.5 or xr < half or xr >= width - half - 1:
+        return nothing
+    # found back within a pixel? a point seen by one camera only is not
+    _normalized_patch(right, xr, y, half, back)
+    _correlations(back, half, left, xr + low, y, 1, num_disparities, strip, sums, scores)
+    if abs(low + int(np.argmax(scores[:num_disparities])) - disparity) > 1.0:
+        return nothing
+    return disparity, sigma
+
+
+@njit(**_OPTIONS)
 def match_along_rows(left, right, points, half, max_disparity, min_score, max_ratio):
     """Disparity of each point (x, y) of `left` in `right` (float32 pictures of one size) with its standard deviation.
 
     NaN where the point is too near the border, without texture, not distinct along the row (the best score elsewhere
     reaches `max_ratio` of the best), below `min_score`, or not found back from the right picture within a pixel.
     """
-    height, width = left.shape
     num = len(points)
-    side = 2 * half + 1
-    num_disparities = max_disparity + 1
-    disparities = np.full(num, np.nan, np.float32)
-    sigmas = np.full(num, np.nan, np.float32)
-    patch = np.empty((side, side), np.float32)
-    back = np.empty((side, side), np.float32)
-    strip = np.empty((side, num_disparities + side), np.float32)
-    scores = np.empty(num_disparities, np.float32)
-    for n in range(num):
-        x, y = points[n, 0], points[n, 1]
-        if x < half or y < half or x >= width - half - 1 or y >= height - half - 1:
-            continue
-        norm = _normalized_patch(left, x, y, half, patch)
-        if norm < 2.0 * side:  # standard deviation of less than two grey levels
-            continue
-        _correlations(patch, half, right, x, y, -1, num_disparities, strip, scores)
-        best = int(np.argmax(scores))
-        if not scores[best] >= min_score:
-            continue
-        second = np.float32(-1)
-        for d in range(num_disparities):
-            if abs(d - best) > 2 and scores[d] > second:
-                second = scores[d]
-        if second > max_ratio * scores[best]:
-            continue
-        disparity, sigma = _refine_disparity(patch, half, right, x, y, np.float32(best), 8)
-        xr = x - disparity
-        if not np.isfinite(sigma) or abs(disparity - best) > 1.5 or xr < half or xr >= width - half - 1:
-            continue
-        # found back within a pixel? a point seen by one camera only is not
-        _normalized_patch(right, xr, y, half, back)
-        _correlations(back, half, left, xr, y, 1, num_disparities, strip, scores)
-        if abs(int(np.argmax(scores)) - disparity) > 1.0:
-            continue
-        disparities[n] = disparity
-        sigmas[n] = sigma
+    disparities, sigmas = np.empty(num, np.float32), np.empty(num, np.float32)
+    lows, nums = np.zeros(num, np.int64), np.full(num, max_disparity + 1)
+    match_in_ranges(left, right, points, lows, nums, half, min_score, max_ratio, disparities, sigmas)
     return disparities, sigmas
+
+
+@njit(**_OPTIONS)
+def match_in_ranges(left, right, points, lows, nums, half, min_score, max_ratio, disparities, sigmas):
+    """As `match_along_rows`, the disparity of point n sought among lows[n] .. lows[n] + nums[n] - 1 only; fills the last two."""
+    side = 2 * half + 1
+    most = 1
+    for n in range(len(points)):
+        most = max(most, nums[n])
+    patch, back = np.empty((side, side), np.float32), np.empty((side, side), np.float32)
+    strip, sums, scores = np.empty((side, most + side), np.float32), np.empty((5, most + side), np.float32), np.empty(most, np.float32)
+    for n in range(len(points)):
+        disparities[n], sigmas[n] = _match_point(
+            left, right, points[n, 0], points[n, 1], half, lows[n], nums[n], min_score, max_ratio, patch, back, strip, sums, scores
+        )

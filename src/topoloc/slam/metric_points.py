@@ -107,12 +107,12 @@ def _from_depth(
     features: Features, view: FrameView, config: MetricPointsConfig
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     assert view.depth is not None
-    depth = _smooth_depth(view.depth, features.points_img, config.max_depth_step)
+    depth = smooth_depth(view.depth, features.points_img, config.max_depth_step)
     points_cam = points_from_depth(features.points_img.astype(np.float64), depth, view.camera)
     return points_cam, depth_sigmas(points_cam[:, 2], DepthNoise())
 
 
-def _smooth_depth(depth: np.ndarray, points_img: np.ndarray, max_step: float) -> Float[np.ndarray, " n"]:
+def smooth_depth(depth: np.ndarray, points_img: np.ndarray, max_step: float) -> Float[np.ndarray, " n"]:
     """Mean depth of the 5x5 neighbourhood of each pixel; NaN at its edges, and where half of it is unknown."""
     height, width = depth.shape
     columns = np.rint(points_img[:, 0]).astype(np.int64)[:, None] + np.tile(np.arange(-2, 3), 5)

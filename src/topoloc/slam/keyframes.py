@@ -1,0 +1,113 @@
+"""Key frames and the landmarks that they see: what SLAM remembers. Data, and the few questions asked of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from topoloc.features.features import Features
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.slam.metric_points import MetricPoints
+
+
+@dataclass(frozen=True)
+class StereoCamera:
+    """A pinhole that measures disparity, too: ``disparity = bf / depth``, bf in pixels times metres."""
+
+    camera: Camera
+    bf: float
+
+    def points_cam(self, measured: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Points (metres) of pixels and disparities (x, y, d); rows of NaN where d is unknown or not positive."""
+        z = self.bf / np.where(measured[:, 2] > 0.0, measured[:, 2], np.nan)
+        return np.column_stack([self.camera.normalized_from_img(measured[:, :2]) * z[:, None], z])
+
+    def project(self, points_cam: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """(x, y, d) of points in the camera's frame; NaN behind it."""
+        z = np.where(points_cam[:, 2] > 1e-9, points_cam[:, 2], np.nan)
+        return np.column_stack([self.camera.img_from_cam(points_cam), self.bf / z])
+
+
+@dataclass(eq=False)
+class DisparityBias:
+    """What a recording's measured disparities are too large by, pixels, and how well that is known (1 / px^2).
+
+    Rectification is never perfect: an angle of one milliradian between the two cameras shifts all disparities by f / 1000, most of
+    a pixel in a street camera, and makes all that is far too far or too near. Motion tells: see `bundle`.
+    """
+
+    value_px: float = 0.0
+    information: float = np.inf
+
+
+@dataclass(eq=False)
+class Landmarks:
+    """Positions of all landmarks by their id, each in the world of its sub-map (metres)."""
+
+    positions: Float[np.ndarray, "capacity 3"] = field(default_factory=lambda: np.full((1024, 3), np.nan))
+    num: int = 0
+
+    def add(self, points_world: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+        """Their new ids."""
+        ids = np.arange(self.num, self.num + len(points_world))
+        self.num += len(points_world)
+        if self.num > len(self.positions):
+            self.positions = np.concatenate([self.positions, np.full((max(self.num, len(self.positions)), 3), np.nan)])
+        self.positions[ids] = points_world
+        return ids
+
+
+@dataclass(eq=False)
+class Observations:
+    """What one key frame sees of landmarks: pixel and disparity (x, y, d) and the inverse of their standard deviations.
+
+    An unknown disparity has weight 0. `active` is False for what has been found to be wrong.
+    """
+
+    landmark_ids: Int[np.ndarray, " n"]
+    measured: Float[np.ndarray, "n 3"]
+    weights: Float[np.ndarray, "n 3"]
+    active: Bool[np.ndarray, " n"]
+
+    def append(self, other: Observations) -> None:
+        self.landmark_ids = np.concatenate([self.landmark_ids, other.landmark_ids])
+        self.measured = np.concatenate([self.measured, other.measured])
+        self.weights = np.concatenate([self.weights, other.weights])
+        self.active = np.concatenate([self.active, other.active])
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceView:
+    """How a key frame looks: local features, and their metric points in the key frame's camera."""
+
+    features: Features
+    points: MetricPoints
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """How a key frame follows from an earlier one, `source`: covariance of the left perturbation of cam_from_source (m, rad)."""
+
+    source: KeyFrame
+    covariance: Float[np.ndarray, "6 6"]
+
+
+@dataclass(eq=False)
+class KeyFrame:
+    """A frame that SLAM keeps. `cam_from_world` is that of the rectified view and changes as the map is optimised.
+
+    `motion` is None for the first of a sub-map.
+    """
+
+    recording: int
+    frame_idx: int
+    submap: int
+    stereo: StereoCamera
+    cam_from_world: Rigid3
+    observations: Observations
+    bias: DisparityBias
+    motion: Motion | None = None
+    place: PlaceView | None = None

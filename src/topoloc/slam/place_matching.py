@@ -1,0 +1,73 @@
+"""Do two key frames see the same place, and from where? Local features matched, then robust PnP on metric points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from topoloc.features.extraction import FeatureConfig, extract_features
+from topoloc.features.matching import MatchingConfig, match_features
+from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
+from topoloc.geometry.rigid import Rigid3
+from topoloc.sequences.frame_view import FrameView
+from topoloc.slam.keyframes import PlaceView, StereoCamera
+from topoloc.slam.metric_points import MetricPointsConfig, locate_points
+
+
+@dataclass(frozen=True)
+class PlaceMatchingConfig:
+    """What makes two views the same place."""
+
+    features: FeatureConfig = field(default_factory=lambda: FeatureConfig(max_features=500))
+    points: MetricPointsConfig = field(default_factory=MetricPointsConfig)
+    matching: MatchingConfig = field(default_factory=MatchingConfig)
+    pose: AbsolutePoseConfig = field(
+        default_factory=lambda: AbsolutePoseConfig(max_reprojection_error_px=2.5, sigma_px=0.8, max_iterations=1000)
+    )
+    min_inliers: int = 25
+    min_inlier_share: float = 0.35
+    max_sigma: float = 0.5
+    """A relative position that is less certain than this (metres, one sigma) says nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceMatch:
+    """target_from_source with the covariance of its left perturbation, and the rows of the features that agree."""
+
+    target_from_source: Rigid3
+    covariance: Float[np.ndarray, "6 6"]
+    source_rows: Int[np.ndarray, " n"]
+    target_rows: Int[np.ndarray, " n"]
+
+
+def place_view(view: FrameView, config: PlaceMatchingConfig) -> PlaceView:
+    """The local features of a view, and where they are."""
+    features = extract_features(view.grey, config.features)
+    return PlaceView(features, locate_points(features, view, config.points))
+
+
+def match_places(source: PlaceView, target: PlaceView, stereo: StereoCamera, config: PlaceMatchingConfig) -> PlaceMatch | None:
+    """Where `source` was taken, seen from `target` (whose camera is `stereo`), or None where they do not agree on it."""
+    rows = np.flatnonzero(source.points.valid)
+    matches = match_features(target.features.descriptors, source.features.descriptors[rows], config.matching)
+    if len(matches) < config.min_inliers:
+        return None
+    source_rows, target_rows = rows[matches.train_idx], matches.query_idx.astype(np.int64)
+    pose = estimate_absolute_pose(
+        target.features.points_img[target_rows].astype(np.float64),
+        source.points.points_cam[source_rows],
+        stereo.camera,
+        config.pose,
+        point_covariances=source.points.covariances[source_rows],
+        priorities=-matches.distances.astype(np.float64),
+    )
+    if pose is None:
+        return None
+    num_inliers = int(np.count_nonzero(pose.inliers))
+    if num_inliers < config.min_inliers or num_inliers < config.min_inlier_share * len(matches):
+        return None
+    if np.sqrt(np.trace(pose.covariance[:3, :3])) > config.max_sigma:
+        return None
+    return PlaceMatch(pose.cam_from_world, pose.covariance, source_rows[pose.inliers], target_rows[pose.inliers])

@@ -1,0 +1,100 @@
+"""Points followed from picture to picture: corners spread over a grid, pyramidal Lucas-Kanade, then the key frame's own patch.
+
+Bouguet, *Pyramidal implementation of the Lucas Kanade feature tracker*, 2000, as in OpenCV, finds a point again across a step of
+motion; alignment with the patch of the last key frame takes the drift of many such steps away and says whether it is still
+the same point.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from topoloc.features.bands import run_in_bands
+from topoloc.slam.tracking_kernels import refine_tracks
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """What is followed, and how."""
+
+    num_corners: int = 450
+    """Cells of the grid; each holds a point where the picture has one."""
+    min_quality: float = 0.002
+    """Least corner strength (smaller eigenvalue), as a share of the strongest in the picture."""
+    min_eigenvalue: float = 2e-4
+    """Least corner strength at all: weaker ones are noise."""
+    window_px: int = 15
+    levels: int = 3
+    patch_half_px: int = 5
+    min_correlation: float = 0.7
+    max_shift_px: float = 2.5
+    """A point whose patch wants it further away than this has been lost."""
+
+
+def follow(
+    previous: UInt8[np.ndarray, "h w"],
+    current: UInt8[np.ndarray, "h w"],
+    points_img: Float32[np.ndarray, "n 2"],
+    guesses_img: Float32[np.ndarray, "n 2"],
+    config: TrackingConfig,
+) -> tuple[Float32[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
+    """Where the points of the previous picture are in the current one, sought from `guesses_img`; and which were found."""
+    if len(points_img) == 0:
+        return guesses_img.copy(), np.zeros(0, np.bool_)
+    window = (config.window_px, config.window_px)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.03)
+    found, status, _ = cv2.calcOpticalFlowPyrLK(
+        previous, current, points_img[:, None], guesses_img[:, None].copy(),
+        winSize=window, maxLevel=config.levels, criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )  # pyright: ignore[reportCallIssue, reportArgumentType]  # fmt: skip
+    found = np.ascontiguousarray(found[:, 0], np.float32)
+    return found, (status[:, 0] > 0) & np.isfinite(found).all(axis=1)
+
+
+def align_with_reference(
+    reference: Float32[np.ndarray, "h w"],
+    picture: Float32[np.ndarray, "h w"],
+    points_ref: Float32[np.ndarray, "n 2"],
+    points_img: Float32[np.ndarray, "n 2"],
+    config: TrackingConfig,
+) -> tuple[Float32[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
+    """Points of `picture` moved to where they look most like `points_ref` of the reference; and which do look alike."""
+    refined, scores = np.empty_like(points_img), np.empty(len(points_img), np.float32)
+
+    def run(first: int, last: int) -> None:
+        refine_tracks(
+            reference, picture, points_ref, points_img, config.patch_half_px, 8, config.max_shift_px, first, last, refined, scores
+        )
+
+    run_in_bands(run, len(points_img), num_threads=2)
+    return refined, scores >= config.min_correlation
+
+
+def find_corners(
+    grey: UInt8[np.ndarray, "h w"], occupied_img: Float[np.ndarray, "n 2"] | Float32[np.ndarray, "n 2"], config: TrackingConfig
+) -> Float32[np.ndarray, "m 2"]:
+    """The strongest corner of each cell of a grid that holds no point yet (Shi and Tomasi, 1994), row by row."""
+    height, width = grey.shape
+    side = max(8, round(np.sqrt(height * width / config.num_corners)))
+    rows, columns = height // side, width // side
+    strength = cv2.cornerMinEigenVal(grey, 3)
+    threshold = max(config.min_quality * float(strength.max()), config.min_eigenvalue)
+    peaks = np.where(strength >= cv2.dilate(strength, np.ones((3, 3), np.uint8)), strength, 0.0)
+    border = config.patch_half_px + 3
+    peaks[:border], peaks[-border:], peaks[:, :border], peaks[:, -border:] = 0.0, 0.0, 0.0, 0.0
+    top, left = (height - rows * side) // 2, (width - columns * side) // 2
+    cells = peaks[top : top + rows * side, left : left + columns * side].reshape(rows, side, columns, side)
+    cells = cells.transpose(0, 2, 1, 3).reshape(rows * columns, side * side)
+    best = np.argmax(cells, axis=1)
+    cell_of = np.floor((occupied_img - [left, top]) / side).astype(np.int64)
+    inside = ((cell_of >= 0) & (cell_of < [columns, rows])).all(axis=1)
+    free = np.ones(rows * columns, np.bool_)
+    free[cell_of[inside, 1] * columns + cell_of[inside, 0]] = False
+    chosen = np.flatnonzero(free & (cells[np.arange(len(cells)), best] > threshold))
+    y = chosen // columns * side + best[chosen] // side + top
+    x = chosen % columns * side + best[chosen] % side + left
+    return np.column_stack([x, y]).astype(np.float32)
