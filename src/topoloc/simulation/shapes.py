@@ -11,10 +11,11 @@ from jaxtyping import Float64
 
 from topoloc.simulation.scene import Mesh, Surface
 
-Vector = Sequence[float] | Float64[np.ndarray, "3"]
+Number = float | int
+Vector = Sequence[Number] | Float64[np.ndarray, "3"]
 
 
-def panel(corner: Vector, across: Vector, down: Vector, repeat: tuple[float, float] = (1.0, 1.0)) -> Mesh:
+def panel(corner: Vector, across: Vector, down: Vector, repeat: tuple[Number, Number] = (1.0, 1.0)) -> Mesh:
     """A parallelogram seen by who looks at it with `across` to the right and `down` downwards; `corner` is its top left.
 
     Args:
@@ -26,7 +27,7 @@ def panel(corner: Vector, across: Vector, down: Vector, repeat: tuple[float, flo
     return Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]], np.int32), uv)
 
 
-def box(low: Vector, high: Vector, texels: float | None = None, faces: str = "nsewtb") -> Mesh:
+def box(low: Vector, high: Vector, texels: Number | None = None, faces: str = "nsewtb") -> Mesh:
     """An axis-aligned box. Each face carries the whole picture, upright on the four sides.
 
     Args:
@@ -54,7 +55,7 @@ def box(low: Vector, high: Vector, texels: float | None = None, faces: str = "ns
     return Mesh(vertices, triangles.reshape(-1, 3).astype(np.int32), uv.reshape(-1, 2))
 
 
-def prism(outline: Sequence[Sequence[float]] | Float64[np.ndarray, "n 2"], low: float, high: float, texels: float | None = None) -> Mesh:
+def prism(outline: Sequence[Sequence[Number]] | Float64[np.ndarray, "n 2"], low: Number, high: Number, texels: Number | None = None) -> Mesh:
     """A convex outline (x, y), counter-clockwise from above, raised from z `low` to `high`; the picture goes round the sides."""
     corners = np.asarray(outline, dtype=np.float64)
     around = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1))])
@@ -73,13 +74,13 @@ def prism(outline: Sequence[Sequence[float]] | Float64[np.ndarray, "n 2"], low: 
     return join([*walls, top, bottom])
 
 
-def cylinder(centre: Sequence[float], radius: float, low: float, high: float, num_sides: int = 16) -> Mesh:
+def cylinder(centre: Sequence[Number], radius: Number, low: Number, high: Number, num_sides: int = 16) -> Mesh:
     """An upright cylinder of `num_sides` flat sides around (x, y)."""
     angles = np.arange(num_sides) * (2 * np.pi / num_sides)
     return prism(np.asarray(centre) + radius * np.column_stack([np.cos(angles), np.sin(angles)]), low, high)
 
 
-def tube(start: Vector, end: Vector, radius: float, num_sides: int = 8) -> Mesh:
+def tube(start: Vector, end: Vector, radius: Number, num_sides: int = 8) -> Mesh:
     """A rod from one point to another, without caps; the picture goes round it."""
     a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
     along = (b - a) / np.linalg.norm(b - a)
@@ -105,14 +106,14 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
     )
 
 
-def placed(mesh: Mesh, at: Vector, yaw: float = 0.0) -> Mesh:
+def placed(mesh: Mesh, at: Vector, yaw: Number = 0.0) -> Mesh:
     """The mesh turned about the z axis by `yaw` (radians, counter-clockwise from above), then moved by `at`."""
     c, s = np.cos(yaw), np.sin(yaw)
     rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     return Mesh(mesh.vertices @ rotation.T + np.asarray(at, dtype=np.float64), mesh.faces, mesh.uv)
 
 
-def lathe(profile: Sequence[tuple[float, float]], num_sides: int = 16) -> Mesh:
+def lathe(profile: Sequence[tuple[Number, Number]], num_sides: int = 16) -> Mesh:
     """A profile of (radius, z), from below to above on the outside, turned about the z axis; the picture goes round it once."""
     rings = np.asarray(profile, dtype=np.float64)
     angles = np.linspace(0.0, 2 * np.pi, num_sides + 1)
@@ -129,12 +130,12 @@ def lathe(profile: Sequence[tuple[float, float]], num_sides: int = 16) -> Mesh:
     return Mesh(vertices, np.concatenate(faces).astype(np.int32), uv)
 
 
-def bent_tube(points: Sequence[Vector], radius: float, num_sides: int = 6) -> Mesh:
+def bent_tube(points: Sequence[Vector], radius: Number, num_sides: int = 6) -> Mesh:
     """A cable or pipe through the points."""
     return join([tube(a, b, radius, num_sides) for a, b in itertools.pairwise(points)])
 
 
-def turned(mesh: Mesh, axis: Vector, angle: float) -> Mesh:
+def turned(mesh: Mesh, axis: Vector, angle: Number) -> Mesh:
     """The mesh turned about an axis through the origin (right-handed, radians)."""
     x, y, z = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -142,6 +143,6 @@ def turned(mesh: Mesh, axis: Vector, angle: float) -> Mesh:
     return Mesh(mesh.vertices @ rotation.T, mesh.faces, mesh.uv)
 
 
-def surfaces_placed(surfaces: Sequence[Surface], at: Vector, yaw: float = 0.0) -> list[Surface]:
+def surfaces_placed(surfaces: Sequence[Surface], at: Vector, yaw: Number = 0.0) -> list[Surface]:
     """A thing of several surfaces put where it stands, as `placed` does it."""
     return [replace(surface, mesh=placed(surface.mesh, at, yaw)) for surface in surfaces]
