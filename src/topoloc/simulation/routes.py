@@ -234,7 +234,7 @@ def _beside(corners: Float64[np.ndarray, "n 2"], lateral: float) -> Float64[np.n
     return moved
 
 
-def _rounded(corners: Float64[np.ndarray, "n 2"], radius: float) -> Float64[np.ndarray, "n 2"]:
+def _rounded(corners: Float64[np.ndarray, "n 2"], radius: float) -> Float64[np.ndarray, "m 2"]:
     """Points at equal steps along a closed line, smoothed by a Gaussian along it."""
     closed = np.concatenate([corners, corners[:1]])
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])

@@ -17,6 +17,7 @@ _LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
 _SHOULDER = 0.8
 """Output above which highlights are compressed, before they clip."""
 _METERED_STEP = 4
+_DARKEST = 1e-7
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,8 @@ class SensorConfig:
 
     Attributes:
         sensitivity: linear output (1 is white) per unit of radiance and second at gain 1.
-        target: mean of the clipped linear picture that the exposure aims at.
+        target: geometric mean of the linear picture that the exposure aims at.
+        max_clipped: largest share of the picture, by weight, that may become white for it.
         max_time: longest exposure, seconds.
         max_gain: largest gain; 1 is the sensor's own sensitivity.
         full_well: electrons at white, at gain 1.
@@ -35,11 +37,12 @@ class SensorConfig:
     """
 
     sensitivity: float = 120.0
-    target: float = 0.2
-    max_time: float = 0.02
-    max_gain: float = 16.0
-    full_well: float = 9000.0
-    read_noise: float = 7.0
+    target: float = 0.16
+    max_clipped: float = 0.4
+    max_time: float = 0.025
+    max_gain: float = 48.0
+    full_well: float = 12000.0
+    read_noise: float = 3.0
     vignetting: float = 0.25
     white_balance_error: float = 0.04
 
@@ -53,20 +56,20 @@ class Exposure:
 
 
 def choose_exposure(radiance: Float32[np.ndarray, "h w 3"], config: SensorConfig) -> Exposure:
-    """The time, then the gain, that bring the centre-weighted mean of the clipped picture to the target, within the limits.
+    """The time, then the gain, that bring the picture's centre-weighted geometric mean to the target, within the camera's limits.
 
-    Clipping before the mean is what cameras see: a bright window counts as white and no more, so the room around it stays visible.
+    The geometric mean hardly heeds how bright a bright window is, so that the room around it stays visible and the window
+    saturates, but never more of the picture than `config.max_clipped`.
     """
     luminance = radiance[::_METERED_STEP, ::_METERED_STEP].astype(np.float64) @ _LUMA.astype(np.float64)
     weight = _centre_weight(luminance.shape)
-    low, high = -12.0, np.log(config.sensitivity * config.max_time * config.max_gain)
-    for _ in range(30):
-        middle = 0.5 * (low + high)
-        mean = float(np.sum(weight * np.minimum(luminance * np.exp(middle), 1.0)))
-        low, high = (middle, high) if mean < config.target else (low, middle)
-    needed = float(np.exp(0.5 * (low + high))) / config.sensitivity
+    mean = float(np.exp(np.sum(weight * np.log(np.maximum(luminance, _DARKEST)))))
+    order = np.argsort(luminance, axis=None)
+    brighter = 1.0 - np.cumsum(weight.ravel()[order])
+    limit = max(float(luminance.ravel()[order][min(int(np.argmax(brighter <= config.max_clipped)), order.size - 1)]), _DARKEST)
+    needed = min(config.target / mean, 1.0 / limit) / config.sensitivity
     time = min(needed, config.max_time)
-    return Exposure(time, max(needed / time, 1.0))
+    return Exposure(time, min(needed / time, config.max_gain))
 
 
 def take_picture(
