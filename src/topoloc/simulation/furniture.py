@@ -52,7 +52,7 @@ def office_chair(finishes: Finishes, height: float = 0.47, turn: float = 0.0) ->
         wheels.append(placed(turned(cylinder((0.0, 0.0), 0.032, -0.02, 0.02, 10), (1, 0, 0), pi / 2), (end[0], end[1], 0.032), angle))
     foot = [*spokes, tube((0, 0, 0.1), (0, 0, height - 0.05), 0.025)]
     seat = [placed(_cushion(0.48, 0.46, 0.08), (0, 0, height - 0.04))]
-    back = placed(turned(_cushion(0.44, 0.52, 0.06), (1, 0, 0), pi / 2 - 0.12), (0, 0.23, height + 0.38))
+    back = placed(turned(_cushion(0.44, 0.46, 0.06), (1, 0, 0), pi / 2 - 0.12), (0, 0.23, height + 0.35))
     arms, bars = [], [tube((0, 0.2, height), (0, 0.25, height + 0.25), 0.02)]
     for x in (-0.27, 0.27):
         arms.append(box((x - 0.03, -0.14, height + 0.18), (x + 0.03, 0.12, height + 0.205)))

@@ -181,9 +181,7 @@ def _built_in(seed: int, finishes: Finishes) -> list[Surface]:
     for x in rng.choice([0.7, 1.3, 2.2, 2.8, 3.6, 4.3], 3, replace=False):
         parts += surfaces_placed(potted_plant(rng, rng.uniform(0.25, 0.45)), (float(x), WIDTH + 0.06, SILL + 0.025))
     red = lathe([(0.0, 0.15), (0.07, 0.16), (0.075, 0.2), (0.075, 0.5), (0.03, 0.58), (0.02, 0.64), (0.0, 0.65)], 18)
-    parts.append(
-        Surface("extinguisher", placed(red, (LENGTH - 0.09, 3.68, 0.25)), plastic((0.62, 0.05, 0.05), 0.15))
-    )
+    parts.append(Surface("extinguisher", placed(red, (LENGTH - 0.09, 3.68, 0.25)), plastic((0.62, 0.05, 0.05), 0.15)))
     return parts
 
 

@@ -19,7 +19,7 @@ from topoloc.simulation.interiors import (
 )
 from topoloc.simulation.noise import rng_of
 from topoloc.simulation.scene import Material, Mesh, Sky, Surface
-from topoloc.simulation.shapes import box, join, lathe, panel, placed, tube
+from topoloc.simulation.shapes import Number, box, join, lathe, panel, placed, tube
 from topoloc.simulation.skies import sky_of
 
 LENGTH, WIDTH, HEIGHT = 5.0, 4.0, 2.8
@@ -122,7 +122,7 @@ def _window_front(seed: int, finishes: Finishes) -> list[Surface]:
     """The north wall around three windows, their reveals, sills and frames. There are no panes: one looks out through open air."""
     rng = rng_of(seed, "window wall")
 
-    def piece(x0: float, x1: float, z0: float, z1: float) -> Mesh:
+    def piece(x0: Number, x1: Number, z0: Number, z1: Number) -> Mesh:
         mesh = panel((x0, WIDTH, z1), (x1 - x0, 0, 0), (0, 0, z0 - z1))
         uv = np.column_stack([mesh.vertices[:, 0] / LENGTH, 1 - mesh.vertices[:, 2] / HEIGHT])
         return Mesh(mesh.vertices, mesh.faces, uv)

@@ -11,7 +11,7 @@ from topoloc.simulation.lettering import blank, vivid, write
 from topoloc.simulation.pictures import plot
 from topoloc.simulation.prints import whiteboard
 from topoloc.simulation.scene import Material, Mesh, Surface
-from topoloc.simulation.shapes import bent_tube, box, cylinder, join, lathe, panel, placed, tube, turned
+from topoloc.simulation.shapes import Vector, bent_tube, box, cylinder, join, lathe, panel, placed, tube, turned
 
 
 def robot_arm(rng: np.random.Generator, finishes: Finishes, reach: float = 0.22) -> list[Surface]:
@@ -131,7 +131,7 @@ def floor_lamp(finishes: Finishes, on: bool, height: float = 1.75) -> list[Surfa
     pole = [cylinder((0, 0), 0.14, 0, 0.025, 24), tube((0, 0, 0.02), (0, 0, height - 0.08), 0.012)]
     bowl = lathe([(0.02, height - 0.08), (0.09, height - 0.06), (0.14, height), (0.135, height)], 24)
     light = lathe([(0.12, height - 0.025), (0.0, height - 0.02)], 20)
-    glow = Material("light", (1.0, 0.86, 0.66), radiance=6.0) if on else finishes.ivory
+    glow = Material("light", (1.0, 0.86, 0.66), radiance=12.0) if on else finishes.ivory
     return [Surface("floor lamp", join([*pole, bowl]), finishes.dark_metal), Surface("floor lamp bulb", light, glow)]
 
 
@@ -163,7 +163,7 @@ def quadcopter(finishes: Finishes) -> list[Surface]:
     return [Surface("quadcopter", join([body, *arms]), finishes.black), Surface("quadcopter", join(blades), finishes.grey)]
 
 
-def mesh_cables(rng: np.random.Generator, start: tuple[float, float, float], end: tuple[float, float, float], num: int = 3) -> Mesh:
+def mesh_cables(rng: np.random.Generator, start: Vector, end: Vector, num: int = 3) -> Mesh:
     """Cables hanging from one point to another, each with its own slack."""
     cables = []
     for _ in range(num):

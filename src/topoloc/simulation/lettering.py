@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from topoloc.simulation.scene import Color, Picture
+from topoloc.simulation.shapes import Number
 
 _TITLES = """
 Open Day; Summer School; Call for Papers; Robotics Seminar; Lab Safety; Thesis Defence; Reading Group; Lost and Found;
@@ -69,7 +70,7 @@ def vivid(rng: np.random.Generator) -> Color:
 
 
 def write(
-    picture: Picture, text: str, at: tuple[float, float], height_px: float, color: Color, max_width_px: float, bold: bool = False
+    picture: Picture, text: str, at: tuple[Number, Number], height_px: Number, color: Color, max_width_px: Number, bold: bool = False
 ) -> float:
     """Writes one line into the picture, its base line starting at `at` (x, y), smaller where it would be too wide.
 
@@ -92,7 +93,7 @@ def sentence(rng: np.random.Generator, num_words: int) -> str:
     return " ".join(str(word) for word in rng.choice(WORDS, num_words))
 
 
-def paragraph(picture: Picture, rng: np.random.Generator, area: tuple[int, int, int, int], line_px: float, color: Color) -> None:
+def paragraph(picture: Picture, rng: np.random.Generator, area: tuple[int, int, int, int], line_px: Number, color: Color) -> None:
     """Fills `area` (x, y, width, height) with lines of text, ragged on the right, with an empty line here and there."""
     x, y, width, height = area
     num_words = max(2, int(width / (line_px * 2.0)))

@@ -9,11 +9,13 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
 
 from topoloc.simulation.lettering import BOOKS, NAMES, PAPER, TITLES, blank, ink_on, paragraph, sentence, to_bytes, vivid, write
 from topoloc.simulation.noise import fractal_noise, smooth_noise
 from topoloc.simulation.pictures import painting, photograph, plot
 from topoloc.simulation.scene import Picture
+from topoloc.simulation.shapes import Number
 
 Area = tuple[int, int, int, int]
 """x, y, width, height in pixels."""
@@ -91,7 +93,7 @@ def notice(rng: np.random.Generator, size: tuple[int, int] = (297, 210)) -> Pict
     return picture
 
 
-def pasted(picture: Picture, piece: Picture, at: tuple[float, float], angle: float) -> None:
+def pasted(picture: Picture, piece: UInt8[np.ndarray, "h2 w2 3"], at: tuple[Number, Number], angle: Number) -> None:
     """Puts a piece, turned by `angle`, into the picture with its centre at `at` (x, y), with a thin shadow."""
     h, w = piece.shape[:2]
     turn = cv2.getRotationMatrix2D(((w - 1) / 2, (h - 1) / 2), float(np.degrees(angle)), 1.0)
