@@ -123,6 +123,7 @@ def test_each_recording_has_its_row_its_colour_and_its_curve(tmp_path: Path):
     for figure in re.findall(r"<svg .*?</svg>", page, re.DOTALL)[:3]:
         assert all(colour[0] in figure for colour in colours[:2])
     assert "localized, 9 of 9 queries, walk" in page, "the headline is that of the first recording"
+    assert "<b>66.7 %</b><span>localized, night &amp; rain, the hardest of the others</span>" in page
 
 
 def test_words_and_published_figures_stand_on_the_page(tmp_path: Path):

@@ -47,6 +47,10 @@ def cards(evaluation: dict[str, Any]) -> str:
     if e["num_localized"]:
         shown.append(("", length_text(e["median_translation_m"]), f"median position error{of}"))
         shown.append(("", f"{e['median_rotation_deg']:.2f}°", f"median rotation error{of}"))
+    if len(rows) > 1:
+        hardest = min(rows[1:], key=lambda row: row["num_localized"] / row["num_queries"])
+        share = 100 * hardest["num_localized"] / hardest["num_queries"]
+        shown.append(("", f"{share:.1f} %", f"localized, {escape(hardest['name'])}, the hardest of the others"))
     if not e["num_queries"]:
         shown.append(("", str(e["num_elsewhere"]), "images from elsewhere"))
     false = evaluation["false_accepts"]
