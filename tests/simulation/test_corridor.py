@@ -8,6 +8,8 @@ from jaxtyping import Float64
 
 from topoloc.simulation.conditions import CONDITIONS
 from topoloc.simulation.corridor import CAMERA_HEIGHT, LOOP, MOVABLE, build
+from topoloc.simulation.corridor_lamps import ceiling_lamps
+from topoloc.simulation.corridor_parts import Fittings
 from topoloc.simulation.corridor_plan import EAST, HEIGHT, LENGTH, NORTH, SOUTH, WEST, WIDTH
 from topoloc.simulation.scene import Scene, Surface
 
@@ -82,12 +84,12 @@ def test_the_condition_changes_light_but_no_fixed_geometry(day: Scene, night: Sc
 
 
 def lit(scene: Scene) -> set[int]:
-    lamps = [surface for surface in scene.surfaces if surface.name == "lamp cover"]
+    lamps = [s for s in scene.surfaces if s.name == "lamp cover" and np.ptp(s.mesh.vertices[:, :2], axis=0).max() > 1.0]
     return {number for number, lamp in enumerate(lamps) if lamp.material.kind == "light"}
 
 
 def test_lamps_by_condition(day: Scene, night: Scene):
-    evening = lit(build(0, EVENING))
+    evening = lit(Scene(tuple(ceiling_lamps(0, EVENING, Fittings.of(0)))))
     assert len(lit(day)) >= 7
     assert len(evening) > len(lit(night)) > len(lit(day))
     assert len(lit(night) ^ lit(day)) >= 6, "the light comes from elsewhere by night"

@@ -36,6 +36,7 @@ from topoloc.simulation.corridor_plan import (
     wall_mesh,
     walls_of,
 )
+from topoloc.simulation.corridor_rooms import niche, room
 from topoloc.simulation.noise import rng_of
 from topoloc.simulation.scene import Color, Material, Scene, Surface
 from topoloc.simulation.shapes import panel
@@ -95,14 +96,13 @@ def _shell(seed: int, walls: dict[str, Wall], fittings: Fittings) -> list[Surfac
     for name, length, width, mesh in wings:
         picture = linoleum_floor(rng_of(seed, f"corridor/floor {name}"), length, width, field, border)
         surfaces.append(Surface(f"floor {name}", mesh, Material("polished", picture, roughness=roughness)))
-    tiles = interiors.ceiling_tiles(rng)
     for x, y, dx, dy in (
         (0.0, 0.0, LENGTH, SOUTH),
         (LENGTH - EAST, SOUTH, EAST, inner),
         (0.0, WIDTH - NORTH, LENGTH, NORTH),
         (0.0, SOUTH, WEST, inner),
     ):
-        surfaces.append(Surface("ceiling", panel((x, y, HEIGHT), (dx, 0.0, 0.0), (0.0, dy, 0.0), (dx / 2.4, dy / 2.4)), tiles))
+        surfaces.append(Surface("ceiling", panel((x, y, HEIGHT), (dx, 0.0, 0.0), (0.0, dy, 0.0), (dx / 2.4, dy / 2.4)), fittings.tiles))
     return surfaces
 
 
@@ -113,52 +113,14 @@ def _in_opening(seed: int, condition: Condition, arrangement: int, name: str, op
         return parts.lift(fittings, opening)
     rng = rng_of(seed, f"corridor/opening {name}")
     if opening.kind == "niche":
-        return _niche(seed, condition, name, opening, fittings)
+        return niche(seed, condition, name, opening, fittings)
     surfaces = parts.door_frame(fittings) + parts.door_plate(rng)
     if opening.kind == "door":
         return surfaces + parts.door_leaf(fittings)
     today = rng_of(seed, f"corridor/opening {name}/{arrangement}")
     angle = float(today.uniform(1.1, 1.75)) if today.random() < 0.6 else 0.0
     surfaces += parts.door_leaf(fittings, angle, f"{MOVABLE}door leaf")
-    return surfaces + shifted(_room(seed, condition, name, fittings), (DOOR_WIDTH / 2, 0.0, 0.0))
-
-
-def _room(seed: int, condition: Condition, name: str, fittings: Fittings) -> list[Surface]:
-    """The office behind a door, with its own lamp."""
-    rng = rng_of(seed, f"corridor/room {name}")
-    tint = (0.88, 0.87, 0.84) if rng.random() < 0.5 else _ACCENTS[int(rng.integers(len(_ACCENTS)))]
-    shell = parts.room_shell(interiors.plaster(rng, tint), interiors.carpet(rng), interiors.ceiling_tiles(rng))
-    on = rng_of(seed, f"corridor/room {name}/{condition.name}").random() < 0.8 * condition.lamps
-    lamp = parts.ceiling_lamp(bool(on), 0.3, fittings)
-    board = parts.framed(prints.whiteboard(rng), 1.5, 1.0, 1.5, fittings.metal, interiors.laminated(prints.whiteboard(rng)))
-    return [*shell, *things.office(fittings, rng, 3.9), *shifted(lamp, (0.0, 2.0, 0.0)), *shifted(board, (1.69, 1.6, 0.0), -np.pi / 2)]
-
-
-def _niche(seed: int, condition: Condition, name: str, opening: Opening, fittings: Fittings) -> list[Surface]:
-    """A recess for the copier, or for the vending machine."""
-    rng = rng_of(seed, f"corridor/niche {name}")
-    width, high, depth = opening.right - opening.left, opening.top, 1.0
-    wall = interiors.plaster(rng, (0.7, 0.72, 0.74))
-    sides = [
-        panel((0.0, 0.0, high), (0.0, depth, 0.0), (0.0, 0.0, -high)),
-        panel((width, depth, high), (0.0, -depth, 0.0), (0.0, 0.0, -high)),
-        panel((0.0, depth, high), (width, 0.0, 0.0), (0.0, 0.0, -high)),
-        panel((0.0, 0.0, high), (width, 0.0, 0.0), (0.0, depth, 0.0)),
-    ]
-    floor = panel((0.0, depth, 0.0), (width, 0.0, 0.0), (0.0, -depth, 0.0), (width / 4, depth / 4))
-    on = condition.lamps > 0.0 and rng_of(seed, f"corridor/niche {name}/{condition.name}").random() < condition.lamps + 0.3
-    lamp = shifted(parts.ceiling_lamp(bool(on), 0.8, fittings, (0.6, 0.15)), (width / 2, depth / 2, high - HEIGHT))
-    surfaces = [parts.solid("niche wall", wall, *sides), Surface("niche floor", floor, interiors.linoleum(rng)), *lamp]
-    if width > 2.4:
-        copier = shifted(things.copier(fittings, rng), (width - 0.6, depth - 0.05, 0.0))
-        shelf = shifted(things.paper_shelf(fittings, rng), (0.75, depth, 0.0))
-        board = parts.framed(prints.notice_board(rng), 1.0, 0.66, 1.65, fittings.wood, interiors.printed(prints.notice_board(rng)))
-        return surfaces + copier + shelf + shifted(board, (width - 0.65, depth, 0.0))
-    return (
-        surfaces
-        + shifted(things.vending_machine(fittings, rng), (0.6, depth, 0.0))
-        + shifted(things.waste_bin(fittings), (1.4, depth - 0.1, 0.0))
-    )
+    return surfaces + shifted(room(seed, condition, name, fittings), (DOOR_WIDTH / 2, 0.0, 0.0))
 
 
 def _put_up(seed: int, wall: Wall, fittings: Fittings) -> list[Surface]:
@@ -174,22 +136,15 @@ def _put_up(seed: int, wall: Wall, fittings: Fittings) -> list[Surface]:
             continue
         choice, at = rng.random(), float(rng.uniform(start + 0.4, end - 0.4))
         if choice < 0.35:
-            surfaces += on_wall(
-                wall, at, parts.framed(prints.poster(rng), 0.59, 0.84, 1.5, fittings.aluminium, interiors.laminated(prints.poster(rng)))
-            )
+            hung = parts.framed(0.59, 0.84, 1.5, fittings.aluminium, interiors.laminated(prints.poster(rng)))
         elif choice < 0.5:
-            picture = prints.photograph(rng, (420, 600))
-            surfaces += on_wall(wall, at, parts.framed(picture, 0.9, 0.63, 1.55, fittings.wood, interiors.laminated(picture)))
+            hung = parts.framed(0.9, 0.63, 1.55, fittings.wood, interiors.laminated(prints.photograph(rng, (420, 600))))
         elif choice < 0.65:
-            surfaces += on_wall(
-                wall,
-                at,
-                [
-                    Surface(
-                        "notice", panel((-0.105, -0.002, 1.62), (0.21, 0.0, 0.0), (0.0, 0.0, -0.297)), interiors.printed(prints.notice(rng))
-                    )
-                ],
-            )
+            sheet = panel((-0.105, -0.002, 1.62), (0.21, 0.0, 0.0), (0.0, 0.0, -0.297))
+            hung = [Surface("notice", sheet, interiors.printed(prints.notice(rng)))]
+        else:
+            continue
+        surfaces += on_wall(wall, at, hung)
     return surfaces
 
 
@@ -199,8 +154,8 @@ def _fixtures(seed: int, walls: dict[str, Wall], fittings: Fittings) -> list[Sur
     column = interiors.concrete(rng)
     boards = [prints.notice_board(rng, size) for size in ((560, 840), (560, 1000))]
     at: list[tuple[str, float, list[Surface]]] = [
-        ("south outer", 11.2, parts.framed(boards[0], 1.5, 1.0, 1.5, fittings.wood, interiors.printed(boards[0]))),
-        ("west inner", 6.2, parts.framed(boards[1], 1.9, 1.06, 1.5, fittings.aluminium, interiors.printed(boards[1]))),
+        ("south outer", 11.2, parts.framed(1.5, 1.0, 1.5, fittings.wood, interiors.printed(boards[0]))),
+        ("west inner", 6.2, parts.framed(1.9, 1.06, 1.5, fittings.aluminium, interiors.printed(boards[1]))),
         ("south outer", 13.7, things.bench(fittings)),
         ("south outer", 16.0, parts.extinguisher(fittings, rng)),
         ("north outer", 18.2, parts.extinguisher(fittings, rng)),
@@ -219,23 +174,17 @@ def _fixtures(seed: int, walls: dict[str, Wall], fittings: Fittings) -> list[Sur
     picture = prints.exit_sign()
     for x, y, yaw in ((12.35, LOOP[2][1], 0.0), (20.2, LOOP[0][1], 0.0), (LOOP[1][0], 4.6, np.pi / 2), (LOOP[0][0], 5.2, np.pi / 2)):
         surfaces += shifted(parts.hung_sign(picture, True, fittings), (x, y, 0.0), yaw)
-    for x, y in (
-        (4.4, 1.6),
-        (9.6, 0.8),
-        (16.6, 1.4),
-        (24.0, 5.3),
-        (23.6, 11.6),
-        (20.6, 17.2),
-        (14.2, 16.6),
-        (7.4, 17.0),
-        (1.5, 13.4),
-        (0.9, 7.1),
-    ):
+    for x, y in _OVERHEAD:
         detector = parts.smoke_detector(fittings) if rng.random() < 0.6 else None
         surfaces += shifted([detector] if detector else parts.air_vent(fittings), (x, y, 0.0))
     return surfaces
 
 
+_OVERHEAD = (
+    *((4.4, 1.6), (9.6, 0.8), (16.6, 1.4), (24.0, 5.3), (23.6, 11.6)),
+    *((20.6, 17.2), (14.2, 16.6), (7.4, 17.0), (1.5, 13.4), (0.9, 7.1)),
+)
+"""Smoke detectors and grilles of the ventilation."""
 _SITES = (
     *(("south outer", x) for x in (10.0, 15.1, 17.0)),
     *(("south inner", x) for x in (5.6, 6.6, 7.8, 10.2, 11.6, 12.5)),

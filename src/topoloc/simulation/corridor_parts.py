@@ -31,6 +31,10 @@ class Fittings:
     red: Material
     wood: Material
     rail: Material
+    plaster: Material
+    carpet: Material
+    linoleum: Material
+    tiles: Material
 
     @staticmethod
     def of(seed: int) -> Fittings:
@@ -47,6 +51,10 @@ class Fittings:
             red=interiors.plastic((0.72, 0.06, 0.05)),
             wood=interiors.wood(rng, interiors.OAK),
             rail=interiors.wood(rng, interiors.BEECH, size=(64, 512)),
+            plaster=interiors.plaster(rng),
+            carpet=interiors.carpet(rng),
+            linoleum=interiors.linoleum(rng),
+            tiles=interiors.ceiling_tiles(rng),
         )
 
 
@@ -216,7 +224,7 @@ def pillar(material: Material) -> Surface:
     return Surface("pillar", placed(cylinder((0.0, 0.0), 0.16, 0.0, HEIGHT, num_sides=24), (0.0, -0.2, 0.0)), material)
 
 
-def framed(picture: Picture, width: float, height: float, centre_z: float, frame: Material, material: Material) -> list[Surface]:
+def framed(width: float, height: float, centre_z: float, frame: Material, material: Material) -> list[Surface]:
     """A print or board on the wall around x = 0, in a thin frame."""
     low, high = centre_z - height / 2, centre_z + height / 2
     border = box((-width / 2 - 0.018, -0.016, low - 0.018), (width / 2 + 0.018, 0.0, high + 0.018), faces="sewtb")
@@ -265,27 +273,3 @@ def _fire_sign() -> Picture:
     flame = [(66, 84), (56, 72), (58, 56), (63, 62), (66, 42), (74, 54), (76, 50), (82, 68), (76, 82)]
     cv2.fillPoly(picture, [np.array(flame, np.int32)], white, cv2.LINE_AA)
     return picture
-
-
-def room_shell(wall: Material, floor: Material, ceiling: Material, depth: float = 3.8, width: float = 3.4) -> list[Surface]:
-    """An office behind a door whose centre is x = 0: walls with a window at the back, floor and ceiling."""
-    near, far, half = WALL_THICKNESS, WALL_THICKNESS + depth, width / 2
-    sides = [
-        panel((-half, near, HEIGHT), (0.0, depth, 0.0), (0.0, 0.0, -HEIGHT)),
-        panel((half, far, HEIGHT), (0.0, -depth, 0.0), (0.0, 0.0, -HEIGHT)),
-    ]
-    front = [
-        panel((x0, near, HEIGHT), (x1 - x0, 0.0, 0.0), (0.0, 0.0, -HEIGHT)) for x0, x1 in ((-half, -DOOR_WIDTH / 2), (DOOR_WIDTH / 2, half))
-    ]
-    front.append(panel((-DOOR_WIDTH / 2, near, HEIGHT), (DOOR_WIDTH, 0.0, 0.0), (0.0, 0.0, DOOR_HEIGHT - HEIGHT)))
-    back = [panel((x0, far, z1), (x1 - x0, 0.0, 0.0), (0.0, 0.0, z0 - z1)) for x0, x1, z0, z1 in _around(half, 1.2, 0.9, 2.3)]
-    level = [
-        Surface("room floor", panel((-half, far, 0.0), (width, 0.0, 0.0), (0.0, near - far, 0.0), (width / 2, depth / 2)), floor),
-        Surface("room ceiling", panel((-half, near, HEIGHT), (width, 0.0, 0.0), (0.0, depth, 0.0), (width / 2.4, depth / 2.4)), ceiling),
-    ]
-    return [solid("room wall", wall, *sides, *front, *back), *level]
-
-
-def _around(half: float, window: float, low: float, high: float) -> list[tuple[float, float, float, float]]:
-    """The four pieces of a wall around a window in it, as (x0, x1, z0, z1)."""
-    return [(-half, -window, 0.0, HEIGHT), (window, half, 0.0, HEIGHT), (-window, window, 0.0, low), (-window, window, high, HEIGHT)]

@@ -210,27 +210,6 @@ def _goods(rng: np.random.Generator) -> Picture:
     return picture
 
 
-def office(fittings: Fittings, rng: np.random.Generator, depth: float) -> list[Surface]:
-    """A desk with a screen and a case of books, for a room whose door is at y = 0 and whose window is `depth` away."""
-    top = box((0.0, depth - 1.2, 0.7), (1.6, depth - 0.4, 0.735), texels=0.8)
-    legs = [box((x, y, 0.0), (x + 0.05, y + 0.05, 0.7)) for x in (0.03, 1.52) for y in (depth - 1.15, depth - 0.5)]
-    screen = box((0.55, depth - 0.72, 0.86), (1.1, depth - 0.69, 1.2))
-    foot = [box((0.8, depth - 0.7, 0.735), (0.85, depth - 0.66, 0.9)), box((0.7, depth - 0.8, 0.735), (0.95, depth - 0.58, 0.75))]
-    case = box((-1.68, depth - 1.9, 0.0), (-1.36, depth - 0.4, 1.9), texels=0.8)
-    rows = []
-    for level in (0.1, 0.48, 0.86, 1.24, 1.58):
-        books = panel((-1.355, depth - 0.45, level + 0.26), (0.0, -1.4, 0.0), (0.0, 0.0, -0.26))
-        rows.append(Surface("books", books, interiors.printed(prints.book_spines(rng, [int(w) for w in rng.integers(14, 46, 26)]))))
-    chair = shifted(visitor_chair(fittings, rng, (0.16, 0.17, 0.2)), (0.8, depth - 1.15, 0.0))
-    return [
-        solid("desk", fittings.wood, top, case),
-        solid("desk legs", fittings.metal, *legs),
-        solid("monitor", fittings.black, screen, *foot),
-        *rows,
-        *chair,
-    ]
-
-
 def foliage(
     rng: np.random.Generator, centre: tuple[float, float, float], radii: tuple[float, float, float], count: int, size: float
 ) -> Mesh:
