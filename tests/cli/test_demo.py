@@ -16,7 +16,7 @@ from topoloc.cli import main
 from topoloc.cli.demo_words import elsewhere_in_words, night_in_words
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.sequences.trajectory import read_trajectory
-from topoloc.simulation.lab_demo import RECORDINGS, SHIPPED, missing_recordings
+from topoloc.simulation.demo_recordings import RECORDINGS, SHIPPED, missing_recordings
 
 SETS = ["day", "night", "other camera", "elsewhere"]
 

@@ -25,7 +25,7 @@ from topoloc.sequences.atomic import write_text
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import open_sequence
 from topoloc.sequences.trajectory import Trajectory, write_tum
-from topoloc.simulation.lab_demo import RECORDINGS, SHIPPED, Role, draw_pictures_of_nothing, missing_recordings, render_recordings
+from topoloc.simulation.demo_recordings import RECORDINGS, SHIPPED, Role, draw_pictures_of_nothing, missing_recordings, render_recordings
 
 Progress = Callable[[str, int, int], None]
 ELSEWHERE = "elsewhere"

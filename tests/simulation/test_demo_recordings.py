@@ -11,8 +11,8 @@ import pytest
 from topoloc.errors import TopolocError
 from topoloc.geometry.camera import Camera
 from topoloc.sequences.open import open_sequence
-from topoloc.simulation import lab_demo
-from topoloc.simulation.lab_demo import RECORDINGS, draw_pictures_of_nothing, missing_recordings, render_recordings
+from topoloc.simulation import demo_recordings
+from topoloc.simulation.demo_recordings import RECORDINGS, draw_pictures_of_nothing, missing_recordings, render_recordings
 from topoloc.simulation.renderer import RenderConfig
 from topoloc.simulation.routes import frame_poses, plan_route
 from topoloc.simulation.worlds import find_world
@@ -30,7 +30,7 @@ def test_rendering_begins_where_it_was_left(tmp_path: Path, monkeypatch: pytest.
         )
         for recording in (RECORDINGS[0], RECORDINGS[3])
     ]
-    monkeypatch.setattr(lab_demo, "RECORDINGS", tuple(tiny))
+    monkeypatch.setattr(demo_recordings, "RECORDINGS", tuple(tiny))
     assert missing_recordings(tmp_path) == ["map_lap1", "night"]
     told: list[tuple[str, int, int]] = []
     render_recordings(tmp_path, lambda *step: told.append(step))
