@@ -9,6 +9,8 @@ TopolocError
 ├── MapError              a map that cannot be opened, read or written
 │   ├── MapVersionError       written by a later topoloc, schema unknown here
 │   └── EmptyMapError         no node could be built, or the map holds none
+├── WeightsError          weights of a network that are missing, damaged or of another network
+├── TrainingError         a training that cannot begin or go on: nothing to learn from, a loss that is not finite
 ├── QueryError            the call of a query is wrong (no camera, camera of another image size)
 └── MissingExtraError     an optional dependency is not installed; names the extra
 """
@@ -48,6 +50,14 @@ class MapVersionError(MapError):
 
 class EmptyMapError(MapError):
     """A map without a single usable node."""
+
+
+class WeightsError(TopolocError):
+    """Weights of a network that are missing, damaged, or those of another network."""
+
+
+class TrainingError(TopolocError):
+    """A training that cannot begin or go on."""
 
 
 class QueryError(TopolocError):

@@ -11,6 +11,7 @@ COMMANDS = {
     "demo": "the whole pipeline on the built-in lab: mapped by day, asked by day, by night and with another camera",
     "simulate": "render a recording of a built-in world (lab, corridor, street) with exact truth",
     "build": "map a place: a stereo or RGB-D recording becomes one map file",
+    "train": "add a learned coarse localizer to a map, or train it anew",
     "localize": "where were these images taken? 6-DoF poses of images, folders, recordings",
     "evaluate": "localize a recording with known truth and judge the poses",
     "info": "what a map file holds",

@@ -38,7 +38,7 @@ class Command:
     """A recording of another place: every pose given for one of its images counts as a false accept."""
     map_from_truth: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
     """A JSON file with the 4x4 matrix (metres) that takes the world of the recordings' truth into the map's, where they differ."""
-    coarse: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: surf-vlad)")] = None
+    coarse: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")] = None
     """Which of the map's coarse localizers is asked; `topoloc info` names them."""
     format: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: recognised)")] = None
     """The recordings' format: kitti, euroc, tum, seven_scenes or folder."""

@@ -40,6 +40,8 @@ def describe_map(topomap: Any, path: Path) -> dict[str, Any]:
     """
     import numpy as np
 
+    from topoloc.mapping.coarse_storage import list_coarse
+
     if len(topomap.summaries) == 0:
         raise EmptyMapError(f"map {path} has no nodes")
     centres = np.array([s.world_from_cam.translation for s in topomap.summaries])
@@ -53,6 +55,8 @@ def describe_map(topomap: Any, path: Path) -> dict[str, Any]:
         "extent_m": np.ptp(centres, axis=0).round(3).tolist(),
         "recordings": sorted({s.recording for s in topomap.summaries}),
         "coarse": sorted(topomap.coarse_models),
+        "default_coarse": topomap.default_coarse,
+        "coarse_models": list_coarse(path),
         "config": dict(topomap.config),
     }
 
@@ -68,8 +72,15 @@ def _print(info: dict[str, Any]) -> None:
             ("place images", str(info["num_place_images"])),
             ("mapped", f"{info['length_m']:.1f} m, extent {' x '.join(f'{e:.1f}' for e in info['extent_m'])} m"),
             ("recordings", ", ".join(info["recordings"])),
-            ("coarse localizers", ", ".join(info["coarse"])),
+            *(("coarse localizer", _coarse_line(facts, info["default_coarse"])) for facts in info["coarse_models"]),
             ("Eq. 1", f"D_thresh {nodes.get('d_thresh', nan):.3g} m, lambda {nodes.get('lambda_rot', nan):.3g} m/rad"),
             ("features", ", ".join(f"{key} {value}" for key, value in features.items() if isinstance(value, str))),
         ]
     )
+
+
+def _coarse_line(facts: dict[str, Any], default: str) -> str:
+    weights = facts.get("weights")
+    source = f"{weights['file']}, SHA-256 {weights['sha256'][:12]}" if weights else "from random weights"
+    network = f", {facts['backbone']} ({source})" if "backbone" in facts else ""
+    return f"{facts['name']}{' (default)' if facts['name'] == default else ''}{network}, {facts['bytes'] / 1e6:.2f} MB"

@@ -50,7 +50,7 @@ class Command:
     """The queries' calibration: a camera.json, `fx,fy,cx,cy` in pixels, or `map` for the camera that the map was made with."""
     format: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: recognised)")] = None
     """The recordings' format: kitti, euroc, tum, seven_scenes or folder."""
-    coarse: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: surf-vlad)")] = None
+    coarse: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")] = None
     """Which of the map's coarse localizers is asked; `topoloc info` names them."""
     json: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
     """Write one JSON line a query to this file (- for standard output)."""

@@ -39,8 +39,8 @@ NODES_IN_MEMORY = 256
 class LocalizerConfig:
     """How a query is answered. The features are those that the map was built with."""
 
-    coarse: str = "surf-vlad"
-    """Which of the map's coarse localizers is asked."""
+    coarse: str | None = None
+    """Which of the map's coarse localizers is asked (None: the map's default)."""
     num_candidates: int = 4
     """Nodes whose points are pooled; 1 is the paper's single node."""
     matching: MatchingConfig = field(default_factory=MatchingConfig)
@@ -82,10 +82,11 @@ class Localizer:
         self.topomap = topomap
         if len(topomap.summaries) == 0:
             raise EmptyMapError("the map has no nodes")
-        if self.config.coarse not in topomap.coarse_models:
+        coarse = self.config.coarse or topomap.default_coarse
+        if coarse not in topomap.coarse_models:
             available = ", ".join(topomap.coarse_models) or "none"
-            raise MapError(f"the map has no coarse localizer {self.config.coarse!r} (it has: {available})")
-        self._coarse = open_coarse(topomap.coarse_models[self.config.coarse])
+            raise MapError(f"the map has no coarse localizer {coarse!r} (it has: {available})")
+        self._coarse = open_coarse(topomap.coarse_models[coarse])
         self._feature_config = FeatureConfig(**topomap.config["features"])
         self._node_poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
         self._lambda_rot = float(topomap.config["nodes"]["lambda_rot"])

@@ -57,9 +57,20 @@ def save_map(topomap: TopoMetricMap, path: Path) -> None:
     """
     if os.path.isdir(path):  # Path.is_dir raises for names that are too long
         raise MapError(f"cannot write map {path}: it is a folder")
+    with replaced_file(path) as temporary:
+        _write_database(topomap, temporary)
+
+
+@contextmanager
+def replaced_file(path: Path) -> Iterator[Path]:
+    """A name beside `path` to write to; what was written there is renamed over `path` when all went well.
+
+    Raises:
+        MapError: it could not be written; nothing is left behind.
+    """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        _write_database(topomap, temporary)
+        yield temporary
         os.replace(temporary, path)
     except (sqlite3.Error, OSError) as error:
         raise MapError(f"cannot write map {path}: {error}") from error
@@ -78,6 +89,7 @@ def _write_database(topomap: TopoMetricMap, path: Path) -> None:
         database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
         database.executescript(_SCHEMA)
         info = {"config": json.dumps(topomap.config, sort_keys=True), "length_m": json.dumps(topomap.length_m)}
+        info["default_coarse"] = json.dumps(topomap.default_coarse)
         database.executemany("INSERT INTO map VALUES (?, ?)", info.items())
         for node in topomap.nodes:
             _insert_node(database, node)
@@ -85,8 +97,7 @@ def _write_database(topomap: TopoMetricMap, path: Path) -> None:
         rows = ((p.recording, p.name, p.node_id, _pose_bytes(p.world_from_cam), p.jpeg) for p in topomap.place_images)
         database.executemany("INSERT INTO place_images (recording, name, node_id, world_from_cam, jpeg) VALUES (?, ?, ?, ?, ?)", rows)
         for model in topomap.coarse_models.values():
-            row = (model.name, json.dumps(model.settings, sort_keys=True), _arrays_bytes(model.arrays))
-            database.execute("INSERT INTO coarse_models VALUES (?, ?, ?)", row)
+            insert_model(database, model)
         database.commit()
     finally:
         database.close()
@@ -109,6 +120,12 @@ def _insert_node(database: sqlite3.Connection, node: TopoNode) -> None:
     database.execute("INSERT INTO node_templates VALUES (?, ?)", (s.node_id, node.template_jpeg))
 
 
+def insert_model(database: sqlite3.Connection, model: CoarseModel) -> None:
+    """Add a coarse localizer, or put it in the place of the one of its name."""
+    row = (model.name, json.dumps(model.settings, sort_keys=True), _arrays_bytes(model.arrays))
+    database.execute("INSERT OR REPLACE INTO coarse_models VALUES (?, ?, ?)", row)
+
+
 def open_map(path: Path) -> TopoMetricMap:
     """Open a map file without reading its nodes.
 
@@ -127,6 +144,7 @@ def open_map(path: Path) -> TopoMetricMap:
             coarse_models=_StoredModels(file),
             config=json.loads(info["config"]),
             length_m=float(json.loads(info["length_m"])),
+            default_coarse=json.loads(info.get("default_coarse", '"surf-vlad"')),
         )
 
 
@@ -141,7 +159,7 @@ class _MapFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.lock = threading.RLock()
-        _check_header(path)
+        check_header(path)
         # The file is never changed in place, so SQLite needs no locks on it (and works on read-only media).
         with self.reading():
             self.database = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True, check_same_thread=False)
@@ -261,7 +279,7 @@ class _StoredModels(Mapping[str, CoarseModel]):
                 return CoarseModel(name, json.loads(row[0]), dict(arrays))
 
 
-def _check_header(path: Path) -> None:
+def check_header(path: Path) -> None:
     """The 100 bytes that every SQLite file begins with: is it one, is it ours, is it whole, is it of our schema?"""
     try:
         with path.open("rb") as file:

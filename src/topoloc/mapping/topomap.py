@@ -76,7 +76,8 @@ class TopoMetricMap:
     """The map. In a map that was loaded, every sequence and mapping reads the file only when an entry is asked for.
 
     `summaries[i]` describes `nodes[i]`, and ``nodes[i].summary.node_id == i``. `config` is the effective configuration it
-    was built with, `length_m` the metres of trajectory that were mapped.
+    was built with, `length_m` the metres of trajectory that were mapped. `default_coarse` names the coarse localizer that answers
+    where the user names none.
     """
 
     summaries: Sequence[NodeSummary]
@@ -86,6 +87,7 @@ class TopoMetricMap:
     coarse_models: Mapping[str, CoarseModel]
     config: Mapping[str, Any] = field(default_factory=dict)
     length_m: float = 0.0
+    default_coarse: str = "surf-vlad"
 
     def save(self, path: str | Path) -> None:
         """Write the map file at once or not at all. Raises MapError."""

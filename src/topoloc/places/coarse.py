@@ -6,14 +6,20 @@ Every coarse localizer answers the same question behind `CoarseLocalizer.rank`; 
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
 
+from topoloc.errors import MapError, MissingExtraError
 from topoloc.features.features import Features
+
+CoarseName = Literal["surf-vlad", "cnn-fc", "cnn-nn", "vlad-nn"]
+COARSE_NAMES: tuple[CoarseName, ...] = get_args(CoarseName)
+_MODULES = {"surf-vlad": "vlad", "cnn-fc": "cnn_fc", "cnn-nn": "cnn_nn", "vlad-nn": "vlad_nn"}
 
 Image = UInt8[np.ndarray, "h w"] | UInt8[np.ndarray, "h w 3"]
 
@@ -45,10 +51,22 @@ class CoarseLocalizer(Protocol):
 
 
 def open_coarse(model: CoarseModel) -> CoarseLocalizer:
-    """The localizer of a stored model. Raises MapError for a name that this version does not know."""
-    from topoloc.errors import MapError
-    from topoloc.places.vlad import SurfVlad
+    """The localizer of a stored model.
 
-    if model.name == SurfVlad.name:
-        return SurfVlad.from_model(model)
-    raise MapError(f"the map's coarse localizer {model.name!r} is not known to this version (known: {SurfVlad.name})")
+    Raises:
+        MapError: the model is damaged, or of a name that this version does not know.
+        MissingExtraError: it needs torch, which is not installed.
+    """
+    if model.name not in COARSE_NAMES:
+        raise MapError(f"the map's coarse localizer {model.name!r} is not known to this version (known: {', '.join(COARSE_NAMES)})")
+    return module_of(model.name).open_model(model)
+
+
+def module_of(name: str) -> Any:
+    """The module of a coarse localizer, loaded now: those that learn need torch. Raises MissingExtraError."""
+    try:
+        return importlib.import_module(f"topoloc.places.{_MODULES[name]}")
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        raise MissingExtraError(f"the coarse localizer {name!r} needs PyTorch: pip install 'topoloc[deep]'") from error

@@ -17,6 +17,7 @@ from topoloc.features.features import Features
 from topoloc.places.coarse import CoarseModel, Image, NodeScore
 from topoloc.places.neighbours import PlaceIndex
 from topoloc.places.place_kernels import add_residuals, multiply_rows
+from topoloc.places.whitening import learn_whitening
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,8 @@ class SurfVlad:
         words: Float32[np.ndarray, "k d"], vlads: Float32[np.ndarray, "n kd"], node_ids: Int[np.ndarray, " n"], config: VladConfig
     ) -> SurfVlad:
         """From the vocabulary (`learn_words`), the `vlad` of each mapping image and the node it belongs to."""
-        mean, projection = _learn_whitening(vlads, config.dimension)
-        return SurfVlad(words, mean, projection, _project(vlads, mean, projection), node_ids, config)
+        whitening = learn_whitening(vlads, config.dimension)
+        return SurfVlad(words, whitening.mean, whitening.projection, whitening.apply(vlads), node_ids, config)
 
     def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
         """See `CoarseLocalizer.rank`; the picture itself is not looked at."""
@@ -79,6 +80,11 @@ class SurfVlad:
         return SurfVlad(a["words"], a["mean"], projection, vectors, a["node_ids"], VladConfig(**model.settings))
 
 
+def open_model(model: CoarseModel) -> SurfVlad:
+    """The localizer of a stored model."""
+    return SurfVlad.from_model(model)
+
+
 def vlad(descriptors: Float32[np.ndarray, "n d"], words: Float32[np.ndarray, "k d"]) -> Float32[np.ndarray, " kd"]:
     """VLAD of unit-length descriptors over `words`; zero for an image without features."""
     sums = np.zeros(words.shape, np.float32)
@@ -99,31 +105,3 @@ def learn_words(descriptors: Float32[np.ndarray, "n d"], config: VladConfig) -> 
     kmeans.train(np.ascontiguousarray(descriptors))
     assert kmeans.centroids is not None
     return np.asarray(kmeans.centroids, np.float32).reshape(num_words, -1)
-
-
-def _learn_whitening(raw: Float32[np.ndarray, "n kd"], dimension: int) -> tuple[Float32[np.ndarray, " kd"], Float32[np.ndarray, "p kd"]]:
-    """Mean and projection to at most `dimension` whitened components.
-
-    The variances are softened by the mean one, since the trailing components of few images are noise, which plain
-    whitening would blow up.
-    """
-    mean = raw.mean(axis=0)
-    centred = raw - mean
-    by_image = len(raw) < raw.shape[1]  # whichever is smaller: the products of images, or those of dimensions
-    eigenvalues, vectors = np.linalg.eigh(centred @ centred.T if by_image else centred.T @ centred)
-    order = np.argsort(-eigenvalues, kind="stable")[:dimension]
-    # Vectors are of unit length: below a millionth of that is rounding.
-    keep = order[eigenvalues[order] > 1e-6 * max(float(eigenvalues.max()), len(raw) * 1e-6)]
-    if len(keep) == 0:  # one image, or all alike
-        direction = mean / max(float(np.linalg.norm(mean)), 1e-6)
-        return np.zeros_like(mean), direction[None].astype(np.float32)
-    axes = centred.T @ vectors[:, keep] / np.sqrt(eigenvalues[keep]) if by_image else vectors[:, keep]
-    softened = np.sqrt(eigenvalues[keep] + eigenvalues[keep].mean())
-    return mean.astype(np.float32), np.ascontiguousarray((axes / softened).T, np.float32)
-
-
-def _project(
-    raw: Float32[np.ndarray, "n kd"], mean: Float32[np.ndarray, " kd"], projection: Float32[np.ndarray, "p kd"]
-) -> Float32[np.ndarray, "n p"]:
-    projected = (raw - mean) @ projection.T
-    return np.ascontiguousarray(projected / np.maximum(np.linalg.norm(projected, axis=1, keepdims=True), 1e-6), np.float32)

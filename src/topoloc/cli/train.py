@@ -1,0 +1,53 @@
+"""topoloc train MAP --coarse NAME."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from topoloc.cli.output import check_outputs, progress_bar, write_json
+from topoloc.mapping.coarse_storage import list_coarse, store_coarse
+from topoloc.mapping.coarse_training import CoarseTrainingConfig, train_coarse
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.places.classifier_config import BackboneName
+
+
+@dataclass(frozen=True)
+class Command:
+    """What `topoloc train` takes."""
+
+    map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP")]
+    """The map file; it gets the coarse localizer, in the place of one of the same name."""
+    coarse: Literal["cnn-fc", "cnn-nn", "vlad-nn"]
+    """The coarse localizer to train."""
+    backbone: BackboneName = "squeezenet1_1"
+    """The network it stands on."""
+    weights: Annotated[str | None, tyro.conf.arg(metavar="FILE|scratch", help_behavior_hint="(default: the published)")] = (
+        None
+    )
+    """The network's weights: a PyTorch file of torchvision's or NetVLAD's layout, or `scratch` for random ones."""
+    default: bool = False
+    """From now on it answers where --coarse is not given."""
+    out: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: MAP itself)")] = None
+    """Write the map with the new coarse localizer to this file and leave MAP as it is."""
+    json: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    """Write what was trained to this file (- for standard output)."""
+    config: CoarseTrainingConfig = field(default_factory=CoarseTrainingConfig)
+
+    def run(self) -> int:
+        target = Path(self.out or self.map)
+        check_outputs([str(target), self.json])
+        start = time.perf_counter()
+        with progress_bar() as progress:
+            model = train_coarse(TopoMetricMap.load(self.map), self.coarse, self.backbone, self.weights, self.config, progress)
+        store_coarse(Path(self.map), target, model, self.default)
+        (facts,) = [facts for facts in list_coarse(target) if facts["name"] == self.coarse]
+        facts |= {"seconds": round(time.perf_counter() - start, 1), "default": self.default}
+        if self.json != "-":
+            print(f"{target}: {self.coarse} on {self.backbone}, {facts['bytes'] / 1e6:.2f} MB, {facts['seconds']:.0f} s")
+        write_json(self.json, facts)
+        return 0

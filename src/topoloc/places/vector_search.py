@@ -1,0 +1,87 @@
+"""What cnn-nn and vlad-nn share: a network turns a picture into a vector; the nodes of the nearest mapping images answer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+from torch import nn
+
+from topoloc.errors import MapError
+from topoloc.features.features import Features
+from topoloc.places.classifier_config import PictureConfig
+from topoloc.places.coarse import CoarseModel, Image, NodeScore
+from topoloc.places.inference import Predictor, from_arrays, rounded_to_half, to_arrays
+from topoloc.places.neighbours import PlaceIndex
+from topoloc.places.training_set import PictureShape, Progress, TrainingSet, decode_pictures, network_pictures
+from topoloc.places.whitening import Whitening, learn_whitening
+
+_CHUNK = 64
+
+
+@dataclass(frozen=True, eq=False)
+class FittedVectors:
+    """The arrays of a model whose vectors were learnt; `model` adds the settings."""
+
+    name: str
+    picture_shape: PictureShape
+    arrays: Mapping[str, np.ndarray]
+
+    def model(self, settings: Mapping[str, Any]) -> CoarseModel:
+        shape = [self.picture_shape.width, self.picture_shape.height]
+        return CoarseModel(self.name, {**settings, "picture_shape": shape}, self.arrays)
+
+
+def fit_vectors(
+    name: str, network: nn.Module, training_set: TrainingSet, picture: PictureConfig, dimension: int, progress: Progress
+) -> FittedVectors:
+    """Vectors of all mapping images and their whitening. The network's weights are rounded to half floats, as the map keeps them.
+
+    Raises:
+        MapError: a mapping image is damaged.
+    """
+    pictures, shape = decode_pictures(training_set)
+    predict = Predictor(rounded_to_half(network))
+    raw = []
+    for start in range(0, len(pictures), _CHUNK):
+        raw.append(predict(network_pictures(pictures[start : start + _CHUNK], shape, picture)))
+        progress(f"{name}: vectors", min(start + _CHUNK, len(pictures)), len(pictures))
+    vectors = np.concatenate(raw)
+    whitening = learn_whitening(vectors, dimension)
+    whitening = Whitening(whitening.mean, whitening.projection.astype(np.float16).astype(np.float32))
+    arrays = to_arrays(network) | {"mean": whitening.mean, "projection": whitening.projection.astype(np.float16)}
+    arrays |= {"vectors": whitening.apply(vectors).astype(np.float16), "node_ids": training_set.node_ids.astype(np.int32)}
+    return FittedVectors(name, shape, arrays)
+
+
+class VectorSearch:
+    """The coarse localizers `cnn-nn` and `vlad-nn`.
+
+    Raises:
+        MapError: the model's arrays do not belong together.
+    """
+
+    def __init__(self, model: CoarseModel, network: nn.Module) -> None:
+        try:
+            self._picture = PictureConfig(**model.settings["config"]["picture"])
+            self._shape = PictureShape(*model.settings["picture_shape"])
+            self._predict = Predictor(from_arrays(network, model.arrays))
+            self._whitening = Whitening(model.arrays["mean"], model.arrays["projection"].astype(np.float32))
+            self._index = PlaceIndex(model.arrays["vectors"].astype(np.float32), model.arrays["node_ids"])
+        except (KeyError, RuntimeError, ValueError) as error:
+            raise MapError(f"the map's coarse localizer {model.name!r} is damaged: {' '.join(str(error).split())[:200]}") from error
+
+    def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
+        """See `CoarseLocalizer.rank`; scores are cosines. The local features are not looked at."""
+        return self._index.rank_nodes(self.vectors([image])[0], num_candidates)
+
+    def rank_batch(self, images: Sequence[Image], num_candidates: int) -> list[list[NodeScore]]:
+        """`rank` of many images, which go through the network together."""
+        return [self._index.rank_nodes(vector, num_candidates) for vector in self.vectors(images)]
+
+    def vectors(self, images: Sequence[Image]) -> Float32[np.ndarray, "n d"]:
+        """The images' unit vectors."""
+        return self._whitening.apply(self._predict(network_pictures(images, self._shape, self._picture)))

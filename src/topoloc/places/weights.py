@@ -1,0 +1,182 @@
+"""Weights of the backbones: from a file, or from where they are published into a cache; checked before they are used.
+
+Files are read without running code from them (`weights_only`). A file of another network is named as what it looks like.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+import urllib.error
+import urllib.request
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from topoloc.errors import WeightsError
+from topoloc.places.backbones import NUM_CHANNELS, Backbone
+from topoloc.places.classifier_config import BACKBONES, BackboneName
+
+SCRATCH = "scratch"
+"""In place of a file: start from random weights."""
+
+# Published by torchvision (BSD-3); a file's name ends with the first eight hexadecimal digits of its SHA-256.
+_URL = "https://download.pytorch.org/models/"
+_PUBLISHED: dict[BackboneName, str] = {
+    "squeezenet1_1": "squeezenet1_1-b8a52dc0.pth",
+    "vgg11": "vgg11-8a719046.pth",
+    "vgg16": "vgg16-397923af.pth",
+}
+_TIMEOUT_SECONDS = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """Tensors under the names of `Backbone`, and the file they came from.
+
+    `netvlad` holds `conv.weight` (k, c, 1, 1) and `centroids` (k, c) where the file brought a NetVLAD layer.
+    """
+
+    backbone: BackboneName
+    tensors: dict[str, Tensor]
+    file_name: str
+    sha256: str
+    netvlad: dict[str, Tensor] | None = None
+
+
+def find_weights(backbone: BackboneName, weights: str | None) -> Weights | None:
+    """The weights to begin with: those of the file `weights`; where None, the published ones; None for `scratch`.
+
+    Raises:
+        WeightsError: the file cannot be read or is of another network, or the published file cannot be had.
+    """
+    if weights == SCRATCH:
+        return None
+    return read_weights(Path(weights) if weights is not None else _published_file(backbone), backbone)
+
+
+def read_weights(path: Path, backbone: BackboneName) -> Weights:
+    """Read a file of torchvision's layout, or of the NetVLAD checkpoints' (`encoder.*`, `pool.conv.weight`, `pool.centroids`).
+
+    A file with the features alone is enough; whether a classifier is wanted is for the caller to see.
+
+    Raises:
+        WeightsError: no such file, truncated, no weights, of another network, or not finite.
+    """
+    tensors = _read_tensors(path)
+    netvlad = None
+    if any(name.startswith("encoder.") for name in tensors):
+        tensors, netvlad = _split_netvlad(tensors)
+    _check(path, tensors, netvlad, backbone)
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return Weights(backbone, tensors, path.name, digest, netvlad)
+
+
+def load_features(network: Backbone, weights: Weights) -> None:
+    """Put the weights into the network's features, as many as it has."""
+    network.load_state_dict({name: weights.tensors[name] for name in network.state_dict() if name.startswith("features.")}, strict=False)
+
+
+def describe(weights: Weights | None) -> dict[str, str] | None:
+    """What a map keeps of where its network comes from: the file's name and hash, None for random weights."""
+    return None if weights is None else {"file": weights.file_name, "sha256": weights.sha256}
+
+
+def cache_folder() -> Path:
+    """Where published weights are kept: $TOPOLOC_CACHE, else `topoloc` in the user's cache folder."""
+    if "TOPOLOC_CACHE" in os.environ:
+        return Path(os.environ["TOPOLOC_CACHE"])
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "topoloc"
+
+
+def _published_file(backbone: BackboneName) -> Path:
+    """The published weights in the cache, fetched if they are not there yet. Raises WeightsError."""
+    name = _PUBLISHED[backbone]
+    path = cache_folder() / name
+    if path.is_file():
+        return path
+    advice = f"fetch it on another machine and put it at {path}, or give --weights FILE (--weights {SCRATCH}: none)"
+    part = path.with_name(f".{name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with urllib.request.urlopen(_URL + name, timeout=_TIMEOUT_SECONDS) as answer, part.open("wb") as file:
+            while block := answer.read(1 << 20):
+                file.write(block)
+        with part.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        if not digest.startswith(name.rpartition("-")[2].removesuffix(".pth")):
+            raise WeightsError(f"{_URL}{name} came with SHA-256 {digest[:8]}..., not as published; {advice}")
+        os.replace(part, path)
+    except (urllib.error.URLError, OSError) as error:
+        reason = getattr(error, "reason", None) or error
+        raise WeightsError(f"no weights of {backbone}: {_URL}{name} cannot be fetched ({reason}); {advice}") from error
+    finally:
+        part.unlink(missing_ok=True)
+    return path
+
+
+def _read_tensors(path: Path) -> dict[str, Tensor]:
+    # Checkpoints of training runs hold NumPy numbers beside the weights (scores, recalls): these alone are let in.
+    harmless: list[Any] = [np.dtype, *(type(np.dtype(t)) for t in (np.float64, np.float32, np.int64))]
+    harmless += [np.float64(0).__reduce__()[0], (np.float64(0).__reduce__()[0], "numpy.core.multiarray.scalar")]
+    try:
+        if path.stat().st_size == 0:
+            raise WeightsError(f"weights {path}: the file is empty")
+        with torch.serialization.safe_globals(harmless):
+            content = torch.load(path, map_location="cpu", weights_only=True)
+    except OSError as error:
+        raise WeightsError(f"cannot read weights {path}: {error.strerror or error}") from error
+    except (RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile) as error:
+        raise WeightsError(f"weights {path}: truncated, damaged, or no file of PyTorch weights") from error
+    if isinstance(content, dict) and isinstance(content.get("state_dict"), dict):
+        content = content["state_dict"]
+    if not isinstance(content, dict) or not content or not all(isinstance(value, Tensor) for value in content.values()):
+        raise WeightsError(f"weights {path}: holds no named tensors")
+    # Networks that were trained on several devices carry "module" in their names.
+    return {str(name).replace("module.", ""): value.float() for name, value in content.items()}
+
+
+def _split_netvlad(tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """The public NetVLAD checkpoints' names, as a backbone's and a layer's."""
+    backbone = {"features." + name.removeprefix("encoder."): value for name, value in tensors.items() if name.startswith("encoder.")}
+    layer = {name.removeprefix("pool."): value for name, value in tensors.items() if name.startswith("pool.")}
+    return backbone, layer
+
+
+def _check(path: Path, tensors: dict[str, Tensor], netvlad: dict[str, Tensor] | None, backbone: BackboneName) -> None:
+    shapes = {name: tuple(value.shape) for name, value in tensors.items()}
+    if fault := _misfit(shapes, backbone):
+        others = [other for other in BACKBONES if other != backbone and not _misfit(shapes, other)]
+        looks = f"; the file looks like {others[0]}" if others else ""
+        raise WeightsError(f"weights {path} are not those of {backbone}: {fault}{looks}")
+    if netvlad is not None:
+        conv, centroids = netvlad.get("conv.weight"), netvlad.get("centroids")
+        if conv is None or centroids is None or centroids.ndim != 2 or centroids.shape[1] != NUM_CHANNELS:
+            raise WeightsError(f"weights {path}: a NetVLAD layer needs pool.conv.weight (k, c, 1, 1) and pool.centroids (k, c)")
+        if tuple(conv.shape) != (*centroids.shape, 1, 1):
+            raise WeightsError(f"weights {path}: pool.conv.weight is {tuple(conv.shape)}, pool.centroids {tuple(centroids.shape)}")
+    for name, value in {**tensors, **(netvlad or {})}.items():
+        if not torch.isfinite(value).all():
+            raise WeightsError(f"weights {path}: {name} holds values that are not finite")
+
+
+def _misfit(shapes: dict[str, tuple[int, ...]], backbone: BackboneName) -> str:
+    """The first thing that does not fit, or nothing. The classifier's outputs may be of any number."""
+    with torch.device("meta"):
+        expected = {name: tuple(value.shape) for name, value in Backbone(backbone).state_dict().items()}
+    names = [name for name in expected if name.startswith("features.") or any(n.startswith("classifier.") for n in shapes)]
+    for name in names:
+        if name not in shapes:
+            return f"{name} is missing"
+        if shapes[name][1:] != expected[name][1:] or (name.startswith("features.") and shapes[name] != expected[name]):
+            return f"{name} is {shapes[name]}, not {expected[name]}"
+    if unknown := [name for name in shapes if name not in expected]:
+        return f"{unknown[0]} is unknown"
+    return ""
