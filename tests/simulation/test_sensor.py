@@ -25,17 +25,17 @@ def test_exposure_makes_any_daylight_mid_grey(radiance: float):
 
 
 def test_where_light_fails_time_goes_first_then_gain_then_the_picture():
-    bright, dim, dark = (choose_exposure(evenly(radiance), CONFIG) for radiance in (1.0, 0.02, 1e-4))
+    bright, dim, dark = (choose_exposure(evenly(radiance), CONFIG) for radiance in (1.0, 0.005, 1e-5))
     assert bright.gain == 1.0
     assert bright.time < CONFIG.max_time
     assert dim.time == CONFIG.max_time
     assert 1.0 < dim.gain < CONFIG.max_gain
     assert dark == Exposure(CONFIG.max_time, CONFIG.max_gain)
-    assert picture(evenly(1e-4)).mean() < 60
+    assert picture(evenly(1e-5)).mean() < 60
 
 
 def test_noise_grows_in_the_dark():
-    sizes = [picture(evenly(radiance)).std() for radiance in (1.0, 0.02, 0.002)]
+    sizes = [picture(evenly(radiance)).std() for radiance in (1.0, 0.003, 0.0006)]
     assert sizes[0] * 1.5 < sizes[1]
     assert sizes[1] * 1.5 < sizes[2]
 

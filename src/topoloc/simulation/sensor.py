@@ -36,11 +36,11 @@ class SensorConfig:
         white_balance_error: standard deviation of the gain of red and blue.
     """
 
-    sensitivity: float = 120.0
+    sensitivity: float = 500.0
     target: float = 0.16
     max_clipped: float = 0.4
     max_time: float = 0.025
-    max_gain: float = 48.0
+    max_gain: float = 24.0
     full_well: float = 12000.0
     read_noise: float = 3.0
     vignetting: float = 0.25
