@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from jaxtyping import Float64
 
-from topoloc.simulation.conditions import CONDITIONS
+from topoloc.simulation.conditions import CONDITIONS, Condition
 from topoloc.simulation.corridor import CAMERA_HEIGHT, LOOP, MOVABLE, build
 from topoloc.simulation.corridor_lamps import ceiling_lamps
+from topoloc.simulation.corridor_outdoors import outdoors
 from topoloc.simulation.corridor_parts import Fittings
-from topoloc.simulation.corridor_plan import EAST, HEIGHT, LENGTH, NORTH, SOUTH, WEST, WIDTH
+from topoloc.simulation.corridor_plan import EAST, HEIGHT, LENGTH, NORTH, SOUTH, WEST, WIDTH, walls_of
 from topoloc.simulation.scene import Scene, Surface
 
 DAY, EVENING, NIGHT = (CONDITIONS[name] for name in ("day", "evening", "night"))
@@ -59,11 +60,11 @@ def test_same_arguments_same_bytes(day: Scene):
     assert digest(list(build(0, DAY).surfaces)) == digest(list(day.surfaces))
 
 
-def test_another_seed_is_another_corridor(day: Scene):
-    other = dict(digest(list(build(1, DAY).surfaces)))
-    here = dict(digest(list(day.surfaces)))
-    for name in ("wall south outer", "floor north", "wall east inner", "lawn"):
-        assert here[name] != other[name], name
+def test_another_seed_is_another_corridor():
+    assert walls_of(0)["south outer"].openings != walls_of(1)["south outer"].openings
+    here, there = (dict(digest(outdoors(seed, DAY))) for seed in (0, 1))
+    for name in ("lawn", "crowns", "front 0"):
+        assert here[name] != there[name], name
 
 
 def test_arrangement_moves_only_movables(day: Scene, rearranged: Scene):
@@ -83,16 +84,14 @@ def test_the_condition_changes_light_but_no_fixed_geometry(day: Scene, night: Sc
     assert shapes(day) == shapes(night)
 
 
-def lit(scene: Scene) -> set[int]:
-    lamps = [s for s in scene.surfaces if s.name == "lamp cover" and np.ptp(s.mesh.vertices[:, :2], axis=0).max() > 1.0]
+def lit(condition: Condition) -> set[int]:
+    lamps = [surface for surface in ceiling_lamps(0, condition, Fittings.of(0)) if surface.name == "lamp cover"]
     return {number for number, lamp in enumerate(lamps) if lamp.material.kind == "light"}
 
 
-def test_lamps_by_condition(day: Scene, night: Scene):
-    evening = lit(Scene(tuple(ceiling_lamps(0, EVENING, Fittings.of(0)))))
-    assert len(lit(day)) >= 7
-    assert len(evening) > len(lit(night)) > len(lit(day))
-    assert len(lit(night) ^ lit(day)) >= 6, "the light comes from elsewhere by night"
+def test_lamps_by_condition():
+    assert len(lit(EVENING)) > len(lit(NIGHT)) > len(lit(DAY)) > 5
+    assert len(lit(NIGHT) ^ lit(DAY)) >= 6, "the light comes from elsewhere by night"
 
 
 def test_windows_are_panes_only_when_it_is_dark(day: Scene, night: Scene):
