@@ -102,7 +102,7 @@ def bands(spans: Openings, out: float, back: float = 0.0) -> Mesh:
     return join([box((x0, -out, z0), (x1, back, z1), faces="sewtb") for x0, x1, z0, z1 in spans.tolist()])
 
 
-def surrounds(openings: Openings, thickness: float) -> Openings:
+def surrounds(openings: Openings, thickness: float) -> Float64[np.ndarray, "m 4"]:
     """The frames of stone or plaster about openings, as spans for bands()."""
     x0, x1, z0, z1 = openings.T
     t = thickness

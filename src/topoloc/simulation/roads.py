@@ -123,7 +123,7 @@ def ground(picture: Picture, wet: bool) -> Material:
     """What one walks and drives on: matt when dry; water makes it darker and gives it a gloss."""
     if not wet:
         return Material("matt", picture)
-    return Material("polished", (picture * 0.72).astype(np.uint8), roughness=0.22)
+    return Material("polished", (picture * 0.72).astype(np.uint8), roughness=0.14)
 
 
 def _is_arc(station: float) -> bool:
@@ -131,7 +131,7 @@ def _is_arc(station: float) -> bool:
 
 
 def _edges(rng: np.random.Generator, wet: bool) -> list[Surface]:
-    kerb_picture = colored((0.6, 0.59, 0.57), 1.0 + 0.09 * smooth_noise(rng, (24, 512), 0.8) + 0.08 * blotches(rng, (24, 512), 40))
+    kerb_picture = colored((0.6, 0.59, 0.57), 1.0 + 0.09 * smooth_noise(rng, (24, 512), 0.8) + 0.08 * blotches(rng, (24, 512), 40.0))
     kerb_picture[:, ::128] = 70
     kerb = ground(kerb_picture, wet)
     tones = [(0.63, 0.62, 0.6), (0.6, 0.59, 0.58), (0.66, 0.62, 0.57), (0.56, 0.55, 0.55)]
@@ -154,13 +154,13 @@ def _edges(rng: np.random.Generator, wet: bool) -> list[Surface]:
 def _asphalt(rng: np.random.Generator, kind: str) -> Picture:
     """One picture of the whole width, left kerb on top; 16 m."""
     h, w = _TILE_PX
-    value = 1.0 + 0.075 * smooth_noise(rng, (h, w), 0.6) + 0.02 * smooth_noise(rng, (h, w), 2.0) + 0.05 * blotches(rng, (h, w), 90)
+    value = 1.0 + 0.075 * smooth_noise(rng, (h, w), 0.6) + 0.02 * smooth_noise(rng, (h, w), 2.0) + 0.05 * blotches(rng, (h, w), 90.0)
     offsets = (np.arange(h) + 0.5) * _TEXEL - HALF_ROAD
     for lane in (-LANE / 2, LANE / 2):
-        value *= 1.0 - 0.10 * np.exp(-(((offsets - lane) / 0.3) ** 2))[:, None] * (1.0 + 0.4 * blotches(rng, (h, w), 60))
+        value *= 1.0 - 0.10 * np.exp(-(((offsets - lane) / 0.3) ** 2))[:, None] * (1.0 + 0.4 * blotches(rng, (h, w), 60.0))
         for wheel in (-0.75, 0.75):
             value *= 1.0 + 0.06 * np.exp(-(((offsets - lane - wheel) / 0.25) ** 2))[:, None]
-    value[np.abs(offsets) > LANE] *= 0.93 + 0.04 * blotches(rng, (h, w), 50)[np.abs(offsets) > LANE]
+    value[np.abs(offsets) > LANE] *= 0.93 + 0.04 * blotches(rng, (h, w), 50.0)[np.abs(offsets) > LANE]
     _repairs(rng, value)
     picture = colored((0.355, 0.355, 0.36), value)
     gutter = np.abs(offsets) > HALF_ROAD - 0.32
@@ -168,7 +168,7 @@ def _asphalt(rng: np.random.Generator, kind: str) -> Picture:
     setts[:, ::14] = 60
     picture[gutter] = setts[gutter]
     paint = _markings(kind)
-    wear = smooth_noise(rng, (h, w), 1.3) + 0.9 * blotches(rng, (h, w), 40)
+    wear = smooth_noise(rng, (h, w), 1.3) + 0.9 * blotches(rng, (h, w), 40.0)
     solid = paint * np.clip(2.2 - wear, 0.05, 0.92)[..., None]
     white = np.array([215, 214, 208], np.float32) * (0.92 + 0.05 * smooth_noise(rng, (h, w), 1.0))[..., None]
     result = picture * (1.0 - solid) + white * solid

@@ -55,7 +55,9 @@ def box(low: Vector, high: Vector, texels: Number | None = None, faces: str = "n
     return Mesh(vertices, triangles.reshape(-1, 3).astype(np.int32), uv.reshape(-1, 2))
 
 
-def prism(outline: Sequence[Sequence[Number]] | Float64[np.ndarray, "n 2"], low: Number, high: Number, texels: Number | None = None) -> Mesh:
+def prism(
+    outline: Sequence[Sequence[Number]] | Float64[np.ndarray, "n 2"], low: Number, high: Number, texels: Number | None = None
+) -> Mesh:
     """A convex outline (x, y), counter-clockwise from above, raised from z `low` to `high`; the picture goes round the sides."""
     corners = np.asarray(outline, dtype=np.float64)
     around = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1))])

@@ -143,7 +143,7 @@ def _far_front(rng: np.random.Generator) -> Picture:
     """12 m of a front as it is seen from far, windows and all."""
     picture = colored(
         (0.7, 0.66, 0.58) if rng.uniform() < 0.6 else (0.55, 0.42, 0.36),
-        1.0 + 0.04 * blotches(rng, (240, 240), 60) + 0.02 * smooth_noise(rng, (240, 240), 1),
+        1.0 + 0.04 * blotches(rng, (240, 240), 60.0) + 0.02 * smooth_noise(rng, (240, 240), 1.0),
     )
     for row in range(4):
         for column in range(4):

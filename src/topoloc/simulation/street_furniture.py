@@ -57,7 +57,7 @@ def _plate(rng: np.random.Generator, kind: int) -> Picture:
     elif kind == 1:
         cv2.circle(picture, (32, 32), 31, red, -1, cv2.LINE_AA)
         cv2.circle(picture, (32, 32), 24, white, -1, cv2.LINE_AA)
-        write(picture, "30", (16, 42), 28, (0.05, 0.05, 0.05), 34, bold=True)
+        write(picture, "30", (16.0, 42.0), 28.0, (0.05, 0.05, 0.05), 34.0, bold=True)
     elif kind == 2:
         cv2.circle(picture, (32, 32), 31, red, -1, cv2.LINE_AA)
         cv2.rectangle(picture, (10, 26), (54, 38), white, -1)
@@ -69,14 +69,14 @@ def _plate(rng: np.random.Generator, kind: int) -> Picture:
             cv2.line(picture, (32, 40), (22, 52), (10, 10, 10), 4)
             cv2.line(picture, (32, 40), (42, 52), (10, 10, 10), 4)
         else:
-            write(picture, "P", (18, 52), 52, (0.95, 0.95, 0.95), 40, bold=True)
+            write(picture, "P", (18.0, 52.0), 52.0, (0.95, 0.95, 0.95), 40.0, bold=True)
     elif kind == 5:
         picture[:] = (225, 225, 220)
         cv2.fillPoly(picture, [np.array([[32, 60], [2, 6], [62, 6]], np.int32)], red)
         cv2.fillPoly(picture, [np.array([[32, 46], [14, 14], [50, 14]], np.int32)], white)
     else:
         picture[:] = to_bytes(vivid(rng))
-        write(picture, str(rng.choice(["BUS", "H", "TAXI", "Zone", "100m"])), (6, 42), 30, (0.95, 0.95, 0.93), 54, bold=True)
+        write(picture, str(rng.choice(["BUS", "H", "TAXI", "Zone", "100m"])), (6.0, 42.0), 30.0, (0.95, 0.95, 0.93), 54.0, bold=True)
     return picture
 
 

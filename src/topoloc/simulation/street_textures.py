@@ -34,11 +34,11 @@ def weathering(rng: np.random.Generator, size: tuple[int, int]) -> Field:
     """What years do to a wall, as a factor: blotches, streaks of rain from above, damp at the foot."""
     h, w = size
     streaks = cv2.GaussianBlur(np.repeat(smooth_noise(rng, (8, w), 1.5)[:1], h, axis=0), (0, 0), 1.0)
-    depth = np.clip(blotches(rng, size, 60), 0, 2)
+    depth = np.clip(blotches(rng, size, 60.0), 0, 2)
     foot = np.exp(-(h - 1 - np.arange(h, dtype=np.float32)) / (h * 0.05))[:, None] * (
-        0.5 + 0.5 * np.clip(blotches(rng, size, 40) + 0.5, 0, 1)
+        0.5 + 0.5 * np.clip(blotches(rng, size, 40.0) + 0.5, 0, 1)
     )
-    return 1.0 + 0.035 * blotches(rng, size, 90) - 0.05 * np.clip(streaks, 0, 2) * depth - 0.22 * foot
+    return 1.0 + 0.035 * blotches(rng, size, 90.0) - 0.05 * np.clip(streaks, 0, 2) * depth - 0.22 * foot
 
 
 def plaster(rng: np.random.Generator, color: Color) -> Picture:
@@ -58,7 +58,7 @@ def plaster(rng: np.random.Generator, color: Color) -> Picture:
     for _ in range(rng.integers(4, 9)):
         cv2.polylines(value, [crack(rng, size, 90)], False, 0.72, 1, cv2.LINE_AA)
     picture = colored(color, value)
-    bare = blotches(rng, size, 50) > rng.uniform(2.0, 2.8)
+    bare = blotches(rng, size, 50.0) > rng.uniform(2.0, 2.8)
     picture[bare] = colored((0.5, 0.42, 0.36), 1.0 + 0.1 * smooth_noise(rng, size, 1.0))[bare]
     return picture
 
@@ -112,14 +112,14 @@ def roof_tiles(rng: np.random.Generator, color: Color) -> Picture:
     wave = 0.5 + 0.5 * np.cos(2 * np.pi * x / 12.8)
     row = (y % 16) / 16
     shades = cv2.resize(rng.normal(1.0, 0.09, (16, 20)).astype(np.float32), (w, h), interpolation=cv2.INTER_NEAREST)
-    return colored(color, shades * (0.62 + 0.3 * wave) * (0.75 + 0.35 * row) + 0.08 * blotches(rng, (h, w), 50))
+    return colored(color, shades * (0.62 + 0.3 * wave) * (0.75 + 0.35 * row) + 0.08 * blotches(rng, (h, w), 50.0))
 
 
 def slabs(rng: np.random.Generator, size: tuple[int, int], stone_px: tuple[int, int], color: Color) -> Picture:
     """Pavement: rows of slabs with dark joints, chewing gum, stains and a mended strip."""
     h, w = size
     sh, sw = stone_px
-    value = 1.0 + 0.05 * blotches(rng, size, 60) + 0.05 * smooth_noise(rng, size, 0.8) + 0.03 * smooth_noise(rng, size, 3)
+    value = 1.0 + 0.05 * blotches(rng, size, 60.0) + 0.05 * smooth_noise(rng, size, 0.8) + 0.03 * smooth_noise(rng, size, 3.0)
     for row, y in enumerate(range(0, h, sh)):
         for x in range(-(row % 2) * sw // 2, w, sw):
             value[y : y + sh, max(x, 0) : x + sw] *= float(rng.normal(1.0, 0.07))
@@ -136,7 +136,7 @@ def slabs(rng: np.random.Generator, size: tuple[int, int], stone_px: tuple[int, 
     return colored(color, value)
 
 
-def foliage(rng: np.random.Generator, size: tuple[int, int], color: Color, leaf_px: float = 4) -> Picture:
+def foliage(rng: np.random.Generator, size: tuple[int, int], color: Color, leaf_px: float = 4.0) -> Picture:
     """Many leaves over each other, seen from so near that each shows; the dark between them is deep."""
     h, w = size
     picture = colored(color, np.full(size, 0.28, np.float32))
@@ -153,9 +153,9 @@ def foliage(rng: np.random.Generator, size: tuple[int, int], color: Color, leaf_
 def grass(rng: np.random.Generator) -> Picture:
     """A lawn of 5 m square with bare and dry places."""
     size = (320, 320)
-    value = 1.0 + 0.16 * smooth_noise(rng, size, 0.8) + 0.08 * smooth_noise(rng, size, 2.5) + 0.1 * blotches(rng, size, 60)
+    value = 1.0 + 0.16 * smooth_noise(rng, size, 0.8) + 0.08 * smooth_noise(rng, size, 2.5) + 0.1 * blotches(rng, size, 60.0)
     picture = colored((0.33, 0.38, 0.2), value)
-    dry = (blotches(rng, size, 40) > 1.3) & (smooth_noise(rng, size, 1.0) > -0.3)
+    dry = (blotches(rng, size, 40.0) > 1.3) & (smooth_noise(rng, size, 1.0) > -0.3)
     picture[dry] = colored((0.47, 0.41, 0.28), value)[dry]
     return picture
 
@@ -166,7 +166,7 @@ def bark(rng: np.random.Generator) -> Picture:
     furrows = cv2.resize(smooth_noise(rng, (64, 96), 1.2), (96, 256), interpolation=cv2.INTER_CUBIC)
     value = 1.0 + 0.25 * furrows + 0.08 * smooth_noise(rng, size, 1.0)
     picture = colored((0.34, 0.3, 0.25), value)
-    scale = blotches(rng, size, 40) > 1.1
+    scale = blotches(rng, size, 40.0) > 1.1
     picture[scale] = colored((0.52, 0.5, 0.42), value)[scale]
     return picture
 
@@ -176,6 +176,6 @@ def planks(rng: np.random.Generator, color: Color, num: int = 14) -> Picture:
     h, w = 128, 14 * num
     grain = cv2.resize(smooth_noise(rng, (16, w), 0.8), (w, h))
     tone = np.repeat(rng.normal(1.0, 0.09, num), 14)[None, :].astype(np.float32)
-    value = tone * (1.0 + 0.07 * grain) + 0.03 * smooth_noise(rng, (h, w), 1)
+    value = tone * (1.0 + 0.07 * grain) + 0.03 * smooth_noise(rng, (h, w), 1.0)
     value[:, ::14] = 0.25
     return colored(color, value)

@@ -28,28 +28,30 @@ class CarShape:
     blind_from: float = 99.0
     """Behind this x there are no side windows."""
     tyre: float = 0.32
+    roof_width: float = 0.74
+    """As a share of the width."""
 
 
 SHAPES = (
     CarShape(
-        4.0, 1.75, ((0, 0.62), (0.15, 0.78), (0.95, 0.95), (3.7, 1.02), (4.0, 0.95)),
+        4.0, 1.75, ((0.0, 0.62), (0.15, 0.78), (0.95, 0.95), (3.7, 1.02), (4.0, 0.95)),
         ((0.95, 0.95), (1.65, 1.4), (2.2, 1.48), (3.2, 1.44), (3.8, 1.02)), (0.75, 3.25), (2.3, 3.2),
     ),
     CarShape(
-        4.65, 1.82, ((0, 0.58), (0.15, 0.72), (1.25, 0.92), (3.8, 0.98), (4.55, 0.98), (4.65, 0.85)),
+        4.65, 1.82, ((0.0, 0.58), (0.15, 0.72), (1.25, 0.92), (3.8, 0.98), (4.55, 0.98), (4.65, 0.85)),
         ((1.25, 0.92), (2.05, 1.38), (2.6, 1.44), (3.3, 1.4), (4.05, 0.98)), (0.9, 3.65), (2.7, 3.55),
     ),
     CarShape(
-        4.7, 1.82, ((0, 0.6), (0.15, 0.75), (1.2, 0.95), (4.5, 1.03), (4.7, 0.95)),
+        4.7, 1.82, ((0.0, 0.6), (0.15, 0.75), (1.2, 0.95), (4.5, 1.03), (4.7, 0.95)),
         ((1.2, 0.95), (1.95, 1.42), (2.5, 1.5), (4.0, 1.47), (4.55, 1.03)), (0.88, 3.65), (2.6, 3.5),
     ),
     CarShape(
-        4.4, 1.86, ((0, 0.75), (0.12, 0.95), (1.05, 1.1), (4.2, 1.15), (4.4, 1.05)),
+        4.4, 1.86, ((0.0, 0.75), (0.12, 0.95), (1.05, 1.1), (4.2, 1.15), (4.4, 1.05)),
         ((1.05, 1.1), (1.7, 1.6), (2.3, 1.68), (3.7, 1.65), (4.25, 1.15)), (0.85, 3.5), (2.4, 3.4), tyre=0.37,
     ),
     CarShape(
-        5.2, 1.98, ((0, 0.85), (0.12, 1.05), (0.9, 1.2), (5.0, 1.25), (5.2, 1.2)),
-        ((0.9, 1.2), (1.6, 1.95), (2.1, 2.05), (4.9, 2.06), (5.15, 1.25)), (0.85, 4.2), (2.0,), blind_from=2.05, tyre=0.35,
+        5.2, 1.98, ((0.0, 0.85), (0.12, 1.05), (0.9, 1.2), (5.0, 1.25), (5.2, 1.2)),
+        ((0.9, 1.2), (1.6, 1.95), (2.1, 2.05), (5.05, 2.04), (5.18, 1.25)), (0.85, 4.2), (2.0,), blind_from=2.05, tyre=0.35, roof_width=0.88,
     ),
 )  # fmt: skip
 PAINTS: tuple[Color, ...] = (
@@ -80,7 +82,7 @@ def car_materials(rng: np.random.Generator) -> CarMaterials:
         plate = blank((24, 112), (0.93, 0.93, 0.91))
         plate[:, :9] = (20, 60, 150)
         letters = "".join(rng.choice(list("ABCDEFGHKLMNPRSTUVWXYZ"), 4))
-        write(plate, f"{letters[:2]} {letters[2:]} {rng.integers(10, 999)}", (14, 19), 17, (0.05, 0.05, 0.06), 92, bold=True)
+        write(plate, f"{letters[:2]} {letters[2:]} {rng.integers(10, 999)}", (14.0, 19.0), 17.0, (0.05, 0.05, 0.06), 92.0, bold=True)
         cv2.rectangle(plate, (0, 0), (111, 23), (30, 30, 30), 1)
         plates.append(plate)
     return CarMaterials(
@@ -158,12 +160,12 @@ def _cabin(shape: CarShape) -> tuple[list[Mesh], list[Mesh]]:
     """Roof and pillars; panes: windscreen, rear window, side windows between the pillars."""
     roof_x, roof_z = np.array(shape.roof).T
     belt_x, belt_z = np.array(shape.belt).T
-    top, foot = shape.width / 2 * 0.74, shape.width / 2 * 0.93
+    top, foot = shape.width / 2 * shape.roof_width, shape.width / 2 * 0.93
     cabin, glass = [], []
     upper = np.where((roof_x == roof_x[0]) | (roof_x == roof_x[-1]), foot, top)
     for i in range(len(roof_x) - 1):
         sheet = _quad((roof_x[i], upper[i], roof_z[i]), (roof_x[i + 1], upper[i + 1], roof_z[i + 1]))
-        is_pane = i == 0 or (i == len(roof_x) - 2 and shape.blind_from > 50)
+        is_pane = i in (0, len(roof_x) - 2)
         (glass if is_pane else cabin).append(sheet)
         if is_pane:
             cabin.append(_rim(sheet))

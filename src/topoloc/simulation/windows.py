@@ -35,7 +35,7 @@ def rooms(rng: np.random.Generator) -> Picture:
     return _grid([_room(rng, (120, 96)) for _ in range(ROOMS[0] * ROOMS[1])], ROOMS)
 
 
-def _grid(pictures: list[Picture], grid: tuple[int, int]) -> Picture:
+def _grid(pictures: list[np.ndarray], grid: tuple[int, int]) -> np.ndarray:
     rows, columns = grid
     return np.concatenate([np.concatenate(pictures[r * columns : (r + 1) * columns], axis=1) for r in range(rows)], axis=0)
 
@@ -103,7 +103,7 @@ def _display(rng: np.random.Generator, size: tuple[int, int]) -> Picture:
         x, y = int(rng.integers(0, w - piece.shape[1])), int(rng.integers(10, h - piece.shape[0]))
         picture[y : y + piece.shape[0], x : x + piece.shape[1]] = piece
     if rng.uniform() < 0.5:
-        write(picture, str(rng.choice(["SALE", "NEW", "-30%", "OPEN"])), (w * 0.2, h * 0.55), 28, (0.95, 0.95, 0.9), w * 0.6, bold=True)
+        write(picture, str(rng.choice(["SALE", "NEW", "-30%", "OPEN"])), (w * 0.2, h * 0.55), 28.0, (0.95, 0.95, 0.9), w * 0.6, bold=True)
     return picture
 
 
@@ -128,7 +128,7 @@ def signs(rng: np.random.Generator) -> Picture:
         title = _TRADES[int(names[i % len(_TRADES)])]
         text = title if rng.uniform() < 0.4 else f"{title} {rng.choice(NAMES)}"
         left = float(rng.uniform(30, 120))
-        write(board, text, (left, 42), 36, ink, 400 - left, bold=bool(rng.uniform() < 0.7))
+        write(board, text, (left, 42.0), 36.0, ink, 400 - left, bold=bool(rng.uniform() < 0.7))
         if rng.uniform() < 0.5:
             cv2.circle(board, (int(left) - 18, 28), 14, to_bytes(vivid(rng)), -1, cv2.LINE_AA)
         cv2.rectangle(board, (0, 0), (447, 55), to_bytes((0.25, 0.25, 0.25)), 2)
