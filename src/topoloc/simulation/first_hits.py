@@ -53,7 +53,7 @@ def find_first_hits(
 
     start = origin.astype(np.float32)
     rays = np.ascontiguousarray(directions_world, np.float32)
-    if mi.variant().startswith("scalar"):
+    if not dr.is_jit_v(mi.Float):
         starts = np.broadcast_to(start, rays.shape)
         found = [_flat(_follow(scene, mi.Point3f(o), mi.Vector3f(d))) for o, d in zip(starts, rays, strict=True)]
         rows = np.array(found, np.float32).reshape(-1, 15)

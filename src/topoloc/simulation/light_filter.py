@@ -19,6 +19,14 @@ _DARKEST = 2e-3
 """Albedo below which the light on a surface cannot be told from its colour."""
 
 
+_COARSE_LEVELS = 2
+_ANY_CONTRAST = 1e12
+Guides = tuple[Float32[np.ndarray, "3 h w"], Float32[np.ndarray, "3 h w"], Float32[np.ndarray, "h w"]]
+"""Normals, positions, and how far off its plane a pixel's surface reaches."""
+State = tuple[Float32[np.ndarray, "3 h w"], Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]
+"""Light, how much it can be trusted, and the variance of its brightness."""
+
+
 @dataclass(frozen=True)
 class LightFilterConfig:
     """How light is smoothed.
@@ -33,9 +41,9 @@ class LightFilterConfig:
 
     levels: int = 5
     mirror_levels: int = 3
-    contrast: float = 3.0
+    contrast: float = 5.0
     flatness: float = 0.01
-    firefly: float = 4.0
+    firefly: float = 30.0
 
 
 def filter_light(
@@ -63,15 +71,28 @@ def filter_light(
     variance = np.maximum(cv2.blur(squared * weight, (7, 7)) / cv2.blur(weight, (7, 7)), squared)
     normals, positions = (np.ascontiguousarray(picture.transpose(2, 0, 1)) for picture in (normal, position))
     reach = np.maximum(np.float32(config.flatness) * np.linalg.norm(position, axis=2), 1e-4).astype(np.float32)
-    buffers = (np.empty_like(light), np.empty_like(weight), np.empty_like(variance))
-    sigma, still = np.float32(config.contrast**2), np.zeros_like(weight)
+    state = (light, weight, variance)
+    guides = (normals, positions, reach)
+    still = np.zeros_like(weight)
+    coarse = state
+    for level in range(_COARSE_LEVELS):  # what to compare at first: single pixels are too noisy for that
+        coarse = _spread(coarse, coarse, guides, still, 2**level, _ANY_CONTRAST)
     for level in range(config.levels):
         if level == config.mirror_levels:
             still = mirror.astype(np.float32)
-        brightness, doubt = light.sum(axis=0), np.maximum(cv2.GaussianBlur(variance, (3, 3), 0), variance)
-        spread_light(light, brightness, weight, variance, doubt, normals, positions, reach, still, 2**level, sigma, *buffers)
-        (light, weight, variance), buffers = buffers, (light, weight, variance)
-    return np.ascontiguousarray(light.transpose(1, 2, 0))
+        state = _spread(state, coarse if level < _COARSE_LEVELS else state, guides, still, 2**level, config.contrast)
+    return np.ascontiguousarray(state[0].transpose(1, 2, 0))
+
+
+def _spread(state: State, compared: State, guides: Guides, still: Float32[np.ndarray, "h w"], step: int, contrast: float) -> State:
+    light, weight, variance = state
+    brightness, doubt = compared[0].sum(axis=0), np.maximum(cv2.GaussianBlur(compared[2], (3, 3), 0), compared[2])
+    normal, position, reach = guides
+    out = (np.empty_like(light), np.empty_like(weight), np.empty_like(variance))
+    spread_light(
+        light, brightness, weight, variance, doubt, normal, position, reach, still, step, np.float32(contrast**2), out[0], out[1], out[2]
+    )
+    return out
 
 
 def _without_fireflies(

@@ -83,7 +83,7 @@ def _mitsuba_mesh(name: str, mesh: Mesh, material: Material) -> Any:
     properties["bsdf"] = mi.load_dict(_bsdf(material))
     if _shines(material):
         properties["emitter"] = mi.load_dict(_emitter(material))
-    result = mi.Mesh(name, len(mesh.vertices), len(mesh.faces), has_vertex_texcoords=True, props=properties)
+    result: Any = mi.Mesh(name, len(mesh.vertices), len(mesh.faces), has_vertex_texcoords=True, props=properties)
     parameters = mi.traverse(result)
     parameters["vertex_positions"] = np.ascontiguousarray(mesh.vertices, np.float32).ravel()
     parameters["faces"] = np.ascontiguousarray(mesh.faces, np.uint32).ravel()

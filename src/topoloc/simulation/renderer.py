@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import isqrt
 from typing import Any
 
 import numpy as np
@@ -123,15 +124,18 @@ class Renderer:
         """What surfaces send back, twice, with independent noise."""
         import mitsuba as mi
 
-        half = max(1, self._config.samples // 2)
+        half = _whole_grid(self._config.samples // 2)
         sensor = _sensor(camera, world_from_cam, half)
+        seeds = ((seed * _SEED_STEP + k * _HALF_STEP) % 2**32 for k in (0, 1))
+        render: Any = mi.render  # its stub knows only the seeds of vectorised code
         first, second = (
-            np.array(mi.render(self._scene, sensor=sensor, integrator=self._integrator, spp=half, seed=(2 * seed + k) % 2**32), np.float32)
-            for k in (0, 1)
+            np.array(render(self._scene, sensor=sensor, integrator=self._integrator, spp=half, seed=each), np.float32) for each in seeds
         )
         return first[:, :, :3], second[:, :, :3]
 
 
+_SEED_STEP, _HALF_STEP = 0x9E3779B1, 0x85EBCA6B
+"""Mitsuba gives a pixel the noise of the one before it at the next seed: seeds must lie far apart, those of the two halves too."""
 _GOLDEN = 0.6180339887498949
 
 
@@ -139,6 +143,12 @@ def _directions_cam(camera: Camera, offset_px: tuple[float, float]) -> Float64[n
     """Unit directions through all pixels, row by row, each at the same offset from its centre."""
     x, y = np.meshgrid(np.arange(camera.width) + offset_px[0], np.arange(camera.height) + offset_px[1])
     return camera.rays_from_img(np.column_stack([x.ravel(), y.ravel()]))
+
+
+def _whole_grid(samples: int) -> int:
+    """The number of samples that Mitsuba's grid of them has, which must not have gaps."""
+    side = max(1, isqrt(samples))
+    return side * max(1, -(-samples // side))
 
 
 def _integrator(scene: Scene, config: RenderConfig) -> Any:
