@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 from collections.abc import Callable
 from functools import cache
 
@@ -48,9 +49,10 @@ def test_same_arguments_same_bytes_and_another_seed_is_another_room():
     again, other = lab.build(3, DAY), lab.build(4, DAY)
     hashes = [_hash(surface) for surface in _day().surfaces]
     assert [_hash(surface) for surface in again.surfaces] == hashes
-    assert _day().sky is not None
-    assert again.sky is not None
-    np.testing.assert_array_equal(again.sky.radiance, _day().sky.radiance)
+    skies = [scene.sky for scene in (_day(), again)]
+    assert skies[0] is not None
+    assert skies[1] is not None
+    np.testing.assert_array_equal(skies[0].radiance, skies[1].radiance)
     differing = {_hash(surface) for surface in other.surfaces} - set(hashes)
     assert len(differing) > len(hashes) // 2
 
@@ -93,7 +95,7 @@ def _near_the_walk(scene: Scene, clearance: float) -> set[str]:
         triangles = surface.mesh.vertices[surface.mesh.faces]
         low, high = triangles.min(axis=1), triangles.max(axis=1)
         at_height = (low[:, 2] < lab.CAMERA_HEIGHT + clearance) & (high[:, 2] > lab.CAMERA_HEIGHT - clearance)
-        for a, b in zip(corners[:-1], corners[1:], strict=True):
+        for a, b in itertools.pairwise(corners):
             start, end = np.minimum(a, b) - clearance, np.maximum(a, b) + clearance
             meets = np.all((low[:, :2] < end) & (high[:, :2] > start), axis=1)
             if np.any(at_height & meets):

@@ -116,13 +116,13 @@ def book_stack(rng: np.random.Generator, num: int = 4) -> list[Surface]:
 
 
 def desk_lamp(finishes: Finishes, on: bool, turn: float = 0.0) -> list[Surface]:
-    """A jointed lamp whose shade hangs over the desk in front of it; light falls only from below the shade."""
+    """A jointed lamp whose shade hangs over the desk in front of it, closed below by an opal cover."""
     arm = [(0, 0, 0.02), (0.0, 0.1, 0.26), (0.0, -0.13, 0.44)]
     foot = cylinder((0, 0), 0.085, 0, 0.022, 20)
     shade = lathe([(0.085, 0.0), (0.05, 0.1), (0.025, 0.12), (0.0, 0.12)], 20)
-    pear = lathe([(0.0, 0.012), (0.026, 0.022), (0.032, 0.045), (0.02, 0.075)], 12)
+    opal = lathe([(0.0, -0.012), (0.05, -0.008), (0.08, 0.004)], 20)
     top = (0.0, -0.15, 0.35)
-    head = [placed(turned(mesh, (1, 0, 0), -0.3), top) for mesh in (shade, pear)]
+    head = [placed(turned(mesh, (1, 0, 0), -0.3), top) for mesh in (shade, opal)]
     meshes = [placed(mesh, (0, 0, 0), turn) for mesh in (join([foot, bent_tube(arm, 0.009)]), *head)]
     return [
         Surface("desk lamp", meshes[0], finishes.dark_metal),

@@ -210,8 +210,8 @@ def ceiling_lamp(on: bool, radiance: float = 1.0, color: Color = (1.0, 0.97, 0.9
     return Material("light", color, radiance=radiance) if on else Material("polished", (0.88, 0.88, 0.86), roughness=0.3)
 
 
-def bulb(on: bool, radiance: float = 30.0) -> Material:
-    """A warm bulb of a desk lamp: small and bright."""
+def bulb(on: bool, radiance: float = 8.0) -> Material:
+    """The opal cover of a desk lamp: warm, small and bright."""
     return ceiling_lamp(on, radiance, (1.0, 0.85, 0.62))
 
 

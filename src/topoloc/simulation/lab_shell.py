@@ -55,26 +55,34 @@ def sky_above(condition: Condition, seed: int) -> Sky:
 
 
 def light_shafts(condition: Condition, seed: int) -> list[Surface]:
-    """What shines in through the windows: a shaft outside of each, along the direction of the sun, its walls as bright as the outdoors.
+    """What shines in through the windows: panes as bright as the outdoors, and outside of the free window a shaft as bright.
 
     A room lit by the sky through its windows is the noisiest picture there is: of a hundred paths towards the sky three find the
-    window. The walls of a shaft that is parallel to the sun's rays keep none of them out, and nearly every path finds them.
-    By day they are as overexposed as what would be outside; by night they are as dark.
+    window, while every path finds a pane. The free window lets the sun in: the walls of its shaft are parallel to the rays.
+    By day all this is as overexposed as what would be outside; by night it is as dark.
     """
     to_sun = _to_sun(seed)
     along = to_sun * (3.0 / to_sun[1])
     y, up = WIDTH + REVEAL, np.array([0.0, 0.0, LINTEL - SILL])
-    above, below = [], []
-    for x0, x1 in WINDOWS:
-        low, right = np.array([x0, y, SILL]), np.array([x1 - x0, 0.0, 0.0])
-        below.append(panel(low, along, right))
-        above.append(panel(low + up + along, -along, right))
-        above.append(panel(low + up, along, -up))
-        above.append(panel(low + right + up + along, -along, -up))
+    *covered, free = _window_order(seed)
+    panes = [panel((WINDOWS[k][0], y, LINTEL), (WINDOWS[k][1] - WINDOWS[k][0], 0, 0), (0, 0, SILL - LINTEL)) for k in covered]
+    x0, x1 = WINDOWS[free]
+    low, right = np.array([x0, y, SILL]), np.array([x1 - x0, 0.0, 0.0])
+    below = panel(low, along, right)
+    above = [
+        panel(low + up + along, -along, right),
+        panel(low + up, along, -up),
+        panel(low + right + up + along, -along, -up),
+    ]
     r, g, b = (_outdoors(condition) / max(_outdoors(condition).max(), 1e-9)).tolist()
     sky = Material("light", (r**0.4545, g**0.4545, b**0.4545), radiance=float(_outdoors(condition).max()))
     land = Material("light", (r**0.4545, g**0.4545, b**0.4545), radiance=0.5 * float(_outdoors(condition).max()))
-    return [Surface("outdoors", join(above), sky), Surface("outdoors", join(below), land)]
+    return [Surface("outdoors", join([*panes, *above]), sky), Surface("outdoors", below, land)]
+
+
+def _window_order(seed: int) -> list[int]:
+    """The window with slats, the one with a roller blind, the free one."""
+    return [int(k) for k in rng_of(seed, "window order").permutation(len(WINDOWS))]
 
 
 def _to_sun(seed: int) -> Float64[np.ndarray, "3"]:
@@ -152,8 +160,8 @@ def _window_front(seed: int, finishes: Finishes) -> list[Surface]:
 def _blinds(seed: int, finishes: Finishes) -> list[Surface]:
     """Slats before one window, a roller blind partly down before another, the third one free."""
     rng = rng_of(seed, "blinds")
-    order = rng.permutation(3)
-    x0, x1 = WINDOWS[int(order[0])]
+    slatted, rolled, _ = _window_order(seed)
+    x0, x1 = WINDOWS[slatted]
     low = SILL + rng.uniform(0.1, 0.6)
     slats = [
         panel((x0 + 0.07, WIDTH + 0.11, z + 0.012), (x1 - x0 - 0.14, 0, 0), (0, 0.03, -0.024)) for z in np.arange(low, LINTEL - 0.05, 0.036)
@@ -163,7 +171,7 @@ def _blinds(seed: int, finishes: Finishes) -> list[Surface]:
         box((x0 + 0.06, WIDTH + 0.1, LINTEL - 0.05), (x1 - 0.06, WIDTH + 0.15, LINTEL)),
         box((x0 + 0.07, WIDTH + 0.11, low - 0.03), (x1 - 0.07, WIDTH + 0.14, low - 0.01)),
     ]
-    x0, x1 = WINDOWS[int(order[1])]
+    x0, x1 = WINDOWS[rolled]
     end = LINTEL - rng.uniform(0.25, 0.7)
     cloth = panel((x0 + 0.03, WIDTH + 0.08, LINTEL), (x1 - x0 - 0.06, 0, 0), (0, 0, end - LINTEL))
     roll = [

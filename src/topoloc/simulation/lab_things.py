@@ -127,12 +127,12 @@ def tripod(finishes: Finishes, height: float = 0.95) -> list[Surface]:
 
 
 def floor_lamp(finishes: Finishes, on: bool, height: float = 1.75) -> list[Surface]:
-    """An uplighter: a bowl on a pole that lights the ceiling."""
-    pole = [cylinder((0, 0), 0.14, 0, 0.025, 24), tube((0, 0, 0.02), (0, 0, height - 0.08), 0.012)]
-    bowl = lathe([(0.02, height - 0.08), (0.09, height - 0.06), (0.14, height), (0.135, height)], 24)
-    light = lathe([(0.12, height - 0.025), (0.0, height - 0.02)], 20)
-    glow = Material("light", (1.0, 0.86, 0.66), radiance=12.0) if on else finishes.ivory
-    return [Surface("floor lamp", join([*pole, bowl]), finishes.dark_metal), Surface("floor lamp bulb", light, glow)]
+    """An opal globe on a pole."""
+    radius = 0.13
+    pole = [cylinder((0, 0), 0.14, 0, 0.025, 24), tube((0, 0, 0.02), (0, 0, height - 2 * radius), 0.012)]
+    globe = lathe([(radius * np.sin(a), height - radius - radius * np.cos(a)) for a in np.linspace(0.05, pi - 0.05, 9)], 18)
+    glow = Material("light", (1.0, 0.86, 0.66), radiance=3.0) if on else finishes.ivory
+    return [Surface("floor lamp", join(pole), finishes.dark_metal), Surface("floor lamp bulb", globe, glow)]
 
 
 def wall_board(rng: np.random.Generator, finishes: Finishes, width: float = 1.2, height: float = 0.8) -> list[Surface]:
@@ -155,10 +155,10 @@ def quadcopter(finishes: Finishes) -> list[Surface]:
     """A quadcopter on its landing gear, propellers at rest."""
     arms, blades = [], []
     for a in (pi / 4, 3 * pi / 4, 5 * pi / 4, 7 * pi / 4):
-        end = np.array([0.24 * np.cos(a), 0.24 * np.sin(a), 0.16])
-        arms += [tube((0, 0, 0.15), end, 0.011, 8), placed(cylinder((0, 0), 0.018, 0, 0.04, 12), end - [0, 0, 0.01])]
+        end = np.array([0.14 * np.cos(a), 0.14 * np.sin(a), 0.16])
+        arms += [tube((0, 0, 0.15), end, 0.011, 8), placed(cylinder((0, 0), 0.013, 0, 0.04, 12), end - [0, 0, 0.01])]
         arms.append(tube(end * 0.5, end * 0.62 * [1, 1, 0], 0.006, 6))
-        blades.append(placed(box((-0.12, -0.012, 0), (0.12, 0.012, 0.003)), end - [0, 0, -0.032], a * 1.7))
+        blades.append(placed(box((-0.075, -0.009, 0), (0.075, 0.009, 0.003)), end - [0, 0, -0.032], a * 1.7))
     body = box((-0.07, -0.05, 0.12), (0.07, 0.05, 0.19))
     return [Surface("quadcopter", join([body, *arms]), finishes.black), Surface("quadcopter", join(blades), finishes.grey)]
 
