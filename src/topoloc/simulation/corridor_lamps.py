@@ -23,12 +23,17 @@ def _lamp_sites() -> list[tuple[float, float, bool]]:
     return south + east + north + west
 
 
+_AT_NIGHT = 0.3
+"""What the lamps are dimmed to when nobody is expected."""
+
+
 def ceiling_lamps(seed: int, condition: Condition, fittings: Fittings) -> list[Surface]:
     """All lamps, lit or not, each with the colour of its own tubes."""
     lit, warmth = _lit_lamps(seed, condition), rng_of(seed, "corridor/lamps").uniform(0.0, 1.0, len(_lamp_sites()))
+    level = _AT_NIGHT if condition.daylight <= 0.0 else 1.0
     surfaces = []
     for number, (x, y, lengthwise) in enumerate(_lamp_sites()):
-        lamp = ceiling_lamp(number in lit, float(warmth[number]), fittings)
+        lamp = ceiling_lamp(level if number in lit else 0.0, float(warmth[number]), fittings)
         surfaces += shifted(lamp, (x, y, 0.0), 0.0 if lengthwise else np.pi / 2)
     return surfaces
 

@@ -209,14 +209,21 @@ def hung_sign(picture: Picture, lit: bool, fittings: Fittings, size: tuple[float
     return [solid("hung sign", fittings.white, body, *rods), Surface("hung sign face", join(faces), material)]
 
 
-def ceiling_lamp(on: bool, warmth: float, fittings: Fittings, size: tuple[float, float] = (1.2, 0.26)) -> list[Surface]:
-    """A flat lamp under the ceiling around the origin, whose sides shine too; `warmth` in [0, 1] is the colour of its light."""
+def ceiling_lamp(radiance: float, warmth: float, fittings: Fittings, size: tuple[float, float] = (1.2, 0.4)) -> list[Surface]:
+    """A flat lamp under the ceiling around the origin, whose sides shine too; `warmth` in [0, 1] is the colour of its light.
+
+    Args:
+        radiance: 1 is full light, 0 is off.
+    """
     x, y = size[0] / 2, size[1] / 2
     cover = box((-x, -y, HEIGHT - 0.065), (x, y, HEIGHT - 0.015), faces="nsewb")
     plate = box((-x - 0.015, -y - 0.015, HEIGHT - 0.015), (x + 0.015, y + 0.015, HEIGHT), faces="nsewb")
     caps = [box((s * x - 0.01, -y - 0.005, HEIGHT - 0.07), (s * x + 0.01, y + 0.005, HEIGHT - 0.01)) for s in (-1, 1)]
     color = (1.0, 0.985 - 0.06 * warmth, 0.96 - 0.14 * warmth)
-    return [Surface("lamp cover", cover, interiors.ceiling_lamp(on, color=color)), solid("lamp frame", fittings.white, plate, *caps)]
+    return [
+        Surface("lamp cover", cover, interiors.ceiling_lamp(radiance > 0.0, radiance, color)),
+        solid("lamp frame", fittings.white, plate, *caps),
+    ]
 
 
 def pillar(material: Material) -> Surface:

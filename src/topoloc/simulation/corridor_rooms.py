@@ -19,7 +19,7 @@ def room(seed: int, condition: Condition, name: str, fittings: Fittings) -> list
     rng = rng_of(seed, f"corridor/room {name}")
     shell = _shell(fittings)
     on = rng_of(seed, f"corridor/room {name}/{condition.name}").random() < 0.8 * condition.lamps
-    lamp = ceiling_lamp(bool(on), 0.3, fittings)
+    lamp = ceiling_lamp(float(on), 0.3, fittings)
     board = framed(1.5, 1.0, 1.5, fittings.metal, interiors.laminated(prints.whiteboard(rng)))
     return [*shell, *_office(fittings, rng, 3.9), *shifted(lamp, (0.0, 2.0, 0.0)), *shifted(board, (1.69, 1.6, 0.0), -np.pi / 2)]
 
@@ -36,7 +36,7 @@ def niche(seed: int, condition: Condition, name: str, opening: Opening, fittings
     ]
     floor = panel((0.0, depth, 0.0), (width, 0.0, 0.0), (0.0, -depth, 0.0), (width / 4, depth / 4))
     on = condition.lamps > 0.0 and rng_of(seed, f"corridor/niche {name}/{condition.name}").random() < condition.lamps + 0.3
-    lamp = shifted(ceiling_lamp(bool(on), 0.8, fittings, (0.6, 0.15)), (width / 2, depth / 2, high - HEIGHT))
+    lamp = shifted(ceiling_lamp(float(on), 0.8, fittings, (0.6, 0.15)), (width / 2, depth / 2, high - HEIGHT))
     surfaces = [solid("niche wall", fittings.plaster, *sides), Surface("niche floor", floor, fittings.linoleum), *lamp]
     if width > 2.4:
         machine = shifted(copier(fittings, rng), (width - 0.6, depth - 0.05, 0.0))
