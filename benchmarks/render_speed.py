@@ -44,7 +44,7 @@ def main() -> None:
 
 def measure(world: World, condition: str, camera: Camera, variant: str, frames: int, reference_samples: int) -> None:
     scene, world_from_cam = world.build(1, find_condition(condition)), on_the_way(world)
-    reference = None
+    reference, halves = None, []
     if reference_samples:
         raw = LightFilterConfig(levels=0, firefly=1e9)
         renderer = Renderer(scene, RenderConfig(samples=reference_samples // 2, albedo_samples=16, light_filter=raw))
