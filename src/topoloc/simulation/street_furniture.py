@@ -114,7 +114,7 @@ def traffic_sign(rng: np.random.Generator, kit: StreetMaterials, things: Furnitu
 
 
 def traffic_light(kit: StreetMaterials, things: FurnitureMaterials) -> list[Surface]:
-    """A post with a head of three lamps and a smaller one for who walks, facing -x."""
+    """A post with a head of three lamps before a dark board, facing -x."""
     dark = [tube((0, 0, 0), (0, 0, 3.4), 0.06), box((-0.16, -0.16, 2.4), (0.12, 0.16, 3.35)), box((-0.3, -0.35, 2.3), (-0.29, 0.35, 3.45))]
     shades = [box((-0.5, -0.13, z + 0.1), (-0.3, 0.13, z + 0.12)) for z in (2.5, 2.8, 3.1)]
     dots = [_disc((-0.31, 0.0, z), 0.1, 0, 12) for z in (2.5, 2.8)]
