@@ -83,7 +83,7 @@ class InputChecks:
         points = seen.measured[rows, :2]
         found = self._seek_in_right(measured, points.astype(np.float32), (points + to_right).astype(np.float32))
         expected = keyframe.stereo.project(keyframe.cam_from_world.apply(landmarks.positions[seen.landmark_ids[rows]]))
-        expected_right = expected[:, :2] - np.column_stack([expected[:, 2] + keyframe.bias.value_px + at_infinity, np.zeros(len(rows))])
+        expected_right = expected[:, :2] - np.column_stack([expected[:, 2] + keyframe.bias.at(points, measured.view.camera) + at_infinity, np.zeros(len(rows))])
         self.right_residuals_px.append(np.linalg.norm(found - expected_right, axis=1))
 
     def verdict(self) -> None:

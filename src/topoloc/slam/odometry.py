@@ -38,8 +38,8 @@ class OdometryConfig:
     places: PlaceMatchingConfig = field(default_factory=PlaceMatchingConfig)
     sigma_px: float = 0.3
     """Standard deviation of a tracked point."""
-    sigma_bias_px: float = 1.0
-    """How wrong all disparities together may be before the recording has shown by how much."""
+    sigma_bias_px: tuple[float, float, float] = (1.0, 0.5, 0.5)
+    """How wrong all disparities together may be, and by how much more at the border, before the recording has shown it."""
     min_disparity_px: float = 0.5
     """What seems further away than this becomes no landmark."""
     sigma_landmark_px: float = 0.25
@@ -121,7 +121,7 @@ class Odometry:
         """Where this frame is, or None where that is not known."""
         measured = measured_view(frame)
         if measured.right is not None:
-            self._bias.information = 1.0 / self._config.sigma_bias_px**2
+            self._bias.information = 1.0 / np.square(self._config.sigma_bias_px)
         cam_from_world = self._track(frame, measured)
         if cam_from_world is None:
             return self._lost(frame_idx, frame, measured)
@@ -214,13 +214,14 @@ class Odometry:
         config = self._config
         points, landmark_ids = self._tracks.points_img, self._tracks.landmark_ids
         corners = find_corners(measured.view.grey, points, self._config.tracking)
-        guesses = measured.stereo.project(cam_from_world.apply(self._landmarks.positions[landmark_ids]))[:, 2] + self._bias.value_px
+        guesses = measured.stereo.project(cam_from_world.apply(self._landmarks.positions[landmark_ids]))[:, 2]
         all_points = np.concatenate([points, corners])
-        guesses = np.concatenate([guesses, np.full(len(corners), np.nan)])
+        bias = self._bias.at(all_points.astype(np.float64), measured.view.camera)
+        guesses = np.concatenate([guesses, np.full(len(corners), np.nan)]) + bias
         disparities, sigmas = measure_disparities(measured, all_points, guesses, self._config.disparity)
         values = np.column_stack([all_points.astype(np.float64), disparities])
-        fresh = np.flatnonzero(disparities[len(points) :] > self._bias.value_px + config.min_disparity_px) + len(points)
-        unbiased = values[fresh] - [0.0, 0.0, self._bias.value_px]
+        fresh = np.flatnonzero((disparities - bias)[len(points) :] > config.min_disparity_px) + len(points)
+        unbiased = values[fresh] - np.column_stack([np.zeros((len(fresh), 2)), bias[fresh]])
         new_points = cam_from_world.inverse().apply(measured.stereo.points_cam(unbiased))
         rows = np.concatenate([np.arange(len(points)), fresh])
         ids = np.concatenate([landmark_ids, self._landmarks.add(new_points)])

@@ -1,21 +1,26 @@
 """Stereo visual SLAM, read from the top: recordings in, the pose of each of their frames out, in one world.
 
-Odometry turns each recording into chains of key frames (sub-maps); loops join them, and themselves, where the same place is seen
-again; a pose graph and a bundle adjustment of the whole make them agree. The world is the camera of the first frame.
+Odometry turns each recording into chains of key frames (sub-maps); loops join them where the same place is seen again, within a
+recording or between two; a pose graph and a bundle adjustment of the whole make them agree. The world is the camera of the
+first frame that was tracked.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
+from jaxtyping import Float
 
+from topoloc.errors import RecordingError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.sequences.frame import StereoSequence
+from topoloc.sequences.frame import StereoFrame, StereoSequence
+from topoloc.slam.global_map import GlobalMapConfig, adjust_all, close_loops, join_submaps
 from topoloc.slam.input_checks import InputCheckConfig, InputChecks
 from topoloc.slam.keyframes import KeyFrame, Landmarks
+from topoloc.slam.loop_closure import LoopConfig, find_links
 from topoloc.slam.odometry import FramePose, Odometry, OdometryConfig
 
 Progress = Callable[[str, int, int], None]
@@ -26,40 +31,84 @@ Progress = Callable[[str, int, int], None]
 class SlamConfig:
     """All steps' settings."""
 
-    odometry: OdometryConfig = field(default_factory=OdometryConfig)
     checks: InputCheckConfig = field(default_factory=InputCheckConfig)
+    odometry: OdometryConfig = field(default_factory=OdometryConfig)
+    loops: LoopConfig = field(default_factory=LoopConfig)
+    globally: GlobalMapConfig = field(default_factory=GlobalMapConfig)
 
 
 @dataclass(frozen=True, eq=False)
 class SlamResult:
-    """`poses[r][i]` is world_from_cam of frame i of recording r, None where it is not known."""
+    """`poses[r][i]` is world_from_cam of frame i of recording r, None where it is not known.
+
+    `num_submaps` counts the stretches in which tracking was never lost for good; of these `num_joined` share the world of the
+    first, and the frames of the others have no pose. `right_residuals_px` are distances between where landmarks are found in the
+    right pictures and where they should be.
+    """
 
     poses: list[list[Rigid3 | None]]
-    keyframes: list[KeyFrame]
-    right_residuals_px: np.ndarray
+    num_keyframes: int
+    num_loops: int
+    num_submaps: int
+    num_joined: int
+    num_lost: int
+    disparity_bias_px: list[float]
+    right_residuals_px: Float[np.ndarray, " n"]
 
 
-def run_slam(sequences: Sequence[StereoSequence], config: SlamConfig | None = None, progress: Progress | None = None) -> SlamResult:
+def run_slam(
+    sequences: StereoSequence | Sequence[StereoSequence], config: SlamConfig | None = None, progress: Progress | None = None
+) -> SlamResult:
+    """Track one or several recordings of one place; those after the first are joined to it where they see the same.
+
+    The same recordings give the same poses, byte for byte.
+
+    Raises:
+        RecordingError: no frame could be tracked; left and right are swapped, or are no pairs; single pictures only.
+        CalibrationError: no calibration, or a baseline that cannot be in metres.
+        UnreadableImageError: from reading the recordings.
+    """
     config = config or SlamConfig()
     progress = progress or (lambda stage, done, total: None)
+    sequences = [sequences] if isinstance(sequences, StereoSequence) else list(sequences)
     keyframes: list[KeyFrame] = []
     landmarks = Landmarks()
-    poses, residuals = [], []
+    tracked: list[list[FramePose | None]] = []
+    residuals: list[np.ndarray] = []
     for number, sequence in enumerate(sequences):
         checks = InputChecks(sequence.name, config.checks)
         odometry = Odometry(number, keyframes, landmarks, checks, config.odometry)
-        tracked: list[FramePose | None] = []
-        for i, frame in enumerate(_read_ahead(sequence)):
-            checks.check_rig(frame)
-            tracked.append(odometry.process(i, frame))
-            progress(f"odometry {sequence.name}", i + 1, len(sequence))
-        checks.verdict()
-        poses.append([pose.world_from_cam() if pose is not None else None for pose in tracked])
+        tracked.append(_track(sequence, odometry, checks, progress))
         residuals += checks.right_residuals_px
-    return SlamResult(poses, keyframes, np.concatenate(residuals) if residuals else np.zeros(0))
+    links = find_links(keyframes, config.loops, progress)
+    joined = join_submaps(keyframes, links, landmarks)
+    links = _optimise(keyframes, links, joined, landmarks, config, progress)
+    return SlamResult(
+        poses=_world_poses(tracked, joined),
+        num_keyframes=len(keyframes),
+        num_loops=len(links),
+        num_submaps=len({keyframe.submap for keyframe in keyframes}),
+        num_joined=len(joined),
+        num_lost=sum(pose is None for poses in tracked for pose in poses),
+        disparity_bias_px=[float(keyframes[0].bias.plane_px[0])],
+        right_residuals_px=np.concatenate(residuals) if residuals else np.zeros(0),
+    )
 
 
-def _read_ahead(sequence: StereoSequence):
+def _track(sequence: StereoSequence, odometry: Odometry, checks: InputChecks, progress: Progress) -> list[FramePose | None]:
+    poses = []
+    for i, frame in enumerate(_read_ahead(sequence)):
+        checks.check_rig(frame)
+        poses.append(odometry.process(i, frame))
+        progress(f"tracking {sequence.name}", i + 1, len(sequence))
+    checks.verdict()
+    if all(pose is None for pose in poses):
+        raise RecordingError(f"{sequence.name}: none of the {len(poses)} frames could be tracked: too dark, without texture, or no stereo")
+    return poses
+
+
+def _read_ahead(sequence: StereoSequence) -> Iterator[StereoFrame]:
+    """The frames, each read while the one before is being worked on."""
     with ThreadPoolExecutor(max_workers=1) as reader:
         coming = reader.submit(sequence.__getitem__, 0)
         for i in range(len(sequence)):
@@ -67,3 +116,26 @@ def _read_ahead(sequence: StereoSequence):
             if i + 1 < len(sequence):
                 coming = reader.submit(sequence.__getitem__, i + 1)
             yield frame
+
+
+def _optimise(
+    keyframes: list[KeyFrame], links: list, joined: list[int], landmarks: Landmarks, config: SlamConfig, progress: Progress
+) -> list:
+    """Make the joined key frames agree; the links that do."""
+    chosen = [i for i, keyframe in enumerate(keyframes) if keyframe.submap in joined]
+    row = {i: k for k, i in enumerate(chosen)}
+    of_joined = [type(link)(row[link.source], row[link.target], link.match) for link in links if link.source in row and link.target in row]
+    ours = [keyframes[i] for i in chosen]
+    progress("optimising", 0, 2)
+    kept = close_loops(ours, of_joined, landmarks, config.globally)
+    progress("optimising", 1, 2)
+    adjust_all(ours, kept, landmarks, config.globally)
+    progress("optimising", 2, 2)
+    return kept
+
+
+def _world_poses(tracked: list[list[FramePose | None]], joined: list[int]) -> list[list[Rigid3 | None]]:
+    """World_from_cam of every frame, the world being the camera of the first of them."""
+    poses = [[p.world_from_cam() if p is not None and p.keyframe.submap in joined else None for p in one] for one in tracked]
+    world_from_any = next(pose for one in poses for pose in one if pose is not None).inverse()
+    return [[world_from_any @ pose if pose is not None else None for pose in one] for one in poses]

@@ -1,0 +1,76 @@
+"""The pose graph: key frames as nodes, motions and loops as edges, brought to agree (Gauss-Newton, Cauchy's loss on the loops).
+
+An edge (i, j) measures Z = j_from_i. Its residual is ``log(X_j X_i^-1 Z^-1)`` with X = cam_from_world, moved by left perturbations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from topoloc.geometry.rigid import Rigid3
+from topoloc.slam.pose_graph_kernels import solve_graph
+
+
+@dataclass(frozen=True)
+class PoseGraphConfig:
+    """How the edges are weighed and how long is optimised."""
+
+    max_steps: int = 15
+    min_step: float = 1e-5
+    """Metres or radians: smaller steps end it."""
+    cauchy_scale: float = 3.0
+    """Of loops: residuals (in sigma) beyond this count less and less."""
+    max_residual: float = 8.0
+    """A loop that misses by more than this many sigma after all is dropped."""
+
+
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """second_from_first with the covariance of its left perturbation; a loop may be wrong, a motion may not."""
+
+    first: int
+    second: int
+    second_from_first: Rigid3
+    covariance: Float[np.ndarray, "6 6"]
+    is_loop: bool
+
+
+def optimise_graph(cam_from_worlds: Sequence[Rigid3], edges: Sequence[Edge], config: PoseGraphConfig) -> list[Rigid3]:
+    """The poses, the first one unmoved."""
+    poses = list(cam_from_worlds)
+    informations = [np.linalg.inv(edge.covariance) for edge in edges]
+    firsts, seconds = np.array([e.first for e in edges]), np.array([e.second for e in edges])
+    for _ in range(config.max_steps):
+        diagonal, right = np.tile(1e-6 * np.eye(6), (len(poses), 1, 1)), np.zeros((len(poses), 6))
+        blocks = np.empty((len(edges), 6, 6))
+        diagonal[0] += 1e12 * np.eye(6)
+        for k, (edge, information) in enumerate(zip(edges, informations, strict=True)):
+            predicted = poses[edge.second] @ poses[edge.first].inverse()
+            residual = (predicted @ edge.second_from_first.inverse()).log()
+            if edge.is_loop:
+                information = information / (1.0 + residual @ information @ residual / config.cauchy_scale**2)
+            adjoint = predicted.adjoint()
+            weighted = adjoint.T @ information
+            diagonal[edge.second] += information
+            diagonal[edge.first] += weighted @ adjoint
+            blocks[k] = -weighted
+            right[edge.second] -= information @ residual
+            right[edge.first] += weighted @ residual
+        steps = solve_graph(diagonal, firsts, seconds, blocks, right, 300, 1e-6)
+        poses = [Rigid3.exp(step) @ pose for step, pose in zip(steps, poses, strict=True)]
+        if np.abs(steps).max() < config.min_step:
+            break
+    return poses
+
+
+def residuals_in_sigma(poses: Sequence[Rigid3], edges: Sequence[Edge]) -> Float[np.ndarray, " e"]:
+    """Length of each edge's residual, in standard deviations."""
+    lengths = np.empty(len(edges))
+    for k, edge in enumerate(edges):
+        residual = (poses[edge.second] @ poses[edge.first].inverse() @ edge.second_from_first.inverse()).log()
+        lengths[k] = np.sqrt(residual @ np.linalg.solve(edge.covariance, residual))
+    return lengths
