@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from multiprocessing import get_context
@@ -98,7 +98,7 @@ def record(
     being rendered.
 
     Args:
-        progress: called with ("frames", done, total).
+        progress: called with ("frames", done, total), last of all if this fails.
         processes: each renders frames of its own; None chooses. They have no influence on the pictures.
         overwrite: remove a recording of other settings that lies there.
 
@@ -115,9 +115,15 @@ def record(
     progress("frames", done, route.num_frames)
     job = _Job(world, condition, config, layout, variant)
     num = min(len(missing), processes or _num_processes(len(missing)))
-    for _ in _render_here(job, missing) if num <= 1 else _render_in_processes(job, missing, num):
-        done += 1
-        progress("frames", done, route.num_frames)
+    in_turn = _render_here(job, missing) if num <= 1 else _render_in_processes(job, missing, num)
+    try:
+        with closing(in_turn):
+            for _ in in_turn:
+                done += 1
+                progress("frames", done, route.num_frames)
+    except BaseException:  # processes have finished their frames meanwhile
+        progress("frames", route.num_frames - len(missing_frames(layout, route.num_frames)), route.num_frames)
+        raise
     return Recorded(route.num_frames, len(missing), route.length)
 
 
@@ -137,7 +143,7 @@ def _num_processes(num_frames: int) -> int:
     return min(2, os.cpu_count() or 1) if num_frames > _FEW_FRAMES else 1
 
 
-def _render_here(job: _Job, frames: list[int]) -> Iterator[int]:
+def _render_here(job: _Job, frames: list[int]) -> Generator[int, None, None]:
     if not frames:
         return
     shooting = _shooting(job)
@@ -146,7 +152,7 @@ def _render_here(job: _Job, frames: list[int]) -> Iterator[int]:
         yield index
 
 
-def _render_in_processes(job: _Job, frames: list[int], num: int) -> Iterator[int]:
+def _render_in_processes(job: _Job, frames: list[int], num: int) -> Generator[int, None, None]:
     # Not forked: a child of a process in which Mitsuba's threads run would wait for them for ever.
     with ProcessPoolExecutor(num, get_context("spawn"), initializer=_start, initargs=(job,)) as pool:
         try:
