@@ -10,6 +10,7 @@ import sys
 COMMANDS = {
     "demo": "the whole pipeline on the built-in lab: mapped by day, asked by day, by night and with another camera",
     "simulate": "render a recording of a built-in world (lab, corridor, street) with exact truth",
+    "slam": "where did the camera go? a stereo or RGB-D recording becomes a trajectory",
     "build": "map a place: a stereo or RGB-D recording becomes one map file",
     "train": "add a learned coarse localizer to a map, or train it anew",
     "localize": "where were these images taken? 6-DoF poses of images, folders, recordings",

@@ -10,10 +10,11 @@ import tyro
 
 from topoloc.cli.info import describe_map
 from topoloc.cli.output import UsageError, check_outputs, progress_bar, write_json
-from topoloc.errors import TopolocError
-from topoloc.mapping.build import BuildConfig, build_map
+from topoloc.errors import RecordingError
+from topoloc.mapping.build import BuildConfig, Progress, build_map
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import open_sequence
+from topoloc.sequences.recording import SequenceView
 from topoloc.sequences.trajectory import with_trajectory
 
 
@@ -24,12 +25,12 @@ class Command:
     paths: Annotated[
         tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="SEQ [SEQ ...] MAP", help_behavior_hint="(required)")
     ] = ()
-    """One or several recordings whose poses share one world, then the map file to write. PATH@0::2 takes every second frame of PATH."""
+    """One or several recordings of one place, then the map file to write. PATH@0::2 takes every second frame of PATH."""
     trajectory: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
-        tyro.conf.arg(metavar="truth|FILE", help_behavior_hint="(default: truth; once for all recordings or once for each)"),
+        tyro.conf.arg(metavar="truth|slam|FILE", help_behavior_hint="(default: truth where there is one, else slam)"),
     ] = ()
-    """Where poses come from: `truth` (what the recording holds) or a TUM or KITTI trajectory file."""
+    """Where poses come from: `truth` (the recording's own), `slam`, or a TUM or KITTI trajectory file; for all, or once for each."""
     format: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: recognised)")] = None
     """The recordings' format: kitti, euroc, tum, seven_scenes or folder."""
     d_thresh: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="(default: from the scene's median depth)")] = None
@@ -48,15 +49,17 @@ class Command:
 
     def run(self) -> int:
         recordings, target = self._split_paths()
-        check_outputs([str(target), self.json], inputs=[path for path in self.trajectory if path != "truth"])
-        sequences = self._open(recordings)
+        check_outputs([str(target), self.json], inputs=[path for path in self.trajectory if path not in ("truth", "slam")])
+        sequences, poses_from = self._open(recordings)
         with progress_bar() as progress:
+            if poses_from == "slam":
+                sequences = _with_slam(sequences, progress)
             topomap = build_map(sequences, self._config(), progress)
         topomap.save(target)
         info = describe_map(topomap, target)
         if self.json != "-":
             size = f"{info['num_nodes']} nodes, {info['num_points']} points, {info['bytes'] / 1e6:.2f} MB"
-            print(f"{target}: {size}, {info['length_m']:.1f} m mapped")
+            print(f"{target}: {size}, {info['length_m']:.1f} m mapped, poses from {poses_from}")
         write_json(self.json, info)
         return 0
 
@@ -83,19 +86,36 @@ class Command:
             features = replace(features, kind=self.features)
         return replace(self.config, nodes=nodes, features=features)
 
-    def _open(self, recordings: list[str]) -> list[StereoSequence]:
-        trajectories = self.trajectory or ("truth",)
+    def _open(self, recordings: list[str]) -> tuple[list[StereoSequence], str]:
+        """The recordings with their poses, and where these come from; with `slam` they are still to be found."""
+        sequences = [open_sequence(path, self.format) for path in recordings]
+        trajectories = self.trajectory or ("truth" if all(any(sequence.poses) for sequence in sequences) else "slam",)
         if len(trajectories) == 1:
             trajectories *= len(recordings)
         if len(trajectories) != len(recordings):
             raise UsageError(f"{len(recordings)} recordings but {len(trajectories)} trajectories")
         if "slam" in trajectories:
-            raise TopolocError("--trajectory slam: SLAM is not in this version yet; give the poses as a TUM or KITTI trajectory file")
-        sequences = []
-        for path, trajectory in zip(recordings, trajectories, strict=True):
-            sequence = open_sequence(path, self.format)
-            sequences.append(sequence if trajectory == "truth" else with_trajectory(sequence, Path(trajectory)))
-        return sequences
+            if set(trajectories) != {"slam"}:
+                raise UsageError("--trajectory slam goes for all recordings or for none: its world is no other's")
+            return sequences, "slam"
+        pairs = zip(sequences, trajectories, strict=True)
+        posed = [sequence if trajectory == "truth" else with_trajectory(sequence, Path(trajectory)) for sequence, trajectory in pairs]
+        return posed, " and ".join(sorted(set(trajectories)))
+
+
+def _with_slam(sequences: list[StereoSequence], progress: Progress) -> list[StereoSequence]:
+    """The recordings with the poses that SLAM finds.
+
+    Raises:
+        RecordingError: one of them shares no place with the others.
+    """
+    from topoloc.slam.slam import run_slam
+
+    result = run_slam(sequences, progress=progress)
+    for sequence, poses in zip(sequences, result.poses, strict=True):
+        if not any(poses):
+            raise RecordingError(f"{sequence.name}: no place of it was recognised in {sequences[0].name}; map it alone")
+    return [SequenceView(sequence, list(range(len(sequence))), poses) for sequence, poses in zip(sequences, result.poses, strict=True)]
 
 
 def _first_bytes(path: Path) -> bytes:

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from topoloc.geometry.rigid import Rigid3
 from topoloc.slam.bundle_kernels import eliminate_points, move_points, robust_cost, squared_residuals
-from topoloc.slam.keyframes import DisparityBias, KeyFrame, Landmarks, bias_basis
+from topoloc.slam.keyframes import DisparityBias, KeyFrame, Landmarks
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class _Problem:
 
     rotations: Float[np.ndarray, "k 3 3"]
     translations: Float[np.ndarray, "k 3"]
-    cameras: Float[np.ndarray, "k 8"]
+    cameras: Float[np.ndarray, "k 6"]
     slots: Int[np.ndarray, " k"]
     columns: Int[np.ndarray, " k"]
     biases: list[DisparityBias]
@@ -45,29 +45,28 @@ class _Problem:
     frames: Int[np.ndarray, " m"]
     rows: Int[np.ndarray, " m"]
     measured: Float[np.ndarray, "m 3"]
-    bases: Float[np.ndarray, "m 3"]
     weights: Float[np.ndarray, "m 3"]
 
     def cost(self, rotations: np.ndarray, translations: np.ndarray, points: np.ndarray, cameras: np.ndarray, scale: float) -> float:
         """Robust cost of the observations, and of biases other than expected."""
-        prior = sum(float(bias.information @ (cameras[k, 5:] - bias.plane_px) ** 2) for bias, k in self.first_of_biases())
+        prior = sum(bias.information * (cameras[k, 5] - bias.value_px) ** 2 for bias, k in self.first_of_biases())
         return float(robust_cost(self.squares(rotations, translations, points, cameras), scale**2)) + prior
 
     def squares(self, rotations: np.ndarray, translations: np.ndarray, points: np.ndarray, cameras: np.ndarray) -> Float[np.ndarray, " m"]:
         squares = np.empty(len(self.frames))
-        squared_residuals(rotations, translations, cameras, points, self.frames, self.rows, self.measured, self.bases, self.weights, squares)
+        squared_residuals(rotations, translations, cameras, points, self.frames, self.rows, self.measured, self.weights, squares)
         return squares
 
     def first_of_biases(self) -> list[tuple[DisparityBias, int]]:
         first_column = 6 * int(self.slots.max() + 1)
-        return [(bias, int(np.argmax(self.columns == first_column + 3 * i))) for i, bias in enumerate(self.biases)]
+        return [(bias, int(np.argmax(self.columns == first_column + i))) for i, bias in enumerate(self.biases)]
 
     def add_priors(self, matrix: np.ndarray, vector: np.ndarray) -> None:
         """What is known of the biases already."""
         for bias, k in self.first_of_biases():
-            columns = self.columns[k] + np.arange(3)
-            matrix[columns, columns] += bias.information
-            vector[columns] += bias.information * (bias.plane_px - self.cameras[k, 5:])
+            column = self.columns[k]
+            matrix[column, column] += bias.information
+            vector[column] += bias.information * (bias.value_px - self.cameras[k, 5])
 
 
 def adjust_bundle(free: Sequence[KeyFrame], held: Sequence[KeyFrame], landmarks: Landmarks, config: BundleConfig) -> None:
@@ -89,7 +88,7 @@ def adjust_bundle(free: Sequence[KeyFrame], held: Sequence[KeyFrame], landmarks:
         keyframe.cam_from_world = Rigid3(problem.rotations[k].copy(), problem.translations[k].copy())
     landmarks.positions[ids] = problem.points
     for bias, k in problem.first_of_biases():
-        bias.plane_px = problem.cameras[k, 5:].copy()
+        bias.value_px = float(problem.cameras[k, 5])
     wrong = problem.squares(problem.rotations, problem.translations, problem.points, problem.cameras) > config.outlier_square
     for k, keyframe in enumerate(keyframes):
         keyframe.observations.active[sources[wrong & (problem.frames == k)]] = False
@@ -118,20 +117,19 @@ def _assemble(
     weights = np.concatenate([k.observations.weights[s] for k, s in zip(keyframes, sources, strict=True)])[order]
     slots = np.arange(len(keyframes))
     slots[num_free:] = -1
-    biases = list(dict.fromkeys(k.bias for k in keyframes if np.isfinite(k.bias.information).all()))
+    biases = list(dict.fromkeys(k.bias for k in keyframes if np.isfinite(k.bias.information)))
     problem = _Problem(
         rotations=np.array([k.cam_from_world.rotation for k in keyframes]),
         translations=np.array([k.cam_from_world.translation for k in keyframes]),
         cameras=np.array([_camera_row(k) for k in keyframes]),
         slots=slots,
-        columns=np.array([6 * num_free + 3 * biases.index(k.bias) if k.bias in biases else -1 for k in keyframes]),
+        columns=np.array([6 * num_free + biases.index(k.bias) if k.bias in biases else -1 for k in keyframes]),
         biases=biases,
         points=landmarks.positions[ids],
         starts=np.searchsorted(all_rows[order], np.arange(len(ids) + 1)),
         frames=np.concatenate(frames)[order],
         rows=all_rows[order],
         measured=np.where(weights > 0.0, measured, 0.0),
-        bases=np.concatenate([bias_basis(k.observations.measured[c, :2], k.stereo.camera) for k, c in zip(keyframes, sources, strict=True)])[order],
         weights=weights,
     )
     return problem, np.concatenate(sources)[order]
@@ -139,20 +137,20 @@ def _assemble(
 
 def _camera_row(keyframe: KeyFrame) -> list[float]:
     camera = keyframe.stereo.camera
-    return [camera.fx, camera.fy, camera.cx, camera.cy, keyframe.stereo.bf, *keyframe.bias.plane_px]
+    return [camera.fx, camera.fy, camera.cx, camera.cy, keyframe.stereo.bf, keyframe.bias.value_px]
 
 
 def _optimise(problem: _Problem, config: BundleConfig) -> None:
     p, num_free = problem, int(problem.slots.max() + 1)
     cost = p.cost(p.rotations, p.translations, p.points, p.cameras, config.cauchy_scale)
     damping = 1e-4
-    num_points, size = len(p.points), 6 * num_free + 3 * len(p.biases)
+    num_points, size = len(p.points), 6 * num_free + len(p.biases)
     couplings, inverses = np.empty((len(p.frames), 6, 3)), np.empty((num_points, 3, 3))
-    gradients, moved, bias_couplings = np.empty((num_points, 3)), np.empty((num_points, 3)), np.empty((num_points, 3, 3))
+    gradients, bias_couplings, moved = (np.empty((num_points, 3)) for _ in range(3))
     for _ in range(config.max_steps):
         matrix, vector = np.zeros((size, size)), np.zeros(size)
         eliminate_points(
-            p.rotations, p.translations, p.cameras, p.slots, p.columns, p.points, p.starts, p.frames, p.measured, p.bases, p.weights,
+            p.rotations, p.translations, p.cameras, p.slots, p.columns, p.points, p.starts, p.frames, p.measured, p.weights,
             config.cauchy_scale**2, damping, matrix, vector, couplings, inverses, gradients, bias_couplings,
         )  # fmt: skip
         p.add_priors(matrix, vector)
@@ -163,8 +161,7 @@ def _optimise(problem: _Problem, config: BundleConfig) -> None:
         for k in range(num_free):
             new = Rigid3.exp(steps[6 * k : 6 * k + 6]) @ Rigid3(rotations[k], translations[k])
             rotations[k], translations[k] = new.rotation, new.translation
-        biased = p.columns >= 0
-        cameras[biased, 5:] += steps[p.columns[biased][:, None] + np.arange(3)]
+        cameras[p.columns >= 0, 5] += steps[p.columns[p.columns >= 0]]
         new_cost = p.cost(rotations, translations, moved, cameras, config.cauchy_scale)
         if not new_cost < cost:
             damping *= 10.0

@@ -1,8 +1,7 @@
 """Numba kernels of bundle adjustment: normal equations with the points eliminated, and what a step changes.
 
-A key frame sees a point at (x, y, d): pixel and disparity, d = bf / depth + basis . bias. Poses move by left perturbations
-``exp(xi) @ cam_from_world``, xi = (translation, rotation). Cameras are rows (fx, fy, cx, cy, bf, bias 0, 1, 2); a bias is
-a plane over the picture, and an observation's basis is (1, x, y) in units of it.
+A key frame sees a point at (x, y, d): pixel and disparity, d = bf / depth + bias. Poses move by left perturbations
+``exp(xi) @ cam_from_world``, xi = (translation, rotation). Cameras are rows (fx, fy, cx, cy, bf, bias).
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ _BEHIND = 1e4
 
 
 @njit(**_OPTIONS)
-def _residual(rotation, translation, camera, point, measured, basis, weights, residual, seen):
+def _residual(rotation, translation, camera, point, measured, weights, residual, seen):
     """Whitened (measured - predicted), and the point in the camera's frame; returns its square, negative behind the camera."""
     for axis in range(3):
         seen[axis] = rotation[axis, 0] * point[0] + rotation[axis, 1] * point[1] + rotation[axis, 2] * point[2] + translation[axis]
@@ -26,20 +25,17 @@ def _residual(rotation, translation, camera, point, measured, basis, weights, re
     inverse = 1.0 / seen[2]
     residual[0] = weights[0] * (measured[0] - camera[0] * seen[0] * inverse - camera[2])
     residual[1] = weights[1] * (measured[1] - camera[1] * seen[1] * inverse - camera[3])
-    bias = camera[5] * basis[0] + camera[6] * basis[1] + camera[7] * basis[2]
-    residual[2] = weights[2] * (measured[2] - camera[4] * inverse - bias)
+    residual[2] = weights[2] * (measured[2] - camera[4] * inverse - camera[5])
     return residual[0] ** 2 + residual[1] ** 2 + residual[2] ** 2
 
 
 @njit(**_OPTIONS)
-def squared_residuals(rotations, translations, cameras, points, frames, rows, measured, bases, weights, squares):
+def squared_residuals(rotations, translations, cameras, points, frames, rows, measured, weights, squares):
     """Fill the squared whitened residual of each observation (frame and point rows given); infinite behind the camera."""
     residual, seen = np.empty(3), np.empty(3)
     for k in range(len(frames)):
         f = frames[k]
-        square = _residual(
-            rotations[f], translations[f], cameras[f], points[rows[k]], measured[k], bases[k], weights[k], residual, seen
-        )
+        square = _residual(rotations[f], translations[f], cameras[f], points[rows[k]], measured[k], weights[k], residual, seen)
         squares[k] = square if square >= 0.0 else np.inf
 
 
@@ -91,21 +87,19 @@ def _invert_symmetric(m, inverse):
 
 @njit(**_OPTIONS)
 def eliminate_points(
-    rotations, translations, cameras, slots, columns, points, starts, frames, measured, bases, weights, scale_squared, damping,
+    rotations, translations, cameras, slots, columns, points, starts, frames, measured, weights, scale_squared, damping,
     matrix, vector, couplings, inverses, gradients, bias_couplings,
 ):  # fmt: skip
     """The reduced system of the free poses and biases (`matrix` (s, s) and `vector`, zero at the call), point by point.
 
-    `slots[k]` is the place of key frame k among the free ones, -1 where it is held; `columns[k]` that of the first of the
-    three numbers of its disparity's bias in the system, -1 where that is held; the key frames that see a point share it. Observations are sorted by point: those
+    `slots[k]` is the place of key frame k among the free ones, -1 where it is held; `columns[k]` that of its disparity's bias
+    in the system, -1 where that is held; the key frames that see a point share it. Observations are sorted by point: those
     of point n are starts[n] .. starts[n + 1] - 1. `couplings` (m, 6, 3), `inverses` (n, 3, 3), `gradients` (n, 3) and
-    `bias_couplings` (n, 3, 3) are kept for `move_points`.
+    `bias_couplings` (n, 3) are kept for `move_points`.
     """
     residual, seen = np.empty(3), np.empty(3)
     by_pose, by_point = np.empty((3, 6)), np.empty((3, 3))
     product = np.empty((6, 3))
-    by_bias = np.empty(3)
-    towards = np.empty((3, 3))
     block, step = np.empty((3, 3)), np.empty(3)
     for n in range(len(points)):
         first, last = starts[n], starts[n + 1]
@@ -116,7 +110,7 @@ def eliminate_points(
         for k in range(first, last):
             f = frames[k]
             couplings[k] = 0.0
-            square = _residual(rotations[f], translations[f], cameras[f], points[n], measured[k], bases[k], weights[k], residual, seen)
+            square = _residual(rotations[f], translations[f], cameras[f], points[n], measured[k], weights[k], residual, seen)
             if square < 0.0:
                 continue
             robust = 1.0 / (1.0 + square / scale_squared)
@@ -128,17 +122,14 @@ def eliminate_points(
                         block[r, s] += robust * by_point[q, r] * by_point[q, s]
             slot = slots[f]
             if column >= 0:
-                for i in range(3):
-                    by_bias[i] = weights[k, 2] * bases[k, i]
-                for i in range(3):
-                    vector[column + i] += robust * by_bias[i] * residual[2]
-                    for j in range(3):
-                        matrix[column + i, column + j] += robust * by_bias[i] * by_bias[j]
-                        bias_couplings[n, i, j] += robust * by_bias[i] * by_point[2, j]
-                    if slot >= 0:
-                        for r in range(6):
-                            matrix[6 * slot + r, column + i] += robust * by_bias[i] * by_pose[2, r]
-                            matrix[column + i, 6 * slot + r] += robust * by_bias[i] * by_pose[2, r]
+                vector[column] += robust * weights[k, 2] * residual[2]
+                matrix[column, column] += robust * weights[k, 2] ** 2
+                for r in range(3):
+                    bias_couplings[n, r] += robust * weights[k, 2] * by_point[2, r]
+                if slot >= 0:
+                    for r in range(6):
+                        matrix[6 * slot + r, column] += robust * weights[k, 2] * by_pose[2, r]
+                        matrix[column, 6 * slot + r] += robust * weights[k, 2] * by_pose[2, r]
             if slot < 0:
                 continue
             for r in range(6):
@@ -154,15 +145,10 @@ def eliminate_points(
         for r in range(3):
             step[r] = inverses[n, r, 0] * gradients[n, 0] + inverses[n, r, 1] * gradients[n, 1] + inverses[n, r, 2] * gradients[n, 2]
         if column >= 0:
-            for i in range(3):
-                for r in range(3):
-                    vector[column + i] -= bias_couplings[n, i, r] * step[r]
-                    towards[i, r] = 0.0
-                    for q in range(3):
-                        towards[i, r] += bias_couplings[n, i, q] * inverses[n, q, r]
-                for j in range(3):
-                    for r in range(3):
-                        matrix[column + i, column + j] -= towards[i, r] * bias_couplings[n, j, r]
+            for r in range(3):
+                vector[column] -= bias_couplings[n, r] * step[r]
+                for s in range(3):
+                    matrix[column, column] -= bias_couplings[n, r] * inverses[n, r, s] * bias_couplings[n, s]
         for k in range(first, last):
             i = slots[frames[k]]
             if i < 0:
@@ -176,12 +162,11 @@ def eliminate_points(
                     )
                 vector[6 * i + r] -= couplings[k, r, 0] * step[0] + couplings[k, r, 1] * step[1] + couplings[k, r, 2] * step[2]
                 if column >= 0:
-                    for b in range(3):
-                        shared = 0.0
-                        for q in range(3):
-                            shared += product[r, q] * bias_couplings[n, b, q]
-                        matrix[6 * i + r, column + b] -= shared
-                        matrix[column + b, 6 * i + r] -= shared
+                    shared = (
+                        product[r, 0] * bias_couplings[n, 0] + product[r, 1] * bias_couplings[n, 1] + product[r, 2] * bias_couplings[n, 2]
+                    )
+                    matrix[6 * i + r, column] -= shared
+                    matrix[column, 6 * i + r] -= shared
             for other in range(first, last):
                 j = slots[frames[other]]
                 if j < 0:
@@ -205,8 +190,7 @@ def move_points(slots, columns, starts, frames, couplings, bias_couplings, inver
         column = columns[frames[first]] if last > first else -1
         if column >= 0:
             for s in range(3):
-                for b in range(3):
-                    rest[s] -= bias_couplings[n, b, s] * steps[column + b]
+                rest[s] -= bias_couplings[n, s] * steps[column]
         for k in range(first, last):
             slot = slots[frames[k]]
             if slot < 0:

@@ -83,7 +83,7 @@ class InputChecks:
         points = seen.measured[rows, :2]
         found = self._seek_in_right(measured, points.astype(np.float32), (points + to_right).astype(np.float32))
         expected = keyframe.stereo.project(keyframe.cam_from_world.apply(landmarks.positions[seen.landmark_ids[rows]]))
-        expected_right = expected[:, :2] - np.column_stack([expected[:, 2] + keyframe.bias.at(points, measured.view.camera) + at_infinity, np.zeros(len(rows))])
+        expected_right = expected[:, :2] - np.column_stack([expected[:, 2] + keyframe.bias.value_px + at_infinity, np.zeros(len(rows))])
         self.right_residuals_px.append(np.linalg.norm(found - expected_right, axis=1))
 
     def verdict(self) -> None:
@@ -102,7 +102,9 @@ class InputChecks:
     ) -> Float[np.ndarray, "n 2"]:
         """Where points of the left picture are in the right one, up and down as well; NaN where not found. Keeps the median height."""
         assert measured.right is not None
-        found, alike = align_with_reference(measured.left, measured.right, points, guesses, self._config.tracking)
+        found, alike = align_with_reference(
+            measured.left, measured.right, points, guesses, np.ones(len(points), np.float32), self._config.tracking
+        )
         places = np.where(alike[:, None], found, np.nan).astype(np.float64)
         if np.count_nonzero(alike) >= max(10, len(points) // 3):
             self._vertical_px.append(float(np.nanmedian(np.abs(places[:, 1] - points[:, 1]))))

@@ -33,25 +33,14 @@ class StereoCamera:
 
 @dataclass(eq=False)
 class DisparityBias:
-    """What a recording's measured disparities are too large by: a plane over the picture, and how well it is known (1 / px^2).
+    """What a recording's measured disparities are too large by, pixels, and how well that is known (1 / px^2).
 
     Rectification is never perfect: an angle of one milliradian between the two cameras shifts all disparities by f / 1000, most of
     a pixel in a street camera, and makes all that is far too far or too near. Motion tells: see `bundle`.
-    `plane_px` are the bias in the middle, and its growth from there to the right border and by as much downwards.
     """
 
-    plane_px: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
-    information: Float[np.ndarray, "3"] = field(default_factory=lambda: np.full(3, np.inf))
-
-    def at(self, points_img: Float[np.ndarray, "n 2"], camera: Camera) -> Float[np.ndarray, " n"]:
-        """The bias at these pixels."""
-        return bias_basis(points_img, camera) @ self.plane_px
-
-
-def bias_basis(points_img: Float[np.ndarray, "n 2"], camera: Camera) -> Float[np.ndarray, "n 3"]:
-    """(1, x, y) in half widths of the picture from its middle."""
-    half = camera.width / 2.0
-    return np.column_stack([np.ones(len(points_img)), (points_img - [camera.width / 2.0, camera.height / 2.0]) / half])
+    value_px: float = 0.0
+    information: float = np.inf
 
 
 @dataclass(eq=False)

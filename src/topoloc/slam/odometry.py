@@ -38,8 +38,8 @@ class OdometryConfig:
     places: PlaceMatchingConfig = field(default_factory=PlaceMatchingConfig)
     sigma_px: float = 0.3
     """Standard deviation of a tracked point."""
-    sigma_bias_px: tuple[float, float, float] = (1.0, 0.5, 0.5)
-    """How wrong all disparities together may be, and by how much more at the border, before the recording has shown it."""
+    sigma_bias_px: float = 1.0
+    """How wrong all disparities together may be before the recording has shown by how much."""
     min_disparity_px: float = 0.5
     """What seems further away than this becomes no landmark."""
     sigma_landmark_px: float = 0.25
@@ -51,9 +51,9 @@ class OdometryConfig:
     min_tracked: int = 25
     """Points that agree on a pose; a frame with fewer is lost."""
     min_tracked_share: float = 0.35
-    keyframe_share: float = 0.65
+    keyframe_share: float = 0.7
     """A key frame is due when so few of the last one's points are left."""
-    keyframe_motion: float = 0.045
+    keyframe_motion: float = 0.03
     """... or when they have moved in the picture by this share of its width (median)."""
     max_lost_tracked: int = 3
     """The points of the last frame that was tracked are sought in so many more."""
@@ -121,7 +121,7 @@ class Odometry:
         """Where this frame is, or None where that is not known."""
         measured = measured_view(frame)
         if measured.right is not None:
-            self._bias.information = 1.0 / np.square(self._config.sigma_bias_px)
+            self._bias.information = 1.0 / self._config.sigma_bias_px**2
         cam_from_world = self._track(frame, measured)
         if cam_from_world is None:
             return self._lost(frame_idx, frame, measured)
@@ -165,8 +165,16 @@ class Odometry:
         guesses = (tracks.points_img + np.clip(np.nan_to_num(after - before), -limit, limit)).astype(np.float32)
         found, is_found = follow(self._last.grey, measured.view.grey, tracks.points_img, guesses, config)
         tracks = _Tracks(tracks.landmark_ids, found, tracks.points_ref).select(is_found)
-        refined, alike = align_with_reference(self._reference_picture, measured.left, tracks.points_ref, tracks.points_img, config)
+        scales = self._patch_scales(tracks.landmark_ids, predicted)
+        refined, alike = align_with_reference(self._reference_picture, measured.left, tracks.points_ref, tracks.points_img, scales, config)
         return _Tracks(tracks.landmark_ids, refined, tracks.points_ref).select(alike)
+
+    def _patch_scales(self, landmark_ids: Int[np.ndarray, " n"], predicted: Rigid3) -> Float32[np.ndarray, " n"]:
+        """How much larger each landmark's surroundings look than in the last key frame: what is approached grows."""
+        assert self._reference is not None
+        points_world = self._landmarks.positions[landmark_ids]
+        before, now = (pose.apply(points_world)[:, 2] for pose in (self._reference.cam_from_world, predicted))
+        return np.clip(before / np.maximum(now, 1e-3), 0.5, 2.0).astype(np.float32)
 
     def _estimate_pose(self, tracks: _Tracks, stereo: StereoCamera, predicted: Rigid3) -> AbsolutePose | None:
         config = self._config
@@ -216,12 +224,12 @@ class Odometry:
         corners = find_corners(measured.view.grey, points, self._config.tracking)
         guesses = measured.stereo.project(cam_from_world.apply(self._landmarks.positions[landmark_ids]))[:, 2]
         all_points = np.concatenate([points, corners])
-        bias = self._bias.at(all_points.astype(np.float64), measured.view.camera)
+        bias = self._bias.value_px
         guesses = np.concatenate([guesses, np.full(len(corners), np.nan)]) + bias
         disparities, sigmas = measure_disparities(measured, all_points, guesses, self._config.disparity)
         values = np.column_stack([all_points.astype(np.float64), disparities])
         fresh = np.flatnonzero((disparities - bias)[len(points) :] > config.min_disparity_px) + len(points)
-        unbiased = values[fresh] - np.column_stack([np.zeros((len(fresh), 2)), bias[fresh]])
+        unbiased = values[fresh] - [0.0, 0.0, bias]
         new_points = cam_from_world.inverse().apply(measured.stereo.points_cam(unbiased))
         rows = np.concatenate([np.arange(len(points)), fresh])
         ids = np.concatenate([landmark_ids, self._landmarks.add(new_points)])

@@ -90,7 +90,7 @@ def run_slam(
         num_submaps=len({keyframe.submap for keyframe in keyframes}),
         num_joined=len(joined),
         num_lost=sum(pose is None for poses in tracked for pose in poses),
-        disparity_bias_px=[float(keyframes[0].bias.plane_px[0])],
+        disparity_bias_px=[keyframes[0].bias.value_px],
         right_residuals_px=np.concatenate(residuals) if residuals else np.zeros(0),
     )
 

@@ -60,14 +60,15 @@ def align_with_reference(
     picture: Float32[np.ndarray, "h w"],
     points_ref: Float32[np.ndarray, "n 2"],
     points_img: Float32[np.ndarray, "n 2"],
+    scales: Float32[np.ndarray, " n"],
     config: TrackingConfig,
 ) -> tuple[Float32[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
-    """Points of `picture` moved to where they look most like `points_ref` of the reference; and which do look alike."""
+    """Points of `picture` moved to where they look most like `points_ref` of the reference enlarged by `scales`; and which do."""
     refined, scores = np.empty_like(points_img), np.empty(len(points_img), np.float32)
 
     def run(first: int, last: int) -> None:
         refine_tracks(
-            reference, picture, points_ref, points_img, config.patch_half_px, 8, config.max_shift_px, first, last, refined, scores
+            reference, picture, points_ref, points_img, scales, config.patch_half_px, 8, config.max_shift_px, first, last, refined, scores
         )
 
     run_in_bands(run, len(points_img), num_threads=2)

@@ -50,12 +50,13 @@ def _prepare(image, x, y, half, patch, slope_x, slope_y):
 
 
 @njit(**_OPTIONS)
-def refine_tracks(reference, image, points_ref, points, half, num_iterations, max_shift, first, last, refined, scores):
+def refine_tracks(reference, image, points_ref, points, scales, half, num_iterations, max_shift, first, last, refined, scores):
     """Fill `refined` and `scores` for the rows first .. last - 1.
 
-    Gauss-Newton on a shift, gain and offset of the light eliminated, slopes taken from the reference (inverse compositional
-    alignment, Baker and Matthews, IJCV 2004). The score is the normalised correlation at the end; -1 where the point is near
-    a border, has no texture, or wanders further than `max_shift` pixels from where it was.
+    The patch around a point of the image is `scales` times as large as that of the reference. Gauss-Newton on a shift, gain
+    and offset of the light eliminated, slopes taken from the reference (inverse compositional alignment, Baker and Matthews,
+    IJCV 2004). The score is the normalised correlation at the end; -1 where the point is near a border, has no texture, or
+    wanders further than `max_shift` pixels from where it was.
     """
     side = 2 * half + 1
     patch = np.empty((side, side), np.float32)
@@ -63,18 +64,20 @@ def refine_tracks(reference, image, points_ref, points, half, num_iterations, ma
     slope_y = np.empty((side, side), np.float32)
     window = np.empty((side, side), np.float32)
     height, width = image.shape
-    margin = half + 2
     for n in range(first, last):
         scores[n] = np.float32(-1)
         x, y = points[n, 0], points[n, 1]
         refined[n, 0], refined[n, 1] = x, y
         rx, ry = points_ref[n, 0], points_ref[n, 1]
+        margin = half + 2
         if rx < margin or ry < margin or rx >= width - margin - 1 or ry >= height - margin - 1:
             continue
         norm, a, b, c = _prepare(reference, rx, ry, half, patch, slope_x, slope_y)
         determinant = a * c - b * b
         if norm < 2.0 * side or determinant < 1e-3 * (a + c) * (a + c):
             continue
+        scale = scales[n]
+        margin = int(half * scale) + 2
         for _ in range(num_iterations):
             if not (x >= margin and y >= margin and x < width - margin - 1 and y < height - margin - 1):
                 scores[n] = np.float32(-1)
@@ -82,7 +85,7 @@ def refine_tracks(reference, image, points_ref, points, half, num_iterations, ma
             mean = np.float32(0)
             for j in range(side):
                 for i in range(side):
-                    window[j, i] = _sample(image, x + i - half, y + j - half)
+                    window[j, i] = _sample(image, x + scale * (i - half), y + scale * (j - half))
                     mean += window[j, i]
             mean /= side * side
             squares, dot = np.float32(0), np.float32(0)
@@ -102,8 +105,8 @@ def refine_tracks(reference, image, points_ref, points, half, num_iterations, ma
                     residual = window[j, i] * gain - patch[j, i]
                     gx += slope_x[j, i] * residual
                     gy += slope_y[j, i] * residual
-            step_x = (c * gx - b * gy) / determinant
-            step_y = (a * gy - b * gx) / determinant
+            step_x = scale * (c * gx - b * gy) / determinant
+            step_y = scale * (a * gy - b * gx) / determinant
             length = np.sqrt(step_x * step_x + step_y * step_y)
             if length > 1.0:
                 step_x, step_y = step_x / length, step_y / length
