@@ -66,4 +66,5 @@ def training_set_of(topomap: TopoMetricMap) -> TrainingSet:
         node_ids=np.array([image.node_id for image in images], np.int64),
         node_distances=np.stack([node_distances(image.world_from_cam, nodes, lambda_rot) for image in images]),
         d_thresh=d_thresh,
+        lambda_rot=lambda_rot,
     )

@@ -1,7 +1,7 @@
 """The networks that the learned coarse localizers stand on: VGG-11, VGG-16 (Simonyan & Zisserman 2014) and SqueezeNet 1.1
-(Iandola et al. 2016), in PyTorch.
+(Iandola et al. 2016), and a small one of our own for training from nothing, in PyTorch.
 
-Layers carry torchvision's names and order, so that the ImageNet weights that torchvision publishes load as they are.
+Layers of the first three carry torchvision's names and order, so that the ImageNet weights that torchvision publishes load as they are.
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
 NUM_IMAGENET_CLASSES = 1000
 NUM_CHANNELS = 512
-"""Channels of the last feature maps of each backbone."""
+"""Channels of the last feature maps of VGG and SqueezeNet."""
 
 _POOL = "M"
 _VGG_LAYERS: dict[str, tuple[int | str, ...]] = {
     "vgg11": (64, _POOL, 128, _POOL, 256, 256, _POOL, 512, 512, _POOL, 512, 512, _POOL),
     "vgg16": (64, 64, _POOL, 128, 128, _POOL, 256, 256, 256, _POOL, 512, 512, 512, _POOL, 512, 512, 512, _POOL),
 }
+_COMPACT_LAYERS = (24, 48, 96, 128, 128)
 VGG_GRID = 7
 """Rows and columns that VGG's features are pooled to before its classifier."""
 
@@ -39,8 +40,7 @@ class Backbone(nn.Module):
     def __init__(self, name: BackboneName, num_outputs: int | None = NUM_IMAGENET_CLASSES, depth: int | None = None) -> None:
         super().__init__()
         self.name = name
-        features = _squeezenet_features() if name == "squeezenet1_1" else _vgg_features(_VGG_LAYERS[name])
-        self.features = features[:depth]
+        self.features = _features(name)[:depth]
         self.num_channels = max(_num_channels(layer) for layer in self.features)  # they never decrease
         self.classifier = None if num_outputs is None else _classifier(name, num_outputs)
 
@@ -49,9 +49,14 @@ class Backbone(nn.Module):
         maps = self.features(images)
         if self.classifier is None:
             return maps
-        if self.name == "squeezenet1_1":
+        if not has_wide_classifier(self.name):
             return self.classifier(maps).flatten(1)
         return self.classifier(nn.functional.adaptive_avg_pool2d(maps, VGG_GRID).flatten(1))
+
+
+def has_wide_classifier(name: BackboneName) -> bool:
+    """Whether the classifier looks at the places of features, as VGG's does, and not at their mean over the picture."""
+    return name in _VGG_LAYERS
 
 
 def normalize_pictures(pictures: Tensor) -> Tensor:
@@ -81,6 +86,24 @@ def _num_channels(layer: nn.Module) -> int:
     return layer.out_channels if isinstance(layer, nn.Conv2d) else 0
 
 
+def _features(name: BackboneName) -> nn.Sequential:
+    if name == "compact":
+        return _compact_features()
+    return _squeezenet_features() if name == "squeezenet1_1" else _vgg_features(_VGG_LAYERS[name])
+
+
+def _compact_features() -> nn.Sequential:
+    """Ours: five convolutions, each halving the picture but the last, normalised by batch so that it learns from nothing fast."""
+    modules: list[nn.Module] = []
+    num_channels = 3
+    for number, width in enumerate(_COMPACT_LAYERS):
+        stride = 1 if number + 1 == len(_COMPACT_LAYERS) else 2
+        convolution = nn.Conv2d(num_channels, width, 3, stride=stride, padding=1, bias=False)
+        modules += [convolution, nn.BatchNorm2d(width), nn.ReLU(True)]
+        num_channels = width
+    return nn.Sequential(*modules)
+
+
 def _squeezenet_features() -> nn.Sequential:
     def pool() -> nn.MaxPool2d:
         return nn.MaxPool2d(3, stride=2, ceil_mode=True)
@@ -104,7 +127,9 @@ def _vgg_features(layers: Sequence[int | str]) -> nn.Sequential:
 
 def _classifier(name: BackboneName, num_outputs: int) -> nn.Sequential:
     if name == "squeezenet1_1":
-        return nn.Sequential(nn.Dropout(0.5), nn.Conv2d(512, num_outputs, 1), nn.ReLU(True), nn.AdaptiveAvgPool2d(1))
+        return nn.Sequential(nn.Dropout(0.5), nn.Conv2d(NUM_CHANNELS, num_outputs, 1), nn.ReLU(True), nn.AdaptiveAvgPool2d(1))
+    if name == "compact":
+        return nn.Sequential(nn.Dropout(0.5), nn.Conv2d(_COMPACT_LAYERS[-1], num_outputs, 1), nn.AdaptiveAvgPool2d(1))
     wide = 4096
     hidden = [nn.Linear(512 * VGG_GRID**2, wide), nn.ReLU(True), nn.Dropout(0.5), nn.Linear(wide, wide), nn.ReLU(True), nn.Dropout(0.5)]
     return nn.Sequential(*hidden, nn.Linear(wide, num_outputs))

@@ -8,7 +8,7 @@ from typing import Any, Literal, TypeVar, get_args
 
 T = TypeVar("T")
 
-BackboneName = Literal["squeezenet1_1", "vgg11", "vgg16"]
+BackboneName = Literal["squeezenet1_1", "vgg11", "vgg16", "compact"]
 BACKBONES: tuple[BackboneName, ...] = get_args(BackboneName)
 
 
@@ -88,6 +88,25 @@ class CnnNnConfig:
 
 
 @dataclass(frozen=True)
+class TripletConfig:
+    """How NetVLAD is tuned to the place by the triplet loss."""
+
+    num_epochs: int = 0
+    """0: not at all."""
+    learning_rate: float = 2e-5
+    margin: float = 0.1
+    num_negatives: int = 5
+    """The most similar images from elsewhere that each image is compared with."""
+    num_tuned: int = 2
+    """Layers of the backbone that are tuned, the last ones, with NetVLAD itself."""
+    near: float = 1.0
+    """Images within this share of D_thresh by Eq. 1 show the same place."""
+    far: float = 3.0
+    """Images further apart than this share of D_thresh do not."""
+    seed: int = 0
+
+
+@dataclass(frozen=True)
 class VladNnConfig:
     """Settings of vlad-nn: NetVLAD of a network's features; nearest neighbours."""
 
@@ -96,20 +115,27 @@ class VladNnConfig:
     """Layers of the backbone's `features` that are used (None: what measured best for each backbone)."""
     num_clusters: int = 64
     """Words of the vocabulary, where none come with the weights."""
-    sharpness: float = 100.0
-    """Two words' share in a feature differ by exp(sharpness) where the feature is nearer to the one by a cosine of 1."""
     num_sampled_features: int = 100
     """Features of each mapping picture that the vocabulary is learnt from."""
     dimension: int = 256
     """Length of a place vector after whitening, at most."""
+    tuning: TripletConfig = field(default_factory=TripletConfig)
     seed: int = 0
+
+
+_NESTED = {"picture": PictureConfig, "training": TrainingConfig, "augmentation": AugmentationConfig, "tuning": TripletConfig}
 
 
 def settings_of(kind: type[T], stored: Mapping[str, Any]) -> T:
     """A configuration from the JSON that a map keeps of it."""
     known = {item.name for item in fields(kind)}  # pyright: ignore[reportArgumentType]
     values = {name: value for name, value in stored.items() if name in known}
-    for name, nested in (("picture", PictureConfig), ("training", TrainingConfig), ("augmentation", AugmentationConfig)):
+    for name, nested in (
+        ("picture", PictureConfig),
+        ("training", TrainingConfig),
+        ("augmentation", AugmentationConfig),
+        ("tuning", TripletConfig),
+    ):
         if isinstance(values.get(name), Mapping):
             values[name] = settings_of(nested, values[name])
     return kind(**values)

@@ -20,7 +20,7 @@ from topoloc.places.weights import Weights, describe, load_features
 NAME = "cnn-nn"
 
 # Deeper layers know more of things and less of places: the fifth and sixth of SqueezeNet's fire modules rank nodes best.
-_DEPTHS: dict[BackboneName, int | None] = {"squeezenet1_1": 11, "vgg11": None, "vgg16": None}
+_DEPTHS: dict[BackboneName, int | None] = {"squeezenet1_1": 11, "vgg11": None, "vgg16": None, "compact": None}
 
 
 class PooledFeatures(nn.Module):

@@ -25,7 +25,8 @@ class TrainingSet:
     """The mapping images of a map.
 
     `jpegs` are their pictures, `world_from_cams` their poses, `node_ids` the node nearest to each by Eq. 1 and
-    `node_distances` (metres) D_total of each image to each node; `d_thresh` (metres) is that of Eq. 1.
+    `node_distances` (metres) D_total of each image to each node; `d_thresh` (metres) and `lambda_rot` (metres a
+    radian) are those of Eq. 1.
     """
 
     jpegs: Sequence[bytes]
@@ -33,10 +34,18 @@ class TrainingSet:
     node_ids: Int[np.ndarray, " n"]
     node_distances: Float[np.ndarray, "n nodes"]
     d_thresh: float
+    lambda_rot: float
 
     @property
     def num_nodes(self) -> int:
         return self.node_distances.shape[1]
+
+    def image_distances(self) -> Float[np.ndarray, "n n"]:
+        """D_total of Eq. 1 (metres) between the images."""
+        centres = np.stack([pose.translation for pose in self.world_from_cams])
+        rotations = np.stack([pose.rotation for pose in self.world_from_cams]).reshape(len(centres), 9)
+        angles = np.arccos(np.clip((rotations @ rotations.T - 1.0) / 2.0, -1.0, 1.0))
+        return np.linalg.norm(centres[:, None] - centres[None], axis=2) + self.lambda_rot * angles
 
 
 @dataclass(frozen=True)

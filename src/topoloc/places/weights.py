@@ -51,12 +51,14 @@ class Weights:
 
 
 def find_weights(backbone: BackboneName, weights: str | None) -> Weights | None:
-    """The weights to begin with: those of the file `weights`; where None, the published ones; None for `scratch`.
+    """The weights to begin with: those of the file `weights`; where None, the published ones, if any; None for `scratch`.
 
     Raises:
         WeightsError: the file cannot be read or is of another network, or the published file cannot be had.
     """
     if weights == SCRATCH:
+        return None
+    if weights is None and backbone not in _PUBLISHED:
         return None
     return read_weights(Path(weights) if weights is not None else _published_file(backbone), backbone)
 
