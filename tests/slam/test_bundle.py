@@ -1,0 +1,82 @@
+"""Bundle adjustment of made-up key frames whose truth is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.slam.bundle import BundleConfig, adjust_bundle
+from topoloc.slam.keyframes import DisparityBias, KeyFrame, Landmarks, Observations, StereoCamera
+
+STEREO = StereoCamera(Camera.pinhole(640, 400, 380.0, 380.0, 319.5, 199.5), 45.0)
+NOISE_PX = 0.2
+
+
+def world(num: int = 5, bias_px: float = 0.0) -> tuple[list[KeyFrame], Landmarks, list[Rigid3], np.ndarray]:
+    """Key frames going sideways and ahead past a cloud of points, all seen by all; their poses and points are wrong at first."""
+    rng = np.random.default_rng(4)
+    points = np.column_stack([rng.uniform(-3, 4, 150), rng.uniform(-1.5, 1.5, 150), rng.uniform(3, 12, 150)])
+    landmarks = Landmarks()
+    ids = landmarks.add(points + rng.normal(0, 0.1, points.shape))
+    bias = DisparityBias(0.0, 1.0) if bias_px else DisparityBias()
+    keyframes, poses = [], []
+    for k in range(num):
+        pose = Rigid3.exp(np.array([-0.3 * k, 0.02 * k, -0.2 * k, 0.01 * k, 0.03 * k, 0.0]))
+        measured = STEREO.project(pose.apply(points)) + rng.normal(0, NOISE_PX, (len(points), 3)) + [0.0, 0.0, bias_px]
+        seen = Observations(ids, measured, np.full((len(points), 3), 1.0 / NOISE_PX), np.ones(len(points), np.bool_))
+        wrong = Rigid3.exp(rng.normal(0, 0.02, 6)) @ pose if k else pose
+        keyframes.append(KeyFrame(0, k, 0, STEREO, wrong, seen, bias))
+        poses.append(pose)
+    return keyframes, landmarks, poses, points
+
+
+def pose_errors(keyframes: list[KeyFrame], poses: list[Rigid3]) -> np.ndarray:
+    return np.array([np.linalg.norm((k.cam_from_world @ pose.inverse()).log()) for k, pose in zip(keyframes, poses, strict=True)])
+
+
+def test_wrong_poses_and_points_are_put_right_and_the_first_stays():
+    keyframes, landmarks, poses, points = world()
+    before = pose_errors(keyframes, poses)
+    adjust_bundle(keyframes, [], landmarks, BundleConfig())
+    after = pose_errors(keyframes, poses)
+    assert after[0] == 0.0
+    assert after.max() < 0.005 < before[1:].min()
+    assert np.median(np.linalg.norm(landmarks.positions[: len(points)] - points, axis=1)) < 0.05
+
+
+def test_held_keyframes_do_not_move():
+    keyframes, landmarks, poses, _ = world()
+    keyframes[0].cam_from_world, keyframes[1].cam_from_world = poses[0], poses[1]
+    held = [keyframe.cam_from_world for keyframe in keyframes[:2]]
+    adjust_bundle(keyframes[2:], keyframes[:2], landmarks, BundleConfig())
+    assert [keyframe.cam_from_world for keyframe in keyframes[:2]] == held
+    assert pose_errors(keyframes, poses).max() < 0.005
+
+
+@pytest.mark.parametrize("bias_px", [-1.5, 0.8])
+def test_a_bias_of_all_disparities_is_found_with_the_motion(bias_px: float):
+    keyframes, landmarks, poses, _ = world(8, bias_px)
+    adjust_bundle(keyframes, [], landmarks, BundleConfig(max_steps=20))
+    assert keyframes[0].bias.value_px == pytest.approx(bias_px, abs=0.25)
+    assert pose_errors(keyframes, poses).max() < 0.1
+
+
+def test_wrong_observations_are_outvoted_and_marked():
+    keyframes, landmarks, poses, _ = world()
+    seen = keyframes[3].observations
+    seen.measured[:20, 0] += 30.0
+    adjust_bundle(keyframes, [], landmarks, BundleConfig(max_steps=15))
+    assert not seen.active[:20].any()
+    assert seen.active[20:].mean() > 0.95
+    assert pose_errors(keyframes, poses).max() < 0.01
+
+
+def test_unknown_disparities_do_no_harm():
+    keyframes, landmarks, poses, _ = world()
+    for keyframe in keyframes[1:]:
+        keyframe.observations.measured[::2, 2] = np.nan
+        keyframe.observations.weights[::2, 2] = 0.0
+    adjust_bundle(keyframes, [], landmarks, BundleConfig())
+    assert pose_errors(keyframes, poses).max() < 0.01

@@ -1,0 +1,71 @@
+"""Pose graphs whose loops close, and one that a wrong loop tries to bend."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.slam.pose_graph import Edge, PoseGraphConfig, optimise_graph, residuals_in_sigma
+from topoloc.slam.pose_graph_kernels import solve_graph
+
+NUM = 40
+COVARIANCE = np.diag([1e-4] * 3 + [1e-5] * 3)
+
+
+def ring() -> tuple[list[Rigid3], list[Rigid3], list[Edge]]:
+    """The true cam_from_world of a round walk, the drifted one, and its motion edges."""
+    step = Rigid3(exp_so3(np.array([0.0, 2 * np.pi / NUM, 0.0])), np.array([0.0, 0.0, -0.5]))
+    drift = Rigid3.exp(np.array([0.004, 0.0, 0.006, 0.0, 0.004, 0.0]))
+    true, drifted, edges = [Rigid3.identity()], [Rigid3.identity()], []
+    for k in range(1, NUM):
+        true.append(step @ true[-1])
+        drifted.append(drift @ step @ drifted[-1])
+        edges.append(Edge(k - 1, k, drift @ step, COVARIANCE, is_loop=False))
+    return true, drifted, edges
+
+
+def loop(true: list[Rigid3], first: int, second: int) -> Edge:
+    return Edge(first, second, true[second] @ true[first].inverse(), COVARIANCE, is_loop=True)
+
+
+def errors(poses: list[Rigid3], true: list[Rigid3]) -> np.ndarray:
+    return np.array([np.linalg.norm(p.inverse().translation - t.inverse().translation) for p, t in zip(poses, true, strict=True)])
+
+
+def test_a_loop_takes_most_of_the_drift_away():
+    true, drifted, edges = ring()
+    loops = [loop(true, 0, NUM - 1), loop(true, 2, NUM - 3)]
+    poses = optimise_graph(drifted, edges + loops, PoseGraphConfig())
+    np.testing.assert_allclose(poses[0].matrix(), np.eye(4), atol=1e-9)
+    assert errors(poses, true).max() < 0.35 * errors(drifted, true).max()
+    assert residuals_in_sigma(poses, loops).max() < 3.0
+
+
+def test_a_wrong_loop_is_outvoted_and_stands_out():
+    true, drifted, edges = ring()
+    right = [loop(true, i, NUM - 1 - i) for i in range(4)]
+    wrong = Edge(5, 25, Rigid3(np.eye(3), np.array([0.3, 0.0, 0.2])), COVARIANCE, is_loop=True)
+    with_wrong = optimise_graph(drifted, [*edges, *right, wrong], PoseGraphConfig())
+    without = optimise_graph(drifted, edges + right, PoseGraphConfig())
+    assert errors(with_wrong, without).max() < 0.1
+    lengths = residuals_in_sigma(with_wrong, [*right, wrong])
+    assert lengths[-1] > PoseGraphConfig().max_residual > lengths[:-1].max()
+
+
+def test_the_solver_agrees_with_a_dense_one():
+    rng = np.random.default_rng(0)
+    num = 12
+    firsts = np.array([*range(num - 1), 0, 3, 9])
+    seconds = np.array([*range(1, num), 11, 8, 2])
+    dense, blocks = np.zeros((6 * num, 6 * num)), []
+    for i, j in zip(firsts, seconds, strict=True):
+        a, b = rng.normal(size=(2, 6, 6))
+        jacobian = np.zeros((6, 6 * num))
+        jacobian[:, 6 * i : 6 * i + 6], jacobian[:, 6 * j : 6 * j + 6] = a, b
+        dense += jacobian.T @ jacobian
+        blocks.append(a.T @ b)
+    dense += 0.1 * np.eye(6 * num)
+    diagonal = np.array([dense[6 * n : 6 * n + 6, 6 * n : 6 * n + 6] for n in range(num)])
+    right = rng.normal(size=(num, 6))
+    x = solve_graph(diagonal, firsts, seconds, np.array(blocks), right, 500, 1e-10)
+    np.testing.assert_allclose(x.ravel(), np.linalg.solve(dense, right.ravel()), rtol=1e-5, atol=1e-7)
