@@ -22,7 +22,7 @@ class InputCheckConfig:
     """A stereo rig this wide (metres) is taken for one whose baseline is in millimetres."""
     min_start_points: int = 40
     """Points with disparity that tracking can begin with."""
-    max_vertical_px: float = 1.5
+    max_vertical_px: float = 0.9
     """Vertical distance of left and right (median over a key frame's points, then over key frames): beyond it they are no pair."""
     min_keyframes: int = 3
     """Key frames seen before such a verdict."""

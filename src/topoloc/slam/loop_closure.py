@@ -98,7 +98,7 @@ def _within_drift(link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig)
     between = [k.cam_from_world.inverse().translation for k in keyframes[link.source : link.target + 1] if k.submap == source.submap]
     way = float(np.linalg.norm(np.diff(between, axis=0), axis=1).sum())
     drift = _difference(link.match.target_from_source, target.cam_from_world @ source.cam_from_world.inverse())
-    return drift[0] < 0.5 + config.max_drift * way and drift[1] < np.deg2rad(config.max_drift_deg)
+    return bool(drift[0] < 0.5 + config.max_drift * way and drift[1] < np.deg2rad(config.max_drift_deg))
 
 
 def _supports(other: Link, link: Link, keyframes: Sequence[KeyFrame], rank: dict[int, int], config: LoopConfig) -> bool:
@@ -115,7 +115,7 @@ def _supports(other: Link, link: Link, keyframes: Sequence[KeyFrame], rank: dict
     expected = targets.inverse() @ other.match.target_from_source @ sources
     way = float(np.linalg.norm(sources.translation) + np.linalg.norm(targets.translation) + np.linalg.norm(expected.translation))
     metres, radians = _difference(link.match.target_from_source, expected)
-    return metres < config.max_disagreement * (1.0 + way) and radians < np.deg2rad(config.max_disagreement_deg)
+    return bool(metres < config.max_disagreement * (1.0 + way) and radians < np.deg2rad(config.max_disagreement_deg))
 
 
 def _difference(a: Rigid3, b: Rigid3) -> tuple[float, float]:
