@@ -33,3 +33,25 @@ def test_a_node_of_many_images_does_not_hide_the_others():
     node_ids = np.concatenate([np.zeros(500, np.int64), np.arange(1, 9)])
     ranking = PlaceIndex(vectors, node_ids).rank_nodes(unit(np.ones(8)), 5)
     assert [score.node_id for score in ranking] == [0, 1, 2, 3, 4]
+
+
+def test_many_vectors_are_searched_by_cells_and_nearly_always_as_exactly():
+    rng = np.random.default_rng(3)
+    steps = rng.standard_normal((120, 24)).repeat(25, axis=0)
+    vectors = unit(steps + 0.4 * rng.standard_normal((3000, 24)))
+    node_ids = np.arange(3000) // 3
+    exact, by_cells = PlaceIndex(vectors, node_ids), PlaceIndex(vectors, node_ids, max_exact=100)
+    queries = unit(vectors[::20] + 0.05 * rng.standard_normal((150, 24)))
+    pairs = [(exact.rank_nodes(query, 5), by_cells.rank_nodes(query, 5)) for query in queries]
+    assert np.mean([a[0].node_id == b[0].node_id for a, b in pairs]) >= 0.98
+    for a, b in pairs:
+        assert len({score.node_id for score in b}) == len(b) == 5
+        assert [score.score for score in b] == sorted((score.score for score in b), reverse=True)
+        assert b[0].score <= a[0].score + 2e-3  # the cells keep half floats
+
+
+def test_cells_look_further_where_one_node_has_most_images():
+    vectors = unit(np.vstack([np.ones((900, 8)) + 0.01 * np.random.default_rng(4).standard_normal((900, 8)), np.eye(8)]))
+    node_ids = np.concatenate([np.zeros(900, np.int64), np.arange(1, 9)])
+    ranking = PlaceIndex(vectors, node_ids, max_exact=100).rank_nodes(unit(np.ones(8)), 3)
+    assert len({score.node_id for score in ranking}) == 3

@@ -115,7 +115,9 @@ def _print(evaluation: dict[str, Any]) -> None:
     if e["num_queries"]:
         facts.append(("recall", ", ".join(f"{name.replace('_', ' ')} {100 * share:.1f} %" for name, share in e["recall"].items())))
     if e["topological_accuracy"] is not None:
-        facts.append(("nearest node named first", f"{100 * e['topological_accuracy']:.1f} %"))
+        facts.append(
+            ("nearest node named first", f"{100 * e['topological_accuracy']:.1f} %, or a neighbour {100 * e['neighbour_accuracy']:.1f} %")
+        )
     elsewhere = f"of {e['num_elsewhere']} images from elsewhere, and " if e["num_elsewhere"] else ""
     facts.append(
         ("false accepts", f"{e['false_accepts']} ({elsewhere}of poses off by more than {MAX_TRANSLATION} m or {MAX_ROTATION_DEG:g} deg)")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from jaxtyping import Float
 
 from topoloc.errors import CalibrationError, TrajectoryError
 from topoloc.evaluation.metrics import Answer
@@ -12,7 +13,11 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.sequences.frame import Image, StereoFrame, StereoSequence
+
+# A node this many times D_thresh away, or nearer, sees the query's view as the nearest one does.
+NEIGHBOUR_SHARE = 1.5
 
 
 def answer_queries(
@@ -43,9 +48,10 @@ def answer_queries(
         frame = sequence[i]
         assert frame.world_from_cam is not None
         world_from_cam = (map_from_truth or Rigid3.identity()) @ frame.world_from_cam
-        nearest = int(np.argmin(node_distances(world_from_cam, nodes, lambda_rot)))
+        distances = node_distances(world_from_cam, nodes, lambda_rot)
+        nearest, near = int(np.argmin(distances)), neighbours_of(localizer.topomap, distances)
         result = _localize(localizer, frame)
-        answers.append(Answer(frame.name, result, world_from_cam, nearest, label, _image_reader(sequence, i), frame.camera))
+        answers.append(Answer(frame.name, result, world_from_cam, nearest, label, _image_reader(sequence, i), frame.camera, near))
         if progress:
             progress(label, done + 1, len(frames))
     return answers
@@ -71,6 +77,15 @@ def answer_elsewhere(
         if progress:
             progress(f"{label} (elsewhere)", i + 1, len(sequence))
     return answers
+
+
+def neighbours_of(topomap: TopoMetricMap, distances: Float[np.ndarray, " nodes"]) -> frozenset[int]:
+    """The nodes next to the nearest one along the route, and those within 1.5 D_thresh, given D_total to each node (metres, Eq. 1)."""
+    nearest = int(np.argmin(distances))
+    along = {edge.target_id for edge in topomap.edges if edge.source_id == nearest}
+    along |= {edge.source_id for edge in topomap.edges if edge.target_id == nearest}
+    d_thresh = float(topomap.config["nodes"]["d_thresh"])
+    return frozenset(along | {int(node) for node in np.flatnonzero(distances <= NEIGHBOUR_SHARE * d_thresh)})
 
 
 def _localize(localizer: Localizer, frame: StereoFrame) -> Localization | NotLocalized:

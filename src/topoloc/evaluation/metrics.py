@@ -25,6 +25,7 @@ class Answer:
     """A query with its result and its truth, which is None for an image from elsewhere: any pose given for that is false.
 
     `read_image` reads the picture once more, for who wants to look at it: answers hold no pictures. `camera` is what it was taken with.
+    `neighbour_ids` are the nodes that are as good as the nearest one: see `neighbours_of`.
     """
 
     query: str
@@ -34,6 +35,7 @@ class Answer:
     recording: str = ""
     read_image: Callable[[], Image] | None = None
     camera: Camera | None = None
+    neighbour_ids: frozenset[int] = frozenset()
 
     @property
     def translation_m(self) -> float:
@@ -79,7 +81,9 @@ def _summary(answers: list[Answer]) -> dict[str, Any]:
     rotation = np.array([a.rotation_deg for a in with_truth])
     localized = np.isfinite(translation)
     ranked = [a for a in with_truth if a.nearest_node_id is not None]
-    hits = [bool(a.result.candidates) and a.result.candidates[0].node_id == a.nearest_node_id for a in ranked]
+    first = [a.result.candidates[0].node_id if a.result.candidates else None for a in ranked]
+    hits = [node == a.nearest_node_id for node, a in zip(first, ranked, strict=True)]
+    near = [node == a.nearest_node_id or node in a.neighbour_ids for node, a in zip(first, ranked, strict=True)]
     stages = sorted({stage for a in answers for stage in a.result.times_ms})
     return {
         "num_queries": len(with_truth),
@@ -91,6 +95,7 @@ def _summary(answers: list[Answer]) -> dict[str, Any]:
             for metres, degrees in RECALL_THRESHOLDS
         },
         "topological_accuracy": float(np.mean(hits)) if hits else None,
+        "neighbour_accuracy": float(np.mean(near)) if near else None,
         "num_elsewhere": len(answers) - len(with_truth),
         "false_accepts": sum(a.is_false_accept for a in answers),
         "not_localized": _reasons(answers),

@@ -39,9 +39,9 @@ class Backbone(nn.Module):
 
     def __init__(self, name: BackboneName, num_outputs: int | None = NUM_IMAGENET_CLASSES, depth: int | None = None) -> None:
         super().__init__()
-        self.name = name
+        self.name: BackboneName = name
         self.features = _features(name)[:depth]
-        self.num_channels = max(_num_channels(layer) for layer in self.features)  # they never decrease
+        self.num_channels = max(_num_channels(layer) for layer in self.features.children())  # they never decrease
         self.classifier = None if num_outputs is None else _classifier(name, num_outputs)
 
     def forward(self, images: Tensor) -> Tensor:

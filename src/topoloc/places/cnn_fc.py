@@ -21,7 +21,7 @@ from topoloc.places.augmentation import augment
 from topoloc.places.backbones import Backbone, has_wide_classifier, normalize_pictures
 from topoloc.places.classifier_config import BackboneName, CnnFcConfig, PictureConfig, settings_of
 from topoloc.places.coarse import CoarseModel, Image, NodeScore
-from topoloc.places.inference import BATCH_SIZE, Predictor, from_arrays, rounded_to_half, to_arrays
+from topoloc.places.inference import BATCH_SIZE, Predictor, from_arrays, in_channels_last, rounded_to_half, to_arrays
 from topoloc.places.training import Task, fit, hold_out
 from topoloc.places.training_set import PictureShape, Progress, TrainingSet, decode_pictures, network_pictures
 from topoloc.places.weights import Weights, describe
@@ -61,7 +61,8 @@ def train(
     if training_set.num_nodes < 1:
         raise TrainingError(f"{NAME}: the map has no nodes")
     torch.manual_seed(config.training.seed)
-    network = NodeClassifier(backbone, training_set.num_nodes).to(memory_format=torch.channels_last)
+    network = NodeClassifier(backbone, training_set.num_nodes)
+    in_channels_last(network)
     pretrained = [] if weights is None else _load(network, weights)
     images, shape = decode_pictures(training_set)
     pictures = torch.from_numpy(network_pictures(images, shape, config.picture))

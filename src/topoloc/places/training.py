@@ -23,7 +23,7 @@ from torch import Generator, Tensor, nn
 
 from topoloc.errors import TrainingError
 from topoloc.places.classifier_config import TrainingConfig
-from topoloc.places.inference import has_bfloat16
+from topoloc.places.inference import has_bfloat16, threads
 from topoloc.places.training_set import Progress
 
 BatchLoss = Callable[[Tensor, Generator], Tensor]
@@ -200,13 +200,11 @@ def _train_epoch(task: Task, config: TrainingConfig, state: _State, progress: Pr
 @contextmanager
 def _deterministic(config: TrainingConfig) -> Iterator[None]:
     """The same sums in the same order on every run; what the caller had set is put back."""
-    threads, deterministic = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
-    rng_state = torch.get_rng_state()
+    deterministic, rng_state = torch.are_deterministic_algorithms_enabled(), torch.get_rng_state()
     try:
-        torch.set_num_threads(config.num_threads or threads)
         torch.use_deterministic_algorithms(True)
-        yield
+        with threads(config.num_threads or torch.get_num_threads()):
+            yield
     finally:
-        torch.set_num_threads(threads)
         torch.use_deterministic_algorithms(deterministic)
         torch.set_rng_state(rng_state)

@@ -16,8 +16,8 @@ from topoloc.places.coarse import Image
 
 Progress = Callable[[str, int, int], None]
 """Called with a stage's name, steps done and steps in all."""
-RgbPicture = UInt8[np.ndarray, "h w 3"]
-RgbPictures = UInt8[np.ndarray, "n h w 3"]
+RgbPicture = UInt8[np.ndarray, "_ _ 3"]
+RgbPictures = UInt8[np.ndarray, "_ _ _ 3"]
 
 
 @dataclass(frozen=True, eq=False)

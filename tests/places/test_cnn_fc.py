@@ -1,0 +1,149 @@
+"""cnn-fc: it learns, the same every time; what interrupts or spoils a training is dealt with."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from test_vector_search import NO_FEATURES, silent
+
+from built_room import unseen_views
+from topoloc.errors import MapError, TrainingError
+from topoloc.places import cnn_fc, training
+from topoloc.places.classifier_config import AugmentationConfig, CnnFcConfig, PictureConfig, TrainingConfig
+from topoloc.places.cnn_fc import CnnFc, calibrated_temperature, soft_labels
+from topoloc.places.coarse import CoarseModel, open_coarse
+from topoloc.places.training_set import TrainingSet, decode_picture
+from topoloc.places.weights import read_weights
+
+TINY = PictureConfig(64, 48)
+
+
+def config(num_epochs: int, **settings: float) -> CnnFcConfig:
+    how = TrainingConfig(max_epochs=num_epochs, patience=num_epochs, batch_size=7, held_out=0.0, num_threads=1)
+    return CnnFcConfig(TINY, replace(how, **settings), AugmentationConfig(occlusion=0.0), label_spread=0.0)
+
+
+def train(room_set: TrainingSet, how: CnnFcConfig, checkpoint: Path | None = None) -> CoarseModel:
+    return cnn_fc.train(room_set, "compact", None, how, silent, checkpoint)
+
+
+def test_from_nothing_it_learns_the_room(room_set: TrainingSet):
+    model = train(room_set, config(60, learning_rate=3e-3))
+    localizer = open_coarse(model)
+    assert isinstance(localizer, CnnFc)
+    pictures = [decode_picture(jpeg) for jpeg in room_set.jpegs]
+    answers = [ranking[0].node_id for ranking in localizer.rank_batch(pictures, 1)]
+    assert np.mean(np.array(answers) == room_set.node_ids) > 0.9
+    probabilities = localizer.probabilities([unseen_views()[0][0]])
+    assert probabilities.sum() == pytest.approx(1.0, abs=1e-5)
+    ranking = localizer.rank(unseen_views()[0][0], NO_FEATURES, 3)
+    assert [score.score for score in ranking] == sorted((float(p) for p in probabilities[0]), reverse=True)[:3]
+
+
+def same(first: CoarseModel, second: CoarseModel) -> bool:
+    return all(np.array_equal(first.arrays[key], second.arrays[key]) for key in first.arrays)
+
+
+def test_an_interrupted_training_goes_on_to_the_same_bytes(room_set: TrainingSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    whole = train(room_set, config(4))
+    assert same(whole, train(room_set, config(4)))
+    assert not same(whole, train(room_set, config(4, seed=1)))
+    epochs = 0
+
+    def interrupted(*args: object) -> str:
+        nonlocal epochs
+        epochs += 1
+        if epochs == 3:
+            raise KeyboardInterrupt
+        return train_epoch(*args)  # pyright: ignore[reportArgumentType]
+
+    train_epoch = training._train_epoch
+    monkeypatch.setattr(training, "_train_epoch", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        train(room_set, config(4), tmp_path / "training.ckpt")
+    monkeypatch.undo()
+    resumed = train(room_set, config(4), tmp_path / "training.ckpt")
+    assert same(whole, resumed)
+    assert resumed.settings["trained"] == whole.settings["trained"]
+
+
+def test_a_checkpoint_of_another_training_or_a_broken_one_is_refused(room_set: TrainingSet, tmp_path: Path):
+    path = tmp_path / "training.ckpt"
+    train(room_set, config(1), path)
+    with pytest.raises(TrainingError, match="is of another training"):
+        train(room_set, config(2), path)
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(TrainingError, match="truncated, damaged or no checkpoint"):
+        train(room_set, config(1), path)
+
+
+def test_a_loss_that_is_not_finite_ends_with_the_last_good_state(room_set: TrainingSet, monkeypatch: pytest.MonkeyPatch):
+    augment = cnn_fc.augment
+    calls = 0
+
+    def spoilt(pictures: torch.Tensor, *args: object) -> torch.Tensor:
+        nonlocal calls
+        calls += 1
+        return augment(pictures, *args) * (torch.nan if calls > after else 1.0)  # pyright: ignore[reportArgumentType]
+
+    monkeypatch.setattr(cnn_fc, "augment", spoilt)
+    after = 4  # two batches an epoch
+    model = train(room_set, config(6))
+    assert model.settings["trained"]["stopped_by"] == "the loss was not finite in epoch 3"
+    assert all(np.isfinite(value).all() for value in model.arrays.values())
+    after, calls = 0, 0
+    with pytest.raises(TrainingError, match="not finite in epoch 1"):
+        train(room_set, config(6))
+
+
+def test_one_node_and_nodes_with_one_image(two_images: TrainingSet, room_set: TrainingSet):
+    localizer = open_coarse(train(two_images, config(1)))
+    assert [(s.node_id, s.score) for s in localizer.rank(unseen_views()[0][0], NO_FEATURES, 5)] == [(0, 1.0)]
+    rows = [int(np.flatnonzero(room_set.node_ids == node)[0]) for node in np.unique(room_set.node_ids)]
+    lonely = replace(
+        room_set,
+        jpegs=[room_set.jpegs[row] for row in rows],
+        world_from_cams=[room_set.world_from_cams[row] for row in rows],
+        node_ids=room_set.node_ids[rows],
+        node_distances=room_set.node_distances[rows],
+    )
+    model = train(lonely, config(1, held_out=0.5))
+    assert model.settings["trained"]["num_held_out"] == 0
+    assert model.settings["temperature"] == 1.0
+
+
+def test_weights_from_elsewhere_are_where_it_begins(two_images: TrainingSet, random_file: Path):
+    weights = read_weights(random_file, "squeezenet1_1")
+    still = config(1, learning_rate=0.0)
+    model = cnn_fc.train(two_images, "squeezenet1_1", weights, still, silent)
+    kept = torch.from_numpy(model.arrays["network.backbone.features.0.weight"])
+    assert torch.equal(kept, weights.tensors["features.0.weight"].half())
+    assert model.settings["weights"]["sha256"] == weights.sha256
+
+
+def test_a_model_that_lacks_a_part_is_damaged(two_images: TrainingSet):
+    model = train(two_images, config(1))
+    with pytest.raises(MapError, match=r"'cnn-fc' is damaged"):
+        open_coarse(replace(model, settings={**model.settings, "num_nodes": 5}))
+
+
+def test_labels_are_single_or_spread_over_nodes_about_as_near(room_set: TrainingSet):
+    hard = soft_labels(room_set, 0.0)
+    assert np.array_equal(hard.argmax(axis=1), room_set.node_ids)
+    assert set(np.unique(hard)) == {0.0, 1.0}
+    soft = soft_labels(room_set, 1.0)
+    np.testing.assert_allclose(soft.sum(axis=1), 1.0, atol=1e-6)
+    assert np.array_equal(np.argsort(-soft, axis=1)[:, 0], room_set.node_distances.argmin(axis=1))
+
+
+def test_the_temperature_undoes_too_much_confidence():
+    rng = np.random.default_rng(0)
+    outputs = 2.0 * rng.standard_normal((4000, 6))
+    powers = np.exp(outputs)
+    labels = np.array([rng.choice(6, p=row / row.sum()) for row in powers])
+    temperature = calibrated_temperature(torch.from_numpy(5.0 * outputs), torch.from_numpy(labels))
+    assert temperature == pytest.approx(5.0, rel=0.1)
