@@ -20,6 +20,7 @@ from topoloc.slam.keyframes import StereoCamera
 from topoloc.slam.metric_points import smooth_depth
 
 _BASELINE_OF_DEPTH = 0.08
+_MIN_SIGMA_OF_DEPTH_PX = 0.03
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class DisparityConfig:
     search_px: int = 4
     """A disparity that is known already is sought again this far on either side."""
     min_sigma_px: float = 0.15
-    """What calibration and interpolation leave even of a perfect correlation."""
+    """Stereo: what calibration and interpolation leave even of a perfect correlation."""
     max_sigma_px: float = 1.0
     max_share_of_width: float = 0.2
     """Largest disparity, as a share of the picture's width."""
@@ -108,4 +109,4 @@ def _from_depth(
     assert measured.view.depth is not None
     depth = smooth_depth(measured.view.depth, points_img, config.max_depth_step)
     sigmas = measured.stereo.bf / depth**2 * depth_sigmas(depth, DepthNoise())
-    return measured.stereo.bf / depth, np.hypot(sigmas, config.min_sigma_px)
+    return measured.stereo.bf / depth, np.maximum(sigmas, _MIN_SIGMA_OF_DEPTH_PX)
