@@ -98,7 +98,8 @@ class Command:
 
         def count(stage: str, num_done: int, num: int) -> None:
             nonlocal done, total
-            done, total = num_done, num
+            if stage == "frames":
+                done, total = num_done, num
             draw(stage, num_done, num)
 
         try:

@@ -14,8 +14,8 @@ from jaxtyping import Float32
 from topoloc.simulation.scene import Color, Material, Mesh, Picture, Scene, Sky
 from topoloc.simulation.shapes import join
 
-KIND, TINT = "face_kind", "face_tint"
-"""Attributes of every mesh, for `first_hits`: the kind of its material, and a metal's mean colour."""
+KIND, TINT, ROUGHNESS = "face_kind", "face_tint", "face_roughness"
+"""Attributes of every mesh, for `first_hits`: the kind of its material, a metal's mean colour, how rough it is."""
 MATT, POLISHED, METAL, GLASS, LIGHT = range(5)
 _KINDS = {"matt": MATT, "polished": POLISHED, "metal": METAL, "glass": GLASS, "light": LIGHT}
 _LAMP_PIECE = 4.0
@@ -30,13 +30,18 @@ def load_scene(scene: Scene, lamps: list[tuple[Material, Mesh]]) -> Any:
     """
     import mitsuba as mi
 
-    parts: dict[str, Any] = {"type": "scene"}
+    parts: dict[str, Any] = {"type": "scene", **lamp_meshes(lamps)}
     dark = [entry for entry in meshes_by_material(scene) if not _shines(entry[0])]
-    for index, (material, mesh) in enumerate([*lamps, *dark]):
+    for index, (material, mesh) in enumerate(dark, start=len(lamps)):
         parts[lamp_name(index)] = _mitsuba_mesh(lamp_name(index), mesh, material)
     if scene.sky is not None:
-        parts |= _sky(scene.sky)
+        parts |= sky_and_sun(scene.sky)
     return mi.load_dict(parts)
+
+
+def lamp_meshes(lamps: list[tuple[Material, Mesh]]) -> dict[str, Any]:
+    """Lamps by the names that `lamp_name` gives them."""
+    return {lamp_name(index): _mitsuba_mesh(lamp_name(index), mesh, material) for index, (material, mesh) in enumerate(lamps)}
 
 
 def meshes_by_material(scene: Scene) -> list[tuple[Material, Mesh]]:
@@ -92,6 +97,8 @@ def _mitsuba_mesh(name: str, mesh: Mesh, material: Material) -> Any:
     tint = linear_from_srgb(material.color).reshape(-1, 3).mean(axis=0)
     result.add_attribute(KIND, 1, np.full(len(mesh.faces), _KINDS[material.kind], np.float32))
     result.add_attribute(TINT, 3, np.tile(tint, len(mesh.faces)))
+    roughness = 0.0 if material.kind == "glass" else material.roughness
+    result.add_attribute(ROUGHNESS, 1, np.full(len(mesh.faces), roughness, np.float32))
     return result
 
 
@@ -128,7 +135,8 @@ def _shines(material: Material) -> bool:
     return material.kind == "light" and material.radiance > 0.0
 
 
-def _sky(sky: Sky) -> dict[str, Any]:
+def sky_and_sun(sky: Sky) -> dict[str, Any]:
+    """The lights of the sky, named "sky" and "sun"."""
     import mitsuba as mi
 
     # Mitsuba's own picture of the sky has y up and starts elsewhere; this turns it so that column 0 looks along +x.

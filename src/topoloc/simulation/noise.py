@@ -44,7 +44,9 @@ def _enlarged(noise: Float32[np.ndarray, "h w"], size: tuple[int, int]) -> Float
     return cv2.remap(np.pad(noise, 3, mode="wrap"), columns, rows, cv2.INTER_CUBIC).astype(np.float32, copy=False)
 
 
-def fractal_noise(rng: np.random.Generator, size: tuple[int, int], coarsest_px: float | int, octaves: int = 5) -> Float32[np.ndarray, "h w"]:
+def fractal_noise(
+    rng: np.random.Generator, size: tuple[int, int], coarsest_px: float | int, octaves: int = 5
+) -> Float32[np.ndarray, "h w"]:
     """Noise of several grain sizes, each half as large and half as strong as the one before; mean 0, variance 1."""
     total = np.zeros(size, np.float32)
     for octave in range(octaves):

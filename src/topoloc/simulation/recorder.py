@@ -98,7 +98,8 @@ def record(
     being rendered.
 
     Args:
-        progress: called with ("frames", done, total), last of all if this fails.
+        progress: called with ("light", done, total) while the light of the world is traced, if it has to be, then with
+            ("frames", done, total), last of all if this fails.
         processes: each renders frames of its own; None chooses. They have no influence on the pictures.
         overwrite: remove a recording of other settings that lies there.
 
@@ -115,7 +116,7 @@ def record(
     progress("frames", done, route.num_frames)
     job = _Job(world, condition, config, layout, variant)
     num = min(len(missing), processes or _num_processes(len(missing)))
-    in_turn = _render_here(job, missing) if num <= 1 else _render_in_processes(job, missing, num)
+    in_turn = _render_here(job, missing, progress) if num <= 1 else _render_in_processes(job, missing, num, progress)
     try:
         with closing(in_turn):
             for _ in in_turn:
@@ -143,16 +144,17 @@ def _num_processes(num_frames: int) -> int:
     return min(2, os.cpu_count() or 1) if num_frames > _FEW_FRAMES else 1
 
 
-def _render_here(job: _Job, frames: list[int]) -> Generator[int, None, None]:
+def _render_here(job: _Job, frames: list[int], progress: Progress) -> Generator[int, None, None]:
     if not frames:
         return
-    shooting = _shooting(job)
+    shooting = _shooting(job, progress)
     for index in frames:
         write_shot(job.layout, index, shoot(shooting, index))
         yield index
 
 
-def _render_in_processes(job: _Job, frames: list[int], num: int) -> Generator[int, None, None]:
+def _render_in_processes(job: _Job, frames: list[int], num: int, progress: Progress) -> Generator[int, None, None]:
+    _shooting(job, progress)  # traces the light, which the processes then find in the cache
     # Not forked: a child of a process in which Mitsuba's threads run would wait for them for ever.
     with ProcessPoolExecutor(num, get_context("spawn"), initializer=_start, initargs=(job,)) as pool:
         try:
@@ -198,12 +200,12 @@ def _children_ignore_interrupts() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _shooting(job: _Job) -> Shooting:
+def _shooting(job: _Job, progress: Progress = lambda stage, done, total: None) -> Shooting:
     config = job.config
     use_best_variant(job.variant)
     scene = job.world.build(config.seed, job.condition, config.arrangement)
     return Shooting(
-        renderer=Renderer(scene, config.render),
+        renderer=Renderer(scene, config.render, job.world.viewpoints(), progress),
         condition=job.condition,
         route=plan_route(job.world.loop, job.world.camera_height, config.route),
         camera=config.camera,

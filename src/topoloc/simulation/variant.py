@@ -124,9 +124,14 @@ def _key(library: str) -> str | None:
         return None
 
 
-def _cache_file() -> Path:
+def cache_folder() -> Path:
+    """Where things are kept that can be made again. Raises RuntimeError where the user has no home."""
     folder = os.environ.get("XDG_CACHE_HOME")
-    return Path(folder or Path.home() / ".cache") / "topoloc" / "llvm.json"
+    return Path(folder or Path.home() / ".cache") / "topoloc"
+
+
+def _cache_file() -> Path:
+    return cache_folder() / "llvm.json"
 
 
 def _read_cache() -> dict[str, bool]:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import importlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
+
+import numpy as np
+from jaxtyping import Float64
 
 from topoloc.errors import TopolocError
 from topoloc.simulation.conditions import Condition
-from topoloc.simulation.routes import Motion, RouteConfig
+from topoloc.simulation.routes import Motion, RouteConfig, frame_poses, plan_route
 from topoloc.simulation.scene import Scene
 
 
@@ -24,6 +27,8 @@ class World:
         corner_radius: metres, of the bends.
         baseline: metres between left and right camera.
         depth_factor: units a metre of depth pictures of 16 bits.
+        view_spacing: metres between the places along the line from which the light of the world is traced.
+        view_offsets: metres to the left of the line, of the same.
     """
 
     name: str
@@ -36,6 +41,8 @@ class World:
     corner_radius: float = 0.4
     baseline: float = 0.12
     depth_factor: float = 5000.0
+    view_spacing: float = 0.4
+    view_offsets: tuple[float, ...] = (-0.3, 0.3)
 
     def build(self, seed: int, condition: Condition, arrangement: int = 0) -> Scene:
         """All that can be seen. Another seed is another place of the kind; `arrangement` is where people left what they move."""
@@ -54,6 +61,12 @@ class World:
     def route(self) -> RouteConfig:
         """One natural lap."""
         return RouteConfig(spacing=self.spacing, speed=self.speed, motion=self.motion, corner_radius=self.corner_radius)
+
+    def viewpoints(self) -> Float64[np.ndarray, "n 3"]:
+        """Places all over where cameras usually are, for `Renderer`."""
+        still = replace(self.route(), spacing=self.view_spacing, wobble=0.0)
+        routes = [plan_route(self.loop, self.camera_height, replace(still, lateral=offset)) for offset in self.view_offsets]
+        return np.array([pose.translation for route in routes for pose in frame_poses(route)])
 
     def _module(self) -> ModuleType:
         return importlib.import_module(self.module)
@@ -75,6 +88,8 @@ WORLDS = {
             spacing=0.2,
             corner_radius=0.7,
             depth_factor=2000.0,
+            view_spacing=0.7,
+            view_offsets=(-0.4, 0.4),
         ),
         World(
             "street",
@@ -87,6 +102,8 @@ WORLDS = {
             corner_radius=6.0,
             baseline=0.54,
             depth_factor=200.0,
+            view_spacing=8.0,
+            view_offsets=(0.0, 3.5),
         ),
     )
 }
