@@ -27,7 +27,7 @@ class Barred:
     def find_spec(self, name, path=None, target=None):
         if name.split(".")[0] in FOREIGN:
             self.asked.add(name.split(".")[0])
-            raise ModuleNotFoundError(name)
+            raise ModuleNotFoundError(name, name=name)
 
 sys.meta_path.insert(0, Barred())
 import topoloc

@@ -12,6 +12,9 @@ from topoloc.cli.info import describe_map
 from topoloc.cli.output import UsageError, check_outputs, progress_bar, write_json
 from topoloc.errors import RecordingError
 from topoloc.mapping.build import BuildConfig, Progress, build_map
+from topoloc.mapping.coarse_training import train_coarse
+from topoloc.places.classifier_config import BackboneName
+from topoloc.places.coarse import CoarseName
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import open_sequence
 from topoloc.sequences.recording import SequenceView
@@ -39,8 +42,12 @@ class Command:
         float | None, tyro.conf.arg(name="lambda", metavar="M/RAD", help_behavior_hint="(default: from an angle that alone makes a node)")
     ] = None
     """lambda of Eq. 1, metres a radian."""
-    coarse: Literal["surf-vlad"] = "surf-vlad"
-    """The coarse localizer that the map gets."""
+    coarse: CoarseName = "surf-vlad"
+    """The coarse localizer that answers; another than surf-vlad is trained once the map is built, as `topoloc train` does."""
+    backbone: BackboneName = "squeezenet1_1"
+    """The network that a learned coarse localizer stands on."""
+    weights: Annotated[str | None, tyro.conf.arg(metavar="FILE|scratch", help_behavior_hint="(default: the published)")] = None
+    """The network's weights: a PyTorch file of torchvision's or NetVLAD's layout, or `scratch` for random ones."""
     features: Annotated[Literal["surf", "sift"] | None, tyro.conf.arg(metavar="surf|sift", help_behavior_hint="(default: surf)")] = None
     """Local features of the map, and of every query to it."""
     json: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
@@ -55,6 +62,9 @@ class Command:
             if poses_from == "slam":
                 sequences = _with_slam(sequences, progress)
             topomap = build_map(sequences, self._config(), progress)
+            if self.coarse != "surf-vlad":
+                model = train_coarse(topomap, self.coarse, self.backbone, self.weights, progress=progress)
+                topomap = replace(topomap, coarse_models={**topomap.coarse_models, model.name: model}, default_coarse=model.name)
         topomap.save(target)
         info = describe_map(topomap, target)
         if self.json != "-":

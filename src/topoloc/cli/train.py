@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,11 +10,12 @@ from typing import Annotated, Literal
 
 import tyro
 
-from topoloc.cli.output import check_outputs, progress_bar, write_json
+from topoloc.cli.output import UsageError, check_outputs, progress_bar, write_json
 from topoloc.mapping.coarse_storage import list_coarse, store_coarse
 from topoloc.mapping.coarse_training import CoarseTrainingConfig, train_coarse
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.places.classifier_config import BackboneName
+from topoloc.places.coarse import CoarseModel
 
 
 @dataclass(frozen=True)
@@ -26,28 +28,49 @@ class Command:
     """The coarse localizer to train."""
     backbone: BackboneName = "squeezenet1_1"
     """The network it stands on."""
-    weights: Annotated[str | None, tyro.conf.arg(metavar="FILE|scratch", help_behavior_hint="(default: the published)")] = (
-        None
-    )
+    weights: Annotated[str | None, tyro.conf.arg(metavar="FILE|scratch", help_behavior_hint="(default: the published)")] = None
     """The network's weights: a PyTorch file of torchvision's or NetVLAD's layout, or `scratch` for random ones."""
     default: bool = False
     """From now on it answers where --coarse is not given."""
     out: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: MAP itself)")] = None
     """Write the map with the new coarse localizer to this file and leave MAP as it is."""
+    checkpoint: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    """cnn-fc: write the state of the training to this file after each epoch, and go on from it if it is there already."""
     json: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
     """Write what was trained to this file (- for standard output)."""
     config: CoarseTrainingConfig = field(default_factory=CoarseTrainingConfig)
 
     def run(self) -> int:
         target = Path(self.out or self.map)
-        check_outputs([str(target), self.json])
+        if self.checkpoint is not None and self.coarse != "cnn-fc":
+            raise UsageError("--checkpoint is for cnn-fc; the others are done in one go")
+        check_outputs([str(target), self.json, self.checkpoint], inputs=[] if self.weights is None else [self.weights])
+        checkpoint = None if self.checkpoint is None else Path(self.checkpoint)
         start = time.perf_counter()
         with progress_bar() as progress:
-            model = train_coarse(TopoMetricMap.load(self.map), self.coarse, self.backbone, self.weights, self.config, progress)
+            topomap = TopoMetricMap.load(self.map)
+            model = train_coarse(topomap, self.coarse, self.backbone, self.weights, self.config, progress, checkpoint)
         store_coarse(Path(self.map), target, model, self.default)
         (facts,) = [facts for facts in list_coarse(target) if facts["name"] == self.coarse]
         facts |= {"seconds": round(time.perf_counter() - start, 1), "default": self.default}
         if self.json != "-":
             print(f"{target}: {self.coarse} on {self.backbone}, {facts['bytes'] / 1e6:.2f} MB, {facts['seconds']:.0f} s")
+        for warning in warnings_of(model):
+            print(f"warning: {warning}", file=sys.stderr)
         write_json(self.json, facts)
         return 0
+
+
+def warnings_of(model: CoarseModel) -> list[str]:
+    """What the user should know of a training that ended well enough."""
+    warnings = []
+    trained = model.settings.get("trained")
+    if isinstance(trained, dict) and "not finite" in trained["stopped_by"]:
+        warnings.append(f"{trained['stopped_by']}; epoch {trained['best_epoch']} is kept")
+    if model.settings.get("weights") is None and model.name != "cnn-fc":
+        warnings.append(f"{model.name} stands on random features: in other light it will name wrong nodes")
+    elif model.settings.get("weights") is None:
+        warnings.append(
+            "cnn-fc began at random and knows these images alone: in other light weights of ImageNet do better"
+        )
+    return warnings

@@ -32,6 +32,8 @@ from topoloc.places.weights import Weights, load_features
 
 _ROWS, _COLUMNS, _SQUEEZED = 4, 5, 64
 POINTS_PER_IMAGE = 64
+# Metres a radian, the paper's lambda: how rotation counts where one PoseNet is preferred to another.
+LAMBDA_ROT = 2.0
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ class PoseRegressor(nn.Module):
 
 @dataclass(eq=False)
 class PoseNet:
-    """A trained PoseNet. `held_out_m` is its mean D_total (metres, Eq. 1) on the images held out of the training."""
+    """A trained PoseNet. `held_out_m` is its mean D_total (metres, Eq. 1 with the paper's lambda) on the images held out of the training."""
 
     backbone: BackboneName
     config: PoseNetConfig
@@ -147,7 +149,7 @@ def train_posenet(
     def score() -> float:
         found_t, found_q = _poses(network, pictures[judged])
         angles = 2.0 * torch.arccos((found_q * quaternions[judged]).sum(dim=1).abs().clamp(max=1.0))
-        return float(((found_t - translations[judged]).norm(dim=1) + training_set.lambda_rot * angles).mean())
+        return float(((found_t - translations[judged]).norm(dim=1) + LAMBDA_ROT * angles).mean())
 
     rows = np.flatnonzero(~held_out)
     stages = ["learnt", "reprojection"] if config.loss == "reprojection" else [config.loss]

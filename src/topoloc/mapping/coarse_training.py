@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -30,11 +31,13 @@ def train_coarse(
     weights: str | None,
     config: CoarseTrainingConfig | None = None,
     progress: Progress | None = None,
+    checkpoint: Path | None = None,
 ) -> CoarseModel:
     """Train the coarse localizer `name` (cnn-fc, cnn-nn or vlad-nn) for this map.
 
     Args:
         weights: a file, ``scratch``, or None for the published weights of the backbone.
+        checkpoint: cnn-fc writes its state here after each epoch, and goes on from it if it is there.
 
     Raises:
         MissingExtraError: torch is not installed.
@@ -50,7 +53,8 @@ def train_coarse(
     config = config or CoarseTrainingConfig()
     of_name = {"cnn-fc": config.cnn_fc, "cnn-nn": config.cnn_nn, "vlad-nn": config.vlad_nn}[name]
     found = find_weights(backbone, weights)
-    return module.train(training_set_of(topomap), backbone, found, of_name, progress or (lambda stage, done, total: None))
+    arguments = (training_set_of(topomap), backbone, found, of_name, progress or (lambda stage, done, total: None))
+    return module.train(*arguments, checkpoint) if name == "cnn-fc" else module.train(*arguments)
 
 
 def training_set_of(topomap: TopoMetricMap) -> TrainingSet:

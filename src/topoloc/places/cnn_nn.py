@@ -20,7 +20,7 @@ from topoloc.places.weights import Weights, describe, load_features
 NAME = "cnn-nn"
 
 # Deeper layers know more of things and less of places: the fifth and sixth of SqueezeNet's fire modules rank nodes best.
-_DEPTHS: dict[BackboneName, int | None] = {"squeezenet1_1": 11, "vgg11": None, "vgg16": None, "compact": None}
+DEPTHS: dict[BackboneName, int | None] = {"squeezenet1_1": 11, "vgg11": None, "vgg16": None, "compact": None}
 
 
 class PooledFeatures(nn.Module):
@@ -61,5 +61,5 @@ def open_model(model: CoarseModel) -> VectorSearch:
 
 
 def _network(backbone: BackboneName, config: CnnNnConfig) -> PooledFeatures:
-    depth = config.depth if config.depth is not None else _DEPTHS[backbone]
+    depth = config.depth if config.depth is not None else DEPTHS[backbone]
     return PooledFeatures(backbone, depth, config.grid_rows, config.grid_columns, config.power)

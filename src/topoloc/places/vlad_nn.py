@@ -25,7 +25,7 @@ from topoloc.places.weights import Weights, describe, load_features
 
 NAME = "vlad-nn"
 # NetVLAD takes VGG's last convolution before its rectifier and pooling, as the public checkpoints do.
-_DEPTHS: dict[BackboneName, int | None] = {"squeezenet1_1": 11, "vgg11": 19, "vgg16": 29, "compact": None}
+DEPTHS: dict[BackboneName, int | None] = {"squeezenet1_1": 11, "vgg11": 19, "vgg16": 29, "compact": None}
 
 
 class VladNetwork(nn.Module):
@@ -49,7 +49,7 @@ def train(
         MapError: a mapping image is damaged.
         TrainingError: the tuning failed.
     """
-    depth = config.depth if config.depth is not None else _DEPTHS[backbone]
+    depth = config.depth if config.depth is not None else DEPTHS[backbone]
     network = VladNetwork(backbone, depth, config.num_clusters)
     if weights is not None:
         load_features(network.backbone, weights)
@@ -72,7 +72,7 @@ def open_model(model: CoarseModel) -> VectorSearch:
     """The localizer of what `train` made."""
     settings = model.settings
     config = settings_of(VladNnConfig, settings["config"])
-    depth = config.depth if config.depth is not None else _DEPTHS[settings["backbone"]]
+    depth = config.depth if config.depth is not None else DEPTHS[settings["backbone"]]
     return VectorSearch(model, VladNetwork(settings["backbone"], depth, settings["num_clusters"]))
 
 

@@ -1,0 +1,123 @@
+"""`topoloc train`: a map gets a learned coarse localizer and is asked through it; what fails is said in one line."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from topoloc.cli import main
+from topoloc.mapping.coarse_storage import list_coarse
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.places.backbones import Backbone
+
+SMALL = ("--config.cnn-nn.picture.width-px", "64", "--config.cnn-nn.picture.height-px", "48")
+ONE_EPOCH = (
+    "--config.cnn-fc.training.max-epochs",
+    "1",
+    "--config.cnn-fc.picture.width-px",
+    "64",
+    "--config.cnn-fc.picture.height-px",
+    "48",
+)
+
+
+@pytest.fixture(scope="session")
+def weights_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("weights") / "squeezenet.pth"
+    torch.save(Backbone("squeezenet1_1", num_outputs=None).state_dict(), path)
+    return path
+
+
+@pytest.fixture
+def copied_map(room_map: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copy(room_map, tmp_path / "room.topo"))
+
+
+def test_a_map_learns_and_is_asked(copied_map: Path, queries: Path, weights_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    before = TopoMetricMap.load(copied_map)
+    facts = tmp_path / "facts.json"
+    assert main(["train", str(copied_map), "--coarse", "cnn-nn", "--weights", str(weights_file), *SMALL, "--json", str(facts)]) == 0
+    written = json.loads(facts.read_text())
+    assert written["weights"]["file"] == "squeezenet.pth"
+    after = TopoMetricMap.load(copied_map)
+    assert (sorted(after.coarse_models), after.default_coarse) == (["cnn-nn", "surf-vlad"], "surf-vlad")
+    assert after.nodes[0].template_jpeg == before.nodes[0].template_jpeg
+    assert main(["evaluate", str(copied_map), str(queries), "--coarse", "cnn-nn", "--json", str(facts)]) == 0
+    evaluation = json.loads(facts.read_text())
+    assert evaluation["num_localized"] >= 0.8 * evaluation["num_queries"]
+    assert evaluation["topological_accuracy"] <= evaluation["neighbour_accuracy"] <= 1.0
+    capsys.readouterr()
+    assert main(["info", str(copied_map)]) == 0
+    printed = capsys.readouterr().out
+    assert f"cnn-nn, squeezenet1_1 (squeezenet.pth, SHA-256 {written['weights']['sha256'][:12]})" in printed
+    assert "surf-vlad (default)" in printed
+
+
+def test_the_default_changes_when_asked_to_and_the_map_can_stay_as_it_is(copied_map: Path, weights_file: Path, tmp_path: Path):
+    data, out = copied_map.read_bytes(), tmp_path / "new.topo"
+    options = ("--weights", str(weights_file), *SMALL, "--default", "--out", str(out))
+    assert main(["train", str(copied_map), "--coarse", "cnn-nn", *options]) == 0
+    assert copied_map.read_bytes() == data
+    assert TopoMetricMap.load(out).default_coarse == "cnn-nn"
+    size = out.stat().st_size
+    assert main(["train", str(out), "--coarse", "cnn-nn", "--weights", str(weights_file), *SMALL]) == 0
+    assert abs(out.stat().st_size - size) < 20_000  # replaced, not added once more
+    assert TopoMetricMap.load(out).default_coarse == "cnn-nn"
+
+
+def test_cnn_fc_needs_no_weights_and_says_what_that_costs(copied_map: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["train", str(copied_map), "--coarse", "cnn-fc", "--backbone", "compact", "--weights", "scratch", *ONE_EPOCH]) == 0
+    assert "warning: cnn-fc knows these images alone" in capsys.readouterr().err
+    (facts, _) = list_coarse(copied_map)
+    assert facts["trained"]["epochs"] == 1
+    assert facts["weights"] is None
+
+
+def test_build_can_train_at_once(tiny_recording: Path, tmp_path: Path, weights_file: Path):
+    path = tmp_path / "room.topo"
+    assert main(["build", f"{tiny_recording}@0:4", str(path), "--coarse", "cnn-nn", "--weights", str(weights_file)]) == 0
+    assert TopoMetricMap.load(path).default_coarse == "cnn-nn"
+
+
+def test_known_failures_are_one_line(copied_map: Path, weights_file: Path, queries: Path, complaint: Callable[..., str]):
+    train = ("train", copied_map, "--coarse", "cnn-nn")
+    assert "looks like squeezenet1_1" in complaint(*train, "--backbone", "vgg16", "--weights", weights_file)
+    assert "cannot read weights" in complaint(*train, "--weights", "none.pth")
+    assert "--checkpoint is for cnn-fc" in complaint(*train, "--checkpoint", "x.ckpt", status=2)
+    assert "is not a topoloc map" in complaint("train", weights_file, "--coarse", "cnn-nn")
+    assert "no coarse localizer 'vlad-nn' (it has: surf-vlad)" in complaint("localize", copied_map, queries, "--coarse", "vlad-nn")
+
+
+_WITHOUT_TORCH = """
+import sys
+class Barred:
+    def find_spec(self, name, path=None, target=None):
+        if name == "torch":
+            raise ModuleNotFoundError(name, name=name)
+sys.meta_path.insert(0, Barred())
+from topoloc.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_without_torch_the_extra_is_named(copied_map: Path):
+    command = [sys.executable, "-c", _WITHOUT_TORCH, "train", str(copied_map), "--coarse", "cnn-fc"]
+    answer = subprocess.run(command, capture_output=True, text=True, env=dict(os.environ), timeout=120, check=False)
+    assert answer.stderr == "error: the coarse localizer 'cnn-fc' needs PyTorch: pip install 'topoloc[deep]'\n"
+    assert answer.returncode == 1
+
+
+def test_mapping_and_asking_surf_vlad_loads_no_torch(copied_map: Path, queries: Path):
+    code = "import sys; from topoloc.cli import main; main(sys.argv[1:]); print('torch' in sys.modules)"
+    command = [sys.executable, "-c", code, "localize", str(copied_map), str(queries)]
+    answer = subprocess.run(command, capture_output=True, text=True, env=dict(os.environ), timeout=120, check=False)
+    assert answer.stdout.splitlines()[-1] == "False", answer.stderr
