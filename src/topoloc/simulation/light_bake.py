@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from topoloc.simulation.light_cells import CellGrid, LightCells, LightGatherer
+from topoloc.simulation.light_cells import CellGrid, FoundLight, LightCells, LightGatherer
 
 Progress = Callable[[str, int, int], None]
 _LIFT = 1e-3  # metres off a surface, so that a ray does not meet it again
@@ -60,8 +60,8 @@ def bake_light(
             parameters[name] = weight
         parameters.update()
         sampler.seed(number, config.rays * config.paths)
-        points, normals, light = _light_seen(light_scene, integrator, sampler, viewpoint, _directions(number, config.rays), config.paths)
-        gatherer.add(points, normals, light, config.paths)
+        points, normals, found = _light_seen(light_scene, integrator, sampler, viewpoint, _directions(number, config.rays), config.paths)
+        gatherer.add(points, normals, found)
         progress("light", number + 1, len(viewpoints))
     return gatherer.cells()
 
@@ -77,7 +77,7 @@ def _directions(number: int, count: int) -> Float64[np.ndarray, "n 3"]:
 
 def _light_seen(
     scene: Any, integrator: Any, sampler: Any, viewpoint: Float64[np.ndarray, "3"], directions: Float64[np.ndarray, "n 3"], paths: int
-) -> tuple[Float64[np.ndarray, "m 3"], Float32[np.ndarray, "m 3"], Float32[np.ndarray, "m 3"]]:
+) -> tuple[Float64[np.ndarray, "m 3"], Float32[np.ndarray, "m 3"], FoundLight]:
     """Points that rays meet, their normals, and the light there: irradiance over pi, the sun's own left out."""
     import drjit as dr
     import mitsuba as mi
@@ -93,23 +93,33 @@ def _light_seen(
     there.p = dr.gather(mi.Point3f, si.p, index) + _LIFT * mi.Vector3f(there.n)
     there.sh_frame = mi.Frame3f(there.n)
     active = dr.gather(mi.Bool, met, index)
-    arriving = _from_lights(scene, sampler, there, active) + _from_surfaces(scene, integrator, sampler, there, active)
-    dr.eval(arriving)  # all three colours in one kernel
-    mean = np.array(dr.block_sum(arriving, paths), np.float32).reshape(3, -1).T / np.float32(paths)
-    mean = np.nan_to_num(mean, nan=0.0, posinf=0.0)  # a path in a million or so
+    lamps, sky = _from_lights(scene, sampler, there, active)
+    surfaces = _from_surfaces(scene, integrator, sampler, there, active)
     seen = np.array(met)
+    sharp, soft = (_mean(light, paths)[seen] for light in (lamps, sky + surfaces))
     points, normals = np.array(si.p).T.astype(np.float64), np.array(normal).T.astype(np.float32)
-    return points[seen], np.ascontiguousarray(normals[seen]), mean[seen]
+    return points[seen], np.ascontiguousarray(normals[seen]), FoundLight(sharp, soft)
 
 
-def _from_lights(scene: Any, sampler: Any, si: Any, active: Any) -> Any:
+def _mean(light: Any, paths: int) -> Float32[np.ndarray, "n 3"]:
+    import drjit as dr
+
+    dr.eval(light)  # all three colours in one kernel
+    mean = np.array(dr.block_sum(light, paths), np.float32).reshape(3, -1).T / np.float32(paths)
+    return np.nan_to_num(mean, nan=0.0, posinf=0.0)  # a path in a million or so
+
+
+def _from_lights(scene: Any, sampler: Any, si: Any, active: Any) -> tuple[Any, Any]:
+    """What comes straight from lamps, and from the sky."""
     import drjit as dr
     import mitsuba as mi
 
     sample, radiance = scene.sample_emitter_direction(si, sampler.next_2d(), True, active)
     cosine = dr.maximum(dr.dot(sample.d, si.n), 0.0)
     # The sun has no extent, so that its density is a delta; pictures ask it themselves.
-    return mi.Color3f(dr.select(active & ~sample.delta, radiance * (cosine * dr.inv_pi), 0.0))
+    light = dr.select(active & ~sample.delta, mi.Color3f(radiance * (cosine * dr.inv_pi)), 0.0)
+    of_sky = sample.emitter == scene.environment()
+    return dr.select(of_sky, mi.Color3f(0.0), light), dr.select(of_sky, light, 0.0)
 
 
 def _from_surfaces(scene: Any, integrator: Any, sampler: Any, si: Any, active: Any) -> Any:

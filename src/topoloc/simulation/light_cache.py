@@ -17,7 +17,7 @@ from topoloc.simulation.light_cells import CellGrid, LightCells, light_cells
 from topoloc.simulation.scene import Scene
 from topoloc.simulation.variant import cache_folder
 
-_FORMAT = 1
+_FORMAT = 3
 _MAX_FILES = 24
 
 

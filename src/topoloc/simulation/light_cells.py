@@ -17,8 +17,8 @@ from topoloc.simulation import light_cells_kernels as kernels
 
 _GRID = 0.5
 _MARGIN = 60.0
-_ENOUGH = 1500.0
-"""Paths after which a cell needs nothing of its neighbours."""
+_ENOUGH_SHARP, _ENOUGH_SOFT = 10.0, 400.0
+"""Points in a cell after which it takes little from its neighbours."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,33 +59,42 @@ def divide_space(viewpoints: Float64[np.ndarray, "n 3"], finest: float, angle: f
     return CellGrid(np.array([*low, viewpoints[:, 2].mean(), _GRID]), distances, finest, angle)
 
 
+@dataclass(frozen=True, eq=False)
+class FoundLight:
+    """Irradiance over pi at each of n points. `sharp` is that of lamps, with shadows and little noise; `soft` that of the sky and of
+    all surfaces, which is noisy and changes slowly from place to place."""
+
+    sharp: Float32[np.ndarray, "n 3"]
+    soft: Float32[np.ndarray, "n 3"]
+
+
 class LightGatherer:
     """Collects samples of light, cell by cell."""
 
     def __init__(self, grid: CellGrid) -> None:
         self._grid = grid
         self._keys = np.empty(0, np.int64)
-        self._sums = np.empty((0, 4))
+        self._sums = np.empty((0, 7))
 
-    def add(
-        self, points: Float64[np.ndarray, "n 3"], normals: Float32[np.ndarray, "n 3"], light: Float32[np.ndarray, "n 3"], paths: int
-    ) -> None:
-        """Light found at points on surfaces, each the mean of `paths` paths."""
+    def add(self, points: Float64[np.ndarray, "n 3"], normals: Float32[np.ndarray, "n 3"], found: FoundLight) -> None:
+        """Light found at points on surfaces."""
         g = self._grid
         keys = kernels.keys_of(points, normals, g.frame, g.distances, g.finest, g.angle)
-        rows = np.column_stack([light * np.float32(paths), np.full(len(light), paths, np.float32)])
+        rows = np.column_stack([found.sharp, found.soft, np.ones(len(keys))])
         self._keys, where = np.unique(np.concatenate([self._keys, keys]), return_inverse=True)
         self._sums = _sum_rows(np.concatenate([self._sums, rows]), where.ravel(), len(self._keys))
 
     def cells(self) -> LightCells:
         """All that was collected, smoothed where it was little; coarser cells are the means of the finer ones."""
-        keys, sums = self._keys, self._sums
-        table = kernels.hash_table(keys)
-        counts = sums[:, 3].astype(np.float32)
-        light = (sums[:, :3] / sums[:, 3:]).astype(np.float32)
-        for _ in range(2):
-            light, counts = kernels.smooth(keys, light, counts, table, np.float32(_ENOUGH))
-        return light_cells(self._grid, *_with_coarser(keys, light, counts))
+        keys, table = self._keys, kernels.hash_table(self._keys)
+        counts = self._sums[:, 6].astype(np.float32)
+        sharp, soft = ((self._sums[:, k : k + 3] / self._sums[:, 6:]).astype(np.float32) for k in (0, 3))
+        sharp, _ = kernels.smooth(keys, sharp, counts, table, _ENOUGH_SHARP, 1)
+        trusted = counts
+        for step in (1, 2, 4):
+            soft, trusted = kernels.smooth(keys, soft, trusted, table, _ENOUGH_SOFT, step)
+        keys, light = _with_coarser(keys, sharp + soft, counts)
+        return light_cells(self._grid, keys, light)
 
 
 def light_cells(grid: CellGrid, keys: Int64[np.ndarray, " n"], light: Float32[np.ndarray, "n 3"]) -> LightCells:
@@ -100,8 +109,8 @@ def light_at(cells: LightCells, points: Float64[np.ndarray, "n 3"], normals: Flo
     return kernels.look_up(points, normals, cells.keys, cells.light, cells.table, g.frame, g.distances, g.finest, g.angle, ambient)
 
 
-def _sum_rows(rows: Float64[np.ndarray, "n 4"], where: Int64[np.ndarray, " n"], count: int) -> Float64[np.ndarray, "k 4"]:
-    return np.column_stack([np.bincount(where, rows[:, column], count) for column in range(4)])
+def _sum_rows(rows: Float64[np.ndarray, "n columns"], where: Int64[np.ndarray, " n"], count: int) -> Float64[np.ndarray, "k columns"]:
+    return np.column_stack([np.bincount(where, column, count) for column in rows.T])
 
 
 def _with_coarser(

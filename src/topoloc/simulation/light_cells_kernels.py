@@ -105,8 +105,8 @@ def look_up(points, normals, keys, light, table, frame, distances, finest, angle
 
 
 @njit(cache=True, parallel=True)
-def smooth(keys, light, counts, table, enough):
-    """Cells with few samples take from their neighbours of the same side and size. Returns light (n, 3) and counts (n,)."""
+def smooth(keys, light, counts, table, enough, step):
+    """Cells with few samples take from those `step` cells away, of the same side and size. Returns light (n, 3) and counts (n,)."""
     result = np.empty_like(light)
     trusted = np.empty_like(counts)
     for row in prange(len(keys)):
@@ -114,16 +114,18 @@ def smooth(keys, light, counts, table, enough):
         side, level = key & 31, key >> 56
         iz, iy, ix = (key >> 5 & _MASK) - _BIAS, (key >> 22 & _MASK) - _BIAS, (key >> 39 & _MASK) - _BIAS
         share = enough / (enough + counts[row])
-        total = 0.0
-        r, g, b = 0.0, 0.0, 0.0
+        total = counts[row]
+        r, g, b = light[row, 0] * total, light[row, 1] * total, light[row, 2] * total
         for dx in range(-1, 2):
             for dy in range(-1, 2):
                 for dz in range(-1, 2):
                     steps = abs(dx) + abs(dy) + abs(dz)
-                    other = np.int64(row) if steps == 0 else _find(table, keys, _key(level, ix + dx, iy + dy, iz + dz, side))
+                    if steps == 0:
+                        continue
+                    other = _find(table, keys, _key(level, ix + step * dx, iy + step * dy, iz + step * dz, side))
                     if other == _EMPTY:
                         continue
-                    weight = counts[other] * (1.0 if steps == 0 else share * 0.5 ** (steps - 1))
+                    weight = counts[other] * share * 0.5 ** (steps - 1)
                     total += weight
                     r += weight * light[other, 0]
                     g += weight * light[other, 1]
