@@ -86,6 +86,41 @@ def _invert_symmetric(m, inverse):
 
 
 @njit(**_OPTIONS)
+def _subtract_point(n, first, last, column, slots, frames, couplings, inverses, bias_couplings, step, product, matrix, vector):
+    """Take point n out of the system: what the poses and the bias that it ties together still know without it."""
+    if column >= 0:
+        for r in range(3):
+            vector[column] -= bias_couplings[n, r] * step[r]
+            for s in range(3):
+                matrix[column, column] -= bias_couplings[n, r] * inverses[n, r, s] * bias_couplings[n, s]
+    for k in range(first, last):
+        i = slots[frames[k]]
+        if i < 0:
+            continue
+        for r in range(6):
+            for s in range(3):
+                product[r, s] = (
+                    couplings[k, r, 0] * inverses[n, 0, s] + couplings[k, r, 1] * inverses[n, 1, s] + couplings[k, r, 2] * inverses[n, 2, s]
+                )
+            vector[6 * i + r] -= couplings[k, r, 0] * step[0] + couplings[k, r, 1] * step[1] + couplings[k, r, 2] * step[2]
+            if column >= 0:
+                shared = product[r, 0] * bias_couplings[n, 0] + product[r, 1] * bias_couplings[n, 1] + product[r, 2] * bias_couplings[n, 2]
+                matrix[6 * i + r, column] -= shared
+                matrix[column, 6 * i + r] -= shared
+        for other in range(first, last):
+            j = slots[frames[other]]
+            if j < 0:
+                continue
+            for r in range(6):
+                for s in range(6):
+                    matrix[6 * i + r, 6 * j + s] -= (
+                        product[r, 0] * couplings[other, s, 0]
+                        + product[r, 1] * couplings[other, s, 1]
+                        + product[r, 2] * couplings[other, s, 2]
+                    )
+
+
+@njit(**_OPTIONS)
 def eliminate_points(
     rotations, translations, cameras, slots, columns, points, starts, frames, measured, weights, scale_squared, damping,
     matrix, vector, couplings, inverses, gradients, bias_couplings,
@@ -144,40 +179,7 @@ def eliminate_points(
         _invert_symmetric(block, inverses[n])
         for r in range(3):
             step[r] = inverses[n, r, 0] * gradients[n, 0] + inverses[n, r, 1] * gradients[n, 1] + inverses[n, r, 2] * gradients[n, 2]
-        if column >= 0:
-            for r in range(3):
-                vector[column] -= bias_couplings[n, r] * step[r]
-                for s in range(3):
-                    matrix[column, column] -= bias_couplings[n, r] * inverses[n, r, s] * bias_couplings[n, s]
-        for k in range(first, last):
-            i = slots[frames[k]]
-            if i < 0:
-                continue
-            for r in range(6):
-                for s in range(3):
-                    product[r, s] = (
-                        couplings[k, r, 0] * inverses[n, 0, s]
-                        + couplings[k, r, 1] * inverses[n, 1, s]
-                        + couplings[k, r, 2] * inverses[n, 2, s]
-                    )
-                vector[6 * i + r] -= couplings[k, r, 0] * step[0] + couplings[k, r, 1] * step[1] + couplings[k, r, 2] * step[2]
-                if column >= 0:
-                    shared = (
-                        product[r, 0] * bias_couplings[n, 0] + product[r, 1] * bias_couplings[n, 1] + product[r, 2] * bias_couplings[n, 2]
-                    )
-                    matrix[6 * i + r, column] -= shared
-                    matrix[column, 6 * i + r] -= shared
-            for other in range(first, last):
-                j = slots[frames[other]]
-                if j < 0:
-                    continue
-                for r in range(6):
-                    for s in range(6):
-                        matrix[6 * i + r, 6 * j + s] -= (
-                            product[r, 0] * couplings[other, s, 0]
-                            + product[r, 1] * couplings[other, s, 1]
-                            + product[r, 2] * couplings[other, s, 2]
-                        )
+        _subtract_point(n, first, last, column, slots, frames, couplings, inverses, bias_couplings, step, product, matrix, vector)
 
 
 @njit(**_OPTIONS)
