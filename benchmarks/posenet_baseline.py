@@ -55,7 +55,8 @@ def main() -> None:
         if row["ours_m"]:
             print(
                 f"{path[-30:]:<32}PoseNet {theirs[0]:.3f} m, {theirs[1]:.2f} deg; ours {row['ours_m']:.4f} m, {row['ours_deg']:.3f} deg"
-                f" ({100 * row['localized']:.0f} % localized): {theirs[0] / row['ours_m']:.1f} and {theirs[1] / row['ours_deg']:.1f} times smaller",
+                f" ({100 * row['localized']:.0f} % localized),"
+                f" {theirs[0] / row['ours_m']:.1f} and {theirs[1] / row['ours_deg']:.1f} times smaller",
                 flush=True,
             )
     if arguments.json:

@@ -70,7 +70,5 @@ def warnings_of(model: CoarseModel) -> list[str]:
     if model.settings.get("weights") is None and model.name != "cnn-fc":
         warnings.append(f"{model.name} stands on random features: in other light it will name wrong nodes")
     elif model.settings.get("weights") is None:
-        warnings.append(
-            "cnn-fc began at random and knows these images alone: in other light weights of ImageNet do better"
-        )
+        warnings.append("cnn-fc began at random and knows these images alone: in other light weights of ImageNet do better")
     return warnings

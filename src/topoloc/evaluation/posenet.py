@@ -72,7 +72,7 @@ class PoseRegressor(nn.Module):
 
 @dataclass(eq=False)
 class PoseNet:
-    """A trained PoseNet. `held_out_m` is its mean D_total (metres, Eq. 1 with the paper's lambda) on the images held out of the training."""
+    """A trained PoseNet. `held_out_m` is its mean D_total (metres, Eq. 1 with the paper's lambda) on the held-out images."""
 
     backbone: BackboneName
     config: PoseNetConfig

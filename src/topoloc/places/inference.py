@@ -81,7 +81,8 @@ def _fastest_threads(call: Callable[[], object]) -> int:
     times = {}
     for number in {1, torch.get_num_threads()}:
         with threads(number):
-            call(), call()  # the first two runs compile
+            for _ in range(2):  # these compile
+                call()
             starts = [time.perf_counter()]
             for _ in range(NUM_TRIALS):
                 call()
