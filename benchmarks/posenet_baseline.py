@@ -1,6 +1,6 @@
 """PoseNet against the deep-geometric localizer: median pose errors on the same images, and how many times smaller ours are.
 
-    python benchmarks/posenet_baseline.py MAP --queries SEQ [SEQ ...] [--weights FILE] [--epochs 80] [--json FILE]
+    python benchmarks/posenet_baseline.py MAP --queries SEQ [SEQ ...] [--weights FILE] [--epochs 80] [--losses ...] [--rates ...]
 
 PoseNet is tuned as carefully as our own: every loss and learning rate below is trained on the map's images, and the one with the
 least mean D_total on the held-out images is asked. It answers every query; ours is judged by what it localizes, and its share is printed.
@@ -35,11 +35,13 @@ def main() -> None:
     parser.add_argument("--queries", nargs="+", required=True)
     parser.add_argument("--weights", help="SqueezeNet 1.1 trained on ImageNet")
     parser.add_argument("--epochs", type=int, default=80)
+    parser.add_argument("--losses", nargs="+", default=LOSSES, choices=LOSSES)
+    parser.add_argument("--rates", nargs="+", type=float, default=LEARNING_RATES)
     parser.add_argument("--coarse", default=None)
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     topomap = TopoMetricMap.load(arguments.map)
-    posenet = tuned(topomap, arguments.weights, arguments.epochs)
+    posenet = tuned(topomap, arguments)
     localizer = Localizer(topomap, LocalizerConfig(coarse=arguments.coarse))
     rows = []
     for path in arguments.queries:
@@ -63,12 +65,12 @@ def main() -> None:
         arguments.json.write_text(json.dumps(rows, indent=1))
 
 
-def tuned(topomap: TopoMetricMap, weights: str | None, num_epochs: int) -> PoseNet:
+def tuned(topomap: TopoMetricMap, arguments: argparse.Namespace) -> PoseNet:
     """The PoseNet that does best on the held-out images."""
-    found = find_weights("squeezenet1_1", weights)
+    found = find_weights("squeezenet1_1", arguments.weights)
     best: PoseNet | None = None
-    for loss, rate in itertools.product(LOSSES, LEARNING_RATES):
-        training = TrainingConfig(max_epochs=num_epochs, patience=num_epochs // 3, learning_rate=rate)
+    for loss, rate in itertools.product(arguments.losses, arguments.rates):
+        training = TrainingConfig(max_epochs=arguments.epochs, patience=arguments.epochs // 3, learning_rate=rate)
         posenet = train_posenet(topomap, "squeezenet1_1", found, PoseNetConfig(loss, picture=PictureConfig(112, 84), training=training))
         print(f"PoseNet, {loss} loss, learning rate {rate:g}: D_total {posenet.held_out_m:.3f} m on held-out images", flush=True)
         if best is None or posenet.held_out_m < best.held_out_m:

@@ -10,13 +10,15 @@ import pytest
 import torch
 from test_weights import netvlad_tensors
 
+import topoloc.places.cnn_nn as cnn_nn
+import topoloc.places.vlad_nn as vlad_nn
 from built_room import unseen_views
 from topoloc.errors import MapError, TrainingError
 from topoloc.features.features import Features
-from topoloc.places import cnn_nn, vlad_nn
 from topoloc.places.classifier_config import CnnNnConfig, PictureConfig, TripletConfig, VladNnConfig
 from topoloc.places.coarse import CoarseLocalizer, CoarseModel, open_coarse
 from topoloc.places.training_set import TrainingSet, decode_picture
+from topoloc.places.triplets import tune
 from topoloc.places.vector_search import VectorSearch
 from topoloc.places.weights import read_weights
 
@@ -104,7 +106,7 @@ def test_triplets_bring_near_images_together(room_set: TrainingSet):
     tuning = TripletConfig(num_epochs=3, learning_rate=1e-3, near=3.0, far=4.0, margin=0.3)
     network = vlad_nn.VladNetwork("squeezenet1_1", 5, 8)
     pictures = np.stack([np.ascontiguousarray(decode_picture(jpeg)[:64, :64]) for jpeg in room_set.jpegs])
-    losses = vlad_nn.tune(network, pictures, room_set, tuning, silent)
+    losses = tune(network, pictures, room_set, tuning, silent)
     assert losses[-1] < losses[0]
 
 

@@ -66,7 +66,7 @@ class CnnFcConfig:
     picture: PictureConfig = field(default_factory=PictureConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
     augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
-    label_spread: float = 0.35
+    label_spread: float = 1.0
     """An image belongs to its nearest node and, by a bell curve of D_total - D_nearest over this share of D_thresh, to those
     about as near; 0 is the paper's single label."""
 
