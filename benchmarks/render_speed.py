@@ -17,9 +17,9 @@ import numpy as np
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.simulation.conditions import find_condition
-from topoloc.simulation.light_filter import LightFilterConfig
-from topoloc.simulation.renderer import RenderConfig, Renderer
-from topoloc.simulation.variant import LLVM, SCALAR, use_best_variant
+from topoloc.simulation.rendering.light_filter import LightFilterConfig
+from topoloc.simulation.rendering.renderer import RenderConfig, Renderer
+from topoloc.simulation.rendering.variant import LLVM, SCALAR, use_best_variant
 from topoloc.simulation.worlds import WORLDS, World
 
 

@@ -13,7 +13,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.sequences.open import open_sequence
 from topoloc.simulation import demo_recordings
 from topoloc.simulation.demo_recordings import RECORDINGS, draw_pictures_of_nothing, missing_recordings, render_recordings
-from topoloc.simulation.renderer import RenderConfig
+from topoloc.simulation.rendering.renderer import RenderConfig
 from topoloc.simulation.routes import frame_poses, plan_route
 from topoloc.simulation.worlds import find_world
 

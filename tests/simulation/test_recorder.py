@@ -16,7 +16,7 @@ from topoloc.mapping.build import build_map
 from topoloc.sequences.open import open_sequence
 from topoloc.simulation.conditions import CONDITIONS
 from topoloc.simulation.recorder import RecordConfig, record
-from topoloc.simulation.renderer import RenderConfig
+from topoloc.simulation.rendering.renderer import RenderConfig
 from topoloc.simulation.sensor import SensorConfig
 
 pytest.importorskip("mitsuba", reason="the extra `sim` is not installed")

@@ -8,7 +8,7 @@ import pytest
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.simulation.conditions import CONDITIONS
-from topoloc.simulation.renderer import Renderer, Rendering
+from topoloc.simulation.rendering.renderer import Renderer, Rendering
 from topoloc.simulation.routes import RouteConfig, plan_route
 from topoloc.simulation.sensor import SensorConfig
 from topoloc.simulation.shots import Shooting, shoot

@@ -16,7 +16,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.sequences.camera_json import read_camera_json
 from topoloc.simulation.conditions import find_condition
 from topoloc.simulation.recorder import ZED, RecordConfig, Recorded, record
-from topoloc.simulation.renderer import RenderConfig
+from topoloc.simulation.rendering.renderer import RenderConfig
 from topoloc.simulation.routes import RouteConfig
 from topoloc.simulation.worlds import World, find_world
 

@@ -19,11 +19,11 @@ from topoloc.geometry.camera import Camera
 from topoloc.sequences.trajectory import Trajectory
 from topoloc.simulation.conditions import Condition
 from topoloc.simulation.layout import Layout, missing_frames, prepare, write_shot
-from topoloc.simulation.renderer import RenderConfig, Renderer
+from topoloc.simulation.rendering.renderer import RenderConfig, Renderer
+from topoloc.simulation.rendering.variant import use_best_variant
 from topoloc.simulation.routes import Route, RouteConfig, frame_poses, plan_route
 from topoloc.simulation.sensor import SensorConfig
 from topoloc.simulation.shots import Shooting, shoot
-from topoloc.simulation.variant import use_best_variant
 from topoloc.simulation.worlds import World
 
 Progress = Callable[[str, int, int], None]

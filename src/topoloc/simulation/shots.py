@@ -11,7 +11,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.simulation.conditions import Condition
 from topoloc.simulation.noise import rng_of
-from topoloc.simulation.renderer import Renderer, Rendering
+from topoloc.simulation.rendering.renderer import Renderer, Rendering
 from topoloc.simulation.routes import Route, velocity_at, world_from_cam_at
 from topoloc.simulation.sensor import SensorConfig, choose_exposure, take_picture, white_balance_of
 from topoloc.simulation.weather import Drops, draw_lens_drops, draw_rain, falling_drops

@@ -78,12 +78,12 @@ WORLDS = {
         World(
             "lab",
             "a room of 5 x 4 m: desks, shelves, screens, clutter",
-            "topoloc.simulation.lab",
+            "topoloc.simulation.lab.world",
         ),
         World(
             "corridor",
             "a loop of 25 x 18 m: doors, notice boards, windows to the floor, polished linoleum, long bare walls",
-            "topoloc.simulation.corridor",
+            "topoloc.simulation.corridor.world",
             speed=1.2,
             spacing=0.2,
             corner_radius=0.7,
@@ -94,7 +94,7 @@ WORLDS = {
         World(
             "street",
             "a loop of 333 x 81 m: lanes, façades, trees, parked cars, signs, sky",
-            "topoloc.simulation.street",
+            "topoloc.simulation.street.world",
             outdoor=True,
             motion="drive",
             speed=8.0,

@@ -1,0 +1,1 @@
+"""What rooms are furnished with: materials, furniture, things printed and shown."""

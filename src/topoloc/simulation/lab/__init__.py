@@ -1,0 +1,1 @@
+"""The lab: a room of 5 x 4 m."""
