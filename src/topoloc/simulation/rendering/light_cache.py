@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -49,8 +50,9 @@ def _keep(file: Path, cells: LightCells) -> None:
         os.replace(part, file)
         for old in sorted(file.parent.glob("*.npz"), key=lambda path: path.stat().st_mtime)[:-_MAX_FILES]:
             old.unlink()
-    except OSError:
-        part.unlink(missing_ok=True)  # it is only a shortcut
+    except OSError:  # it is only a shortcut
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
 
 
 def _digest(scene: Scene, viewpoints: Float64[np.ndarray, "n 3"], config: LightBakeConfig) -> str:
