@@ -159,10 +159,6 @@ def test_ctrl_c_in_a_compiled_function_is_no_bug(recording: Path, tmp_path: Path
     assert "interrupted" in complaint("build", recording, tmp_path / "room.topo")
 
 
-def test_slam_is_not_here_yet(recording: Path, tmp_path: Path, complaint: Complaint):
-    assert "SLAM is not in this version yet" in complaint("build", "--trajectory", "slam", recording, tmp_path / "room.topo")
-
-
 @pytest.mark.parametrize("last", ["recording", "recording@0:5", "recording/image_0", "recording/image_0/000000.png", "recording/truth.tum"])
 def test_a_forgotten_map_argument(last: str, recording: Path, tmp_path: Path, complaint: Complaint):
     assert "was MAP forgotten?" in complaint("build", recording, tmp_path / last, status=2)

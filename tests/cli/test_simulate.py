@@ -29,7 +29,7 @@ def no_rendering(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(recorder, "use_best_variant", lambda force=None: "none")
     monkeypatch.setattr(recorder, "version", lambda package: "0")
-    monkeypatch.setattr(recorder, "_shooting", lambda job: None)
+    monkeypatch.setattr(recorder, "_shooting", lambda *_: None)
     monkeypatch.setattr(recorder, "shoot", grey)
 
 

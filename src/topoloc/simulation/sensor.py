@@ -40,7 +40,7 @@ class SensorConfig:
     target: float = 0.16
     max_clipped: float = 0.4
     max_time: float = 0.025
-    max_gain: float = 16.0
+    max_gain: float = 24.0
     full_well: float = 12000.0
     read_noise: float = 3.0
     vignetting: float = 0.25
