@@ -164,7 +164,7 @@ def test_evaluate_writes_what_the_interface_says(
     assert _without_times(evaluations[0]) == _without_times(evaluations[1])
     page = (tmp_path / "0.html").read_text()
     assert page.startswith("<!DOCTYPE html>")
-    assert page.count("<article>") == 6
+    assert page.count("<article>") == 8
 
 
 def test_a_map_from_truth_moves_the_truth(room_map: Path, queries: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -87,13 +87,13 @@ def render_recordings(folder: Path, progress: Callable[[str, int, int], None] = 
     except OSError as error:
         raise TopolocError(f"cannot write {folder}: {error.strerror}") from error
     for recording in RECORDINGS:
-        stage = f"rendering {recording.name.replace('_', ' ')}"
+        stages = {"frames": f"rendering {recording.name.replace('_', ' ')}", "light": f"light for {recording.name.replace('_', ' ')}"}
         record(
             find_world(recording.world),
             find_condition(recording.condition),
             folder / recording.name,
             recording.config,
-            progress=lambda _, done, total, stage=stage: progress(stage, done, total),
+            progress=lambda stage, done, total, stages=stages: progress(stages[stage], done, total),
         )
 
 

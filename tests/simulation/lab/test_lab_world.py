@@ -75,7 +75,7 @@ def test_lamps_follow_the_condition():
         return float(np.mean([s.material.kind == "light" for s in lamps]))
 
     assert share(lab.build(3, CONDITIONS["evening"])) == 1.0
-    assert share(_night()) == pytest.approx(NIGHT.lamps, abs=0.07)
+    assert 0.0 < share(_night()) < NIGHT.lamps  # only such as people leave on
     assert share(_day()) == pytest.approx(DAY.lamps, abs=0.07)
 
 

@@ -58,20 +58,20 @@ def _keep(file: Path, cells: LightCells) -> None:
 def _digest(scene: Scene, viewpoints: Float64[np.ndarray, "n 3"], config: LightBakeConfig) -> str:
     """Of all that the light depends on."""
     digest = hashlib.sha256(repr((_FORMAT, version("mitsuba"), asdict(config), viewpoints.shape)).encode())
-    digest.update(np.ascontiguousarray(viewpoints))
+    digest.update(np.ascontiguousarray(viewpoints).tobytes())
     if scene.sky is not None:
-        digest.update(np.ascontiguousarray(scene.sky.radiance))
+        digest.update(np.ascontiguousarray(scene.sky.radiance).tobytes())
         digest.update(repr((scene.sky.sun_irradiance, scene.sky.sun_direction)).encode())
     pictures: dict[int, str] = {}
     for surface in scene.surfaces:
         for array in (surface.mesh.vertices, surface.mesh.faces, surface.mesh.uv):
-            digest.update(np.ascontiguousarray(array))
+            digest.update(np.ascontiguousarray(array).tobytes())
         material = surface.material
         digest.update(repr((material.kind, material.roughness, material.radiance)).encode())
         for picture in (material.color, material.opacity):
             if isinstance(picture, np.ndarray):
                 if id(picture) not in pictures:
-                    pictures[id(picture)] = hashlib.sha256(np.ascontiguousarray(picture)).hexdigest()
+                    pictures[id(picture)] = hashlib.sha256(np.ascontiguousarray(picture).tobytes()).hexdigest()
                 digest.update(pictures[id(picture)].encode())
             else:
                 digest.update(repr(picture).encode())

@@ -68,7 +68,7 @@ def _one_mesh(mesh: Mesh, colors: Float32[np.ndarray, "m 3"]) -> Any:
     plain = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": _COLOR}}
     properties["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": plain})
     result = mi.Mesh("surfaces", len(mesh.vertices), len(mesh.faces), props=properties)
-    result.add_attribute(_COLOR, 3, np.ascontiguousarray(colors).ravel())
+    result.add_attribute(_COLOR, 3, np.ascontiguousarray(colors).ravel())  # pyright: ignore[reportArgumentType]
     parameters = mi.traverse(result)
     parameters["vertex_positions"] = np.ascontiguousarray(mesh.vertices, np.float32).ravel()
     parameters["faces"] = np.ascontiguousarray(mesh.faces, np.uint32).ravel()
