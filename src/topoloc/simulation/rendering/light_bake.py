@@ -85,8 +85,9 @@ def _light_seen(
     index = dr.arange(mi.UInt32, len(directions) * paths) // paths
     towards = mi.Vector3f(np.ascontiguousarray(directions.T, np.float32))
     si = scene.ray_intersect(mi.Ray3f(mi.Point3f(*viewpoint.tolist()), towards))
+    outward: Any = si.n
     met = si.is_valid()
-    normal = dr.select(dr.dot(si.n, towards) > 0.0, -mi.Vector3f(si.n), mi.Vector3f(si.n))
+    normal = dr.select(dr.dot(outward, towards) > 0.0, mi.Vector3f(-outward), mi.Vector3f(outward))
     dr.eval(met, normal, si.p)
     there: Any = dr.zeros(mi.SurfaceInteraction3f, len(directions) * paths)
     facing: Any = dr.gather(mi.Vector3f, normal, index)
