@@ -94,7 +94,7 @@ def _light_seen(
     start: Any = dr.gather(mi.Point3f, si.p, index)
     there.n = mi.Normal3f(facing)
     there.p = start + _LIFT * facing
-    there.sh_frame = mi.Frame3f(there.n)
+    there.sh_frame = mi.Frame3f(facing)
     active = dr.gather(mi.Bool, met, index)
     lamps, sky = _from_lights(scene, sampler, there, active)
     surfaces = _from_surfaces(scene, integrator, sampler, there, active)
