@@ -20,7 +20,7 @@ from topoloc.sequences.trajectory import Trajectory
 from topoloc.simulation.conditions import Condition
 from topoloc.simulation.layout import Layout, missing_frames, prepare, write_shot
 from topoloc.simulation.rendering.renderer import RenderConfig, Renderer
-from topoloc.simulation.rendering.variant import use_best_variant
+from topoloc.simulation.rendering.variant import LLVM, use_best_variant
 from topoloc.simulation.routes import Route, RouteConfig, frame_poses, plan_route
 from topoloc.simulation.sensor import SensorConfig
 from topoloc.simulation.shots import Shooting, shoot
@@ -154,7 +154,8 @@ def _render_here(job: _Job, frames: list[int], progress: Progress) -> Generator[
 
 
 def _render_in_processes(job: _Job, frames: list[int], num: int, progress: Progress) -> Generator[int, None, None]:
-    _shooting(job, progress)  # traces the light, which the processes then find in the cache
+    if job.variant == LLVM:  # the light is traced here, and the processes find it in the cache
+        _shooting(job, progress)
     # Not forked: a child of a process in which Mitsuba's threads run would wait for them for ever.
     with ProcessPoolExecutor(num, get_context("spawn"), initializer=_start, initargs=(job,)) as pool:
         try:

@@ -9,17 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from topoloc.slam.sampling_kernels import sample_bilinear
+
 _OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"reassoc", "contract", "arcp"}}
-
-
-@njit(**_OPTIONS)
-def _sample(image, x, y):
-    """Bilinear; the caller keeps (x, y) inside."""
-    ix, iy = int(x), int(y)
-    fx, fy = np.float32(x - ix), np.float32(y - iy)
-    top = image[iy, ix] * (1 - fx) + image[iy, ix + 1] * fx
-    bottom = image[iy + 1, ix] * (1 - fx) + image[iy + 1, ix + 1] * fx
-    return top * (1 - fy) + bottom * fy
 
 
 @njit(**_OPTIONS)
@@ -29,7 +21,7 @@ def _normalized_patch(image, x, y, half, patch):
     mean = np.float32(0)
     for j in range(side):
         for i in range(side):
-            value = _sample(image, x + i - half, y + j - half)
+            value = sample_bilinear(image, x + i - half, y + j - half)
             patch[j, i] = value
             mean += value
     mean /= side * side
@@ -106,8 +98,8 @@ def _refine_disparity(patch, half, right, x, y, disparity, num_iterations):
         for j in range(side):
             for i in range(side):
                 xx, yy = xr + i - half, y + j - half
-                window[j, i] = _sample(right, xx, yy)
-                slope[j, i] = np.float32(0.5) * (_sample(right, xx + 1, yy) - _sample(right, xx - 1, yy))
+                window[j, i] = sample_bilinear(right, xx, yy)
+                slope[j, i] = np.float32(0.5) * (sample_bilinear(right, xx + 1, yy) - sample_bilinear(right, xx - 1, yy))
                 mean += window[j, i]
                 slope_mean += slope[j, i]
         mean /= side * side

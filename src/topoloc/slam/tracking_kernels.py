@@ -8,17 +8,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from topoloc.slam.sampling_kernels import sample_bilinear
+
 _OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"reassoc", "contract", "arcp"}}
-
-
-@njit(**_OPTIONS)
-def _sample(image, x, y):
-    """Bilinear; the caller keeps (x, y) inside."""
-    ix, iy = int(x), int(y)
-    fx, fy = np.float32(x - ix), np.float32(y - iy)
-    top = image[iy, ix] * (1 - fx) + image[iy, ix + 1] * fx
-    bottom = image[iy + 1, ix] * (1 - fx) + image[iy + 1, ix + 1] * fx
-    return top * (1 - fy) + bottom * fy
 
 
 @njit(**_OPTIONS)
@@ -29,9 +21,9 @@ def _prepare(image, x, y, half, patch, slope_x, slope_y):
     for j in range(side):
         for i in range(side):
             xx, yy = x + i - half, y + j - half
-            patch[j, i] = _sample(image, xx, yy)
-            slope_x[j, i] = np.float32(0.5) * (_sample(image, xx + 1, yy) - _sample(image, xx - 1, yy))
-            slope_y[j, i] = np.float32(0.5) * (_sample(image, xx, yy + 1) - _sample(image, xx, yy - 1))
+            patch[j, i] = sample_bilinear(image, xx, yy)
+            slope_x[j, i] = np.float32(0.5) * (sample_bilinear(image, xx + 1, yy) - sample_bilinear(image, xx - 1, yy))
+            slope_y[j, i] = np.float32(0.5) * (sample_bilinear(image, xx, yy + 1) - sample_bilinear(image, xx, yy - 1))
             mean += patch[j, i]
             mean_x += slope_x[j, i]
             mean_y += slope_y[j, i]
@@ -85,7 +77,7 @@ def refine_tracks(reference, image, points_ref, points, scales, half, num_iterat
             mean = np.float32(0)
             for j in range(side):
                 for i in range(side):
-                    window[j, i] = _sample(image, x + scale * (i - half), y + scale * (j - half))
+                    window[j, i] = sample_bilinear(image, x + scale * (i - half), y + scale * (j - half))
                     mean += window[j, i]
             mean /= side * side
             squares, dot = np.float32(0), np.float32(0)
