@@ -10,7 +10,7 @@ be seen, make it exact; and it is reported only where the evidence is strong. On
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -25,6 +25,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.guided import GuidedConfig, count_visible, match_guided
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.seen_points import SeenPoints
 from topoloc.localization.stages import StageClock
 from topoloc.localization.verification import Evidence, VerificationConfig, probability_of
 from topoloc.mapping.nodes import NodePoses, node_distances
@@ -98,16 +99,34 @@ class Localizer:
         Raises:
             QueryError: the camera is of another image size.
         """
+        return self.localize_near(image, camera, None)[0]
+
+    def localize_near(
+        self, image: Image, camera: Camera, near: Rigid3 | None, radius_px: float | None = None
+    ) -> tuple[Localization | NotLocalized, SeenPoints | None]:
+        """As `localize`, where the camera is known to be about `near` (world_from_cam): no coarse search, no candidates.
+
+        Map points are sought within `radius_px` (as `GuidedConfig.radius_px`) of where `near` lets expect them; None for `near`
+        is `localize` itself. Also returned are the points that the pose stands on, in pixels of `image`; None without a pose.
+
+        Raises:
+            QueryError: the camera is of another image size.
+        """
         height, width = image.shape[:2]
         if (camera.width, camera.height) != (width, height):
             raise QueryError(f"the image is {width}x{height}, its camera {camera.width}x{camera.height}")
         clock = StageClock()
         image, camera = _reduced(image, camera, self.config.max_side_px)
         features = self._extract(image, clock)
-        candidates = self._rank_nodes(image, features, clock)
-        first = self._localize_among(candidates, features, camera, clock)
+        candidates = [] if near is not None else self._rank_nodes(image, features, clock)
+        first = (
+            self._localize_among(candidates, features, camera, clock)
+            if near is None
+            else self._localize_expecting(near, radius_px, features, camera, clock)
+        )
         final = self._localize_around(first, features, camera, clock)
-        return self._judge(first, final, camera, candidates, clock)
+        result = self._judge(first, final, camera, candidates, clock)
+        return result, _seen_points(final, features, width / camera.width) if isinstance(result, Localization) else None
 
     def _extract(self, image: Image, clock: StageClock) -> Features:
         """Patch normalisation, then the local features."""
@@ -131,6 +150,18 @@ class Localizer:
         if attempt.num_inliers < self.config.num_clear_inliers and len(features) > self.config.num_first_features:
             attempt = self._localize_in(local_map, features, camera, clock)
         return attempt
+
+    def _localize_expecting(self, near: Rigid3, radius_px: float | None, features: Features, camera: Camera, clock: StageClock) -> _Attempt:
+        """The points of the nodes nearest to `near`, sought where they must be seen; of these matches any pose that most agree on."""
+        with clock.stage("matching"):
+            distances = node_distances(near, self._node_poses, self._lambda_rot)
+            num_nodes = max(self.config.guided.num_nodes, 1)
+            local_map = self._pooled([int(i) for i in np.argsort(distances, kind="stable")[:num_nodes]])
+            guided = replace(self.config.guided, radius_px=radius_px or self.config.guided.radius_px)
+            matches = match_guided(features, local_map, near.inverse(), camera, guided)
+        if len(matches) < self.config.min_matches:
+            return _Attempt(local_map, matches, None)
+        return _Attempt(local_map, matches, self._estimate_pose(local_map, matches, features, camera, None, clock))
 
     def _localize_in(self, local_map: LocalMap, features: Features, camera: Camera, clock: StageClock) -> _Attempt:
         """The fine step: match with the candidates' points, then robust PnP."""
@@ -205,6 +236,14 @@ class Localizer:
                 self._local_maps.popitem(last=False)
         self._local_maps.move_to_end(node_id)
         return self._local_maps[node_id]
+
+
+def _seen_points(attempt: _Attempt, features: Features, scale: float) -> SeenPoints:
+    """The inliers of an attempt, in an image that is `scale` times as wide as that of the features."""
+    assert attempt.pose is not None
+    query_idx, train_idx = attempt.matches.query_idx[attempt.pose.inliers], attempt.matches.train_idx[attempt.pose.inliers]
+    points_img = ((features.points_img[query_idx] + 0.5) * scale - 0.5).astype(np.float32)
+    return SeenPoints(points_img, attempt.local_map.points_world[train_idx], attempt.local_map.covariances[train_idx])
 
 
 def _reduced(image: Image, camera: Camera, max_side_px: int) -> tuple[np.ndarray, Camera]:
