@@ -6,7 +6,9 @@ and screens, and cost one ray a sample; the light on the surfaces may be traced 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from math import inf
 from typing import Any
 
@@ -64,7 +66,9 @@ def find_first_hits(
         rows = np.array(each, np.float32).reshape(-1, NUM_COLUMNS)
         columns = [*np.split(rows[:, :-NUM_NUMBERS], NUM_VECTORS, axis=1), *rows[:, -NUM_NUMBERS:].T]
     else:
-        found = follow(scene, mi.Point3f(np.ascontiguousarray(start.T)), mi.Vector3f(np.ascontiguousarray(rays.T)))
+        origins = mi.Point3f(np.ascontiguousarray(start.T))
+        dr.make_opaque(origins)  # a value that the code would contain costs a compilation for every picture
+        found = _recorded(follow)(scene, origins, mi.Vector3f(np.ascontiguousarray(rays.T)))
         dr.eval(*found)  # all in one kernel
         columns = [_array(part, len(rays)) for part in found]
     return _first_hits(columns, rays, haze_range)
@@ -83,7 +87,16 @@ def open_towards(scene: Any, points: Float64[np.ndarray, "n 3"], direction_world
     import mitsuba as mi
 
     starts = mi.Point3f(np.ascontiguousarray(points.T, np.float32))
-    return np.array(let_through(scene, mi.Ray3f(starts, mi.Vector3f(*direction_world.tolist()))), np.float32)
+    ray = mi.Ray3f(starts, mi.Vector3f(*direction_world.tolist()))
+    return np.array(_recorded(let_through)(scene, ray), np.float32)
+
+
+@cache
+def _recorded(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same, but Python runs it only once for a scene: its kernels are recorded and launched again, which saves half of the time."""
+    import drjit as dr
+
+    return dr.freeze(function)
 
 
 def _first_hits(columns: list[np.ndarray], rays: Float32[np.ndarray, "n 3"], haze_range: float) -> FirstHits:
