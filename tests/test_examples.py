@@ -1,0 +1,132 @@
+"""The examples run as their first lines say, and what they print is right."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import runpy
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.sequences.trajectory import read_trajectory
+from topoloc.simulation.demo_recordings import SHIPPED
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+MAX_LINES = 60
+
+Run = Callable[..., str]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Runs an example in an empty folder as the command line does; returns what it printed."""
+
+    def run_example(name: str, *args: object) -> str:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setenv("MPLBACKEND", "Agg")
+        monkeypatch.setattr(sys, "argv", [f"examples/{name}.py", *map(str, args)])
+        runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
+        return capsys.readouterr().out
+
+    return run_example
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A map of the built-in lab, made by the first example of all."""
+    path = tmp_path_factory.mktemp("example") / "lab.topo"
+    runpy.run_path(str(EXAMPLES / "map_and_localize.py"))["main"](str(SHIPPED / "map_lap1"), str(SHIPPED / "day@0"), path)
+    return path
+
+
+def _centimetres(text: str, before: str) -> list[float]:
+    return [float(number) for number in re.findall(rf"{before} ([\d.]+) cm", text)]
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
+def test_an_example_is_short_says_how_it_is_run_and_is_tested_here(path: Path):
+    text = path.read_text(encoding="utf-8")
+    docstring = ast.get_docstring(ast.parse(text))
+    assert docstring
+    assert f"    python examples/{path.name}" in docstring
+    assert len(text.splitlines()) <= MAX_LINES
+    assert f'run("{path.stem}"' in Path(__file__).read_text(encoding="utf-8")
+
+
+def test_map_and_localize(run: Run, tmp_path: Path):
+    printed = run("map_and_localize", "--ask", SHIPPED / "day@0::8")
+    assert len(TopoMetricMap.load(tmp_path / "lab.topo").nodes) > 20
+    assert "not localized" not in printed
+    errors = _centimetres(printed, "off by")
+    assert len(errors) == 4
+    assert max(errors) < 2.0
+
+
+def test_localize_folder(run: Run, lab: Path, tmp_path: Path):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for source in ("camera.json", "images/000000.jpg", "images/000004.jpg"):
+        (photos / Path(source).name).write_bytes((SHIPPED / "day" / source).read_bytes())
+    cv2.imwrite(str(photos / "black.png"), np.zeros((400, 640), np.uint8))
+    (photos / "broken.jpg").write_bytes(b"no picture")
+    printed = run("localize_folder", lab, photos, "--out", "answers")
+    assert "2 of 4 photos localized" in printed
+    lines = [json.loads(line) for line in (tmp_path / "answers" / "poses.jsonl").read_text().splitlines()]
+    assert {line["query"]: line.get("reason") for line in lines} == {
+        "000000.jpg": None,
+        "000004.jpg": None,
+        "black.png": "too_few_matches",
+        "broken.jpg": "unreadable",
+    }
+    assert len(read_trajectory(tmp_path / "answers" / "poses.tum")) == 2
+
+
+def test_own_camera(run: Run):
+    with_lens, as_pinhole = run("own_camera").splitlines()
+    assert "8 of 8 localized" in with_lens
+    (error,), (error_as_pinhole,) = (_centimetres(line, "median error") for line in (with_lens, as_pinhole))
+    assert error < 1.5
+    assert error_as_pinhole > 3.0 * error
+
+
+def test_reject_elsewhere(run: Run, lab: Path):
+    printed = run("reject_elsewhere", lab, SHIPPED / "day@0::8", SHIPPED / "corridor", SHIPPED / "street@0::2")
+    accepted = re.findall(r"^(\S+): (\d+) of (\d+) accepted", printed, re.MULTILINE)
+    assert accepted == [("day@0::8", "4", "4"), ("corridor", "0", "8"), ("street@0::2", "0", "4")]
+
+
+def test_slam_trajectory(run: Run, tmp_path: Path):
+    printed = run("slam_trajectory", SHIPPED / "map_lap1@0:14")
+    assert "14 of 14 frames tracked" in printed
+    assert max(_centimetres(printed, "absolute trajectory error")) < 2.0
+    assert len(read_trajectory(tmp_path / "lap.tum")) == 14
+    where = re.search(r"found at \[(.*?)\] m", printed)
+    assert where
+    assert np.abs(np.array(where.group(1).split(), float)).max() < 0.01
+
+
+def test_inspect_map(run: Run, lab: Path, tmp_path: Path):
+    printed = run("inspect_map", lab)
+    assert f"{len(TopoMetricMap.load(lab).nodes)} nodes" in printed
+    assert cv2.imread(str(tmp_path / "map.png")).std() > 5.0
+
+
+@pytest.mark.parametrize("coarse", ["cnn-fc", "cnn-nn"])
+def test_train_classifier(run: Run, coarse: str, tmp_path: Path, request: pytest.FixtureRequest):
+    pytest.importorskip("torch")
+    weights: tuple[object, ...] = ()
+    if coarse == "cnn-nn":
+        weights = ("--weights", request.getfixturevalue("shared") / "weights/squeezenet1_1-imagenet-features.pth")
+    printed = run("train_classifier", "--epochs", 1, *weights)
+    assert set(TopoMetricMap.load(tmp_path / "lab_learned.topo").coarse_models) == {"surf-vlad", coarse}
+    near = re.search(rf"^{coarse}: .* in (\d+) %$", printed, re.MULTILINE)
+    assert near
+    if coarse == "cnn-nn":  # one epoch from nothing promises little
+        assert int(near.group(1)) >= 90
