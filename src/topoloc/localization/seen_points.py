@@ -21,3 +21,8 @@ class SeenPoints:
 
     def select(self, rows: np.ndarray) -> SeenPoints:
         return SeenPoints(self.points_img[rows], self.points_world[rows], self.covariances[rows])
+
+    def in_image(self, scale: float) -> SeenPoints:
+        """The same in a picture that is `scale` times as wide."""
+        points_img = ((self.points_img + np.float32(0.5)) * np.float32(scale) - np.float32(0.5)).astype(np.float32)
+        return SeenPoints(points_img, self.points_world, self.covariances)

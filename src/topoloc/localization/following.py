@@ -1,0 +1,126 @@
+"""Points of the map followed from picture to picture, between two pictures that were localized in full.
+
+The points that a full localization stands on are sought again by Lucas and Kanade's method and aligned with their patch in that picture
+(`slam/tracking.py`). The pose is that of the localized picture, moved by what the points say of the motion since: the map's own errors
+are the same in both and cancel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.seen_points import SeenPoints
+from topoloc.slam.tracking import TrackingConfig, align_with_reference, follow
+
+
+@dataclass(frozen=True)
+class FollowingConfig:
+    """Which points are followed, and when they are too few."""
+
+    max_points: int = 160
+    """Points followed, spread over the picture: more cost time and add little."""
+    min_points: int = 20
+    """Points that agree on a pose; with fewer it is not believed."""
+    min_agreeing: float = 0.6
+    """Share of the points found again that must agree."""
+    tracking: TrackingConfig = field(default_factory=lambda: TrackingConfig(max_shift_px=4.0))
+    pose: AbsolutePoseConfig = field(
+        default_factory=lambda: AbsolutePoseConfig(max_reprojection_error_px=4.0, sigma_px=0.5, max_iterations=300, min_iterations=20)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """Where a picture was taken, relative to the localized one; `covariance` is of the left perturbation of `cam_from_ref` (m, rad)."""
+
+    cam_from_ref: Rigid3
+    covariance: Float[np.ndarray, "6 6"]
+    num_found: int
+    num_agreeing: int
+    share_left: float
+    """Of the points that there were at first, those that agree."""
+    shift_px: float
+    """How far they have moved in the picture since (median)."""
+
+
+class PointFollower:
+    """Holds the localized picture, its points, and where they were last seen."""
+
+    def __init__(self, grey: UInt8[np.ndarray, "h w"], seen: SeenPoints, cam_from_world: Rigid3, camera: Camera, config: FollowingConfig):
+        self._config, self._camera, self._cam_from_world = config, camera, cam_from_world
+        self._seen = _spread(seen, camera, config.max_points)
+        self._reference = grey.astype(np.float32)
+        self._last_grey, self._last_img, self._rows = grey, self._seen.points_img, np.arange(len(self._seen))
+        self._last_from_world = cam_from_world
+        # What the points followed say of the localized picture itself; the motion since is measured from there.
+        self._ref_from_world = self._pose(self._seen.points_img, self._rows, cam_from_world)
+
+    @property
+    def camera(self) -> Camera:
+        return self._camera
+
+    def follow(self, grey: UInt8[np.ndarray, "h w"], expected: Rigid3) -> Followed | None:
+        """The motion up to this picture, taken at about `expected` (cam_from_world); None where the points are lost."""
+        if self._ref_from_world is None:
+            return None
+        for guess in (expected, self._last_from_world):
+            rows, points_img = self._seek(grey, guess)
+            pose = self._pose(points_img, rows, guess) or self._pose(points_img, rows, None)
+            if pose is not None:
+                break
+        else:
+            return None
+        agreeing = rows[pose.inliers]
+        self._last_grey, self._last_img, self._rows = grey, points_img[pose.inliers], agreeing
+        self._last_from_world = pose.cam_from_world
+        return Followed(
+            cam_from_ref=pose.cam_from_world @ self._ref_from_world.cam_from_world.inverse(),
+            covariance=pose.covariance,
+            num_found=len(rows),
+            num_agreeing=len(agreeing),
+            share_left=len(agreeing) / len(self._seen),
+            shift_px=float(np.median(np.linalg.norm(self._last_img - self._seen.points_img[agreeing], axis=1))),
+        )
+
+    def _seek(self, grey: UInt8[np.ndarray, "h w"], guess: Rigid3) -> tuple[np.ndarray, Float32[np.ndarray, "n 2"]]:
+        """Rows of the points found again, and where."""
+        points_world = self._seen.points_world[self._rows]
+        before, after = (self._camera.img_from_cam(pose.apply(points_world)) for pose in (self._last_from_world, guess))
+        limit = np.array([self._camera.width, self._camera.height]) / 2.0
+        guesses = (self._last_img + np.clip(np.nan_to_num(after - before), -limit, limit)).astype(np.float32)
+        found, is_found = follow(self._last_grey, grey, self._last_img, guesses, self._config.tracking)
+        rows, found = self._rows[is_found], found[is_found]
+        depths = [pose.apply(self._seen.points_world[rows])[:, 2] for pose in (self._cam_from_world, guess)]
+        scales = np.clip(depths[0] / np.maximum(depths[1], 1e-3), 0.5, 2.0).astype(np.float32)
+        points_ref = self._seen.points_img[rows]
+        refined, alike = align_with_reference(self._reference, grey.astype(np.float32), points_ref, found, scales, self._config.tracking)
+        return rows[alike], refined[alike]
+
+    def _pose(self, points_img: Float32[np.ndarray, "n 2"], rows: np.ndarray, start: Rigid3 | None) -> AbsolutePose | None:
+        """The pose that enough of the points agree on."""
+        config = self._config
+        if len(rows) < config.min_points:
+            return None
+        pose = estimate_absolute_pose(
+            points_img.astype(np.float64), self._seen.points_world[rows], self._camera, config.pose,
+            point_covariances=self._seen.covariances[rows], start=start,
+        )  # fmt: skip
+        enough = max(config.min_points, config.min_agreeing * len(rows))
+        return pose if pose is not None and np.count_nonzero(pose.inliers) >= enough else None
+
+
+def _spread(seen: SeenPoints, camera: Camera, max_points: int) -> SeenPoints:
+    """At most so many of the points, taken in turn from the cells of a grid."""
+    if len(seen) <= max_points:
+        return seen
+    cells = np.floor(seen.points_img / [camera.width / 8.0, camera.height / 6.0]).astype(np.int64) @ [1, 8]
+    order = np.argsort(cells, kind="stable")
+    starts = np.flatnonzero(np.diff(cells[order], prepend=-1))
+    turns = np.arange(len(order)) - np.repeat(starts, np.diff(np.append(starts, len(order))))
+    return seen.select(np.sort(order[np.argsort(turns, kind="stable")[:max_points]]))
