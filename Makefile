@@ -2,6 +2,7 @@
 # make install   the program with all its extras and the tests' tools, into .venv, at the versions of constraints.txt
 # make test      all checks: ruff, import contract, types, tests; installs into .venv only what these need
 # make lint      the same without the tests
+# make docs      these pages as HTML, in docs/_build/html; a warning is an error
 # make clean     remove what the above made
 # PYTHON=... chooses the interpreter that .venv is made with.
 
@@ -13,7 +14,7 @@ CANDIDATES := $(PYTHON) python3.13 python3.12 python3.11 python3
 # Without a look at the network for a newer pyright; its node comes from the package index.
 PYRIGHT := PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright
 
-.PHONY: demo install test lint clean
+.PHONY: demo install test lint docs clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed-core
@@ -30,14 +31,20 @@ lint: $(VENV)/installed-test
 	@$(BIN)/lint-imports --no-logo > $(VENV)/lint-imports.txt || { cat $(VENV)/lint-imports.txt; exit 1; }
 	@$(PYRIGHT)
 
+docs: $(VENV)/installed-docs
+	@$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -d docs/_build/trees docs docs/_build/html
+	@echo "docs/_build/html/index.html"
+
 # What each kind of installation brings; one that brings more has brought the others, too.
 $(VENV)/installed-core: EXTRAS :=
 $(VENV)/installed-core: BRINGS := core
+$(VENV)/installed-docs: EXTRAS := [docs]
+$(VENV)/installed-docs: BRINGS := core docs
 $(VENV)/installed-test: EXTRAS := [sim,test]
-$(VENV)/installed-test: BRINGS := core test
+$(VENV)/installed-test: BRINGS := core docs test
 $(VENV)/installed-all: EXTRAS := [all,test]
-$(VENV)/installed-all: BRINGS := core test all
-$(VENV)/installed-core $(VENV)/installed-test $(VENV)/installed-all: pyproject.toml constraints.txt $(BIN)/python
+$(VENV)/installed-all: BRINGS := core docs test all
+$(VENV)/installed-core $(VENV)/installed-docs $(VENV)/installed-test $(VENV)/installed-all: pyproject.toml constraints.txt $(BIN)/python
 	@echo "installing topoloc$(EXTRAS) into $(VENV) ..."
 	@$(PIP) hatchling editables
 	@$(PIP) --no-build-isolation --editable '.$(EXTRAS)'
@@ -54,5 +61,5 @@ $(BIN)/python:
 	exit 1
 
 clean:
-	@rm -rf $(VENV) topoloc-demo build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	@rm -rf $(VENV) topoloc-demo build dist docs/_build .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +

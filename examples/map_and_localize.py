@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 import topoloc
+from topoloc.geometry.absolute_pose import covariance_of_inverse, position_covariance
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.simulation.demo_recordings import SHIPPED
 
@@ -29,9 +30,11 @@ def main(map_from: str, ask: str, out: Path) -> None:
         if isinstance(result, topoloc.NotLocalized):
             print(f"{frame.name}: not localized ({result.reason})")
             continue
-        # The covariance is that of (translation, rotation), metres and radians: the first three of its diagonal are the position's.
+        # The covariance is that of a perturbation of the whole pose; the position's own follows from it.
+        covariance = covariance_of_inverse(result.world_from_cam, result.covariance)
+        position = position_covariance(result.world_from_cam.inverse(), covariance)
         x, y, z = result.world_from_cam.translation
-        sigma_cm = 100.0 * np.sqrt(np.trace(result.covariance[:3, :3]))
+        sigma_cm = 100.0 * np.sqrt(np.trace(position))
         line = f"{frame.name}: ({x:.3f}, {y:.3f}, {z:.3f}) m, give or take {sigma_cm:.2f} cm"
         if frame.world_from_cam is not None:
             metres, radians = (error(frame.world_from_cam, result.world_from_cam) for error in (translation_error, rotation_error))

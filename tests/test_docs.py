@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import sqlite3
 import warnings
@@ -24,7 +25,7 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 CLI = (ROOT / "docs" / "cli.md").read_text(encoding="utf-8")
 MAP_FORMAT = (ROOT / "docs" / "map-format.md").read_text(encoding="utf-8")
 PLAN = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
-PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 
 LOCALIZED = Localization(Rigid3.identity(), np.eye(6), 1.0, 0, [NodeScore(0, 1.0)], 30, 20, {"total": 1.0})
 UNREADABLE = NotLocalized("unreadable", detail="which file, and why")
@@ -112,7 +113,9 @@ def test_python_examples_compile_and_use_public_names():
     assert blocks
     for block in blocks:
         compile(block, "example", "exec")
-        assert set(re.findall(r"\btopoloc\.(\w+)", block)) <= set(topoloc.__all__)
+        for module, names in re.findall(r"^from (topoloc\.[\w.]+) import ([\w, ]+)$", block, re.MULTILINE):
+            assert [name for name in names.split(", ") if not hasattr(importlib.import_module(module), name)] == []
+        assert set(re.findall(r"(?<!from )\btopoloc\.(\w+)", block)) <= set(topoloc.__all__)
 
 
 def test_the_plan_names_the_files_that_are_there():

@@ -1,0 +1,112 @@
+"""The pages of docs/: scripts, settings and names that they mention are there; the quickstart runs; Sphinx has nothing to warn of."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import topoloc
+from topoloc.cli import COMMANDS
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = sorted([*ROOT.glob("*.md"), *DOCS.glob("*.md")])
+SCRIPTS = sorted((ROOT / "benchmarks").glob("*.py"))
+SPHINX_PACKAGES = ("sphinx", "furo", "myst_parser")
+
+
+def _read(name: str) -> str:
+    return (DOCS / name).read_text(encoding="utf-8")
+
+
+def _run(*command: str | Path, folder: Path) -> str:
+    """The output of a program that must end with status 0, run with this Python's programs first in PATH."""
+    path = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", "")))
+    done = subprocess.run(list(map(str, command)), cwd=folder, env=os.environ | {"PATH": path}, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def _marked_blocks(page: str, language: str) -> list[str]:
+    """The code blocks of a page that it says are run here."""
+    mark = re.escape("<!-- run by tests/test_pages.py -->")
+    return re.findall(rf"^{mark}\n```{language}\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+def test_every_benchmark_is_on_its_page_and_says_how_it_is_run(script: Path):
+    assert f"`python benchmarks/{script.name}" in _read("benchmarks.md")
+    docstring = ast.get_docstring(ast.parse(script.read_text(encoding="utf-8")))
+    assert docstring
+    assert f"python benchmarks/{script.name}" in docstring
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_benchmarks_and_options_that_a_page_names_are_there(page: Path):
+    for name, words in re.findall(r"\bbenchmarks/(\w+\.py)\b([^`\n|]*)", page.read_text(encoding="utf-8")):
+        script = ROOT / "benchmarks" / name
+        assert script.is_file(), f"{page.name} names benchmarks/{name}"
+        text = script.read_text(encoding="utf-8")
+        for option in re.findall(r"--([a-z][a-z-]*)", words):
+            assert f"--{option}" in text, f"{page.name}: {name} has no --{option}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_targets_of_make_that_a_page_names_are_there(page: Path):
+    targets = set(re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    assert set(re.findall(r"(?:^|`)make (\w+)", page.read_text(encoding="utf-8"), re.MULTILINE)) <= targets
+
+
+@pytest.mark.parametrize("name", topoloc.__all__)
+def test_every_public_name_is_in_the_reference(name: str):
+    described = re.findall(r"^\.\. (?:autofunction|autoclass|autoexception|py:data):: (?:topoloc\.)?(\w+)$", _read("api.md"), re.MULTILINE)
+    assert described.count(name) == 1
+
+
+def test_settings_that_the_pipeline_names_are_there(capsys: pytest.CaptureFixture[str]):
+    """The table of the paper's own settings."""
+    from topoloc.cli import main
+
+    helps = ""
+    for command in COMMANDS:
+        with pytest.raises(SystemExit):
+            main([command, "--help"])
+        helps += capsys.readouterr().out
+    page = _read("pipeline.md")
+    settings = set(re.findall(r"(--[a-z][\w.-]*)", page))
+    assert len(settings) > 5
+    assert {setting for setting in settings if f"{setting} " not in helps} == set()
+
+
+def test_every_page_is_reached_from_the_index():
+    index = _read("index.md")
+    listed = {line for block in re.findall(r"^```\{toctree\}\n(.*?)^```", index, re.MULTILINE | re.DOTALL) for line in block.split()}
+    assert {page.stem for page in DOCS.glob("*.md")} - {"index"} <= listed
+
+
+def test_the_quickstart_runs(tmp_path: Path):
+    page = _read("quickstart.md")
+    (shell,), (python,) = _marked_blocks(page, "sh"), _marked_blocks(page, "python")
+    printed = _run("bash", "-euo", "pipefail", "-c", shell, folder=tmp_path)
+    assert "8 of 8" in printed
+    assert len((tmp_path / "night.jsonl").read_text(encoding="utf-8").splitlines()) == 8
+    for name in ("lab.topo", "night.tum", "day-and-night.html"):
+        assert (tmp_path / name).stat().st_size > 0
+    assert _run(sys.executable, "-c", python, folder=tmp_path).strip()
+
+
+def test_the_pages_build_without_a_warning(tmp_path: Path):
+    missing = [name for name in SPHINX_PACKAGES if importlib.util.find_spec(name) is None]
+    if missing:
+        pytest.skip(f"{', '.join(missing)} not installed (the extra docs)")
+    _run(sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-d", tmp_path / "trees", DOCS, tmp_path / "html", folder=ROOT)
+    reference, commands = ((tmp_path / "html" / f"{name}.html").read_text(encoding="utf-8") for name in ("api", "commands"))
+    assert [name for name in topoloc.__all__ if f'id="topoloc.{name}"' not in reference] == []
+    assert [name for name in COMMANDS if f"usage: topoloc {name} " not in commands] == []
