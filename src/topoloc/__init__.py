@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from topoloc.geometry.rigid import Rigid3
     from topoloc.localization.localizer import Localizer, LocalizerConfig
     from topoloc.localization.result import Localization, NotLocalized
+    from topoloc.localization.stream_result import StreamedPose
+    from topoloc.localization.tracker import Tracker, TrackerConfig
     from topoloc.mapping.build import BuildConfig, build_map
     from topoloc.mapping.topomap import TopoMetricMap
     from topoloc.sequences.open import open_sequence
@@ -28,8 +30,11 @@ __all__ = [
     "LocalizerConfig",
     "NotLocalized",
     "Rigid3",
+    "StreamedPose",
     "TopoMetricMap",
     "TopolocError",
+    "Tracker",
+    "TrackerConfig",
     "__version__",
     "build_map",
     "open_sequence",
@@ -43,8 +48,11 @@ _MODULES = {
     "LocalizerConfig": "topoloc.localization.localizer",
     "NotLocalized": "topoloc.localization.result",
     "Rigid3": "topoloc.geometry.rigid",
+    "StreamedPose": "topoloc.localization.stream_result",
     "TopoMetricMap": "topoloc.mapping.topomap",
     "TopolocError": "topoloc.errors",
+    "Tracker": "topoloc.localization.tracker",
+    "TrackerConfig": "topoloc.localization.tracker",
     "build_map": "topoloc.mapping.build",
     "open_sequence": "topoloc.sequences.open",
 }

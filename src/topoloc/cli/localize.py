@@ -3,37 +3,41 @@
 from __future__ import annotations
 
 import json
-import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from topoloc.cli.output import UsageError, check_outputs, interruptible, progress_bar, write_text
+from topoloc.cli.query_answers import QueryAnswer, answer_line, exit_status, stream_summary, trajectory_of
 from topoloc.errors import CalibrationError, QueryError, TopolocError, UnreadableImageError
 from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.result import NotLocalized
+from topoloc.localization.tracker import Tracker, TrackerConfig
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.sequences.camera_json import read_camera_json
 from topoloc.sequences.frame import StereoFrame, StereoSequence
-from topoloc.sequences.open import open_sequence
-from topoloc.sequences.trajectory import Trajectory, write_tum
+from topoloc.sequences.open import find_format, open_sequence
+from topoloc.sequences.recording import single_pictures
+from topoloc.sequences.trajectory import frame_poses, read_trajectory, write_tum
 
 # The camera of a picture of this width and height (pixels).
 CameraOfSize = Callable[[int, int], Camera]
 
 
 @dataclass(frozen=True, eq=False)
-class _Answer:
-    """A query with the time of its frame."""
+class _Query:
+    """An input: its pictures, whether they are a stream, and the pose of each by external odometry."""
 
-    query: str
-    t_ns: int
-    result: Localization | NotLocalized
+    path: str
+    sequence: StereoSequence
+    is_stream: bool
+    odom_from_cams: list[Rigid3 | None]
 
 
 @dataclass(frozen=True)
@@ -43,37 +47,50 @@ class Command:
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP")]
     """The map file."""
     inputs: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="INPUT ...", help_behavior_hint="(required)")] = ()
-    """Images, folders of images, recordings. PATH@0:100 takes the first hundred frames of PATH."""
+    """Images, folders of images, videos, recordings. PATH@0:100 takes the first hundred frames of PATH."""
     camera: Annotated[str | None, tyro.conf.arg(metavar="FILE|fx,fy,cx,cy|map", help_behavior_hint="(default: that of the recording)")] = (
         None
     )
     """The queries' calibration: a camera.json, `fx,fy,cx,cy` in pixels, or `map` for the camera that the map was made with."""
     format: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: recognised)")] = None
-    """The recordings' format: kitti, euroc, tum, seven_scenes or folder."""
+    """The recordings' format: kitti, euroc, tum, seven_scenes, video or folder."""
     coarse: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")] = None
     """Which of the map's coarse localizers is asked; `topoloc info` names them."""
     json: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
     """Write one JSON line a query to this file (- for standard output)."""
     tum: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
     """Write the poses found to this file, TUM format, world_from_cam. Single photos have no times: t is then the query's number."""
+    smoothed: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Of streams, --tum takes the smoothed poses instead of the raw ones."""
+    stream: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Take every input for a stream, folders of pictures, too."""
+    single: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Localize each picture alone, those of recordings and videos, too."""
+    odometry: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    """A stream's poses by external odometry, TUM format, in any world of its own: used to predict where the next picture was taken."""
+    max_jump: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="")] = None
+    """The paper's rule for streams, not the motion model: a pose further than this from the one before is refused, which is copied."""
+    tracker: Annotated[TrackerConfig, tyro.conf.arg(name="config.tracker")] = field(default_factory=TrackerConfig)
     config: LocalizerConfig = field(default_factory=LocalizerConfig)
 
     def run(self) -> int:
         if not self.inputs:
             raise UsageError("localize takes a map and at least one image, folder or recording")
-        check_outputs([self.json, self.tum], inputs=[self.map, *self.inputs])
+        self._check_usage()
+        check_outputs([self.json, self.tum], inputs=[self.map, *self.inputs, *([self.odometry] if self.odometry else [])])
         topomap = TopoMetricMap.load(self.map)
         camera = None if self.camera is None else _camera_of_size(self.camera, topomap)
-        sequences = [open_sequence(path, self.format) for path in self.inputs]
+        queries = [self._open(path) for path in self.inputs]
         localizer = Localizer(topomap, replace(self.config, coarse=self.coarse or self.config.coarse))
-        answers: list[_Answer] = []
-        total = sum(map(len, sequences))
+        answers: list[QueryAnswer] = []
+        total = sum(len(query.sequence) for query in queries)
+        start = time.perf_counter()
         try:
             with interruptible(), progress_bar() as progress:
-                for answer in self._answers(localizer, sequences, camera):
+                for answer in self._answers(localizer, queries, camera):
                     answers.append(answer)
                     as_json = self.json == "-"
-                    print(json.dumps(answer.result.to_json(answer.query)) if as_json else _line(answer), flush=True)
+                    print(json.dumps(answer.to_json()) if as_json else answer_line(answer), flush=True)
                     progress("queries", len(answers), total)
         except (KeyboardInterrupt, TopolocError) as stopped:
             files = self._write_files(answers) if answers else []
@@ -82,33 +99,71 @@ class Command:
             what = "interrupted" if isinstance(stopped, KeyboardInterrupt) else str(stopped)
             raise TopolocError(f"{what} (results of the {len(answers)} queries before: {', '.join(files)})") from stopped
         self._write_files(answers)
-        return _status(answers)
+        if any(query.is_stream for query in queries) and self.json != "-":
+            print(stream_summary(answers, time.perf_counter() - start))
+        return exit_status(answers)
 
-    def _answers(self, localizer: Localizer, sequences: list[StereoSequence], camera_of_size: CameraOfSize | None) -> Iterator[_Answer]:
-        for path, sequence in zip(self.inputs, sequences, strict=True):
-            for i, name in enumerate(sequence.names):
-                query = name if len(self.inputs) == 1 else path if len(sequence) == 1 else f"{path}/{name}"
+    def _check_usage(self) -> None:
+        if self.stream and self.single:
+            raise UsageError("--stream and --single cannot both be meant")
+        if self.odometry is not None and len(self.inputs) > 1:
+            raise UsageError("--odometry is that of one stream: give one input with it")
+        if self.max_jump is not None and not self.max_jump > 0:
+            raise UsageError(f"--max-jump is a length in metres, not {self.max_jump:g}")
+
+    def _open(self, path: str) -> _Query:
+        """Recordings and videos are streams; pictures, and folders of them, are single unless they are said not to be."""
+        is_stream = self.stream or (not self.single and find_format(path, self.format) != "folder")
+        sequence = single_pictures(open_sequence(path, self.format))
+        is_stream = is_stream and len(sequence) > 1
+        odometry = None
+        if self.odometry is not None:
+            if not is_stream:
+                raise UsageError(f"--odometry is for streams, and {path} is none; --stream makes it one")
+            odometry = frame_poses(read_trajectory(Path(self.odometry)), sequence.t_ns, Path(self.odometry))
+        return _Query(path, sequence, is_stream, odometry or [None] * len(sequence))
+
+    def _answers(self, localizer: Localizer, queries: list[_Query], camera_of_size: CameraOfSize | None) -> Iterator[QueryAnswer]:
+        for query in queries:
+            tracker = self._tracker(localizer) if query.is_stream else None
+            for i, frame_name in enumerate(query.sequence.names):
+                name = frame_name if len(queries) == 1 else query.path if len(query.sequence) == 1 else f"{query.path}/{frame_name}"
                 try:
-                    frame = sequence[i]
-                except UnreadableImageError as error:
-                    yield _Answer(query, sequence.t_ns[i], NotLocalized("unreadable", detail=str(error)))
-                    continue
-                try:
-                    result = localizer.localize(frame.image, _camera_of_frame(frame, camera_of_size))
+                    yield _answer(name, query, i, localizer, tracker, camera_of_size)
                 except (QueryError, CalibrationError) as error:
-                    raise type(error)(f"{query}: {error}") from error
-                yield _Answer(query, frame.t_ns, result)
+                    raise type(error)(f"{name}: {error}") from error
 
-    def _write_files(self, answers: list[_Answer]) -> list[str]:
+    def _tracker(self, localizer: Localizer) -> Tracker:
+        config = self.tracker
+        return Tracker(localizer, config if self.max_jump is None else replace(config, mode="paper", max_jump=self.max_jump))
+
+    def _write_files(self, answers: list[QueryAnswer]) -> list[str]:
         """The paths written."""
         files = []
         if self.json is not None and self.json != "-":
-            write_text(Path(self.json), "".join(json.dumps(a.result.to_json(a.query)) + "\n" for a in answers))
+            write_text(Path(self.json), "".join(json.dumps(a.to_json()) + "\n" for a in answers))
             files.append(self.json)
         if self.tum is not None:
-            write_tum(Path(self.tum), _trajectory(answers))
+            write_tum(Path(self.tum), trajectory_of(answers, self.smoothed))
             files.append(self.tum)
         return files
+
+
+def _answer(
+    name: str, query: _Query, index: int, localizer: Localizer, tracker: Tracker | None, camera_of_size: CameraOfSize | None
+) -> QueryAnswer:
+    """One picture, alone or as the next of a stream."""
+    t_ns, odom_from_cam = query.sequence.t_ns[index], query.odom_from_cams[index]
+    try:
+        frame = query.sequence[index]
+    except UnreadableImageError as error:
+        unreadable = NotLocalized("unreadable", detail=str(error))
+        return QueryAnswer(name, t_ns, unreadable, tracker.miss(t_ns, unreadable, odom_from_cam) if tracker is not None else None)
+    camera = _camera_of_frame(frame, camera_of_size)
+    if tracker is None:
+        return QueryAnswer(name, t_ns, localizer.localize(frame.image, camera))
+    streamed = tracker.process(frame.image, camera, t_ns, odom_from_cam)
+    return QueryAnswer(name, t_ns, streamed.result, streamed)
 
 
 def _camera_of_frame(frame: StereoFrame, camera_of_size: CameraOfSize | None) -> Camera:
@@ -142,40 +197,3 @@ def _rescaled(camera: Camera) -> CameraOfSize:
         return camera.rescaled(width, height)
 
     return of_size
-
-
-def _trajectory(answers: list[_Answer]) -> Trajectory:
-    """The poses found, in the order of the queries; their numbers are their seconds where the times do not increase."""
-    times = [answer.t_ns for answer in answers]
-    if any(after <= before for before, after in pairwise(times)):
-        times = [number * 1_000_000_000 for number in range(len(answers))]
-    found = [(t_ns, a.result.world_from_cam) for t_ns, a in zip(times, answers, strict=True) if isinstance(a.result, Localization)]
-    return Trajectory([world_from_cam for _, world_from_cam in found], [t_ns for t_ns, _ in found])
-
-
-def _status(answers: list[_Answer]) -> int:
-    """The exit status; one line on stderr where pictures could not be read."""
-    details = [a.result.detail for a in answers if isinstance(a.result, NotLocalized) and a.result.reason == "unreadable"]
-    if not details:
-        return 0
-    if len(details) == len(answers):
-        more = f" (and the other {len(details) - 1} could not be read either)" if len(details) > 1 else ""
-        print(f"error: {details[0]}{more}", file=sys.stderr)
-        return 1
-    print(f"warning: {len(details)} of {len(answers)} images could not be read; the first: {details[0]}", file=sys.stderr)
-    return 0
-
-
-def _line(answer: _Answer) -> str:
-    """One query for people."""
-    result = answer.result
-    ms = f"  {result.times_ms['total']:.0f} ms" if result.times_ms else ""
-    if isinstance(result, NotLocalized):
-        evidence = "" if result.reason == "unreadable" else f"  ({result.num_inliers} of {result.num_matches} matches)"
-        return f"{answer.query}  not localized: {result.reason}{evidence}{ms}"
-    x, y, z = result.world_from_cam.translation
-    w, i, j, k = result.world_from_cam.quat_wxyz()
-    return (
-        f"{answer.query}  at {x:.3f} {y:.3f} {z:.3f} m, quat wxyz {w:.4f} {i:.4f} {j:.4f} {k:.4f}  p {result.probability:.2f}"
-        f"  node {result.node_id}  ({result.num_inliers} of {result.num_matches} matches){ms}"
-    )

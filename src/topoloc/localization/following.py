@@ -59,7 +59,7 @@ class PointFollower:
         self._last_grey, self._last_img, self._rows = grey, self._seen.points_img, np.arange(len(self._seen))
         self._last_from_world = cam_from_world
         # What the points followed say of the localized picture itself; the motion since is measured from there.
-        self._ref_from_world = self._pose(self._seen.points_img, self._rows, cam_from_world)
+        self._ref_from_world = self._pose(self._seen.points_img, self._rows)
 
     @property
     def camera(self) -> Camera:
@@ -71,7 +71,7 @@ class PointFollower:
             return None
         for guess in (expected, self._last_from_world):
             rows, points_img = self._seek(grey, guess)
-            pose = self._pose(points_img, rows, guess) or self._pose(points_img, rows, None)
+            pose = self._pose(points_img, rows)
             if pose is not None:
                 break
         else:
@@ -102,14 +102,14 @@ class PointFollower:
         refined, alike = align_with_reference(self._reference, grey.astype(np.float32), points_ref, found, scales, self._config.tracking)
         return rows[alike], refined[alike]
 
-    def _pose(self, points_img: Float32[np.ndarray, "n 2"], rows: np.ndarray, start: Rigid3 | None) -> AbsolutePose | None:
-        """The pose that enough of the points agree on."""
+    def _pose(self, points_img: Float32[np.ndarray, "n 2"], rows: np.ndarray) -> AbsolutePose | None:
+        """The pose that enough of the points agree on, found anew: from a prediction that is off the refinement may not get there."""
         config = self._config
         if len(rows) < config.min_points:
             return None
         pose = estimate_absolute_pose(
             points_img.astype(np.float64), self._seen.points_world[rows], self._camera, config.pose,
-            point_covariances=self._seen.covariances[rows], start=start,
+            point_covariances=self._seen.covariances[rows],
         )  # fmt: skip
         enough = max(config.min_points, config.min_agreeing * len(rows))
         return pose if pose is not None and np.count_nonzero(pose.inliers) >= enough else None

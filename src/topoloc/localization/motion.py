@@ -19,7 +19,7 @@ from topoloc.geometry.rigid import Rigid3
 class MotionConfig:
     """What cameras do: in a hand, on a robot, on a car."""
 
-    sigma_acceleration: float = 3.0
+    sigma_acceleration: float = 2.0
     """Of an unknown acceleration, m/s^2."""
     sigma_angular_acceleration: float = 6.0
     """rad/s^2."""

@@ -51,7 +51,7 @@ class TrackerConfig:
     """Seconds after which a picture that could be tracked is localized in full all the same ..."""
     min_share_left: float = 0.6
     """... as it is where fewer of the followed points are left ..."""
-    max_shift: float = 0.08
+    max_shift: float = 0.06
     """... or where these have moved by this share of the picture's width."""
     retry_after: float = 0.1
     """Seconds to the next attempt where that failed and the points are still there."""
@@ -59,9 +59,9 @@ class TrackerConfig:
     """Where a point may be further than this from where it is expected (three sigma, in 640 pixels' width), the coarse search is asked."""
     covariance_scale: float = 3.0
     """By how much errors of localization exceed their sigma: points share the errors of the map ..."""
-    floor_share: float = 0.005
+    floor_share: float = 0.004
     """... which do not vanish with their number: sigma, as a share of the points' depth."""
-    followed_share: float = 0.05
+    followed_share: float = 0.04
     """Sigma of a followed motion, as a share of its way and turn, beside what the points say."""
 
 
@@ -247,13 +247,13 @@ class Tracker:
         else:
             motion, motion_covariance = self._motion(predicted, followed)
             smoothed = self._window.add(cam_from_world, covariance, motion, motion_covariance)
-            measured = covariance if followed is None else followed.covariance + covariance / self.config.window.size
+            measured = covariance if followed is None else motion_covariance + covariance / self.config.window.size
             state = self._gate.correct(predicted, smoothed.inverse(), measured, odom_from_cam)
             self._gate.drop_rival()
         points = seen.in_image(picture.grey_camera.width / picture.camera.width)
         follower = PointFollower(picture.grey, points, cam_from_world, picture.grey_camera, self.config.following)
         self._reference = _Reference(t_ns, found, cam_from_world, covariance, smoothed, depth, follower)
-        return StreamedPose(t_ns, "localized", found, smoothed.inverse(), self._covariance(state))
+        return StreamedPose(t_ns, "localized", found, state.world_from_cam, self._covariance(state))
 
     def _motion(self, predicted: MotionState, followed: Followed | None) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
         """cam_from_before, from the picture localized last, with the covariance of its left perturbation."""
@@ -266,7 +266,7 @@ class Tracker:
         reference = self._reference
         assert reference is not None
         smoothed = (followed.cam_from_ref @ reference.smoothed).inverse()
-        state = self._gate.correct(predicted, smoothed, followed.covariance, picture.odom_from_cam)
+        state = self._gate.correct(predicted, smoothed, self._followed_covariance(followed), picture.odom_from_cam)
         world_from_cam = (followed.cam_from_ref @ reference.cam_from_world).inverse()
         adjoint, motion = world_from_cam.adjoint(), followed.cam_from_ref.adjoint()
         covariance = adjoint @ (motion @ reference.covariance @ motion.T + followed.covariance) @ adjoint.T
@@ -281,7 +281,7 @@ class Tracker:
             num_inliers=followed.num_agreeing,
             times_ms=clock.times_ms(),
         )
-        return StreamedPose(picture.t_ns, "tracked", result, smoothed, self._covariance(state))
+        return StreamedPose(picture.t_ns, "tracked", result, state.world_from_cam, self._covariance(state))
 
     def _without_pose(self, result: NotLocalized, predicted: MotionState | None, t_ns: int) -> StreamedPose:
         """Predicted for a while, then lost."""

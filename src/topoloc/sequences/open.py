@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from topoloc.errors import RecordingError, UnknownFormatError
-from topoloc.sequences import euroc, folder, kitti, seven_scenes, tum
+from topoloc.sequences import euroc, folder, kitti, seven_scenes, tum, video
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.selection import parse_selection, sequence_subset
 
@@ -27,6 +27,7 @@ FORMATS = {
     "tum": SequenceFormat(tum.LOOKS_FOR, tum.recognises, tum.open_tum),
     "seven_scenes": SequenceFormat(seven_scenes.LOOKS_FOR, seven_scenes.recognises, seven_scenes.open_seven_scenes),
     "kitti": SequenceFormat(kitti.LOOKS_FOR, kitti.recognises, kitti.open_kitti),
+    "video": SequenceFormat(video.LOOKS_FOR, video.recognises, video.open_video),
     "folder": SequenceFormat(folder.LOOKS_FOR, folder.recognises, folder.open_folder),
 }
 
@@ -35,7 +36,7 @@ def open_sequence(path: str | Path, format: str | None = None) -> StereoSequence
     """Open a recording, or some frames of it. Pictures are read frame by frame, when asked for.
 
     Args:
-        path: a folder, or one picture file. A part is chosen by a suffix: ``PATH@START:STOP:STEP`` as Python slices,
+        path: a folder, a video, or one picture file. A part is chosen by a suffix: ``PATH@START:STOP:STEP`` as Python slices,
             several of them by commas (``@0:10,50:60``); ``PATH@0-59/100`` are the frames whose number modulo 100 is 0 to 59.
         format: one of `FORMATS`; recognised where None.
 
@@ -44,18 +45,29 @@ def open_sequence(path: str | Path, format: str | None = None) -> StereoSequence
         RecordingError: nothing is there, nothing is chosen, or the recording is broken; CalibrationError is one of these.
         TrajectoryError: the recording's truth is malformed or fits no frame.
     """
-    if format is not None and format not in FORMATS:
-        raise UnknownFormatError(f"format {format!r} is not known; there are {', '.join(FORMATS)}")
     folder, selection = _split_selection(str(path))
-    if not folder.exists():
-        raise RecordingError(f"{folder}: no such file or folder")
-    sequence = FORMATS[format or _recognise(folder)].open(folder)
+    sequence = FORMATS[find_format(path, format)].open(folder)
     if selection is None:
         return sequence
     indices = parse_selection(selection, len(sequence))
     if not indices:
         raise RecordingError(f"{path}: none of the {len(sequence)} frames is chosen")
     return sequence_subset(sequence, indices)
+
+
+def find_format(path: str | Path, format: str | None = None) -> str:
+    """The name of a recording's format, which `open_sequence` opens it by; `format` where it is named.
+
+    Raises:
+        UnknownFormatError: `format` is none of `FORMATS`, or no format recognises the folder.
+        RecordingError: nothing is there.
+    """
+    if format is not None and format not in FORMATS:
+        raise UnknownFormatError(f"format {format!r} is not known; there are {', '.join(FORMATS)}")
+    folder, _ = _split_selection(str(path))
+    if not folder.exists():
+        raise RecordingError(f"{folder}: no such file or folder")
+    return format or _recognise(folder)
 
 
 def _split_selection(path: str) -> tuple[Path, str | None]:

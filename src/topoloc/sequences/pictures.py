@@ -107,7 +107,7 @@ def _decode(path: Path) -> np.ndarray:
         if _checked_size(path, data) is not None:
             pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         else:
-            with _opencv_silent():
+            with opencv_silent():
                 pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         pixels = None
@@ -119,7 +119,7 @@ def _decode(path: Path) -> np.ndarray:
 
 
 @contextmanager
-def _opencv_silent() -> Iterator[None]:
+def opencv_silent() -> Iterator[None]:
     """No OpenCV messages on stderr: types that are checked only by decoding make it write there about every broken file."""
     logging: Any = getattr(cv2.utils, "logging", cv2)  # OpenCV 4 has these functions in its own name space
     with _LOG_LEVEL_LOCK:

@@ -102,6 +102,15 @@ class SequenceView:
         return replace(self.base[self.indices[index]], world_from_cam=self.poses[index])
 
 
+def single_pictures(sequence: StereoSequence) -> StereoSequence:
+    """The same recording without its right and depth pictures, which are then not read either."""
+    if isinstance(sequence, Recording):
+        return replace(sequence, right=None, depth=None)
+    if isinstance(sequence, SequenceView):
+        return replace(sequence, base=single_pictures(sequence.base))
+    return sequence
+
+
 def list_pictures(folder: Path, suffix: str = "") -> list[Path]:
     """The picture files of a folder in natural order (2 before 10), those only whose name ends in `suffix` if given.
 

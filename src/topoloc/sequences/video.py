@@ -1,0 +1,139 @@
+"""A video file (MP4, AVI, ...) as a recording of single pictures, by OpenCV's reader.
+
+Calibration is the ``camera.json`` beside it, truth is ``NAME.tum`` for ``NAME.mp4``. Times are the container's, so
+that a camera of varying rate keeps its own. A turn that the file asks players for is not applied: a calibration is of the pixels as
+they are stored.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+
+from topoloc.errors import CalibrationError, RecordingError, UnreadableImageError
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.sequences.camera_json import FILE_NAME, read_camera_json
+from topoloc.sequences.frame import Image, StereoFrame
+from topoloc.sequences.pictures import opencv_silent
+from topoloc.sequences.truth import read_truth
+
+VIDEO_SUFFIXES = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm"})
+LOOKS_FOR = "a video file (.mp4, .mov, .avi, .mkv, .webm)"
+
+
+def recognises(path: Path) -> bool:
+    """Whether this is a video file, by its name."""
+    return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
+
+
+@dataclass(eq=False)
+class _Reader:
+    """An open video and the number of the frame that it gives next."""
+
+    capture: cv2.VideoCapture
+    next_idx: int = 0
+
+
+@dataclass(eq=False)
+class Video:
+    """A StereoSequence in one file. Frames are decoded in their order; to ask for an earlier one begins anew."""
+
+    name: str
+    path: Path
+    names: list[str]
+    t_ns: list[int]
+    poses: list[Rigid3 | None]
+    camera: Camera | None
+    size: tuple[int, int]
+    _reader: _Reader | None = field(default=None, repr=False)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, index: int) -> StereoFrame:
+        """Read one frame.
+
+        Raises:
+            IndexError: no such frame.
+            UnreadableImageError: it cannot be decoded, or is of another size than the first.
+        """
+        if index < 0:
+            index += len(self)
+        if not 0 <= index < len(self):
+            raise IndexError(f"frame {index} of a video of {len(self)}")
+        return StereoFrame(self.names[index], self.t_ns[index], self._decode(index), self.camera, world_from_cam=self.poses[index])
+
+    def _decode(self, index: int) -> Image:
+        reader = self._reader
+        if reader is None or reader.next_idx > index:
+            reader = self._reader = _Reader(_open(self.path))
+        while reader.next_idx <= index:
+            grabbed = reader.capture.grab()
+            reader.next_idx += 1
+            if not grabbed:
+                self._reader = None
+                raise UnreadableImageError(f"{self.path}, frame {index}: cannot be decoded")
+        decoded, picture = reader.capture.retrieve()
+        if not decoded or picture is None:
+            raise UnreadableImageError(f"{self.path}, frame {index}: cannot be decoded")
+        height, width = picture.shape[:2]
+        if (width, height) != self.size:
+            raise UnreadableImageError(
+                f"{self.path}, frame {index}: {width}x{height} pixels, but the first frame is of {self.size[0]}x{self.size[1]}"
+            )
+        return picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+
+
+def open_video(path: Path) -> Video:
+    """Open a video file. It is gone through once for its times; a file that was cut off ends with its last whole frame.
+
+    Raises:
+        RecordingError: no video, no frame in it that can be decoded, or its clock goes backwards.
+        CalibrationError: camera.json is not usable, or is of another size than the frames.
+        TrajectoryError: the truth is malformed or fits no frame.
+    """
+    capture = _open(path)
+    decoded, first = capture.read()
+    if not decoded or first is None:
+        raise RecordingError(f"{path}: no frame of this video can be decoded")
+    size = (first.shape[1], first.shape[0])
+    rate = capture.get(cv2.CAP_PROP_FPS)
+    capture.release()
+    t_ns = _times(path, rate)
+    camera = None
+    if (path.parent / FILE_NAME).is_file():
+        camera = read_camera_json(path.parent / FILE_NAME).camera
+        if (camera.width, camera.height) != size:
+            raise CalibrationError(f"{path.parent / FILE_NAME}: of {camera.width}x{camera.height}, but {path.name} is {size[0]}x{size[1]}")
+    poses = read_truth(path.with_suffix(".tum"), [], t_ns)
+    return Video(path.name, path, [f"{index:06d}" for index in range(len(t_ns))], t_ns, poses, camera, size)
+
+
+def _open(path: Path) -> cv2.VideoCapture:
+    with opencv_silent():
+        capture = cv2.VideoCapture(str(path))
+    if not capture.isOpened():
+        raise RecordingError(f"{path}: not a video, damaged, or of a codec that OpenCV cannot read")
+    capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+    return capture
+
+
+def _times(path: Path, rate: float) -> list[int]:
+    """The time of each frame; by the rate where the container gives none."""
+    capture = _open(path)
+    t_ns = []
+    while capture.grab():
+        t_ns.append(round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6))
+    if len(t_ns) > 1 and not any(t_ns):
+        if not rate > 0:
+            raise RecordingError(f"{path}: neither its frames have times, nor does it name a rate")
+        return [round(index * 1e9 / rate) for index in range(len(t_ns))]
+    for index in range(1, len(t_ns)):
+        if t_ns[index] <= t_ns[index - 1]:
+            raise RecordingError(
+                f"{path}, frame {index}: at {t_ns[index] / 1e9:.3f} s, but the frame before is at {t_ns[index - 1] / 1e9:.3f} s"
+            )
+    return t_ns
