@@ -32,7 +32,7 @@ lint: $(VENV)/installed-test
 	@$(PYRIGHT)
 
 docs: $(VENV)/installed-docs
-	@$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -d docs/_build/trees docs docs/_build/html
+	@$(BIN)/sphinx-build --quiet --fresh-env --fail-on-warning --keep-going -d docs/_build/trees docs docs/_build/html
 	@echo "docs/_build/html/index.html"
 
 # What each kind of installation brings; one that brings more has brought the others, too.
