@@ -10,7 +10,7 @@ be seen, make it exact; and it is reported only where the evidence is strong. On
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -101,13 +101,11 @@ class Localizer:
         """
         return self.localize_near(image, camera, None)[0]
 
-    def localize_near(
-        self, image: Image, camera: Camera, near: Rigid3 | None, radius_px: float | None = None
-    ) -> tuple[Localization | NotLocalized, SeenPoints | None]:
-        """As `localize`, where the camera is known to be about `near` (world_from_cam): no coarse search, no candidates.
+    def localize_near(self, image: Image, camera: Camera, near: Rigid3 | None) -> tuple[Localization | NotLocalized, SeenPoints | None]:
+        """As `localize`, where the camera is known to be about `near` (world_from_cam): the nodes nearest to it replace the coarse search.
 
-        Map points are sought within `radius_px` (as `GuidedConfig.radius_px`) of where `near` lets expect them; None for `near`
-        is `localize` itself. Also returned are the points that the pose stands on, in pixels of `image`; None without a pose.
+        None for `near` is `localize` itself. Only the choice of nodes is taken from `near`: the pose needs the same evidence as any
+        other, of matches that it did not guide. Also returned are the points that the pose stands on, in pixels of `image`.
 
         Raises:
             QueryError: the camera is of another image size.
@@ -118,14 +116,10 @@ class Localizer:
         clock = StageClock()
         image, camera = _reduced(image, camera, self.config.max_side_px)
         features = self._extract(image, clock)
-        candidates = [] if near is not None else self._rank_nodes(image, features, clock)
-        first = (
-            self._localize_among(candidates, features, camera, clock)
-            if near is None
-            else self._localize_expecting(near, radius_px, features, camera, clock)
-        )
+        candidates = self._rank_nodes(image, features, clock) if near is None else self._nodes_near(near)
+        first = self._localize_among(candidates, features, camera, clock)
         final = self._localize_around(first, features, camera, clock)
-        result = self._judge(first, final, camera, candidates, clock)
+        result = self._judge(first, final, camera, candidates if near is None else [], clock)
         return result, _seen_points(final, features, width / camera.width) if isinstance(result, Localization) else None
 
     def _extract(self, image: Image, clock: StageClock) -> Features:
@@ -151,17 +145,11 @@ class Localizer:
             attempt = self._localize_in(local_map, features, camera, clock)
         return attempt
 
-    def _localize_expecting(self, near: Rigid3, radius_px: float | None, features: Features, camera: Camera, clock: StageClock) -> _Attempt:
-        """The points of the nodes nearest to `near`, sought where they must be seen; of these matches any pose that most agree on."""
-        with clock.stage("matching"):
-            distances = node_distances(near, self._node_poses, self._lambda_rot)
-            num_nodes = max(self.config.guided.num_nodes, 1)
-            local_map = self._pooled([int(i) for i in np.argsort(distances, kind="stable")[:num_nodes]])
-            guided = replace(self.config.guided, radius_px=radius_px or self.config.guided.radius_px)
-            matches = match_guided(features, local_map, near.inverse(), camera, guided)
-        if len(matches) < self.config.min_matches:
-            return _Attempt(local_map, matches, None)
-        return _Attempt(local_map, matches, self._estimate_pose(local_map, matches, features, camera, None, clock))
+    def _nodes_near(self, world_from_cam: Rigid3) -> list[NodeScore]:
+        """As many nodes as the coarse step would name; nearer ones (Eq. 1) score higher."""
+        distances = node_distances(world_from_cam, self._node_poses, self._lambda_rot)
+        nearest = np.argsort(distances, kind="stable")[: self.config.num_candidates]
+        return [NodeScore(int(i), -float(distances[i])) for i in nearest]
 
     def _localize_in(self, local_map: LocalMap, features: Features, camera: Camera, clock: StageClock) -> _Attempt:
         """The fine step: match with the candidates' points, then robust PnP."""
