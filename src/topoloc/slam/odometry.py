@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Float, Float32, Int
 
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.rigid import Rigid3
@@ -19,6 +19,7 @@ from topoloc.geometry.stereo import ray_covariances
 from topoloc.sequences.frame import StereoFrame
 from topoloc.slam.bundle import BundleConfig, adjust_bundle
 from topoloc.slam.disparity import DisparityConfig, MeasuredView, measure_disparities, measured_view
+from topoloc.slam.frame_state import FramePose, LastFrame, Tracks
 from topoloc.slam.input_checks import InputChecks
 from topoloc.slam.keyframes import DisparityBias, KeyFrame, Landmarks, Motion, Observations, StereoCamera
 from topoloc.slam.place_matching import PlaceMatchingConfig, match_places, place_view
@@ -65,53 +66,16 @@ class OdometryConfig:
     """... or turned by this angle."""
 
 
-@dataclass(frozen=True, eq=False)
-class FramePose:
-    """Where a frame is: relative to a key frame, so that it moves with it."""
-
-    frame_idx: int
-    keyframe: KeyFrame
-    cam_from_keyframe: Rigid3
-    view_from_cam: Rigid3
-
-    def world_from_cam(self) -> Rigid3:
-        """The pose of the frame's own camera, which rectification may have turned."""
-        return (self.cam_from_keyframe @ self.keyframe.cam_from_world).inverse() @ self.view_from_cam
-
-
-@dataclass(eq=False)
-class _Tracks:
-    """The points being followed: where they are in the last frame, where in the last key frame, and their landmarks."""
-
-    landmark_ids: Int[np.ndarray, " n"]
-    points_img: Float32[np.ndarray, "n 2"]
-    points_ref: Float32[np.ndarray, "n 2"]
-
-    def select(self, rows: np.ndarray) -> _Tracks:
-        return _Tracks(self.landmark_ids[rows], self.points_img[rows], self.points_ref[rows])
-
-
-@dataclass(eq=False)
-class _Last:
-    """The frame before."""
-
-    t_ns: int
-    grey: UInt8[np.ndarray, "h w"]
-    cam_from_world: Rigid3
-    motion: Rigid3 | None
-    interval_ns: int
-
-
 class Odometry:
     """The state of one recording's odometry. `keyframes` and `landmarks` are those of all recordings, and are added to."""
 
     def __init__(self, recording: int, keyframes: list[KeyFrame], landmarks: Landmarks, checks: InputChecks, config: OdometryConfig):
         self._recording, self._keyframes, self._landmarks = recording, keyframes, landmarks
         self._checks, self._config = checks, config
-        self._last: _Last | None = None
+        self._last: LastFrame | None = None
         self._reference: KeyFrame | None = None
         self._reference_picture: np.ndarray = np.zeros((0, 0), np.float32)
-        self._tracks = _Tracks(np.zeros(0, np.int64), np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32))
+        self._tracks = Tracks(np.zeros(0, np.int64), np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32))
         self._chain: list[KeyFrame] = []  # the key frames since tracking began or began again
         self._num_lost = 0
         self._covariance = np.zeros((6, 6))
@@ -156,7 +120,7 @@ class Odometry:
         share = min((t_ns - last.t_ns) / last.interval_ns, 3.0)
         return Rigid3.exp(share * last.motion.log()) @ last.cam_from_world
 
-    def _follow(self, measured: MeasuredView, predicted: Rigid3) -> _Tracks:
+    def _follow(self, measured: MeasuredView, predicted: Rigid3) -> Tracks:
         assert self._last is not None
         config, tracks = self._config.tracking, self._tracks
         points_world = self._landmarks.positions[tracks.landmark_ids]
@@ -164,10 +128,10 @@ class Odometry:
         limit = np.array([measured.view.camera.width, measured.view.camera.height]) / 2.0
         guesses = (tracks.points_img + np.clip(np.nan_to_num(after - before), -limit, limit)).astype(np.float32)
         found, is_found = follow(self._last.grey, measured.view.grey, tracks.points_img, guesses, config)
-        tracks = _Tracks(tracks.landmark_ids, found, tracks.points_ref).select(is_found)
+        tracks = Tracks(tracks.landmark_ids, found, tracks.points_ref).select(is_found)
         scales = self._patch_scales(tracks.landmark_ids, predicted)
         refined, alike = align_with_reference(self._reference_picture, measured.left, tracks.points_ref, tracks.points_img, scales, config)
-        return _Tracks(tracks.landmark_ids, refined, tracks.points_ref).select(alike)
+        return Tracks(tracks.landmark_ids, refined, tracks.points_ref).select(alike)
 
     def _patch_scales(self, landmark_ids: Int[np.ndarray, " n"], predicted: Rigid3) -> Float32[np.ndarray, " n"]:
         """How much larger each landmark's surroundings look than in the last key frame: what is approached grows."""
@@ -176,7 +140,7 @@ class Odometry:
         before, now = (pose.apply(points_world)[:, 2] for pose in (self._reference.cam_from_world, predicted))
         return np.clip(before / np.maximum(now, 1e-3), 0.5, 2.0).astype(np.float32)
 
-    def _estimate_pose(self, tracks: _Tracks, stereo: StereoCamera, predicted: Rigid3) -> AbsolutePose | None:
+    def _estimate_pose(self, tracks: Tracks, stereo: StereoCamera, predicted: Rigid3) -> AbsolutePose | None:
         config = self._config
         if len(tracks.landmark_ids) < config.min_tracked:
             return None
@@ -207,7 +171,7 @@ class Odometry:
         motion, interval = None, 0
         if self._last is not None:
             motion, interval = cam_from_world @ self._last.cam_from_world.inverse(), frame.t_ns - self._last.t_ns
-        self._last = _Last(frame.t_ns, measured.view.grey, cam_from_world, motion, interval)
+        self._last = LastFrame(frame.t_ns, measured.view.grey, cam_from_world, motion, interval)
 
     def _is_keyframe_due(self, measured: MeasuredView) -> bool:
         assert self._reference is not None
@@ -270,7 +234,7 @@ class Odometry:
     def _follow_from(self, keyframe: KeyFrame, measured: MeasuredView) -> None:
         seen = keyframe.observations
         points = np.ascontiguousarray(seen.measured[seen.active, :2], np.float32)
-        self._tracks = _Tracks(seen.landmark_ids[seen.active], points, points)
+        self._tracks = Tracks(seen.landmark_ids[seen.active], points, points)
         self._reference, self._reference_picture = keyframe, measured.left
         if self._last is not None:
             self._last.cam_from_world = keyframe.cam_from_world
