@@ -55,8 +55,8 @@ class TrackerConfig:
     """... or where these have moved by this share of the picture's width."""
     retry_after: float = 0.1
     """Seconds to the next attempt where that failed and the points are still there."""
-    max_radius_px: float = 60.0
-    """Where a point may be further than this from where it is expected (three sigma, in 640 pixels' width), the coarse search is asked."""
+    max_doubt: float = 0.3
+    """Where the prediction leaves open by more than this where points are seen (three sigma, radians), the coarse search is asked."""
     covariance_scale: float = 3.0
     """By how much errors of localization exceed their sigma: points share the errors of the map ..."""
     floor_share: float = 0.004
@@ -73,7 +73,7 @@ class _Picture:
     camera: Camera
     t_ns: int
     odom_from_cam: Rigid3 | None
-    grey: UInt8[np.ndarray, "h w"]
+    grey: UInt8[np.ndarray, "a b"]
     grey_camera: Camera
 
 
@@ -208,20 +208,11 @@ class Tracker:
         if reference is not None and followed is not None:
             near = (followed.cam_from_ref @ reference.cam_from_world).inverse()
             return self.localizer.localize_near(picture.image, picture.camera, near)
-        if reference is not None and predicted is not None:
-            radius_px = self._radius_px(predicted, picture.camera, reference.depth)
-            if radius_px <= self.config.max_radius_px:
-                found, seen = self.localizer.localize_near(picture.image, picture.camera, predicted.world_from_cam, radius_px)
-                if isinstance(found, Localization):
-                    return found, seen
+        if reference is not None and predicted is not None and _doubt(predicted, reference.depth) <= self.config.max_doubt:
+            found, seen = self.localizer.localize_near(picture.image, picture.camera, predicted.world_from_cam)
+            if isinstance(found, Localization):
+                return found, seen
         return self.localizer.localize_near(picture.image, picture.camera, None)
-
-    def _radius_px(self, predicted: MotionState, camera: Camera, depth: float) -> float:
-        """How far (three sigma, at 640 pixels' width) points may be from where the prediction lets expect them."""
-        sigmas = np.sqrt(np.diag(predicted.pose_covariance))
-        sigma_px = camera.fx * float(np.hypot(sigmas[:3].max() / depth, sigmas[3:].max()))
-        least = self.localizer.config.guided.radius_px
-        return max(least, 3.0 * sigma_px * 640.0 / camera.width)
 
     def _believe(
         self,
@@ -306,6 +297,12 @@ class Tracker:
     def _floor(self, depth: float) -> Float[np.ndarray, "6 6"]:
         """The covariance that the map's own errors leave, of points at this depth (metres), in the camera's axes."""
         return np.diag(np.repeat([(self.config.floor_share * depth) ** 2, self.config.floor_share**2], 3))
+
+
+def _doubt(predicted: MotionState, depth: float) -> float:
+    """Three sigma (radians) of the direction in which points at this depth (metres) are seen."""
+    sigmas = np.sqrt(np.diag(predicted.pose_covariance))
+    return 3.0 * float(np.hypot(sigmas[:3].max() / depth, sigmas[3:].max()))
 
 
 def _reduced(grey: UInt8[np.ndarray, "h w"], camera: Camera, max_side_px: int) -> tuple[UInt8[np.ndarray, "a b"], Camera]:
