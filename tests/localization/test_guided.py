@@ -1,18 +1,17 @@
-"""Guided matching on map points and key points made by hand, and the weighing of evidence."""
+"""Guided matching on map points and key points made by hand."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization.guided import GuidedConfig, count_visible, match_guided
+from topoloc.localization.guided import GuidedConfig, count_by_chance, count_visible, match_guided
 from topoloc.localization.local_map import LocalMap
-from topoloc.localization.verification import Evidence, VerificationConfig, probability_of
 from topoloc.mapping.topomap import NodeSummary, TopoNode
 
 CAMERA = Camera.pinhole(640, 480, 500.0, 500.0, 320.0, 240.0)
@@ -81,19 +80,18 @@ def test_nothing_is_visible_behind_the_camera():
     assert count_visible(local_map, backwards, CAMERA) == 0
 
 
-counts = st.integers(0, 2000)
+def test_chance_finds_next_to_nothing_among_descriptors_that_differ():
+    node = _node(np.random.default_rng(4))
+    features = _seen(node, POSES[0])
+    assert len(match_guided(features, LocalMap.of_node(node), POSES[0], CAMERA, GuidedConfig())) > 100
+    assert count_by_chance(features, LocalMap.of_node(node), POSES[0], CAMERA, GuidedConfig()) < 5
 
 
-@given(counts, counts, counts, counts)
-def test_more_found_is_never_less_probable(num_matches: int, num_inliers: int, num_found: int, num_visible: int):
-    config = VerificationConfig()
-    weak = probability_of(Evidence(num_matches, num_inliers, num_found, num_visible), config)
-    strong = probability_of(Evidence(num_matches, num_inliers, num_found + 1, num_visible), config)
-    fewer_missing = probability_of(Evidence(num_matches, num_inliers, num_found, num_visible + 50), config)
-    assert 0.0 <= fewer_missing <= weak <= strong <= 1.0
-
-
-def test_many_found_of_very_many_that_should_be_is_still_improbable():
-    """What peers accept: scores of inliers, though nearly all that the pose predicts is missing."""
-    assert probability_of(Evidence(num_matches=40, num_inliers=6, num_found=70, num_visible=2000), VerificationConfig()) < 0.5
-    assert probability_of(Evidence(num_matches=150, num_inliers=90, num_found=300, num_visible=1700), VerificationConfig()) > 0.95
+def test_chance_finds_as_much_as_the_pose_where_all_descriptors_are_alike():
+    node = _node(np.random.default_rng(5))
+    same = np.tile(node.features.descriptors[:1], (NUM_POINTS, 1))
+    alike = replace(node, features=replace(node.features, descriptors=same, angles=np.zeros_like(node.features.angles)))
+    config = GuidedConfig(min_margin=0.0, max_scale=4.0, radius_px=40.0)
+    found = len(match_guided(_seen(alike, POSES[0]), LocalMap.of_node(alike), POSES[0], CAMERA, config))
+    by_chance = count_by_chance(_seen(alike, POSES[0]), LocalMap.of_node(alike), POSES[0], CAMERA, config)
+    assert by_chance > 0.5 * found > 10

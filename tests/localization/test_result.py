@@ -57,3 +57,13 @@ def test_detail_is_there_only_where_there_is_more_to_say():
         "num_inliers": 0,
         "times_ms": {},
     }
+
+
+def test_the_cameras_own_covariance_is_that_of_a_perturbation_on_its_side():
+    rng = np.random.default_rng(0)
+    roots = np.diag([0.01, 0.02, 0.03, 1e-3, 2e-3, 3e-3])
+    samples = rng.normal(size=(20_000, 6)) @ roots
+    left = np.array([(POSE @ Rigid3.exp(xi) @ POSE.inverse()).log() for xi in samples])
+    result = Localization(POSE, np.cov(left.T), 0.98, 17, CANDIDATES, 212, 158)
+    deviations = np.sqrt(np.diag(result.camera_covariance))
+    np.testing.assert_allclose(deviations, np.diag(roots), rtol=0.03)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int32
 
 from topoloc.features.features import Features, Matches
 from topoloc.geometry.camera import Camera
@@ -39,9 +39,30 @@ class GuidedConfig:
 
 def match_guided(features: Features, local_map: LocalMap, cam_from_world: Rigid3, camera: Camera, config: GuidedConfig) -> Matches:
     """Matches of key points with map points that `cam_from_world` lets expect nearby: one map point a key point, the most similar."""
+    found, similarities = _find(features, local_map, _expected_key_points(local_map, cam_from_world, camera), camera, config)
+    train_idx = np.flatnonzero(found >= 0)
+    train_idx = train_idx[np.argsort(-similarities[train_idx], kind="stable")]
+    query_idx, first = np.unique(found[train_idx], return_index=True)
+    train_idx = train_idx[first]
+    distances = np.sqrt(np.maximum(2.0 - 2.0 * similarities[train_idx], 0.0)).astype(np.float32)
+    return Matches(query_idx.astype(np.int32), train_idx.astype(np.int32), distances)
+
+
+def count_by_chance(features: Features, local_map: LocalMap, cam_from_world: Rigid3, camera: Camera, config: GuidedConfig) -> int:
+    """How many matches `match_guided` would find were the pose wrong: all map points are sought a third of the picture away."""
     expected = _expected_key_points(local_map, cam_from_world, camera)
+    size = np.array([camera.width, camera.height], np.float32)
+    expected[:, :2] = np.mod(expected[:, :2] + size / 3.0, size)
+    found, _ = _find(features, local_map, expected, camera, config)
+    return len(np.unique(found[found >= 0]))
+
+
+def _find(
+    features: Features, local_map: LocalMap, expected: Float32[np.ndarray, "n 5"], camera: Camera, config: GuidedConfig
+) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
+    """The most similar key point near where each map point is expected, -1 for none; and how similar it is."""
     seen = np.column_stack([features.points_img, features.sizes_px, np.cos(features.angles), np.sin(features.angles)])
-    found, similarities = match_projections(
+    return match_projections(
         expected,
         local_map.descriptors,
         seen.astype(np.float32),
@@ -54,12 +75,6 @@ def match_guided(features: Features, local_map: LocalMap, cam_from_world: Rigid3
         np.float32(config.min_similarity),
         np.float32(config.min_margin),
     )
-    train_idx = np.flatnonzero(found >= 0)
-    train_idx = train_idx[np.argsort(-similarities[train_idx], kind="stable")]
-    query_idx, first = np.unique(found[train_idx], return_index=True)
-    train_idx = train_idx[first]
-    distances = np.sqrt(np.maximum(2.0 - 2.0 * similarities[train_idx], 0.0)).astype(np.float32)
-    return Matches(query_idx.astype(np.int32), train_idx.astype(np.int32), distances)
 
 
 def count_visible(local_map: LocalMap, cam_from_world: Rigid3, camera: Camera) -> int:

@@ -3,14 +3,16 @@
 The coarse localizer names the nodes that the image may belong to; the image is patch-normalised and its features are
 matched with those of the nodes; PnP on the matches gives the camera's global pose. Unlike the paper's blind first choice,
 several candidate nodes pool their points; the nodes nearest to the pose so found, whose points are sought where they must
-be seen, make it exact; and it is reported only where the evidence is strong. One candidate and no guided step
-(`num_candidates=1`, `guided.num_nodes=0`) give the paper's own behaviour.
+be seen, make it exact; and it is reported only where the evidence is strong and no other part of the map explains the image as
+well. One candidate, no guided step and no rivals (`num_candidates=1`, `guided.num_nodes=0`, `rivals.max_groups=0`) give the paper's own
+behaviour.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -19,15 +21,18 @@ from topoloc.errors import EmptyMapError, MapError, QueryError
 from topoloc.features.extraction import FeatureConfig, extract_normalized, normalize_image
 from topoloc.features.features import Features, Matches
 from topoloc.features.matching import MatchingConfig, match_pooled
-from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, covariance_of_inverse, estimate_absolute_pose
+from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.guided import GuidedConfig, count_visible, match_guided
+from topoloc.localization.attempt import Attempt, Judgement, judge
+from topoloc.localization.guided import GuidedConfig, match_guided
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.rivals import RivalsConfig, decide, rival_groups
 from topoloc.localization.seen_points import SeenPoints
+from topoloc.localization.shared_errors import SharedErrorsConfig, measure_shared_errors
 from topoloc.localization.stages import StageClock
-from topoloc.localization.verification import Evidence, VerificationConfig, probability_of
+from topoloc.localization.verification import VerificationConfig
 from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.places.coarse import Image, NodeScore, open_coarse
@@ -53,21 +58,10 @@ class LocalizerConfig:
     min_matches: int = 8
     """With fewer first matches no pose is sought."""
     verification: VerificationConfig = field(default_factory=VerificationConfig)
+    rivals: RivalsConfig = field(default_factory=RivalsConfig)
+    shared_errors: SharedErrorsConfig = field(default_factory=SharedErrorsConfig)
     max_side_px: int = 1600
     """Larger images are reduced to this width or height first: nothing is gained from more, but time and memory."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Attempt:
-    """A pose sought in a part of the map."""
-
-    local_map: LocalMap
-    matches: Matches
-    pose: AbsolutePose | None
-
-    @property
-    def num_inliers(self) -> int:
-        return int(self.pose.inliers.sum()) if self.pose else 0
 
 
 class Localizer:
@@ -91,6 +85,7 @@ class Localizer:
         self._feature_config = FeatureConfig(**topomap.config["features"])
         self._node_poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
         self._lambda_rot = float(topomap.config["nodes"]["lambda_rot"])
+        self._d_thresh = float(topomap.config["nodes"]["d_thresh"])
         self._local_maps: OrderedDict[int, LocalMap] = OrderedDict()
 
     def localize(self, image: Image, camera: Camera) -> Localization | NotLocalized:
@@ -113,14 +108,35 @@ class Localizer:
         height, width = image.shape[:2]
         if (camera.width, camera.height) != (width, height):
             raise QueryError(f"the image is {width}x{height}, its camera {camera.width}x{camera.height}")
+        shared_errors = self.shared_errors  # of the first query alone; it is the map's time, not the query's
         clock = StageClock()
         image, camera = _reduced(image, camera, self.config.max_side_px)
         features = self._extract(image, clock)
-        candidates = self._rank_nodes(image, features, clock) if near is None else self._nodes_near(near)
-        first = self._localize_among(candidates, features, camera, clock)
-        final = self._localize_around(first, features, camera, clock)
-        result = self._judge(first, final, camera, candidates if near is None else [], clock)
-        return result, _seen_points(final, features, width / camera.width) if isinstance(result, Localization) else None
+        if near is not None:
+            expecting = self._localize_among(self._nodes_near(near), features, camera, clock)
+            judgement = self._judge(expecting, [], shared_errors, clock)
+        else:
+            ranked = self._rank_nodes(image, features, clock)
+            candidates = ranked[: self.config.num_candidates]
+            first = self._localize_among(candidates, features, camera, clock)
+            judgement = self._judge(first, candidates, shared_errors, clock)
+            judgement = self._against_rivals(judgement, ranked, features, camera, shared_errors, clock)
+        is_found = isinstance(judgement.result, Localization)
+        return judgement.result, judgement.final.seen_points(width / camera.width) if is_found else None
+
+    @cached_property
+    def shared_errors(self) -> float:
+        """rho of the map: the share of a match's variance that its points have in common (see `shared_errors.py`)."""
+        return measure_shared_errors(
+            lambda node_id: self.topomap.nodes[node_id],
+            self._pooled,
+            self._node_poses,
+            self._lambda_rot,
+            self._d_thresh,
+            self.config.guided,
+            self.config.pose,
+            self.config.shared_errors,
+        )
 
     def _extract(self, image: Image, clock: StageClock) -> Features:
         """Patch normalisation, then the local features."""
@@ -133,14 +149,12 @@ class Localizer:
     def _rank_nodes(self, image: Image, features: Features, clock: StageClock) -> list[NodeScore]:
         """The coarse step: which nodes may this be?"""
         with clock.stage("coarse"):
-            return self._coarse.rank(image, features, self.config.num_candidates)
+            return self._coarse.rank(image, features, max(self.config.num_candidates, self.config.rivals.num_ranked))
 
-    def _localize_among(self, candidates: list[NodeScore], features: Features, camera: Camera, clock: StageClock) -> _Attempt:
+    def _localize_among(self, candidates: list[NodeScore], features: Features, camera: Camera, clock: StageClock) -> Attempt:
         """The candidates' points together. The strongest features are nearly always enough; all are tried where they are not."""
         local_map = self._pooled([candidate.node_id for candidate in candidates])
-        attempt = self._localize_in(
-            local_map, features.select(np.arange(min(len(features), self.config.num_first_features))), camera, clock
-        )
+        attempt = self._localize_in(local_map, features, camera, clock, self.config.num_first_features)
         if attempt.num_inliers < self.config.num_clear_inliers and len(features) > self.config.num_first_features:
             attempt = self._localize_in(local_map, features, camera, clock)
         return attempt
@@ -151,17 +165,16 @@ class Localizer:
         nearest = np.argsort(distances, kind="stable")[: self.config.num_candidates]
         return [NodeScore(int(i), -float(distances[i])) for i in nearest]
 
-    def _localize_in(self, local_map: LocalMap, features: Features, camera: Camera, clock: StageClock) -> _Attempt:
+    def _localize_in(
+        self, local_map: LocalMap, features: Features, camera: Camera, clock: StageClock, max_features: int | None = None
+    ) -> Attempt:
         """The fine step: match with the candidates' points, then robust PnP."""
         with clock.stage("matching"):
-            matches = match_pooled(
-                features.descriptors, local_map.descriptors, local_map.points_world, local_map.radii, self.config.matching
-            )
-        if len(matches) < self.config.min_matches:
-            return _Attempt(local_map, matches, None)
-        return _Attempt(local_map, matches, self._estimate_pose(local_map, matches, features, camera, None, clock))
+            descriptors = features.descriptors[:max_features]
+            matches = match_pooled(descriptors, local_map.descriptors, local_map.points_world, local_map.radii, self.config.matching)
+        return self._attempt(features, camera, local_map, matches, None, clock)
 
-    def _localize_around(self, first: _Attempt, features: Features, camera: Camera, clock: StageClock) -> _Attempt:
+    def _localize_around(self, first: Attempt, clock: StageClock) -> Attempt:
         """Once more with the nodes nearest to the pose found, each point sought where it must be seen."""
         if self.config.guided.num_nodes == 0 or first.pose is None or first.num_inliers < self.config.verification.min_inliers:
             return first
@@ -170,14 +183,17 @@ class Localizer:
             distances = node_distances(cam_from_world.inverse(), self._node_poses, self._lambda_rot)
             nearest = np.argsort(distances, kind="stable")[: self.config.guided.num_nodes]
             local_map = self._pooled([int(i) for i in nearest])
-            matches = match_guided(features, local_map, cam_from_world, camera, self.config.guided)
-        return _Attempt(local_map, matches, self._estimate_pose(local_map, matches, features, camera, cam_from_world, clock))
+            matches = match_guided(first.features, local_map, cam_from_world, first.camera, self.config.guided)
+        return self._attempt(first.features, first.camera, local_map, matches, cam_from_world, clock)
 
-    def _estimate_pose(
-        self, local_map: LocalMap, matches: Matches, features: Features, camera: Camera, start: Rigid3 | None, clock: StageClock
-    ) -> AbsolutePose | None:
+    def _attempt(
+        self, features: Features, camera: Camera, local_map: LocalMap, matches: Matches, start: Rigid3 | None, clock: StageClock
+    ) -> Attempt:
+        """Robust PnP, or the refinement of `start` (cam_from_world)."""
+        if start is None and len(matches) < self.config.min_matches:
+            return Attempt(features, camera, local_map, matches, None)
         with clock.stage("pnp"):
-            return estimate_absolute_pose(
+            pose = estimate_absolute_pose(
                 features.points_img[matches.query_idx].astype(np.float64),
                 local_map.points_world[matches.train_idx],
                 camera,
@@ -185,34 +201,28 @@ class Localizer:
                 point_covariances=local_map.covariances[matches.train_idx],
                 start=start,
             )
+        return Attempt(features, camera, local_map, matches, pose)
 
-    def _judge(
-        self, first: _Attempt, final: _Attempt, camera: Camera, candidates: list[NodeScore], clock: StageClock
-    ) -> Localization | NotLocalized:
-        """A pose is an answer only where the evidence for it is strong."""
-        num_matches, demanded = len(final.matches), self.config.verification
-        if len(first.matches) < self.config.min_matches:
-            return NotLocalized("too_few_matches", candidates, len(first.matches), 0, clock.times_ms())
-        if first.pose is None or final.pose is None or first.num_inliers < demanded.min_inliers or final.num_inliers < demanded.min_found:
-            return NotLocalized("too_few_inliers", candidates, num_matches, final.num_inliers, clock.times_ms())
-        cam_from_world = final.pose.cam_from_world
-        num_visible = count_visible(final.local_map, cam_from_world, camera)
-        evidence = Evidence(len(first.matches), first.num_inliers, final.num_inliers, num_visible)
-        probability = probability_of(evidence, demanded)
-        if probability < demanded.min_probability:
-            return NotLocalized("not_in_map", candidates, num_matches, final.num_inliers, clock.times_ms())
-        node_ids = final.local_map.node_ids[final.matches.train_idx[final.pose.inliers]]
-        return Localization(
-            world_from_cam=cam_from_world.inverse(),
-            covariance=covariance_of_inverse(cam_from_world, final.pose.covariance),
-            probability=probability,
-            node_id=int(np.bincount(node_ids).argmax()),
-            candidates=candidates,
-            num_matches=num_matches,
-            num_inliers=final.num_inliers,
-            times_ms=clock.times_ms(),
-            evidence=evidence,
-        )
+    def _judge(self, first: Attempt, candidates: list[NodeScore], shared_errors: float, clock: StageClock) -> Judgement:
+        """What is found around the first pose, and whether it is believed."""
+        final = self._localize_around(first, clock)
+        with clock.stage("verification"):
+            demanded = self.config.verification
+            return judge(first, final, candidates, shared_errors, self.config.min_matches, self.config.guided, demanded, clock)
+
+    def _against_rivals(
+        self, judgement: Judgement, ranked: list[NodeScore], features: Features, camera: Camera, shared_errors: float, clock: StageClock
+    ) -> Judgement:
+        """Other parts of the map that look like the image are asked on their own."""
+        result, config = judgement.result, self.config.rivals
+        found = result.world_from_cam if isinstance(result, Localization) else None
+        asked = [candidate.node_id for candidate in result.candidates]
+        groups = rival_groups(ranked, asked, found, self._node_poses, self._lambda_rot, self._d_thresh, self.config.num_candidates, config)
+        judgements = [judgement]
+        for group in groups:
+            first = self._localize_in(self._pooled(group), features, camera, clock)
+            judgements.append(self._judge(first, result.candidates, shared_errors, clock))
+        return decide(judgements, self._lambda_rot, self._d_thresh, config, clock) if groups else judgement
 
     def _pooled(self, node_ids: list[int]) -> LocalMap:
         return LocalMap.pooled([self._local_map(node_id) for node_id in node_ids])
@@ -224,14 +234,6 @@ class Localizer:
                 self._local_maps.popitem(last=False)
         self._local_maps.move_to_end(node_id)
         return self._local_maps[node_id]
-
-
-def _seen_points(attempt: _Attempt, features: Features, scale: float) -> SeenPoints:
-    """The inliers of an attempt, in an image that is `scale` times as wide as that of the features."""
-    assert attempt.pose is not None
-    query_idx, train_idx = attempt.matches.query_idx[attempt.pose.inliers], attempt.matches.train_idx[attempt.pose.inliers]
-    points_img = ((features.points_img[query_idx] + 0.5) * scale - 0.5).astype(np.float32)
-    return SeenPoints(points_img, attempt.local_map.points_world[train_idx], attempt.local_map.covariances[train_idx])
 
 
 def _reduced(image: Image, camera: Camera, max_side_px: int) -> tuple[np.ndarray, Camera]:

@@ -1,0 +1,108 @@
+"""Could it be elsewhere in the map? Two places that look alike are told apart here, or the answer is "ambiguous".
+
+The pool of the best candidates hides a second place: where its nodes are in the pool, points that are in both fail the ratio
+test; where they are not, nobody asks. So nodes that look as much like the image as the best one does, but stand far from the
+pose found, are asked once more on their own. Two poses exclude each other, and the one that explains more of the image is the more
+likely by more than its odds against nothing at all say: the share of the points in view that were found counts once more. With
+odds o1 and o2 (that of the lesser one so lowered) against "neither", the first is right with the probability o1 / (1 + o1 + o2).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.attempt import Judgement
+from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.stages import StageClock
+from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.places.coarse import NodeScore
+
+
+@dataclass(frozen=True)
+class RivalsConfig:
+    """When another part of the map is asked, and what makes an answer ambiguous."""
+
+    num_ranked: int = 16
+    """Nodes that the coarse localizer ranks, the candidates among them; rivals come from these."""
+    min_score_share: float = 0.85
+    """A rival's score is at least this share of the best one's."""
+    reach: float = 10.0
+    """Nodes within so many D_thresh of a pose (Eq. 1) belong to it; rivals are farther away."""
+    agreement: float = 3.0
+    """Two poses within so many D_thresh are one."""
+    max_groups: int = 2
+    """Parts of the map that are asked on their own, at most; 0 asks none."""
+    share_weight: float = 4.0
+    """How much the share found counts between two poses, beside their odds, in logarithms."""
+    min_lead: float = 2.0
+    """By how much the best pose must lead the next one, in logarithms of odds."""
+
+
+def rival_groups(
+    ranked: list[NodeScore],
+    asked: list[int],
+    found: Rigid3 | None,
+    nodes: NodePoses,
+    lambda_rot: float,
+    d_thresh: float,
+    num_candidates: int,
+    config: RivalsConfig,
+) -> list[list[int]]:
+    """Groups of node ids, each of one part of the map, that look like the image nearly as much as the best node does.
+
+    Args:
+        asked: the nodes that were asked together already.
+        found: world_from_cam that came of it, if any: nodes around it are no rivals.
+    """
+    reach = config.reach * d_thresh
+    least = config.min_score_share * ranked[0].score if ranked else 0.0
+    left = [candidate.node_id for candidate in ranked if candidate.score >= least]
+    if found is not None:
+        far = node_distances(found, nodes, lambda_rot) > reach
+        left = [node_id for node_id in left if far[node_id]]
+    groups: list[list[int]] = []
+    while left and len(groups) < config.max_groups:
+        leader = Rigid3(nodes.rotations[left[0]], nodes.centres[left[0]])
+        near = node_distances(leader, nodes, lambda_rot) <= reach
+        group = [node_id for node_id in left if near[node_id]]
+        left = [node_id for node_id in left if not near[node_id]]
+        if set(group) != set(asked):
+            groups.append(group[:num_candidates])
+    return groups
+
+
+def decide(judgements: list[Judgement], lambda_rot: float, d_thresh: float, config: RivalsConfig, clock: StageClock) -> Judgement:
+    """The best of them, as probable as the others leave it, or "ambiguous"; the first where none has a pose that is believed."""
+    best = max(judgements, key=lambda judgement: (isinstance(judgement.result, Localization), _strength(judgement, config)))
+    if not isinstance(best.result, Localization):
+        return judgements[0]
+    result = replace(best.result, times_ms=clock.times_ms())
+    rivals = [j for j in judgements if j is not best and j.evidence and not _agree(best, j, lambda_rot, d_thresh, config)]
+    if not rivals:
+        return replace(best, result=result)
+    leads = [_strength(best, config) - _strength(rival, config) for rival in rivals]
+    if min(leads) < config.min_lead:
+        detail = f"as much like node {rivals[int(np.argmin(leads))].final.node_id} as like node {result.node_id}"
+        refusal = NotLocalized("ambiguous", result.candidates, result.num_matches, result.num_inliers, result.times_ms, detail)
+        return replace(best, result=refusal)
+    others = math.exp(-best.log_odds) + sum(math.exp(-lead) for lead in leads)
+    return replace(best, result=replace(result, probability=1.0 / (1.0 + others)))
+
+
+def _strength(judgement: Judgement, config: RivalsConfig) -> float:
+    """What is compared between two poses; minus infinity where there is none."""
+    evidence = judgement.evidence
+    if evidence is None:
+        return float("-inf")
+    return judgement.log_odds + config.share_weight * math.log((evidence.num_found + 1) / (evidence.num_visible + 20))
+
+
+def _agree(a: Judgement, b: Judgement, lambda_rot: float, d_thresh: float, config: RivalsConfig) -> bool:
+    if a.final.pose is None or b.final.pose is None:
+        return True
+    one, other = a.final.pose.cam_from_world.inverse(), b.final.pose.cam_from_world.inverse()
+    return float(node_distances(one, NodePoses.of([other]), lambda_rot)[0]) <= config.agreement * d_thresh

@@ -1,0 +1,117 @@
+"""What the errors of a map's points have in common, and what that does to a pose's covariance.
+
+PnP's covariance takes the errors of n matches for independent, and shrinks with n. But points of one node move together when the
+node's pose is wrong, when its depth is, or its calibration: a thousand matches share that error. With rho the share of a match's variance
+that is common to all of them, the variance of what n matches say together is not v / n but v / n (1 + (n - 1) rho): the design effect of
+samples taken in clusters (Kish, *Survey Sampling*, 1965). So PnP's covariance is multiplied by 1 + n rho.
+
+rho is the map's own, and the map knows it: a node is localized by nodes a few steps away, as if it were a query, and its recorded
+pose is compared with the pose found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
+from topoloc.localization.guided import GuidedConfig, match_guided
+from topoloc.localization.local_map import LocalMap
+from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.topomap import TopoNode
+
+_MEDIAN_CHI_SQUARE_6 = 5.348
+
+
+@dataclass(frozen=True)
+class SharedErrorsConfig:
+    """How rho is measured."""
+
+    num_nodes: int = 20
+    """Nodes that are localized by others, evenly along the map."""
+    min_distances: tuple[float, ...] = (3.0, 1.0)
+    """Neighbours nearer than so many D_thresh (Eq. 1) do not help to localize a node, for their points were refined with its picture.
+    The second number counts where the first leaves too few nodes to compare."""
+    num_helpers: int = 3
+    """The nearest of the others, whose points do."""
+    min_inliers: int = 20
+    min_nodes: int = 5
+    """With fewer nodes compared, rho is taken to be `unknown`."""
+    percentile: float = 75.0
+    """Of the nodes' rho; above the median, since some parts of a map are worse than others."""
+    factor: float = 2.0
+    """What neighbours share cannot be seen by comparing them: recordings with truth showed about as much again."""
+    least: float = 0.005
+    unknown: float = 0.1
+
+
+def inflation(num_inliers: int, rho: float) -> float:
+    """What PnP's covariance from so many inliers is multiplied by."""
+    return 1.0 + num_inliers * rho
+
+
+def measure_shared_errors(
+    node_of: Callable[[int], TopoNode],
+    local_map_of: Callable[[list[int]], LocalMap],
+    poses: NodePoses,
+    lambda_rot: float,
+    d_thresh: float,
+    guided: GuidedConfig,
+    pose: AbsolutePoseConfig,
+    config: SharedErrorsConfig,
+) -> float:
+    """rho of the map: see above.
+
+    Args:
+        local_map_of: the pooled points of these nodes.
+        guided, pose: as queries are matched and localized.
+    """
+    num_nodes = len(poses.centres)
+    node_ids = np.unique(np.linspace(0, num_nodes - 1, config.num_nodes).round().astype(int))
+    for min_distance in config.min_distances:
+        rhos = []
+        for node_id in node_ids:
+            node = node_of(int(node_id))
+            distances = node_distances(node.summary.world_from_cam, poses, lambda_rot)
+            order = np.argsort(distances, kind="stable")
+            helpers = order[distances[order] > min_distance * d_thresh][: config.num_helpers]
+            rho = _rho_of_node(node, helpers, local_map_of, guided, pose, config.min_inliers)
+            if rho is not None:
+                rhos.append(rho)
+        if len(rhos) >= config.min_nodes:
+            return max(config.factor * float(np.percentile(rhos, config.percentile)), config.least)
+    return config.unknown
+
+
+def _rho_of_node(
+    node: TopoNode,
+    helpers: Int[np.ndarray, " k"],
+    local_map_of: Callable[[list[int]], LocalMap],
+    guided: GuidedConfig,
+    config: AbsolutePoseConfig,
+    min_inliers: int,
+) -> float | None:
+    """rho by which the node's pose differs from what its neighbours say; None where they do not see what it sees."""
+    if len(helpers) == 0:
+        return None
+    cam_from_world = node.summary.world_from_cam.inverse()
+    local_map = local_map_of([int(k) for k in helpers])
+    matches = match_guided(node.features, local_map, cam_from_world, node.camera, guided)
+    if len(matches) < min_inliers:
+        return None
+    found: AbsolutePose | None = estimate_absolute_pose(
+        node.features.points_img[matches.query_idx].astype(np.float64),
+        local_map.points_world[matches.train_idx],
+        node.camera,
+        config,
+        point_covariances=local_map.covariances[matches.train_idx],
+        start=cam_from_world,
+    )
+    if found is None or np.count_nonzero(found.inliers) < min_inliers:
+        return None
+    error: Float[np.ndarray, " 6"] = (found.cam_from_world @ cam_from_world.inverse()).log()
+    square = float(error @ np.linalg.solve(found.covariance, error))
+    return (square / _MEDIAN_CHI_SQUARE_6 - 1.0) / np.count_nonzero(found.inliers)

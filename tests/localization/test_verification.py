@@ -1,0 +1,98 @@
+"""The weighing of evidence: more of it is never less probable, and neither a count nor precision alone is enough."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from topoloc.localization.verification import (
+    Evidence,
+    VerificationConfig,
+    doubt_of,
+    is_only_imprecise,
+    probability_of,
+    spread_of,
+    tolerated_translation,
+)
+
+CONFIG = VerificationConfig()
+STRONG = Evidence(num_matches=150, num_inliers=90, num_found=300, num_visible=1700, num_by_chance=20, spread=0.8, doubt=0.1)
+# What peers accept: scores of inliers, though nearly all that the pose predicts is missing, and chance finds as many.
+MANY_OF_VERY_MANY = Evidence(num_matches=40, num_inliers=6, num_found=70, num_visible=2000, num_by_chance=60, spread=0.5, doubt=0.3)
+
+counts = st.integers(0, 2000)
+evidences = st.builds(
+    Evidence, counts, counts, counts, counts, counts, st.floats(0.0, 1.0, allow_nan=False), st.floats(0.0, 1e3, allow_nan=False)
+)
+
+
+@given(evidences)
+def test_what_speaks_for_a_pose_never_makes_it_less_probable(evidence: Evidence):
+    probability = probability_of(evidence, CONFIG)
+    assert 0.0 <= probability <= 1.0
+    for better in (
+        replace(evidence, num_found=evidence.num_found + 5),
+        replace(evidence, spread=min(evidence.spread + 0.1, 1.0)),
+        replace(evidence, num_inliers=evidence.num_inliers + 1),
+    ):
+        assert probability_of(better, CONFIG) >= probability
+    for worse in (
+        replace(evidence, num_visible=evidence.num_visible + 50),
+        replace(evidence, num_by_chance=evidence.num_by_chance + 5),
+        replace(evidence, num_matches=evidence.num_matches + 5),
+        replace(evidence, doubt=evidence.doubt * 2.0),
+    ):
+        assert probability_of(worse, CONFIG) <= probability
+
+
+def test_strong_evidence_is_believed():
+    assert probability_of(STRONG, CONFIG) > 0.97
+
+
+def test_many_found_of_very_many_that_should_be_is_still_improbable():
+    assert probability_of(MANY_OF_VERY_MANY, CONFIG) < 0.3
+
+
+@pytest.mark.parametrize(
+    "weaker",
+    [
+        {"num_by_chance": 300, "num_inliers": 12},
+        {"num_found": 40, "num_inliers": 12, "spread": 0.1},
+        {"num_inliers": 5, "num_matches": 60, "num_found": 60},
+        {"doubt": 8.0, "num_inliers": 12, "num_found": 90},
+    ],
+)
+def test_no_single_part_of_the_evidence_carries_a_pose(weaker: dict[str, float]):
+    assert probability_of(replace(STRONG, **weaker), CONFIG) < 0.7
+
+
+def test_a_pose_that_is_only_imprecise_is_told_from_one_that_has_nothing_to_stand_on():
+    small = replace(STRONG, num_inliers=16, num_matches=40, num_found=80, num_visible=900, num_by_chance=12, spread=0.2, doubt=30.0)
+    assert probability_of(small, CONFIG) < CONFIG.min_probability
+    assert is_only_imprecise(small, CONFIG)
+    assert not is_only_imprecise(MANY_OF_VERY_MANY, CONFIG)
+
+
+def test_indoors_less_is_tolerated():
+    assert tolerated_translation(20.0, CONFIG) == 0.25
+    assert tolerated_translation(2.0, CONFIG) == pytest.approx(0.1)
+
+
+def test_doubt_is_one_where_the_worst_direction_is_as_uncertain_as_is_tolerated():
+    metres = np.diag([1e-6, 0.25**2, 1e-6, 1e-12, 1e-12, 1e-12])
+    radians = np.diag([1e-12, 1e-12, 1e-12, 1e-9, 1e-9, np.deg2rad(2.0) ** 2])
+    assert doubt_of(metres, 20.0, CONFIG) == pytest.approx(1.0, abs=1e-3)
+    assert doubt_of(radians, 20.0, CONFIG) == pytest.approx(1.0, abs=1e-3)
+    assert doubt_of(metres, 2.0, CONFIG) == pytest.approx(2.5, abs=1e-3)
+
+
+def test_spread_counts_cells_not_points():
+    corner = np.random.default_rng(0).uniform(0.0, 20.0, (500, 2))
+    everywhere = np.stack(np.meshgrid(np.arange(40, 640, 80), np.arange(40, 480, 80)), axis=-1).reshape(-1, 2).astype(np.float64)
+    assert spread_of(corner, 640, 480) == pytest.approx(1 / 48)
+    assert spread_of(everywhere, 640, 480) == 1.0
+    assert spread_of(np.array([[-0.5, -0.5], [639.5, 479.5]]), 640, 480) == pytest.approx(2 / 48)
