@@ -32,7 +32,7 @@ def main(map_file: Path | None, weights: str | None, epochs: int, out: Path) -> 
     model = train_coarse(topomap, name, backbone, weights or "scratch", CoarseTrainingConfig(cnn_fc=of_fc))
     store_coarse(map_file, out, model, make_default=False)  # the map's other coarse localizers stay, and so does its default
 
-    trained, day = topoloc.TopoMetricMap.load(out), topoloc.open_sequence(SHIPPED / "day@0::2")
+    trained, day = topoloc.TopoMetricMap.load(out), topoloc.open_sequence(SHIPPED / "day@0::4")
     for coarse in ("surf-vlad", name):
         judged = summarize(answer_queries(topoloc.Localizer(trained, topoloc.LocalizerConfig(coarse=coarse)), day))
         accuracy, near = 100.0 * judged["topological_accuracy"], 100.0 * judged["neighbour_accuracy"]

@@ -102,6 +102,17 @@ def test_reject_elsewhere(run: Run, lab: Path):
     assert accepted == [("day@0::8", "4", "4"), ("corridor", "0", "8"), ("street@0::2", "0", "4")]
 
 
+def test_follow_stream(run: Run):
+    printed = run("follow_stream")
+    assert re.findall(r"^images/0000(\d\d)\.jpg: predicted \((\w+)\)", printed, re.MULTILINE) == [
+        ("08", "too_few_matches"),
+        ("09", "too_few_matches"),
+        ("20", "jump"),
+    ]
+    assert ": lost" not in printed
+    assert max(_centimetres(printed, "median error")) < 1.5
+
+
 def test_slam_trajectory(run: Run, tmp_path: Path):
     printed = run("slam_trajectory", SHIPPED / "map_lap1@0:14")
     assert "14 of 14 frames tracked" in printed

@@ -75,7 +75,7 @@ def test_settings_that_the_pipeline_names_are_there(capsys: pytest.CaptureFixtur
     from topoloc.cli import main
 
     helps = ""
-    for command in COMMANDS:
+    for command in ("build", "train", "localize"):
         with pytest.raises(SystemExit):
             main([command, "--help"])
         helps += capsys.readouterr().out
