@@ -15,6 +15,7 @@ COMMANDS = {
     "train": "add a learned coarse localizer to a map, or train it anew",
     "localize": "where were these images taken? 6-DoF poses of images, folders, recordings",
     "evaluate": "localize a recording with known truth and judge the poses",
+    "benchmark": "the paper's tables and figures, ours and others' beside them",
     "info": "what a map file holds",
 }
 

@@ -111,12 +111,20 @@ class PoseNet:
 
 
 def train_posenet(
-    topomap: TopoMetricMap, backbone: BackboneName, weights: Weights | None, config: PoseNetConfig, progress: Progress | None = None
+    topomap: TopoMetricMap,
+    backbone: BackboneName,
+    weights: Weights | None,
+    config: PoseNetConfig,
+    progress: Progress | None = None,
+    checkpoint: Path | None = None,
 ) -> PoseNet:
     """Train on the map's images but those held out.
 
+    Args:
+        checkpoint: the state is written after each epoch beside this file, under its name and the loss's, and gone on from if it is there.
+
     Raises:
-        TrainingError: the loss was not finite.
+        TrainingError: the loss was not finite, or a checkpoint is of another training.
         EmptyMapError, MapError: the map holds no images, or is damaged.
     """
     progress = progress or (lambda stage, done, total: None)
@@ -158,7 +166,7 @@ def train_posenet(
         task = Task(
             network, lambda r, g, kind=stage: loss_of(kind, r, g), score, rows, np.ones(len(rows)), pretrained, f"PoseNet ({stage})"
         )
-        done = fit(task, config.training, progress)
+        done = fit(task, config.training, progress, None if checkpoint is None else checkpoint.with_suffix(f".{stage}"))
     return PoseNet(backbone, config, shape, network, score(), done)
 
 

@@ -1,0 +1,128 @@
+"""Queries asked, once: every way of answering gives the rows that all tables and figures are made of."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from topoloc.evaluation.experiments import answer_elsewhere, answer_queries
+from topoloc.evaluation.metrics import Answer, summarize
+from topoloc.evaluation.paper.datasets import Dataset
+from topoloc.evaluation.paper.maps import MapKind, opened
+from topoloc.evaluation.paper.settings import Bench, evenly, sequence_digest
+from topoloc.evaluation.paper.stages import Done, digest_of
+from topoloc.evaluation.paper.stored_answers import answers_of, rows_of
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.places.coarse import NodeScore
+from topoloc.sequences.frame import StereoSequence
+from topoloc.sequences.open import open_sequence
+from topoloc.sequences.selection import sequence_subset
+from topoloc.simulation.demo_recordings import draw_pictures_of_nothing
+
+WARM_UP = 3
+
+
+@dataclass(frozen=True)
+class Way:
+    """A way of answering: the map, the coarse localizer, the fine step. `knows_node` puts the truth in the coarse one's place."""
+
+    kind: MapKind
+    coarse: str = "surf-vlad"
+    config: LocalizerConfig = field(default_factory=LocalizerConfig)
+    knows_node: bool = False
+
+    @property
+    def name(self) -> str:
+        special = asdict(self.config) != asdict(LocalizerConfig())
+        coarse = "known-node" if self.knows_node else self.coarse
+        return f"{self.kind.name}-{coarse}" + (f"-{digest_of(asdict(self.config))[:6]}" if special else "")
+
+
+def asked(bench: Bench, dataset: Dataset, label: str, way: Way) -> Done:
+    """Rows (`stored_answers`) of every query of one recording.
+
+    Raises:
+        What `opened` and `answer_queries` raise.
+    """
+    topomap, digest = opened(bench, dataset, way.kind, way.coarse)
+    sequence = queries_of(bench, dataset, label)
+
+    def ask() -> list[dict[str, Any]]:
+        localizer = Localizer(topomap, replace(way.config, coarse=way.coarse))
+        for i in range(min(WARM_UP, len(sequence))):
+            frame = sequence[i]
+            if frame.camera is not None:
+                localizer.localize(frame.image, frame.camera)
+        told = f"{dataset.name} {label}: {way.name}"
+        known = dataset.map_from_query_truth()
+        if way.knows_node:
+            _tell_truth(localizer, [known @ pose for pose in sequence.poses if pose is not None])
+        return rows_of(answer_queries(localizer, sequence, known, lambda _, done, total: bench.progress(told, done, total), label))
+
+    settings = {"map": digest, "config": asdict(way.config), "knows_node": way.knows_node, "queries": sequence_digest(sequence)}
+    return bench.store.get(f"answers-{dataset.name}-{label.replace(' ', '_')}-{way.name}", settings, ask)
+
+
+def answers(bench: Bench, dataset: Dataset, label: str, way: Way) -> list[Answer]:
+    """The answers themselves, with their pictures at hand."""
+    return answers_of(asked(bench, dataset, label, way).result, label, queries_of(bench, dataset, label))
+
+
+def summary(bench: Bench, dataset: Dataset, label: str, way: Way) -> dict[str, Any]:
+    """What `summarize` says of the answers."""
+    return summarize(answers_of(asked(bench, dataset, label, way).result, label))
+
+
+def queries_of(bench: Bench, dataset: Dataset, label: str) -> StereoSequence:
+    sequence = dataset.open_queries(label)
+    chosen = evenly(len(sequence), bench.config.max_queries)
+    return sequence if len(chosen) == len(sequence) else sequence_subset(sequence, chosen)
+
+
+def elsewhere_of(bench: Bench, dataset: Dataset) -> list[tuple[str, StereoSequence]]:
+    """Images that were not taken in the data set's place: of the other places of its kind, and pictures of nothing."""
+    paths = [(path, path) for path in dataset.elsewhere]
+    for other in (*bench.rendered, *bench.real):
+        if other.name != dataset.name and (other.is_real == dataset.is_real):
+            paths += [(f"{other.name} {label}", path) for label, path in other.queries.items()]
+    nothing = bench.out / "pictures_of_nothing"
+    draw_pictures_of_nothing(nothing)
+    sequences = [(name, open_sequence(path)) for name, path in [*paths, ("nothing", str(nothing))]]
+    return [(name, sequence_subset(s, evenly(len(s), bench.config.max_elsewhere))) for name, s in sequences]
+
+
+def false_accepts(bench: Bench, dataset: Dataset, way: Way) -> dict[str, int]:
+    """Of how many images from elsewhere a pose was given, and how many there were."""
+    topomap, digest = opened(bench, dataset, way.kind, way.coarse)
+    others = elsewhere_of(bench, dataset)
+
+    def ask() -> dict[str, int]:
+        localizer = Localizer(topomap, replace(way.config, coarse=way.coarse))
+        given = [a for name, sequence in others for a in answer_elsewhere(localizer, sequence, label=name)]
+        return {"num_elsewhere": len(given), "accepted": sum(a.result.localized for a in given)}
+
+    settings = {"map": digest, "config": asdict(way.config), "others": [sequence_digest(s) for _, s in others]}
+    return bench.store.get(f"elsewhere-{dataset.name}-{way.name}", settings, ask).result
+
+
+class _KnownNodes:
+    """A coarse localizer that is told the truth: the nodes nearest by Eq. 1, query after query."""
+
+    def __init__(self, topomap: TopoMetricMap, world_from_cams: list[Rigid3]) -> None:
+        self._nodes = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
+        self._lambda_rot = float(topomap.config["nodes"]["lambda_rot"])
+        self._truths = iter(world_from_cams)
+
+    def rank(self, image: Any, features: Any, num_candidates: int) -> list[NodeScore]:
+        distances = node_distances(next(self._truths), self._nodes, self._lambda_rot)
+        return [NodeScore(int(i), -float(distances[i])) for i in np.argsort(distances, kind="stable")[:num_candidates]]
+
+
+def _tell_truth(localizer: Localizer, world_from_cams: list[Rigid3]) -> None:
+    """Put the truth in the place of the coarse localizer: what is still wrong is not its doing."""
+    localizer._coarse = _KnownNodes(localizer.topomap, world_from_cams)

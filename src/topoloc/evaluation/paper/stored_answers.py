@@ -1,0 +1,83 @@
+"""Answers as JSON and back, so that tables and figures can be made of them without asking again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from topoloc.evaluation.metrics import Answer
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.verification import Evidence
+from topoloc.places.coarse import NodeScore
+from topoloc.sequences.frame import StereoSequence
+
+
+def rows_of(answers: Sequence[Answer]) -> list[dict[str, Any]]:
+    """A row of plain JSON for each answer."""
+    return [_row_of(answer) for answer in answers]
+
+
+def answers_of(rows: Sequence[dict[str, Any]], recording: str, sequence: StereoSequence | None = None) -> list[Answer]:
+    """The inverse of `rows_of`; pictures and cameras are read again from `sequence` when they are asked for."""
+    cameras = _Pictures(sequence) if sequence is not None else None
+    return [_answer_of(row, recording, cameras) for row in rows]
+
+
+def pose_json(world_from_cam: Rigid3) -> list[float]:
+    """Translation (metres), then the quaternion, w first."""
+    return [*world_from_cam.translation.tolist(), *world_from_cam.quat_wxyz().tolist()]
+
+
+def pose_of(numbers: Sequence[float]) -> Rigid3:
+    """The inverse of `pose_json`."""
+    return Rigid3.from_quat_wxyz(np.array(numbers[3:]), np.array(numbers[:3]))
+
+
+def _row_of(answer: Answer) -> dict[str, Any]:
+    row = answer.result.to_json(answer.query)
+    if isinstance(answer.result, Localization) and answer.result.evidence is not None:
+        row["evidence"] = {name: np.asarray(value).item() for name, value in asdict(answer.result.evidence).items()}
+    if answer.world_from_cam is not None:
+        row["truth"] = pose_json(answer.world_from_cam)
+    return row | {"nearest": answer.nearest_node_id, "neighbours": sorted(answer.neighbour_ids)}
+
+
+def _answer_of(row: dict[str, Any], recording: str, pictures: _Pictures | None) -> Answer:
+    truth = pose_of(row["truth"]) if "truth" in row else None
+    read_image = None if pictures is None else pictures.reader(row["query"])
+    camera = None if pictures is None else pictures.camera
+    return Answer(row["query"], _result_of(row), truth, row["nearest"], recording, read_image, camera, frozenset(row["neighbours"]))
+
+
+def _result_of(row: dict[str, Any]) -> Localization | NotLocalized:
+    candidates = [NodeScore(int(node_id), float(score)) for node_id, score in row["candidates"]]
+    if not row["localized"]:
+        return NotLocalized(row["reason"], candidates, row["num_matches"], row["num_inliers"], row["times_ms"], row.get("detail", ""))
+    pose = row["world_from_cam"]
+    return Localization(
+        world_from_cam=Rigid3.from_quat_wxyz(np.array(pose["quat_wxyz"]), np.array(pose["translation"])),
+        covariance=np.array(row["covariance"]),
+        probability=row["probability"],
+        node_id=row["node"],
+        candidates=candidates,
+        num_matches=row["num_matches"],
+        num_inliers=row["num_inliers"],
+        times_ms=row["times_ms"],
+        evidence=Evidence(**row["evidence"]) if "evidence" in row else None,
+    )
+
+
+class _Pictures:
+    """A recording's pictures by their names, and its camera: that of the first frame."""
+
+    def __init__(self, sequence: StereoSequence) -> None:
+        self._sequence = sequence
+        self._index = {name: i for i, name in enumerate(sequence.names)}
+        self.camera = sequence[0].camera
+
+    def reader(self, name: str) -> Any:
+        return lambda: self._sequence[self._index[name]].image
