@@ -1,8 +1,9 @@
 """Points of the map followed from picture to picture, between two pictures that were localized in full.
 
 The points that a full localization stands on are sought again by Lucas and Kanade's method and aligned with their patch in that picture
-(`slam/tracking.py`). The pose is that of the localized picture, moved by what the points say of the motion since: the map's own errors
-are the same in both and cancel.
+(`slam/tracking.py`). The pose is that of the localized picture, moved by what the points say of the motion since. For this the points
+are put where that picture, at its pose, shows them, at the depth that the map gives: what the map is wrong by is the same before and
+after the motion, and only wrong depths are left to disturb it.
 """
 
 from __future__ import annotations
@@ -15,15 +16,19 @@ from jaxtyping import Float, Float32, UInt8
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.stereo import ray_covariances
 from topoloc.localization.seen_points import SeenPoints
 from topoloc.slam.tracking import TrackingConfig, align_with_reference, follow
+
+# Where a point lies beside its ray: the pixel defines the ray, so this only keeps the covariance regular.
+_RAY_SIGMA_PX = 0.1
 
 
 @dataclass(frozen=True)
 class FollowingConfig:
     """Which points are followed, and when they are too few."""
 
-    max_points: int = 160
+    max_points: int = 320
     """Points followed, spread over the picture: more cost time and add little."""
     min_points: int = 20
     """Points that agree on a pose; with fewer it is not believed."""
@@ -31,7 +36,7 @@ class FollowingConfig:
     """Share of the points found again that must agree."""
     tracking: TrackingConfig = field(default_factory=lambda: TrackingConfig(max_shift_px=4.0))
     pose: AbsolutePoseConfig = field(
-        default_factory=lambda: AbsolutePoseConfig(max_reprojection_error_px=4.0, sigma_px=0.5, max_iterations=300, min_iterations=20)
+        default_factory=lambda: AbsolutePoseConfig(max_reprojection_error_px=2.0, sigma_px=0.5, max_iterations=300, min_iterations=20)
     )
 
 
@@ -54,12 +59,11 @@ class PointFollower:
 
     def __init__(self, grey: UInt8[np.ndarray, "h w"], seen: SeenPoints, cam_from_world: Rigid3, camera: Camera, config: FollowingConfig):
         self._config, self._camera, self._cam_from_world = config, camera, cam_from_world
-        self._seen = _spread(seen, camera, config.max_points)
+        seen = _on_their_rays(_spread(seen, camera, config.max_points), cam_from_world, camera)
+        self._seen = seen
         self._reference = grey.astype(np.float32)
-        self._last_grey, self._last_img, self._rows = grey, self._seen.points_img, np.arange(len(self._seen))
+        self._last_grey, self._last_img, self._rows = grey, seen.points_img, np.arange(len(seen))
         self._last_from_world = cam_from_world
-        # What the points followed say of the localized picture itself; the motion since is measured from there.
-        self._ref_from_world = self._pose(self._seen.points_img, self._rows)
 
     @property
     def camera(self) -> Camera:
@@ -67,8 +71,6 @@ class PointFollower:
 
     def follow(self, grey: UInt8[np.ndarray, "h w"], expected: Rigid3) -> Followed | None:
         """The motion up to this picture, taken at about `expected` (cam_from_world); None where the points are lost."""
-        if self._ref_from_world is None:
-            return None
         for guess in (expected, self._last_from_world):
             rows, points_img = self._seek(grey, guess)
             pose = self._pose(points_img, rows)
@@ -80,7 +82,7 @@ class PointFollower:
         self._last_grey, self._last_img, self._rows = grey, points_img[pose.inliers], agreeing
         self._last_from_world = pose.cam_from_world
         return Followed(
-            cam_from_ref=pose.cam_from_world @ self._ref_from_world.cam_from_world.inverse(),
+            cam_from_ref=pose.cam_from_world @ self._cam_from_world.inverse(),
             covariance=pose.covariance,
             num_found=len(rows),
             num_agreeing=len(agreeing),
@@ -113,6 +115,18 @@ class PointFollower:
         )  # fmt: skip
         enough = max(config.min_points, config.min_agreeing * len(rows))
         return pose if pose is not None and np.count_nonzero(pose.inliers) >= enough else None
+
+
+def _on_their_rays(seen: SeenPoints, cam_from_world: Rigid3, camera: Camera) -> SeenPoints:
+    """The points moved onto the rays of their pixels; their covariance is that of the depth."""
+    depths = cam_from_world.apply(seen.points_world)[:, 2]
+    rays = np.column_stack([camera.normalized_from_img(seen.points_img.astype(np.float64)), np.ones(len(seen))])
+    points_cam = rays * depths[:, None]
+    axis = cam_from_world.rotation[2]
+    sigma_z = np.sqrt(np.maximum(np.einsum("i,nij,j->n", axis, seen.covariances, axis), 0.0))
+    covariances = ray_covariances(points_cam, sigma_z, camera, np.full(len(seen), _RAY_SIGMA_PX))
+    rotation = cam_from_world.rotation
+    return SeenPoints(seen.points_img, cam_from_world.inverse().apply(points_cam), rotation.T @ covariances @ rotation)
 
 
 def _spread(seen: SeenPoints, camera: Camera, max_points: int) -> SeenPoints:

@@ -19,9 +19,9 @@ from topoloc.geometry.rigid import Rigid3
 class MotionConfig:
     """What cameras do: in a hand, on a robot, on a car."""
 
-    sigma_acceleration: float = 2.0
+    sigma_acceleration: float = 3.0
     """Of an unknown acceleration, m/s^2."""
-    sigma_angular_acceleration: float = 6.0
+    sigma_angular_acceleration: float = 12.0
     """rad/s^2."""
     sigma_velocity: float = 8.0
     """Of the velocity of a camera seen once, m/s: it may be on a car."""

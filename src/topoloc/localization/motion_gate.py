@@ -22,6 +22,8 @@ class GateConfig:
     motion: MotionConfig = field(default_factory=MotionConfig)
     max_surprise: float = 33.0
     """Squared Mahalanobis distance from the prediction (chi^2 with 6 degrees of freedom: 1 in 100,000) beyond which a pose is refused."""
+    prediction_scale: float = 2.5
+    """By how much the prediction may be more wrong than its sigma says: hands jerk, wheels meet kerbs."""
     num_agreeing: int = 3
     """So many refused poses in a row that agree with each other are believed after all."""
     max_predicted: float = 1.0
@@ -65,7 +67,8 @@ class MotionGate:
 
     def follows(self, predicted: MotionState, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"]) -> bool:
         """Whether this pose can follow. `covariance` is here, as everywhere below, of the right perturbation."""
-        return surprise(predicted, world_from_cam, covariance) <= self._config.max_surprise
+        slack = (self._config.prediction_scale**2 - 1.0) * predicted.pose_covariance
+        return surprise(predicted, world_from_cam, covariance + slack) <= self._config.max_surprise
 
     def is_overruled(
         self, t_ns: int, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"], odom_from_cam: Rigid3 | None = None

@@ -61,7 +61,9 @@ class TrackerConfig:
     """By how much errors of localization exceed their sigma: points share the errors of the map ..."""
     floor_share: float = 0.004
     """... which do not vanish with their number: sigma, as a share of the points' depth."""
-    followed_share: float = 0.04
+    blend_time: float = 0.2
+    """Seconds (to 1/e) in which what a new localization corrects is worked into the smoothed pose, so that it does not jump."""
+    followed_share: float = 0.1
     """Sigma of a followed motion, as a share of its way and turn, beside what the points say."""
 
 
@@ -79,13 +81,17 @@ class _Picture:
 
 @dataclass(frozen=True, eq=False)
 class _Reference:
-    """The picture that was localized last: its pose raw (with covariance, of the left perturbation) and smoothed, and its points."""
+    """The picture that was localized last: its pose raw (with covariance, of the left perturbation) and smoothed, and its points.
+
+    `offset` (left of `smoothed`) is what the smoothed poses before it were off by; it fades.
+    """
 
     t_ns: int
     found: Localization
     cam_from_world: Rigid3
     covariance: Float[np.ndarray, "6 6"]
     smoothed: Rigid3
+    offset: Rigid3
     depth: float
     follower: PointFollower
 
@@ -187,7 +193,7 @@ class Tracker:
         followed = reference.follower.follow(picture.grey, predicted.world_from_cam.inverse())
         if followed is None:
             return None
-        world_from_cam = (followed.cam_from_ref @ reference.smoothed).inverse()
+        world_from_cam = self._blended(followed, picture.t_ns).inverse()
         return followed if self._gate.follows(predicted, world_from_cam, followed.covariance + self._floor(reference.depth)) else None
 
     def _is_due(self, followed: Followed, picture: _Picture) -> bool:
@@ -234,17 +240,27 @@ class Tracker:
                 return None
             self._window.clear()
             smoothed = self._window.add(cam_from_world, covariance, Rigid3.identity(), covariance)
+            offset = Rigid3.identity()
             state = self._gate.begin(t_ns, found.world_from_cam, covariance, odom_from_cam)
         else:
             motion, motion_covariance = self._motion(predicted, followed)
+            before = self._blended(followed, t_ns) if followed is not None else None
             smoothed = self._window.add(cam_from_world, covariance, motion, motion_covariance)
-            measured = covariance if followed is None else motion_covariance + covariance / self.config.window.size
-            state = self._gate.correct(predicted, smoothed.inverse(), measured, odom_from_cam)
+            offset = Rigid3.identity() if before is None else before @ smoothed.inverse()
+            measured = covariance if followed is None else followed.covariance
+            state = self._gate.correct(predicted, (offset @ smoothed).inverse(), measured, odom_from_cam)
             self._gate.drop_rival()
         points = seen.in_image(picture.grey_camera.width / picture.camera.width)
         follower = PointFollower(picture.grey, points, cam_from_world, picture.grey_camera, self.config.following)
-        self._reference = _Reference(t_ns, found, cam_from_world, covariance, smoothed, depth, follower)
+        self._reference = _Reference(t_ns, found, cam_from_world, covariance, smoothed, offset, depth, follower)
         return StreamedPose(t_ns, "localized", found, state.world_from_cam, self._covariance(state))
+
+    def _blended(self, followed: Followed, t_ns: int) -> Rigid3:
+        """The smoothed cam_from_world of a followed picture."""
+        reference = self._reference
+        assert reference is not None
+        share = np.exp(-(t_ns - reference.t_ns) / 1e9 / self.config.blend_time)
+        return Rigid3.exp(share * reference.offset.log()) @ followed.cam_from_ref @ reference.smoothed
 
     def _motion(self, predicted: MotionState, followed: Followed | None) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
         """cam_from_before, from the picture localized last, with the covariance of its left perturbation."""
@@ -256,8 +272,8 @@ class Tracker:
     def _tracked(self, picture: _Picture, followed: Followed, predicted: MotionState, clock: StageClock) -> StreamedPose:
         reference = self._reference
         assert reference is not None
-        smoothed = (followed.cam_from_ref @ reference.smoothed).inverse()
-        state = self._gate.correct(predicted, smoothed, self._followed_covariance(followed), picture.odom_from_cam)
+        smoothed = self._blended(followed, picture.t_ns).inverse()
+        state = self._gate.correct(predicted, smoothed, followed.covariance, picture.odom_from_cam)
         world_from_cam = (followed.cam_from_ref @ reference.cam_from_world).inverse()
         adjoint, motion = world_from_cam.adjoint(), followed.cam_from_ref.adjoint()
         covariance = adjoint @ (motion @ reference.covariance @ motion.T + followed.covariance) @ adjoint.T
