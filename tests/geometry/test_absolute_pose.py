@@ -9,12 +9,11 @@ from hypothesis import strategies as st
 
 from topoloc.geometry.absolute_pose import (
     AbsolutePoseConfig,
-    covariance_of_inverse,
     estimate_absolute_pose,
-    position_covariance,
 )
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
+from topoloc.geometry.pose_covariance import covariance_of_inverse, position_covariance
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.stereo import covariances_from_depth
 

@@ -126,24 +126,6 @@ def estimate_absolute_pose(
     return _with_evidence(cam_from_world, matches, camera, config, order, len(points_img))
 
 
-def covariance_of_inverse(a_from_b: Rigid3, covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
-    """Covariance of the left perturbation of ``b_from_a = a_from_b.inverse()``, from that of `a_from_b`.
-
-    As ``(exp(xi) @ a_from_b).inverse() == exp(-Ad @ xi) @ b_from_a`` with Ad the adjoint of b_from_a.
-    The result's translation part is of the frame b at its origin; see `position_covariance` for the camera's own position.
-    """
-    adjoint = a_from_b.inverse().adjoint()
-    return adjoint @ covariance @ adjoint.T
-
-
-def position_covariance(cam_from_world: Rigid3, covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "3 3"]:
-    """Covariance (m^2, world axes) of the camera's position, from that of the left perturbation of `cam_from_world`.
-
-    The position is ``-R' t``; moving R and t by (rho, omega) moves it by ``-R' rho`` alone, to first order.
-    """
-    return cam_from_world.rotation.T @ covariance[:3, :3] @ cam_from_world.rotation
-
-
 def _solve_with_poselib(matches: _Matches, camera: Camera, config: AbsolutePoseConfig, is_sorted: bool) -> Rigid3 | None:
     # A pinhole of the same focal length in pixels that are already undistorted: thresholds keep their meaning, and
     # every model works alike. PoseLib adds no half pixel of its own.

@@ -8,8 +8,10 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.features.features import Features, Matches
-from topoloc.geometry.absolute_pose import AbsolutePose, covariance_of_inverse
+from topoloc.geometry.absolute_pose import AbsolutePose
 from topoloc.geometry.camera import Camera
+from topoloc.geometry.pose_covariance import covariance_of_inverse
+from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.guided import GuidedConfig, count_by_chance, count_visible
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.result import Localization, NotLocalized
@@ -30,9 +32,13 @@ from topoloc.places.coarse import NodeScore
 
 @dataclass(frozen=True, eq=False)
 class Attempt:
-    """Matches of the features with a part of the map, seen by `camera`, and the pose that most of them agree on."""
+    """Matches of the features with a part of the map, and the pose that most of them agree on.
+
+    `lens` is what is known of the camera, `camera` the same, or, of a rough one, what comes of it with the focal length found.
+    """
 
     features: Features
+    lens: Camera | RoughCamera
     camera: Camera
     local_map: LocalMap
     matches: Matches
@@ -109,6 +115,7 @@ def judge(
         num_inliers=final.num_inliers,
         times_ms=clock.times_ms(),
         evidence=evidence,
+        focal_length_px=final.camera.fx if isinstance(final.lens, RoughCamera) else None,
     )
     return Judgement(answer, final, evidence, log_odds)
 

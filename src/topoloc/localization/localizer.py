@@ -10,8 +10,9 @@ behaviour.
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import cv2
@@ -22,8 +23,10 @@ from topoloc.features.extraction import FeatureConfig, extract_normalized, norma
 from topoloc.features.features import Features, Matches
 from topoloc.features.matching import MatchingConfig, match_pooled
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
+from topoloc.geometry.absolute_pose_focal import estimate_pose_and_focal
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.attempt import Attempt, Judgement, judge
 from topoloc.localization.guided import GuidedConfig, match_guided
 from topoloc.localization.local_map import LocalMap
@@ -88,15 +91,21 @@ class Localizer:
         self._d_thresh = float(topomap.config["nodes"]["d_thresh"])
         self._local_maps: OrderedDict[int, LocalMap] = OrderedDict()
 
-    def localize(self, image: Image, camera: Camera) -> Localization | NotLocalized:
+    def localize(self, image: Image, camera: Camera | RoughCamera | None) -> Localization | NotLocalized:
         """Where was this image (grey or RGB, uint8) taken, by a camera of this calibration?
+
+        Of a camera that is only roughly known, or not at all (None), the focal length is found with the pose; that takes a few times as
+        long, and it is taken for a pinhole.
 
         Raises:
             QueryError: the camera is of another image size.
         """
-        return self.localize_near(image, camera, None)[0]
+        height, width = image.shape[:2]
+        return self.localize_near(image, RoughCamera.unknown(width, height) if camera is None else camera, None)[0]
 
-    def localize_near(self, image: Image, camera: Camera, near: Rigid3 | None) -> tuple[Localization | NotLocalized, SeenPoints | None]:
+    def localize_near(
+        self, image: Image, camera: Camera | RoughCamera, near: Rigid3 | None
+    ) -> tuple[Localization | NotLocalized, SeenPoints | None]:
         """As `localize`, where the camera is known to be about `near` (world_from_cam): the nodes nearest to it replace the coarse search.
 
         None for `near` is `localize` itself. Only the choice of nodes is taken from `near`: the pose needs the same evidence as any
@@ -110,19 +119,24 @@ class Localizer:
             raise QueryError(f"the image is {width}x{height}, its camera {camera.width}x{camera.height}")
         shared_errors = self.shared_errors  # of the first query alone; it is the map's time, not the query's
         clock = StageClock()
-        image, camera = _reduced(image, camera, self.config.max_side_px)
+        image, lens = _reduced(image, camera, self.config.max_side_px)
+        scale = width / lens.width
         features = self._extract(image, clock)
         if near is not None:
-            expecting = self._localize_among(self._nodes_near(near), features, camera, clock)
+            expecting = self._localize_among(self._nodes_near(near), features, lens, clock)
             judgement = self._judge(expecting, [], shared_errors, clock)
         else:
             ranked = self._rank_nodes(image, features, clock)
             candidates = ranked[: self.config.num_candidates]
-            first = self._localize_among(candidates, features, camera, clock)
+            first = self._localize_among(candidates, features, lens, clock)
             judgement = self._judge(first, candidates, shared_errors, clock)
-            judgement = self._against_rivals(judgement, ranked, features, camera, shared_errors, clock)
-        is_found = isinstance(judgement.result, Localization)
-        return judgement.result, judgement.final.seen_points(width / camera.width) if is_found else None
+            judgement = self._against_rivals(judgement, ranked, features, lens, shared_errors, clock)
+        result = judgement.result
+        if not isinstance(result, Localization):
+            return result, None
+        if result.focal_length_px is not None:
+            result = replace(result, focal_length_px=result.focal_length_px * scale)
+        return result, judgement.final.seen_points(scale)
 
     @cached_property
     def shared_errors(self) -> float:
@@ -151,12 +165,12 @@ class Localizer:
         with clock.stage("coarse"):
             return self._coarse.rank(image, features, max(self.config.num_candidates, self.config.rivals.num_ranked))
 
-    def _localize_among(self, candidates: list[NodeScore], features: Features, camera: Camera, clock: StageClock) -> Attempt:
+    def _localize_among(self, candidates: list[NodeScore], features: Features, lens: Camera | RoughCamera, clock: StageClock) -> Attempt:
         """The candidates' points together. The strongest features are nearly always enough; all are tried where they are not."""
         local_map = self._pooled([candidate.node_id for candidate in candidates])
-        attempt = self._localize_in(local_map, features, camera, clock, self.config.num_first_features)
+        attempt = self._localize_in(local_map, features, lens, clock, self.config.num_first_features)
         if attempt.num_inliers < self.config.num_clear_inliers and len(features) > self.config.num_first_features:
-            attempt = self._localize_in(local_map, features, camera, clock)
+            attempt = self._localize_in(local_map, features, lens, clock)
         return attempt
 
     def _nodes_near(self, world_from_cam: Rigid3) -> list[NodeScore]:
@@ -166,13 +180,13 @@ class Localizer:
         return [NodeScore(int(i), -float(distances[i])) for i in nearest]
 
     def _localize_in(
-        self, local_map: LocalMap, features: Features, camera: Camera, clock: StageClock, max_features: int | None = None
+        self, local_map: LocalMap, features: Features, lens: Camera | RoughCamera, clock: StageClock, max_features: int | None = None
     ) -> Attempt:
         """The fine step: match with the candidates' points, then robust PnP."""
         with clock.stage("matching"):
             descriptors = features.descriptors[:max_features]
             matches = match_pooled(descriptors, local_map.descriptors, local_map.points_world, local_map.radii, self.config.matching)
-        return self._attempt(features, camera, local_map, matches, None, clock)
+        return self._attempt(features, lens, local_map, matches, None, clock)
 
     def _localize_around(self, first: Attempt, clock: StageClock) -> Attempt:
         """Once more with the nodes nearest to the pose found, each point sought where it must be seen."""
@@ -184,24 +198,32 @@ class Localizer:
             nearest = np.argsort(distances, kind="stable")[: self.config.guided.num_nodes]
             local_map = self._pooled([int(i) for i in nearest])
             matches = match_guided(first.features, local_map, cam_from_world, first.camera, self.config.guided)
-        return self._attempt(first.features, first.camera, local_map, matches, cam_from_world, clock)
+        return self._attempt(first.features, first.lens, local_map, matches, (cam_from_world, first.camera), clock)
 
     def _attempt(
-        self, features: Features, camera: Camera, local_map: LocalMap, matches: Matches, start: Rigid3 | None, clock: StageClock
+        self,
+        features: Features,
+        lens: Camera | RoughCamera,
+        local_map: LocalMap,
+        matches: Matches,
+        start: tuple[Rigid3, Camera] | None,
+        clock: StageClock,
     ) -> Attempt:
-        """Robust PnP, or the refinement of `start` (cam_from_world)."""
+        """Robust PnP, or the refinement of `start` (cam_from_world and the camera); with the focal length, of a rough camera."""
+        camera = start[1] if start else _usual(lens)
         if start is None and len(matches) < self.config.min_matches:
-            return Attempt(features, camera, local_map, matches, None)
+            return Attempt(features, lens, camera, local_map, matches, None)
+        points_img = features.points_img[matches.query_idx].astype(np.float64)
+        points_world, covariances = local_map.points_world[matches.train_idx], local_map.covariances[matches.train_idx]
+        config = self.config.pose
         with clock.stage("pnp"):
-            pose = estimate_absolute_pose(
-                features.points_img[matches.query_idx].astype(np.float64),
-                local_map.points_world[matches.train_idx],
-                camera,
-                self.config.pose,
-                point_covariances=local_map.covariances[matches.train_idx],
-                start=start,
-            )
-        return Attempt(features, camera, local_map, matches, pose)
+            if isinstance(lens, RoughCamera):
+                found = estimate_pose_and_focal(points_img, points_world, lens, config, point_covariances=covariances, start=start)
+                pose, camera = found or (None, camera)
+            else:
+                near = start[0] if start else None
+                pose = estimate_absolute_pose(points_img, points_world, lens, config, point_covariances=covariances, start=near)
+        return Attempt(features, lens, camera, local_map, matches, pose)
 
     def _judge(self, first: Attempt, candidates: list[NodeScore], shared_errors: float, clock: StageClock) -> Judgement:
         """What is found around the first pose, and whether it is believed."""
@@ -211,7 +233,13 @@ class Localizer:
             return judge(first, final, candidates, shared_errors, self.config.min_matches, self.config.guided, demanded, clock)
 
     def _against_rivals(
-        self, judgement: Judgement, ranked: list[NodeScore], features: Features, camera: Camera, shared_errors: float, clock: StageClock
+        self,
+        judgement: Judgement,
+        ranked: list[NodeScore],
+        features: Features,
+        lens: Camera | RoughCamera,
+        shared_errors: float,
+        clock: StageClock,
     ) -> Judgement:
         """Other parts of the map that look like the image are asked on their own."""
         result, config = judgement.result, self.config.rivals
@@ -220,7 +248,7 @@ class Localizer:
         groups = rival_groups(ranked, asked, found, self._node_poses, self._lambda_rot, self._d_thresh, self.config.num_candidates, config)
         judgements = [judgement]
         for group in groups:
-            first = self._localize_in(self._pooled(group), features, camera, clock)
+            first = self._localize_in(self._pooled(group), features, lens, clock)
             judgements.append(self._judge(first, result.candidates, shared_errors, clock))
         return decide(judgements, self._lambda_rot, self._d_thresh, config, clock) if groups else judgement
 
@@ -236,7 +264,12 @@ class Localizer:
         return self._local_maps[node_id]
 
 
-def _reduced(image: Image, camera: Camera, max_side_px: int) -> tuple[np.ndarray, Camera]:
+def _usual(lens: Camera | RoughCamera) -> Camera:
+    """The camera, of a rough one that with the focal length in the middle of its range."""
+    return lens.with_focal(math.sqrt(lens.min_focal * lens.max_focal)) if isinstance(lens, RoughCamera) else lens
+
+
+def _reduced(image: Image, camera: Camera | RoughCamera, max_side_px: int) -> tuple[np.ndarray, Camera | RoughCamera]:
     """The image with its camera, smaller where a side is longer than `max_side_px`."""
     height, width = image.shape[:2]
     scale = max_side_px / max(width, height)

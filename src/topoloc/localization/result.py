@@ -26,7 +26,7 @@ class Localization:
 
     `probability` is that of the pose being within 0.25 m and 2 degrees, or within 5 % of the distance of what is seen where that is
     less than 0.25 m; weighed from `evidence`. `node_id` is the node that most inliers come from; `times_ms` the milliseconds of each
-    stage.
+    stage; `focal_length_px` the focal length found with the pose, None where the camera was calibrated.
     """
 
     world_from_cam: Rigid3
@@ -38,6 +38,7 @@ class Localization:
     num_inliers: int
     times_ms: dict[str, float] = field(default_factory=dict)
     evidence: Evidence | None = None
+    focal_length_px: float | None = None
 
     @property
     def localized(self) -> Literal[True]:
@@ -60,6 +61,7 @@ class Localization:
             "probability": self.probability,
             "node": self.node_id,
             **_evidence_json(self),
+            **({} if self.focal_length_px is None else {"focal_length_px": self.focal_length_px}),
         }
 
 

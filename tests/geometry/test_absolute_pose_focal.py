@@ -1,0 +1,80 @@
+"""Pose and focal length of a camera that nobody has calibrated, from exact and from noisy matches."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from topoloc.errors import CalibrationError
+from topoloc.geometry.absolute_pose import AbsolutePoseConfig
+from topoloc.geometry.absolute_pose_focal import estimate_pose_and_focal
+from topoloc.geometry.alignment import rotation_error, translation_error
+from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.geometry.rough_camera import RoughCamera
+
+CAM_FROM_WORLD = Rigid3(exp_so3(np.array([0.2, -0.3, 0.1])), np.array([0.3, -0.2, 1.0]))
+UNKNOWN = RoughCamera.unknown(640, 480)
+CONFIG = AbsolutePoseConfig(max_reprojection_error_px=8.0)
+
+
+def _scene(focal: float, rng: np.random.Generator, num: int = 200, depth: tuple[float, float] = (2.0, 6.0), noise_px: float = 0.0):
+    camera = UNKNOWN.with_focal(focal)
+    pixels = rng.uniform([0, 0], [639, 479], (num, 2))
+    z = rng.uniform(*depth, num)
+    points_cam = np.column_stack([camera.normalized_from_img(pixels) * z[:, None], z])
+    points_world = CAM_FROM_WORLD.inverse().apply(points_cam)
+    return pixels + rng.normal(0.0, noise_px, pixels.shape) if noise_px else pixels, points_world, np.zeros((num, 3, 3))
+
+
+@pytest.mark.parametrize("focal", [300.0, 525.0, 900.0, 1700.0])
+def test_exact_matches_give_pose_and_focal_length_among_outliers(focal: float):
+    rng = np.random.default_rng(0)
+    pixels, points, covariances = _scene(focal, rng)
+    pixels[:80] = rng.uniform([0, 0], [639, 479], (80, 2))
+    found = estimate_pose_and_focal(pixels, points, UNKNOWN, CONFIG, point_covariances=covariances)
+    assert found is not None
+    pose, camera = found
+    assert camera.fx == pytest.approx(focal, rel=0.01)
+    assert translation_error(pose.cam_from_world.inverse(), CAM_FROM_WORLD.inverse()) < 0.03
+    assert rotation_error(pose.cam_from_world, CAM_FROM_WORLD) < np.deg2rad(0.3)
+
+
+def test_the_covariance_counts_what_is_not_known_of_the_focal_length():
+    distances, plain = [], []
+    for seed in range(40):
+        pixels, points, covariances = _scene(600.0, np.random.default_rng(seed), depth=(4.0, 4.6), noise_px=1.0)
+        found = estimate_pose_and_focal(pixels, points, UNKNOWN, CONFIG, point_covariances=covariances)
+        assert found is not None
+        xi = (CAM_FROM_WORLD @ found[0].cam_from_world.inverse()).log()
+        distances.append(float(xi @ np.linalg.solve(found[0].covariance, xi)))
+        plain.append(float(np.sqrt(found[0].covariance[2, 2])))
+    assert 2.0 < np.median(distances) < 9.0  # chi-square of six degrees: median 5.3
+    assert np.median(plain) > 0.03, "distance and focal length trade places in a flat scene"
+
+
+def test_a_start_is_refined_and_the_focal_length_stays_in_its_range():
+    pixels, points, covariances = _scene(600.0, np.random.default_rng(1), noise_px=0.5)
+    start = (CAM_FROM_WORLD, UNKNOWN.with_focal(560.0))
+    found = estimate_pose_and_focal(pixels, points, UNKNOWN, CONFIG, point_covariances=covariances, start=start)
+    assert found is not None
+    assert found[1].fx == pytest.approx(600.0, rel=0.01)
+    narrow = RoughCamera.noted(640, 480, 500.0)
+    found = estimate_pose_and_focal(pixels, points, narrow, CONFIG, point_covariances=covariances)
+    assert found is not None
+    assert found[1].fx <= narrow.max_focal
+
+
+def test_three_matches_give_nothing():
+    pixels, points, covariances = _scene(600.0, np.random.default_rng(2), num=3)
+    assert estimate_pose_and_focal(pixels, points, UNKNOWN, CONFIG, point_covariances=covariances) is None
+
+
+def test_a_rough_camera_keeps_its_field_of_view_when_its_picture_is_resized():
+    half = UNKNOWN.rescaled(320, 240)
+    assert (half.min_focal, half.max_focal) == pytest.approx((UNKNOWN.min_focal / 2, UNKNOWN.max_focal / 2))
+
+
+@pytest.mark.parametrize("focals", [(0.0, 100.0), (200.0, 100.0), (float("nan"), 100.0), (10.0, float("inf"))])
+def test_a_rough_camera_needs_a_range(focals: tuple[float, float]):
+    with pytest.raises(CalibrationError, match="a range of focal lengths"):
+        RoughCamera(640, 480, *focals)
