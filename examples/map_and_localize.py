@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 import topoloc
-from topoloc.geometry.absolute_pose import covariance_of_inverse, position_covariance
 from topoloc.geometry.alignment import rotation_error, translation_error
+from topoloc.geometry.pose_covariance import covariance_of_inverse, position_covariance
 from topoloc.simulation.demo_recordings import SHIPPED
 
 
