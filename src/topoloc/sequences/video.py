@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
 
 import cv2
 
@@ -29,11 +30,20 @@ def recognises(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
 
 
+@runtime_checkable
+class _Capture(Protocol):
+    """What is asked of an open video."""
+
+    def grab(self) -> bool: ...
+
+    def retrieve(self) -> tuple[bool, Any]: ...
+
+
 @dataclass(eq=False)
 class _Reader:
     """An open video and the number of the frame that it gives next."""
 
-    capture: cv2.VideoCapture
+    capture: _Capture
     next_idx: int = 0
 
 
