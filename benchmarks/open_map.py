@@ -43,9 +43,10 @@ def made_up_map(num_nodes: int) -> TopoMetricMap:
     image_nodes = np.repeat(np.arange(num_nodes), IMAGES_A_NODE)
     config = VladConfig()
     vectors, projection = (
-        unit(rng.standard_normal(s)) for s in ((len(image_nodes), config.dimension), (config.dimension, config.num_words * 64))
+        unit(rng.standard_normal(s)) for s in ((len(image_nodes), config.dimension), (config.dimension, config.num_words * 66))
     )
-    coarse = SurfVlad(descriptors[: config.num_words], projection[0], projection, vectors, image_nodes, config)
+    words = unit(rng.standard_normal((config.num_words, 66)))  # descriptors with their places
+    coarse = SurfVlad(words, projection[0], projection, vectors, image_nodes, config)
     effective = BuildConfig()
     return TopoMetricMap(
         summaries,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from topoloc.features.features import Features
 from topoloc.mapping.build import BuildConfig, build_map
 from topoloc.mapping.nodes import NodeConfig, NodePoses, node_distances
 from topoloc.places.coarse import CoarseLocalizer, open_coarse
-from topoloc.places.vlad import SurfVlad, VladConfig, learn_words, vlad
+from topoloc.places.vlad import SurfVlad, VladConfig, learn_words, placed, vlad
 from topoloc.sequences.pictures import grey_image
 
 NO_IMAGE = np.zeros((2, 2), np.uint8)
@@ -40,7 +41,7 @@ def fitted(num_images: int, images_a_node: int = 2, dimension: int = 128, num_wo
     rows = [
         descriptors(120, k, unit(np.random.default_rng(1000 + k // images_a_node).standard_normal((10, 64)))) for k in range(num_images)
     ]
-    config = VladConfig(num_words=num_words, dimension=dimension)
+    config = VladConfig(num_words=num_words, dimension=dimension, position_weight=0.0)
     words = learn_words(np.concatenate(rows), config)
     return SurfVlad.fit(words, np.stack([vlad(r, words) for r in rows]), np.arange(num_images) // images_a_node, config), rows
 
@@ -98,6 +99,44 @@ def test_a_place_seen_again_comes_first(dimension: int):
         assert sorted((score.score for score in ranking), reverse=True) == [score.score for score in ranking]
 
 
+def things(order: np.ndarray) -> Features:
+    """Sixty things side by side in a picture 200 pixels wide, the same in every picture but for their order."""
+    things_seen = descriptors(60, 11)
+    zero = np.zeros(60, np.float32)
+    columns = np.stack([3.0 + 3.25 * np.arange(60), np.full(60, 50.0)], axis=1).astype(np.float32)
+    return Features(columns, zero, zero, zero, things_seen[order])
+
+
+@pytest.mark.parametrize("weight", [0.0, VladConfig().position_weight])
+def test_the_same_things_elsewhere_in_the_picture_are_another_place(weight: float):
+    orders = [np.random.default_rng(k).permutation(60) for k in range(12)]
+    config = VladConfig(num_words=4, position_weight=weight)
+    seen = [placed(things(order), 200, 100, config) for order in orders]
+    words = learn_words(np.concatenate(seen), config)
+    localizer = SurfVlad.fit(words, np.stack([vlad(s, words) for s in seen]), np.arange(12), config)
+    again = SurfVlad.from_model(localizer.to_model())
+    picture = np.zeros((100, 200), np.uint8)
+    named = [again.rank(picture, things(order).select(np.arange(3, 60)), 1)[0].node_id for order in orders]
+    num_right = sum(node_id == k for k, node_id in enumerate(named))
+    assert num_right == 12 if weight > 0.0 else num_right < 6
+
+
+def test_places_count_from_border_to_border_whatever_the_size():
+    features = things(np.arange(60))
+    small = placed(features, 200, 100, VladConfig(position_weight=0.5))
+    assert small.shape == (60, 66)
+    np.testing.assert_allclose(small[[0, -1], 64], [0.5 * (3.5 / 200 - 0.5), 0.5 * (195.25 / 200 - 0.5)], atol=1e-6)
+    large = placed(replace(features, points_img=2.0 * features.points_img + 0.5), 400, 200, VladConfig(position_weight=0.5))
+    np.testing.assert_allclose(small, large, atol=1e-6)
+
+
+def test_maps_without_places_in_their_words_are_read():
+    localizer, rows = fitted(6)
+    model = localizer.to_model()
+    old = replace(model, settings={key: value for key, value in model.settings.items() if key != "position_weight"})
+    assert SurfVlad.from_model(old).rank(NO_IMAGE, features_of(rows[3]), 1)[0].node_id == 1
+
+
 def test_more_images_than_dimensions():
     localizer, rows = fitted(150, images_a_node=10, num_words=2)
     assert len(rows) > 2 * 64
@@ -114,7 +153,7 @@ def test_maps_of_one_or_two_images(num_images: int):
 
 
 def test_images_all_alike_are_ranked_all_the_same():
-    rows, config = descriptors(400, 1), VladConfig(num_words=4)
+    rows, config = descriptors(400, 1), VladConfig(num_words=4, position_weight=0.0)
     words = learn_words(rows, config)
     localizer = SurfVlad.fit(words, np.tile(vlad(rows, words), (5, 1)), np.arange(5), config)
     ranking = localizer.rank(NO_IMAGE, features_of(rows), 5)

@@ -23,7 +23,7 @@ from topoloc.mapping.landmarks import LandmarkConfig, Observations, observe_poin
 from topoloc.mapping.nodes import NodeConfig, NodePoses, node_distances, place_nodes
 from topoloc.mapping.topomap import Edge, NodeSummary, PlaceImage, TopoMetricMap, TopoNode
 from topoloc.mapping.views import MappingView, mapping_view
-from topoloc.places.vlad import SurfVlad, VladConfig, learn_words, vlad
+from topoloc.places.vlad import SurfVlad, VladConfig, learn_words, placed, vlad
 from topoloc.sequences.frame import Image, StereoSequence
 from topoloc.slam.metric_points import MetricPointsConfig, keypoint_sigmas, locate_points
 
@@ -179,7 +179,7 @@ def _visit_all_images(
     """Label every mapping image with its nearest node, let it observe the points of the nodes around, and teach the
     coarse localizer with it."""
     assert node_config.lambda_rot is not None
-    words = learn_words(np.concatenate([draft.features.descriptors for draft in drafts]), config.vlad)
+    words = learn_words(np.concatenate([_placed(draft.features, draft.image, config) for draft in drafts]), config.vlad)
     node_poses = NodePoses.of([draft.image.world_from_cam for draft in drafts])
     drafted = {draft.frame: draft.image for draft in drafts}  # read already
     images: list[PlaceImage] = []
@@ -190,11 +190,15 @@ def _visit_all_images(
         for node_id in nearest[: config.landmarks.nodes_per_image]:
             if drafts[node_id].frame is not frame:
                 _observe(drafts[node_id], image, config)
-        vlads.append(vlad(image.features.descriptors, words))
+        vlads.append(vlad(_placed(image.features, image, config), words))
         images.append(PlaceImage(frame.sequence.name, frame.name, int(nearest[0]), image.world_from_cam, image.place_jpeg))
         progress("images", done + 1, len(frames))
     node_ids = np.array([image.node_id for image in images])
     return images, SurfVlad.fit(words, np.stack(vlads), node_ids, config.vlad)
+
+
+def _placed(features: Features, image: _MappingImage, config: BuildConfig) -> np.ndarray:
+    return placed(features, image.camera.width, image.camera.height, config.vlad)
 
 
 def _observe(draft: _NodeDraft, image: _MappingImage, config: BuildConfig) -> None:

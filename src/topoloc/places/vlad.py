@@ -1,6 +1,8 @@
 """surf-vlad: VLAD of the map's own local features (Jegou et al. 2010), no weights, no torch.
 
-The vocabulary is learnt from the map's descriptors. Residuals are normalised one by one (Delhumeau et al. 2013), each
+The vocabulary is learnt from the map's descriptors, each with its place in the picture behind it (Koniusz et al. 2013, spatial
+coordinate coding): neighbouring nodes see the same things, but elsewhere, and so do places that repeat their doors
+and lamps. Residuals are normalised one by one (Delhumeau et al. 2013), each
 word's sum is normalised on its own (Arandjelovic & Zisserman 2013), and the whole is whitened by the PCA of the mapping
 images where there are enough of them to learn it from.
 """
@@ -24,8 +26,10 @@ from topoloc.places.whitening import learn_whitening
 class VladConfig:
     """Settings of surf-vlad."""
 
-    num_words: int = 32
+    num_words: int = 64
     """Visual words of the vocabulary."""
+    position_weight: float = 0.9
+    """How far two descriptors (of length 1) are apart for lying at opposite borders of the picture; 0 leaves their places out."""
     dimension: int = 128
     """Length of a place vector after PCA, at most."""
     max_training_descriptors: int = 100_000
@@ -55,14 +59,15 @@ class SurfVlad:
     def fit(
         words: Float32[np.ndarray, "k d"], vlads: Float32[np.ndarray, "n kd"], node_ids: Int[np.ndarray, " n"], config: VladConfig
     ) -> SurfVlad:
-        """From the vocabulary (`learn_words`), the `vlad` of each mapping image and the node it belongs to."""
+        """From the vocabulary (`learn_words`), the `vlad` of each mapping image's `placed` features and the node it belongs to."""
         whitening = learn_whitening(vlads, config.dimension)
         return SurfVlad(words, whitening.mean, whitening.projection, whitening.apply(vlads), node_ids, config)
 
     def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
-        """See `CoarseLocalizer.rank`; the picture itself is not looked at."""
+        """See `CoarseLocalizer.rank`; of the picture itself only the size is looked at."""
         vector = np.empty(len(self._projection), np.float32)
-        multiply_rows(self._projection, vlad(features.descriptors, self._words) - self._mean, vector)
+        height, width = image.shape[:2]
+        multiply_rows(self._projection, vlad(placed(features, width, height, self._config), self._words) - self._mean, vector)
         vector /= max(float(np.linalg.norm(vector)), 1e-6)
         return self._index.rank_nodes(vector, num_candidates)
 
@@ -77,7 +82,9 @@ class SurfVlad:
         """The inverse of `to_model`."""
         a = model.arrays
         projection, vectors = a["projection"].astype(np.float32), a["vectors"].astype(np.float32)
-        return SurfVlad(a["words"], a["mean"], projection, vectors, a["node_ids"], VladConfig(**model.settings))
+        return SurfVlad(
+            a["words"], a["mean"], projection, vectors, a["node_ids"], VladConfig(**({"position_weight": 0.0} | model.settings))
+        )
 
 
 def open_model(model: CoarseModel) -> SurfVlad:
@@ -85,8 +92,16 @@ def open_model(model: CoarseModel) -> SurfVlad:
     return SurfVlad.from_model(model)
 
 
+def placed(features: Features, width: int, height: int, config: VladConfig) -> Float32[np.ndarray, "n d"]:
+    """Descriptors with their places in a picture of that size behind them; as they are where places do not count."""
+    if config.position_weight == 0.0:
+        return features.descriptors
+    places = (features.points_img + 0.5) / np.array([width, height], np.float32) - 0.5
+    return np.hstack([features.descriptors, config.position_weight * places]).astype(np.float32)
+
+
 def vlad(descriptors: Float32[np.ndarray, "n d"], words: Float32[np.ndarray, "k d"]) -> Float32[np.ndarray, " kd"]:
-    """VLAD of unit-length descriptors over `words`; zero for an image without features."""
+    """VLAD of descriptors over `words`; zero for an image without features."""
     sums = np.zeros(words.shape, np.float32)
     half_squares = 0.5 * np.sum(words**2, axis=1)
     add_residuals(np.ascontiguousarray(descriptors), np.ascontiguousarray(words), half_squares, sums)

@@ -22,7 +22,7 @@ from topoloc.slam.place_matching import PlaceMatch, PlaceMatchingConfig, match_p
 class LoopConfig:
     """Which places are compared, and which links are believed."""
 
-    vlad: VladConfig = field(default_factory=VladConfig)
+    vlad: VladConfig = field(default_factory=lambda: VladConfig(num_words=32, position_weight=0.0))
     matching: PlaceMatchingConfig = field(default_factory=PlaceMatchingConfig)
     num_candidates: int = 4
     min_places_between: int = 12
