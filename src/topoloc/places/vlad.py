@@ -83,7 +83,7 @@ class SurfVlad:
         a = model.arrays
         projection, vectors = a["projection"].astype(np.float32), a["vectors"].astype(np.float32)
         return SurfVlad(
-            a["words"], a["mean"], projection, vectors, a["node_ids"], VladConfig(**({"position_weight": 0.0} | model.settings))
+            a["words"], a["mean"], projection, vectors, a["node_ids"], VladConfig(**{"position_weight": 0.0, **model.settings})
         )
 
 
