@@ -7,6 +7,7 @@ they are stored.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -123,6 +124,7 @@ def open_video(path: Path) -> Video:
 
 
 def _open(path: Path) -> cv2.VideoCapture:
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # FFmpeg's own lines on stderr; the error below says what is the matter
     with opencv_silent():
         capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
