@@ -22,6 +22,9 @@ from topoloc.sequences.frame import Image, StereoFrame
 from topoloc.sequences.pictures import opencv_silent
 from topoloc.sequences.truth import read_truth
 
+# FFmpeg prints its own lines about broken files on stderr, beside the error that says it; read once a process, at its first use.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+
 VIDEO_SUFFIXES = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm"})
 LOOKS_FOR = "a video file (.mp4, .mov, .avi, .mkv, .webm)"
 
@@ -124,7 +127,6 @@ def open_video(path: Path) -> Video:
 
 
 def _open(path: Path) -> cv2.VideoCapture:
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # FFmpeg's own lines on stderr; the error below says what is the matter
     with opencv_silent():
         capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
