@@ -15,7 +15,7 @@ from topoloc.evaluation.paper.datasets import RENDERED, at_hand, quick_datasets,
 from topoloc.evaluation.paper.readme_block import update_readme
 from topoloc.evaluation.paper.settings import Bench, PaperConfig, Progress, WeightFiles
 from topoloc.evaluation.paper.stages import StageStore
-from topoloc.evaluation.paper.tables import TABLES, Part, tables_of
+from topoloc.evaluation.paper.tables import Part, tables_of
 from topoloc.evaluation.paper.text_tables import markdown_of
 from topoloc.sequences.atomic import write_text
 
@@ -89,7 +89,7 @@ class Command:
             return Bench(config, quick_datasets(), [], store, out, progress, self._words())
         folder = out / "recordings"
         rendered, missing = [d for d in rendered_datasets(folder) if d.name in self.worlds], []
-        if "accuracy" in TABLES[self.part] and self.part == "recordings":
+        if self.part == "recordings":
             rendered = []
         elif not self.at_hand:
             render_missing(folder, [r.name for r in RENDERED if r.world in self.worlds], self.draft, progress)

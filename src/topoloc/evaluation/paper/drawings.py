@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import PercentFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, PercentFormatter
 
 from topoloc.evaluation.figure_style import BAD, GREY, INK, NODE, RECORDING_COLOURS, STYLE
 
@@ -62,7 +62,10 @@ def draw_node_sweep(rows: Sequence[Row]) -> Figure:
             panels[2].set(ylabel="map file (MB)", yscale="log")
         for axes in panels:
             axes.set(xlabel="nodes", xscale="log")
-            axes.tick_params(which="minor", labelsize=6.5)
+            for axis in (axes.xaxis, axes.yaxis):
+                axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+                axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+                axis.set_minor_formatter(NullFormatter())
         figure.legend(loc="outside lower center", ncols=max(len(places), 1))
         return figure
 

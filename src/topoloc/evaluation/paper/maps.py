@@ -20,7 +20,7 @@ from topoloc.mapping.build import BuildConfig, build_map
 from topoloc.mapping.coarse_training import CoarseTrainingConfig, train_coarse
 from topoloc.mapping.nodes import NodeConfig
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.places.classifier_config import CnnFcConfig, PictureConfig, TrainingConfig
+from topoloc.places.classifier_config import CnnFcConfig, PictureConfig
 from topoloc.places.coarse import CoarseModel
 from topoloc.sequences.atomic import write_bytes
 
@@ -96,10 +96,11 @@ def taught(bench: Bench, dataset: Dataset, kind: MapKind, method: str) -> Done:
     map_done = built(bench, dataset, kind)
     target = _model_path(bench, dataset, kind, method)
     backbone, weights = bench.config.weights.choice(method)
-    config = _training_config(bench)
+    config = _training_config(bench, map_done.result["num_images"])
+    settings = {"images": map_done.result["images_digest"], "weights": bench.config.weights.digest(method), "config": asdict(config)}
 
     def train() -> dict[str, Any]:
-        checkpoint = target.with_suffix(".checkpoint") if method == "cnn-fc" else None
+        checkpoint = target.with_suffix(f".{digest_of(settings)}.checkpoint") if method == "cnn-fc" else None
         topomap, label = TopoMetricMap.load(path_of(bench, dataset, kind)), f"{method} of {dataset.name}"
         model = train_coarse(
             topomap, method, backbone, weights, config, lambda stage, done, total: bench.progress(label, done, total), checkpoint
@@ -112,7 +113,6 @@ def taught(bench: Bench, dataset: Dataset, kind: MapKind, method: str) -> Done:
             checkpoint.unlink(missing_ok=True)
         return {"settings": dict(model.settings), "bytes": target.stat().st_size}
 
-    settings = {"images": map_done.result["images_digest"], "weights": bench.config.weights.digest(method), "config": asdict(config)}
     return bench.store.get(f"coarse-{dataset.name}-{kind.name}-{method}", settings, train, LEARNING_CODE, [target])
 
 
@@ -154,8 +154,7 @@ def why_not(bench: Bench, method: str) -> str | None:
     return None
 
 
-def _training_config(bench: Bench) -> CoarseTrainingConfig:
-    epochs = bench.config.epochs
+def _training_config(bench: Bench, num_images: int) -> CoarseTrainingConfig:
     picture = PictureConfig(112, 84)  # a quarter of the work of the default; tables show what it costs
-    training = TrainingConfig(max_epochs=epochs, patience=max(epochs // 3, 3))
+    training = bench.config.training(bench.config.epochs, num_images)
     return replace(CoarseTrainingConfig(), cnn_fc=CnnFcConfig(picture=picture, training=training))

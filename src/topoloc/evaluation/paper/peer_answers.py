@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -23,6 +23,7 @@ class PeerAnswer:
     ms: float
 
 
+@runtime_checkable
 class Peer(Protocol):
     """A localizer of another make, with its map ready."""
 

@@ -1,7 +1,7 @@
 """The paper's baseline: PoseNet, trained on the very mapping images that our classifiers are trained on, and asked the same queries.
 
-Kendall, Grimes & Cipolla (2015) and Kendall & Cipolla (2017); `evaluation/posenet.py` is the network. It is tuned as ours are: each
-loss is tried, and the one with the least mean D_total on the images held out is asked. It answers every query.
+Kendall, Grimes & Cipolla (2015) and Kendall & Cipolla (2017); `evaluation/posenet.py` is the network. Each of the
+losses asked for is trained, and the one with the least mean D_total on the images held out is asked. It answers every query.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from topoloc.evaluation.paper.asking import queries_of
 from topoloc.evaluation.paper.datasets import Dataset
 from topoloc.evaluation.paper.maps import MapKind, built, path_of
 from topoloc.evaluation.paper.settings import Bench, sequence_digest
-from topoloc.evaluation.paper.stages import LEARNING_CODE, Done
+from topoloc.evaluation.paper.stages import LEARNING_CODE, Done, digest_of
 from topoloc.evaluation.paper.stored_answers import pose_json, pose_of
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.places.classifier_config import PictureConfig, TrainingConfig
+from topoloc.places.classifier_config import PictureConfig
 
 if TYPE_CHECKING:
     from topoloc.evaluation.posenet import PoseNet, PoseNetConfig
@@ -37,6 +37,9 @@ def trained(bench: Bench, dataset: Dataset) -> Done:
     kind = MapKind.as_paper(dataset)
     map_done = built(bench, dataset, kind)
     target = _network_path(bench, dataset)
+    configs = [_config(bench, loss, map_done.result["num_images"]) for loss in bench.config.posenet_losses]
+    settings = {"images": map_done.result["images_digest"], "weights": bench.config.weights.digest("posenet")}
+    settings |= {"configs": [asdict(config) for config in configs]}
 
     def train() -> dict[str, Any]:
         from topoloc.evaluation.posenet import train_posenet
@@ -47,13 +50,17 @@ def trained(bench: Bench, dataset: Dataset) -> Done:
         topomap = TopoMetricMap.load(path_of(bench, dataset, kind))
         scores: dict[str, float] = {}
         best: PoseNet | None = None
-        for loss in bench.config.posenet_losses:
-            told, checkpoint = f"PoseNet of {dataset.name} ({loss})", target.with_name(f"{target.stem}-{loss}.checkpoint")
+        for config in configs:
+            loss = config.loss
+            told, checkpoint = (
+                f"PoseNet of {dataset.name} ({loss})",
+                target.with_name(f"{target.stem}-{digest_of(settings)}-{loss}.checkpoint"),
+            )
             found = train_posenet(
                 topomap,
                 backbone,
                 weights,
-                _config(bench, loss),
+                config,
                 lambda stage, done, total, told=told: bench.progress(told, done, total),
                 checkpoint,
             )
@@ -64,10 +71,8 @@ def trained(bench: Bench, dataset: Dataset) -> Done:
         best.save(target)
         for path in target.parent.glob(f"{target.stem}-*"):
             path.unlink()
-        return {"held_out_m": scores, "loss": best.config.loss, "epochs": bench.config.posenet_epochs}
+        return {"held_out_m": scores, "loss": best.config.loss, "epochs": best.config.training.max_epochs}
 
-    settings = {"images": map_done.result["images_digest"], "weights": bench.config.weights.digest("posenet")}
-    settings |= {"configs": [asdict(_config(bench, loss)) for loss in bench.config.posenet_losses]}
     return bench.store.get(f"posenet-{dataset.name}", settings, train, _CODE, [target])
 
 
@@ -103,9 +108,8 @@ def _network_path(bench: Bench, dataset: Dataset) -> Path:
     return bench.folder("models") / f"{dataset.name}-posenet.pth"
 
 
-def _config(bench: Bench, loss: str) -> PoseNetConfig:
+def _config(bench: Bench, loss: str, num_images: int) -> PoseNetConfig:
     from topoloc.evaluation.posenet import PoseNetConfig
 
-    epochs = bench.config.posenet_epochs
-    training = TrainingConfig(max_epochs=epochs, patience=max(epochs // 3, 3))
+    training = bench.config.training(bench.config.posenet_epochs, num_images)
     return PoseNetConfig(loss, picture=PictureConfig(112, 84), training=training)  # pyright: ignore[reportArgumentType]

@@ -10,7 +10,7 @@ from pathlib import Path
 from topoloc.evaluation.paper.datasets import Dataset
 from topoloc.evaluation.paper.stages import StageStore, digest_of
 from topoloc.evaluation.paper.stored_answers import pose_json
-from topoloc.places.classifier_config import BackboneName
+from topoloc.places.classifier_config import BackboneName, TrainingConfig
 from topoloc.sequences.frame import StereoSequence
 
 Progress = Callable[[str, int, int], None]
@@ -60,6 +60,7 @@ class PaperConfig:
         weights: see `WeightFiles`.
         epochs: times that cnn-fc sees every image, at most.
         posenet_epochs: the same of PoseNet, for each of its losses.
+        max_shown: pictures that a training shows in all, about: places with many mapping images get fewer epochs.
         posenet_losses: the one that does best on held-out images is asked.
         max_colmap_images: mapping images that pycolmap is given, evenly spread, at most.
         max_elsewhere: images of other places that each map is asked about, at most, from each of them.
@@ -71,7 +72,8 @@ class PaperConfig:
     weights: WeightFiles = field(default_factory=WeightFiles)
     epochs: int = 40
     posenet_epochs: int = 80
-    posenet_losses: tuple[str, ...] = ("beta", "learnt")
+    max_shown: int = 20_000
+    posenet_losses: tuple[str, ...] = ("learnt",)
     max_colmap_images: int = 250
     max_elsewhere: int = 20
     max_queries: int | None = None
@@ -80,12 +82,15 @@ class PaperConfig:
         """The same with these numbers of epochs, where they are given."""
         return replace(self, epochs=epochs or self.epochs, posenet_epochs=posenet_epochs or self.posenet_epochs)
 
+    def training(self, epochs: int, num_images: int) -> TrainingConfig:
+        """At most so many epochs, fewer where there are many images."""
+        epochs = max(min(epochs, self.max_shown // max(num_images, 1)), 1)
+        return TrainingConfig(max_epochs=epochs, patience=max(epochs // 3, 3))
+
     @staticmethod
     def for_quick_run(weights: WeightFiles) -> PaperConfig:
         """Small enough for five minutes."""
-        return PaperConfig(
-            quick=True, weights=weights, epochs=8, posenet_epochs=8, posenet_losses=("learnt",), max_colmap_images=40, max_elsewhere=8
-        )
+        return PaperConfig(quick=True, weights=weights, epochs=8, posenet_epochs=8, max_colmap_images=40, max_elsewhere=8)
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,10 @@ def markdown_of(results: Mapping[str, Any]) -> str:
 def about(results: Mapping[str, Any]) -> str:
     """What was run, on what, with which weights."""
     s, m = results["settings"], results["machine"]
-    weights = "; ".join(f"{method}: {words}" for method, words in s["weights"].items())
+    of_words: dict[str, list[str]] = {}
+    for method, words in s["weights"].items():
+        of_words.setdefault(words, []).append(method)
+    weights = "; ".join(f"{words} ({', '.join(methods)})" for words, methods in of_words.items())
     missing = f" Recordings not there, and left out: {', '.join(results['missing'])}." if results["missing"] else ""
     return (
         f"`{s['command']}`, {quality_words(s)}, {m['cores']} cores of {m['cpu']}. Weights: {weights}.{missing} "
