@@ -22,10 +22,13 @@ def test_a_missing_calibration(recording: Path, tmp_path: Path, complaint: Compl
     assert "calib.txt: no calibration here" in complaint("build", recording, tmp_path / "room.topo")
 
 
-def test_a_query_without_calibration(room_map: Path, queries: Path, tmp_path: Path, complaint: Complaint):
-    picture = tmp_path / "photo.png"
-    picture.write_bytes((queries / "view00.png").read_bytes())
-    assert "photo.png: no calibration; give --camera FILE" in complaint("localize", room_map, picture, "--json", tmp_path / "a.json")
+def test_a_stream_without_calibration(room_map: Path, queries: Path, tmp_path: Path, complaint: Complaint):
+    stream = tmp_path / "stream"
+    stream.mkdir()
+    for picture in queries.glob("view0[0-2].png"):
+        (stream / picture.name).write_bytes(picture.read_bytes())
+    said = complaint("localize", room_map, stream, "--stream", "--json", tmp_path / "a.json")
+    assert "view00.png: a stream needs a calibration: --camera FILE" in said
 
 
 def test_unequal_numbers_of_left_and_right_pictures(recording: Path, tmp_path: Path, complaint: Complaint):

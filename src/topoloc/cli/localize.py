@@ -16,6 +16,7 @@ from topoloc.cli.query_answers import QueryAnswer, answer_line, exit_status, str
 from topoloc.errors import CalibrationError, QueryError, TopolocError, UnreadableImageError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.result import NotLocalized
 from topoloc.localization.tracker import Tracker, TrackerConfig
@@ -27,7 +28,7 @@ from topoloc.sequences.recording import single_pictures
 from topoloc.sequences.trajectory import frame_poses, read_trajectory, write_tum
 
 # The camera of a picture of this width and height (pixels).
-CameraOfSize = Callable[[int, int], Camera]
+CameraOfSize = Callable[[int, int], Camera | RoughCamera]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,10 +49,11 @@ class Command:
     """The map file."""
     inputs: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="INPUT ...", help_behavior_hint="(required)")] = ()
     """Images, folders of images, videos, recordings. PATH@0:100 takes the first hundred frames of PATH."""
-    camera: Annotated[str | None, tyro.conf.arg(metavar="FILE|fx,fy,cx,cy|map", help_behavior_hint="(default: that of the recording)")] = (
-        None
-    )
-    """The queries' calibration: a camera.json, `fx,fy,cx,cy` in pixels, or `map` for the camera that the map was made with."""
+    camera: Annotated[
+        str | None, tyro.conf.arg(metavar="FILE|fx,fy,cx,cy|map|unknown", help_behavior_hint="(default: that of the recording)")
+    ] = None
+    """The queries' calibration: a camera.json, `fx,fy,cx,cy` in pixels, `map` for the camera that the map was made with, or `unknown`:
+    the focal length is then found with the pose, as it is for single pictures without any calibration."""
     format: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: recognised)")] = None
     """The recordings' format: kitti, euroc, tum, seven_scenes, video or folder."""
     coarse: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")] = None
@@ -162,23 +164,28 @@ def _answer(
     camera = _camera_of_frame(frame, camera_of_size)
     if tracker is None:
         return QueryAnswer(name, t_ns, localizer.localize(frame.image, camera))
+    if isinstance(camera, RoughCamera):
+        raise CalibrationError("a stream needs a calibration: --camera FILE, --camera fx,fy,cx,cy or --camera map; or --single")
     streamed = tracker.process(frame.image, camera, t_ns, odom_from_cam)
     return QueryAnswer(name, t_ns, streamed.result, streamed)
 
 
-def _camera_of_frame(frame: StereoFrame, camera_of_size: CameraOfSize | None) -> Camera:
+def _camera_of_frame(frame: StereoFrame, camera_of_size: CameraOfSize | None) -> Camera | RoughCamera:
+    """What `--camera` says, else the recording; else what the picture's file says of its focal length, or nothing."""
+    height, width = frame.image.shape[:2]
     if camera_of_size is not None:
-        height, width = frame.image.shape[:2]
         return camera_of_size(width, height)
-    if frame.camera is None:
-        raise CalibrationError("no calibration; give --camera FILE, --camera fx,fy,cx,cy or --camera map (the map's own camera)")
-    return frame.camera
+    if frame.camera is not None:
+        return frame.camera
+    return RoughCamera.unknown(width, height) if frame.noted_focal is None else RoughCamera.noted(width, height, frame.noted_focal)
 
 
 def _camera_of_size(text: str, topomap: TopoMetricMap) -> CameraOfSize:
     """What `--camera` says. Raises CalibrationError."""
     if text == "map":
         return _rescaled(topomap.nodes[0].camera)
+    if text == "unknown":
+        return RoughCamera.unknown
     if "," in text and not Path(text).exists():
         try:
             fx, fy, cx, cy = map(float, text.split(","))

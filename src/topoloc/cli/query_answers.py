@@ -63,11 +63,12 @@ def answer_line(answer: QueryAnswer) -> str:
     if isinstance(result, NotLocalized):
         evidence = "" if result.reason == "unreadable" else f"  ({result.num_inliers} of {result.num_matches} matches)"
         return f"{answer.query}  {state}not localized: {result.reason}{evidence}{ms}"
+    focal = "" if result.focal_length_px is None else f"  f {result.focal_length_px:.0f} px (found)"
     x, y, z = result.world_from_cam.translation
     w, i, j, k = result.world_from_cam.quat_wxyz()
     return (
         f"{answer.query}  {state}at {x:.3f} {y:.3f} {z:.3f} m, quat wxyz {w:.4f} {i:.4f} {j:.4f} {k:.4f}  p {result.probability:.2f}"
-        f"  node {result.node_id}  ({result.num_inliers} of {result.num_matches} matches){ms}"
+        f"  node {result.node_id}  ({result.num_inliers} of {result.num_matches} matches){focal}{ms}"
     )
 
 

@@ -244,8 +244,10 @@ class Localizer:
         """Other parts of the map that look like the image are asked on their own."""
         result, config = judgement.result, self.config.rivals
         found = result.world_from_cam if isinstance(result, Localization) else None
-        asked = [candidate.node_id for candidate in result.candidates]
-        groups = rival_groups(ranked, asked, found, self._node_poses, self._lambda_rot, self._d_thresh, self.config.num_candidates, config)
+        asked, is_clear = [candidate.node_id for candidate in result.candidates], judgement.log_odds > config.clear_log_odds
+        groups = rival_groups(
+            ranked, asked, found, is_clear, self._node_poses, self._lambda_rot, self._d_thresh, self.config.num_candidates, config
+        )
         judgements = [judgement]
         for group in groups:
             first = self._localize_in(self._pooled(group), features, lens, clock)

@@ -26,15 +26,17 @@ from topoloc.places.coarse import NodeScore
 class RivalsConfig:
     """When another part of the map is asked, and what makes an answer ambiguous."""
 
-    num_ranked: int = 16
+    num_ranked: int = 24
     """Nodes that the coarse localizer ranks, the candidates among them; rivals come from these."""
-    min_score_share: float = 0.85
-    """A rival's score is at least this share of the best one's."""
+    clear_log_odds: float = 5.5
+    """A pose with more for it (logarithm of its odds) is clear: only parts of the map that look nearly the same are asked then."""
+    min_score_share: tuple[float, float] = (0.85, 0.4)
+    """A rival's score is at least this share of the best one's: where the pose is clear, and where it is not."""
     reach: float = 10.0
     """Nodes within so many D_thresh of a pose (Eq. 1) belong to it; rivals are farther away."""
     agreement: float = 3.0
     """Two poses within so many D_thresh are one."""
-    max_groups: int = 2
+    max_groups: int = 3
     """Parts of the map that are asked on their own, at most; 0 asks none."""
     share_weight: float = 4.0
     """How much the share found counts between two poses, beside their odds, in logarithms."""
@@ -46,20 +48,21 @@ def rival_groups(
     ranked: list[NodeScore],
     asked: list[int],
     found: Rigid3 | None,
+    is_clear: bool,
     nodes: NodePoses,
     lambda_rot: float,
     d_thresh: float,
     num_candidates: int,
     config: RivalsConfig,
 ) -> list[list[int]]:
-    """Groups of node ids, each of one part of the map, that look like the image nearly as much as the best node does.
+    """Groups of node ids, each of one part of the map, that look like the image about as much as the best node does.
 
     Args:
         asked: the nodes that were asked together already.
-        found: world_from_cam that came of it, if any: nodes around it are no rivals.
+        found: world_from_cam that came of it, if any: nodes around it are no rivals; and whether it is clear.
     """
     reach = config.reach * d_thresh
-    least = config.min_score_share * ranked[0].score if ranked else 0.0
+    least = config.min_score_share[0 if is_clear else 1] * ranked[0].score if ranked else 0.0
     left = [candidate.node_id for candidate in ranked if candidate.score >= least]
     if found is not None:
         far = node_distances(found, nodes, lambda_rot) > reach

@@ -29,7 +29,8 @@ class StereoFrame:
     """A frame of a recording. `image` is the left (or colour) picture: grey (H, W) or RGB (H, W, 3), uint8, seen by `camera`.
 
     Either `right` and `rig` are there (stereo), or `depth` (RGB-D), or neither (a plain picture).
-    `world_from_cam` is the truth or an attached trajectory: the pose of the camera of `image`.
+    `world_from_cam` is the truth or an attached trajectory: the pose of the camera of `image`. `noted_focal`
+    (pixels) is what the picture's file says of a camera that is not known otherwise.
     """
 
     name: str
@@ -40,6 +41,7 @@ class StereoFrame:
     rig: StereoRig | None = None
     depth: DepthImage | None = None
     world_from_cam: Rigid3 | None = None
+    noted_focal: float | None = None
 
 
 @runtime_checkable

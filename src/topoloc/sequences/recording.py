@@ -11,6 +11,7 @@ from topoloc.errors import RecordingError, UnreadableImageError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
+from topoloc.sequences.exif import exif_focal_length
 from topoloc.sequences.frame import DepthImage, Image, StereoFrame, StereoSequence
 from topoloc.sequences.pictures import PICTURE_SUFFIXES, read_depth, read_image
 
@@ -62,6 +63,8 @@ class Recording:
         path = self.root / self.names[index]
         image = _read_as(path, self.camera)
         frame = StereoFrame(self.names[index], self.t_ns[index], image, self.camera, world_from_cam=self.poses[index])
+        if self.camera is None:
+            frame = replace(frame, noted_focal=exif_focal_length(path, image.shape[1], image.shape[0]))
         if self.right is not None:
             right = _read_as(self.right.paths[index], self.right.rig.right)
             return replace(frame, right=right, rig=self.right.rig)
