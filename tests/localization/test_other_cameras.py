@@ -1,0 +1,85 @@
+"""The room seen by cameras that did not map it: other lenses, other sizes, rolled, and lenses that nobody has calibrated."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from built_room import built_room, unseen_views
+from tiny_world import CAMERA, path_pose, render, room
+from topoloc.geometry.alignment import rotation_error, translation_error
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.geometry.rough_camera import RoughCamera
+from topoloc.localization.localizer import Localizer
+from topoloc.localization.result import Localization
+
+INDICES = (2.5, 5.5, 8.5)
+
+
+@pytest.fixture(scope="module")
+def localizer(tiny_recording: Path) -> Localizer:
+    return Localizer(built_room(tiny_recording))
+
+
+def _is_right(result: object, truth: Rigid3, metres: float = 0.03) -> bool:
+    return (
+        isinstance(result, Localization)
+        and translation_error(result.world_from_cam, truth) < metres
+        and rotation_error(result.world_from_cam, truth) < np.deg2rad(1.0)
+    )
+
+
+@pytest.mark.parametrize("factor", [0.6, 1.0, 1.4, 1.8])
+@pytest.mark.parametrize("size", [(320, 240), (480, 300)], ids=str)
+def test_other_lenses_and_other_sizes(factor: float, size: tuple[int, int], localizer: Localizer):
+    width, height = size
+    focal = CAMERA.fx * factor * height / CAMERA.height
+    camera = Camera.pinhole(width, height, focal, focal, width / 2 - 3.0, height / 2 + 2.0)
+    panels = room()
+    results = [(localizer.localize(render(panels, path_pose(i), camera)[0], camera), path_pose(i)) for i in INDICES]
+    assert sum(_is_right(result, truth) for result, truth in results) >= 2
+    assert all(result.focal_length_px is None for result, _ in results if isinstance(result, Localization))
+
+
+@pytest.mark.parametrize("degrees", [90, 180, 270])
+def test_rolled_cameras(degrees: int, localizer: Localizer):
+    panels, turn = room(), Rigid3(exp_so3(np.array([0.0, 0.0, np.deg2rad(degrees)])), np.zeros(3))
+    poses = [path_pose(i) @ turn for i in INDICES]
+    assert all(_is_right(localizer.localize(render(panels, pose)[0], CAMERA), pose) for pose in poses)
+
+
+def test_a_camera_that_nobody_has_calibrated(localizer: Localizer):
+    results = [(localizer.localize(picture, None), truth) for picture, truth in unseen_views()]
+    found = [(result, truth) for result, truth in results if isinstance(result, Localization)]
+    assert len(found) >= 0.8 * len(results)
+    assert all(_is_right(result, truth, metres=0.15) for result, truth in found)
+    focals = [result.focal_length_px for result, _ in found if result.focal_length_px is not None]
+    assert np.median(focals) == pytest.approx(CAMERA.fx, rel=0.02)
+
+
+def test_a_focal_length_that_is_about_right_is_corrected(localizer: Localizer):
+    rough = RoughCamera.noted(CAMERA.width, CAMERA.height, 1.08 * CAMERA.fx)
+    focals = []
+    for picture, _ in unseen_views():
+        result = localizer.localize(picture, rough)
+        assert isinstance(result, Localization)
+        focals.append(result.focal_length_px)
+    assert np.median(focals) == pytest.approx(CAMERA.fx, rel=0.02)
+
+
+def test_an_unknown_focal_length_makes_the_pose_less_certain(localizer: Localizer):
+    picture, _ = unseen_views()[2]
+    known, unknown = localizer.localize(picture, CAMERA), localizer.localize(picture, None)
+    assert isinstance(known, Localization)
+    assert isinstance(unknown, Localization)
+    assert np.trace(unknown.camera_covariance[:3, :3]) > np.trace(known.camera_covariance[:3, :3])
+
+
+def test_noise_is_not_made_a_place_by_leaving_the_focal_length_open(localizer: Localizer):
+    rng = np.random.default_rng(0)
+    pictures = [rng.integers(0, 256, (240, 320), dtype=np.uint8) for _ in range(5)]
+    pictures += [picture for picture, _ in unseen_views(seed=1, step=4.0)]
+    assert not any(isinstance(localizer.localize(picture, None), Localization) for picture in pictures)
