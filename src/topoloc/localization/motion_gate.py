@@ -54,6 +54,10 @@ class MotionGate:
         self._odom_from_cam: Rigid3 | None = None
         self._rival: _Rival | None = None
 
+    def seconds_since(self, t_ns: int) -> float:
+        """Seconds from the pose believed last to this time; infinite where there is none."""
+        return float("inf") if self._state is None else (t_ns - self._state.t_ns) / 1e9
+
     def predict(self, t_ns: int, odom_from_cam: Rigid3 | None = None) -> MotionState | None:
         """Where the camera is at this time; None where it is lost."""
         if self._state is None:

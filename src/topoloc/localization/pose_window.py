@@ -54,7 +54,12 @@ class PoseWindow:
         cam_from_before: Rigid3,
         motion_covariance: Float[np.ndarray, "6 6"],
     ) -> Rigid3:
-        """The smoothed cam_from_world of a picture that was localized at `cam_from_world`, `cam_from_before` after the last one added."""
+        """The smoothed cam_from_world of a picture that was localized at `cam_from_world`, `cam_from_before` after the last one added.
+
+        A motion that is known no better than the picture's own pose says nothing of it: the window then begins anew.
+        """
+        if np.trace(motion_covariance) >= np.trace(covariance):
+            self.clear()
         self._smoothed.append(cam_from_before @ self._smoothed[-1] if self._smoothed else cam_from_world)
         self._entries.append(_Entry(cam_from_world, covariance, cam_from_before, motion_covariance))
         edges = [Edge(0, k, entry.cam_from_world, entry.covariance, is_loop=True) for k, entry in enumerate(self._entries, start=1)]

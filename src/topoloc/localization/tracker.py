@@ -15,9 +15,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from topoloc.errors import QueryError
 from topoloc.geometry.camera import Camera
@@ -31,6 +30,7 @@ from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.seen_points import SeenPoints
 from topoloc.localization.stages import StageClock
 from topoloc.localization.stream_result import StreamedPose
+from topoloc.localization.tracker_state import Reference, StreamPicture, doubt_of, reduced
 from topoloc.places.coarse import Image
 from topoloc.sequences.pictures import grey_image
 
@@ -67,35 +67,6 @@ class TrackerConfig:
     """Sigma of a followed motion, as a share of its way and turn, beside what the points say."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Picture:
-    """The picture at hand, its time and external odometry; in grey, and reduced, with the camera of that."""
-
-    image: Image
-    camera: Camera
-    t_ns: int
-    odom_from_cam: Rigid3 | None
-    grey: UInt8[np.ndarray, "a b"]
-    grey_camera: Camera
-
-
-@dataclass(frozen=True, eq=False)
-class _Reference:
-    """The picture that was localized last: its pose raw (with covariance, of the left perturbation) and smoothed, and its points.
-
-    `offset` (left of `smoothed`) is what the smoothed poses before it were off by; it fades.
-    """
-
-    t_ns: int
-    found: Localization
-    cam_from_world: Rigid3
-    covariance: Float[np.ndarray, "6 6"]
-    smoothed: Rigid3
-    offset: Rigid3
-    depth: float
-    follower: PointFollower
-
-
 class Tracker:
     """The state of one stream; `reset` begins another."""
 
@@ -109,7 +80,7 @@ class Tracker:
         self._t_ns: int | None = None
         self._image: np.ndarray | None = None
         self._answer: StreamedPose | None = None
-        self._reference: _Reference | None = None
+        self._reference: Reference | None = None
         self._attempt_ns = 0
         self._gate.forget()
         self._window.clear()
@@ -135,8 +106,8 @@ class Tracker:
         if self.config.mode == "paper":
             self._answer = self._by_paper(image, camera, t_ns)
         else:
-            grey, grey_camera = _reduced(grey_image(image), camera, self.config.max_side_px)
-            self._answer = self._by_motion(_Picture(image, camera, t_ns, odom_from_cam, grey, grey_camera))
+            grey, grey_camera = reduced(grey_image(image), camera, self.config.max_side_px)
+            self._answer = self._by_motion(StreamPicture(image, camera, t_ns, odom_from_cam, grey, grey_camera))
         return self._answer
 
     def miss(self, t_ns: int, result: NotLocalized, odom_from_cam: Rigid3 | None = None) -> StreamedPose:
@@ -171,7 +142,7 @@ class Tracker:
         previous = self._answer.smoothed if self._answer is not None else None
         return StreamedPose(t_ns, "lost" if previous is None else "predicted", result, previous)
 
-    def _by_motion(self, picture: _Picture) -> StreamedPose:
+    def _by_motion(self, picture: StreamPicture) -> StreamedPose:
         clock = StageClock()
         predicted = self._gate.predict(picture.t_ns, picture.odom_from_cam)
         with clock.stage("tracking"):
@@ -185,7 +156,7 @@ class Tracker:
         assert predicted is not None, "points are followed where the motion is known"
         return self._tracked(picture, followed, predicted, clock)
 
-    def _follow(self, picture: _Picture, predicted: MotionState | None) -> Followed | None:
+    def _follow(self, picture: StreamPicture, predicted: MotionState | None) -> Followed | None:
         """The points followed into this picture; None where they are lost or lead where the camera cannot be."""
         reference = self._reference
         if reference is None or predicted is None or reference.follower.camera != picture.grey_camera:
@@ -196,7 +167,7 @@ class Tracker:
         world_from_cam = self._blended(followed, picture.t_ns).inverse()
         return followed if self._gate.follows(predicted, world_from_cam, followed.covariance + self._floor(reference.depth)) else None
 
-    def _is_due(self, followed: Followed, picture: _Picture) -> bool:
+    def _is_due(self, followed: Followed, picture: StreamPicture) -> bool:
         """Whether it is time to localize in full."""
         config, reference = self.config, self._reference
         assert reference is not None
@@ -206,7 +177,7 @@ class Tracker:
         return is_old or followed.share_left < config.min_share_left or followed.shift_px > config.max_shift * picture.grey_camera.width
 
     def _localize(
-        self, picture: _Picture, predicted: MotionState | None, followed: Followed | None
+        self, picture: StreamPicture, predicted: MotionState | None, followed: Followed | None
     ) -> tuple[Localization | NotLocalized, SeenPoints | None]:
         """In full: around the pose that is expected where that is known well enough, else, and where that fails, by the coarse search."""
         self._attempt_ns = picture.t_ns
@@ -214,7 +185,7 @@ class Tracker:
         if reference is not None and followed is not None:
             near = (followed.cam_from_ref @ reference.cam_from_world).inverse()
             return self.localizer.localize_near(picture.image, picture.camera, near)
-        if reference is not None and predicted is not None and _doubt(predicted, reference.depth) <= self.config.max_doubt:
+        if reference is not None and predicted is not None and doubt_of(predicted, reference.depth) <= self.config.max_doubt:
             found, seen = self.localizer.localize_near(picture.image, picture.camera, predicted.world_from_cam)
             if isinstance(found, Localization):
                 return found, seen
@@ -222,7 +193,7 @@ class Tracker:
 
     def _believe(
         self,
-        picture: _Picture,
+        picture: StreamPicture,
         found: Localization | NotLocalized,
         seen: SeenPoints,
         predicted: MotionState | None,
@@ -246,21 +217,23 @@ class Tracker:
             motion, motion_covariance = self._motion(predicted, followed)
             before = self._blended(followed, t_ns) if followed is not None else None
             smoothed = self._window.add(cam_from_world, covariance, motion, motion_covariance)
-            offset = Rigid3.identity() if before is None else before @ smoothed.inverse()
+            offset = Rigid3.identity() if before is None else self._faded(before @ smoothed.inverse(), self._gate.seconds_since(t_ns))
             measured = covariance if followed is None else followed.covariance
             state = self._gate.correct(predicted, (offset @ smoothed).inverse(), measured, odom_from_cam)
             self._gate.drop_rival()
         points = seen.in_image(picture.grey_camera.width / picture.camera.width)
         follower = PointFollower(picture.grey, points, cam_from_world, picture.grey_camera, self.config.following)
-        self._reference = _Reference(t_ns, found, cam_from_world, covariance, smoothed, offset, depth, follower)
+        self._reference = Reference(t_ns, found, cam_from_world, covariance, smoothed, offset, depth, follower)
         return StreamedPose(t_ns, "localized", found, state.world_from_cam, self._covariance(state))
 
     def _blended(self, followed: Followed, t_ns: int) -> Rigid3:
         """The smoothed cam_from_world of a followed picture."""
         reference = self._reference
         assert reference is not None
-        share = np.exp(-(t_ns - reference.t_ns) / 1e9 / self.config.blend_time)
-        return Rigid3.exp(share * reference.offset.log()) @ followed.cam_from_ref @ reference.smoothed
+        return self._faded(reference.offset, (t_ns - reference.t_ns) / 1e9) @ followed.cam_from_ref @ reference.smoothed
+
+    def _faded(self, offset: Rigid3, seconds: float) -> Rigid3:
+        return Rigid3.exp(np.exp(-seconds / self.config.blend_time) * offset.log())
 
     def _motion(self, predicted: MotionState, followed: Followed | None) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
         """cam_from_before, from the picture localized last, with the covariance of its left perturbation."""
@@ -269,7 +242,7 @@ class Tracker:
             return followed.cam_from_ref, self._followed_covariance(followed)
         return predicted.world_from_cam.inverse() @ self._reference.smoothed.inverse(), predicted.pose_covariance
 
-    def _tracked(self, picture: _Picture, followed: Followed, predicted: MotionState, clock: StageClock) -> StreamedPose:
+    def _tracked(self, picture: StreamPicture, followed: Followed, predicted: MotionState, clock: StageClock) -> StreamedPose:
         reference = self._reference
         assert reference is not None
         smoothed = self._blended(followed, picture.t_ns).inverse()
@@ -313,21 +286,6 @@ class Tracker:
     def _floor(self, depth: float) -> Float[np.ndarray, "6 6"]:
         """The covariance that the map's own errors leave, of points at this depth (metres), in the camera's axes."""
         return np.diag(np.repeat([(self.config.floor_share * depth) ** 2, self.config.floor_share**2], 3))
-
-
-def _doubt(predicted: MotionState, depth: float) -> float:
-    """Three sigma (radians) of the direction in which points at this depth (metres) are seen."""
-    sigmas = np.sqrt(np.diag(predicted.pose_covariance))
-    return 3.0 * float(np.hypot(sigmas[:3].max() / depth, sigmas[3:].max()))
-
-
-def _reduced(grey: UInt8[np.ndarray, "h w"], camera: Camera, max_side_px: int) -> tuple[UInt8[np.ndarray, "a b"], Camera]:
-    """The picture with its camera, smaller where a side is longer than `max_side_px`."""
-    scale = max_side_px / max(grey.shape)
-    if scale >= 1.0:
-        return grey, camera
-    width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
-    return cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA), camera.rescaled(width, height)
 
 
 def _refused(found: Localization) -> NotLocalized:
