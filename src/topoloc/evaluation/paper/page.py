@@ -32,10 +32,8 @@ _STYLE = """
 .results th { width: auto; font-size: 13px; white-space: nowrap; }
 .results td { padding: 5px 14px 5px 0; }
 h3 { margin: 22px 0 6px; font-size: 15px; font-weight: 600; }
-.verdict td { white-space: normal; }
 img.figure { display: block; width: 100%; height: auto; margin: 6px 0 22px; }
-.results td:nth-child(-n+3) { white-space: nowrap; }
-.results td:last-child { font-size: 12.5px; min-width: 150px; }
+.results td:first-child, .results .short { white-space: nowrap; }
 """
 _EXPLANATIONS = {
     "accuracy": (

@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from topoloc.errors import TopolocError
-from topoloc.evaluation.paper.text_tables import MISSING, Row, Table, error_words, paper_words, quality_words
+from topoloc.evaluation.paper.settings import LEARNED
+from topoloc.evaluation.paper.text_tables import MISSING, Row, Table, about, error_words, paper_words
 from topoloc.sequences.atomic import write_text
 
 BEGIN, END = "<!-- benchmark paper -->", "<!-- /benchmark paper -->"
+PEERS = ("the paper's step", "pycolmap, SIFT")
 
 
 def block_of(results: Mapping[str, Any]) -> str:
-    """The block with its markers: for every recording PoseNet, the best learned coarse localizer, surf-vlad and the peers."""
-    s, m = results["settings"], results["machine"]
-    about = (
-        f"The paper's experiments, made again by `topoloc benchmark paper`: {quality_words(s)}, {m['cores']} cores of {m['cpu']}. "
-        "Medians over the localized queries, and how many those are where not all; the paper's numbers are from its own recordings."
-    )
-    lines = [cells for row in results.get("accuracy", []) if (cells := _accuracy_cells(row, s["command"]))]
-    lines += [cells for row in results.get("peers", []) if (cells := _peer_cells(row, s["command"]))]
-    missing = f"\n\nLeft out, since not there: {', '.join(results['missing'])}." if results["missing"] else ""
-    columns = ["place, queries", "method (weights)", "median error", "paper", "ms", "command"]
-    return f"{BEGIN}\n{about}\n\n{Table(columns, lines).markdown()}{missing}\n{END}"
+    """The block with its markers: a line for each recording, its methods and the peers side by side, and the command that makes it."""
+    accuracy, peers, command = results.get("accuracy", []), results.get("peers", []), results["settings"]["command"]
+    places = dict.fromkeys((row["dataset"], row["queries"]) for row in accuracy)
+    lines = []
+    for place in places:
+        mine = [row for row in accuracy if (row["dataset"], row["queries"]) == place]
+        others = [row for row in peers if (row["dataset"], row["queries"]) == place]
+        lines.append([", ".join(place), *_cells(mine, others), _of_part(command, mine[0])])
+    own = "surf-vlad (no weights)"
+    columns = ["place, queries", "the paper's best", "PoseNet", *LEARNED, own, f"{own}, own nodes, ms", *PEERS, "command"]
+    how = "All but the last of ours have the paper's D_thresh; in brackets how many queries were localized, where not all."
+    return f"{BEGIN}\n{about(results)} {how}\n\n{Table(columns, lines).markdown()}\n{END}"
 
 
 def update_readme(path: Path, results: Mapping[str, Any]) -> None:
@@ -44,27 +47,23 @@ def update_readme(path: Path, results: Mapping[str, Any]) -> None:
     write_text(path, before + block_of(results) + after)
 
 
-def _accuracy_cells(row: Row, command: str) -> list[str]:
-    name = f"{row['method']}, {row['nodes']}" + ("" if row["weights"] == "none needed" else f" ({row['weights']})")
-    ms = MISSING if row.get("ms") is None else f"{row['ms']:.0f}"
-    return [
-        f"{row['dataset']}, {row['queries']}",
-        name,
-        error_words(row),
-        paper_words(row),
-        ms,
-        f"`{_of_part(command, 'conditions', row)}`",
-    ]
+def _cells(mine: Sequence[Row], others: Sequence[Row]) -> list[str]:
+    """The paper's best, then every method by the paper's D_thresh, surf-vlad on topoloc's own nodes, and the peers."""
+    printed = [row for row in mine if row["paper_m"] is not None and row["method"] != "posenet"]
+    cells = [paper_words(min(printed, key=lambda row: row["paper_m"])) if printed else MISSING]
+    for method in ("posenet", *LEARNED, "surf-vlad"):
+        cells.append(_cell([row for row in mine if row["method"] == method and row["nodes"].startswith("D_thresh")]))
+    own = [row for row in mine if not row["nodes"].startswith("D_thresh")]
+    cells.append(_cell(own) + (f", {own[0]['ms']:.0f} ms" if own and own[0].get("ms") is not None else ""))
+    return cells + [_cell([row for row in others if row["peer"] == peer]) for peer in PEERS]
 
 
-def _peer_cells(row: Row, command: str) -> list[str]:
-    if row["peer"] == "topoloc":
-        return []
-    ms = MISSING if row.get("ms") is None else f"{row['ms']:.0f}"
-    name = f"{row['peer']}, {row['nodes']}"
-    return [f"{row['dataset']}, {row['queries']}", name, error_words(row), MISSING, ms, f"`{_of_part(command, 'peers', row)}`"]
+def _cell(rows: Sequence[Row]) -> str:
+    return error_words(rows[0]) if rows else MISSING
 
 
-def _of_part(command: str, part: str, row: Row) -> str:
-    """The shortest command that makes the row."""
-    return command.replace(" paper", f" {'recordings' if row.get('real') else part}", 1)
+def _of_part(command: str, row: Row) -> str:
+    """The parts that make the line."""
+    if row.get("real"):
+        return f"`{command.replace(' paper', ' recordings', 1)}`"
+    return f"`{command.replace(' paper', ' conditions', 1)}`; others: `peers` in its place"

@@ -11,6 +11,7 @@ from topoloc.evaluation.units import length_text
 
 Row = Mapping[str, Any]
 MISSING = "–"
+SHORT = 28
 
 
 def markdown_of(results: Mapping[str, Any]) -> str:
@@ -31,7 +32,8 @@ def about(results: Mapping[str, Any]) -> str:
     weights = "; ".join(f"{words} ({', '.join(methods)})" for words, methods in of_words.items())
     missing = f" Recordings not there, and left out: {', '.join(results['missing'])}." if results["missing"] else ""
     return (
-        f"`{s['command']}`, {quality_words(s)}, {m['cores']} cores of {m['cpu']}. Weights: {weights}.{missing} "
+        f"`{s['command']}`, {quality_words(s)}, {m['cores']} cores of {m['cpu']}. Weights: {weights}; "
+        f"cnn-fc is trained for at most {s['epochs']} epochs, PoseNet for {s['posenet_epochs']}.{missing} "
         "Errors are medians over the localized queries; the paper's numbers are from its own recordings, not from these."
     )
 
@@ -58,9 +60,14 @@ class Table:
         body, above = "", ""
         for first, *rest in self.lines:
             shown = "" if first == above else f"<b>{escape(first)}</b>"
-            body += f"<tr><td>{shown}</td>" + "".join(f"<td>{escape(cell)}</td>" for cell in rest) + "</tr>"
+            body += f"<tr><td>{shown}</td>" + "".join(_html_cell(cell) for cell in rest) + "</tr>"
             above = first
         return f'<div class="wide"><table class="results"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def _html_cell(cell: str) -> str:
+    """Short cells stay on one line."""
+    return f"<td{' class=short' if len(cell) <= SHORT else ''}>{escape(cell)}</td>"
 
 
 def error_words(row: Row) -> str:
@@ -126,7 +133,7 @@ def speed_table(rows: Sequence[Row]) -> Table:
     lines = []
     for row in rows:
         if row.get("missing"):
-            lines.append([row["dataset"], row["method"], f"not run: {row['missing']}", "", "", "", ""])
+            lines.append([row["dataset"], row["method"], f"not run: {row['missing']}", "", "", "", "", ""])
             continue
         q = {stage: [1e3 * value for value in values] for stage, values in row["quartiles_s"].items()}
         rest = [a + b for a, b in zip(q["features"], q["matching"], strict=True)]
@@ -134,8 +141,10 @@ def speed_table(rows: Sequence[Row]) -> Table:
         total, paper = q["total"], row["paper_s"]
         cells = [f"{values[1]:.1f}" for values in (q["coarse"], q["patch_normalization"], fine)]
         spread = f"{total[1]:.0f} ({total[0]:.0f} to {total[2]:.0f})"
-        lines.append([row["dataset"], row["method"], *cells, spread, f"{1e3 * paper:.0f}" if paper else MISSING])
-    return Table(["place", "coarse", "CNN + NN", "patch norm.", "SURF + PnP", "total (quartiles)", "paper's total"], lines)
+        load = MISSING if row.get("load") is None else f"{row['load']:.1f}"
+        lines.append([row["dataset"], row["method"], *cells, spread, f"{1e3 * paper:.0f}" if paper else MISSING, load])
+    columns = ["place", "coarse", "CNN + NN", "patch norm.", "SURF + PnP", "total (quartiles)", "paper's total", "load meanwhile"]
+    return Table(columns, lines)
 
 
 def peers_table(rows: Sequence[Row]) -> Table:
