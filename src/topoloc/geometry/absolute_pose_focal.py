@@ -2,7 +2,8 @@
 
 PnP is tried with a handful of focal lengths a quarter apart: at an inlier threshold of some pixels the nearest of them is near
 enough to find the inliers. From the best one, Gauss-Newton refines the pose's six numbers and the logarithm of the focal length
-together, and what is not known of the focal length is added to the pose's covariance.
+together. What is not known of the focal length and of the principal point, which is taken to be in the middle, is added to the pose's
+covariance.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ _STEP = 1.25
 _MAX_ITERATIONS = 500  # of RANSAC for each focal length: enough for one match in four to be right
 _ROUNDS = 4
 _CAUCHY_SCALE = 2.3849
+# How far the principal point lies from the middle (standard deviation, of the longer side); it trades places with a rotation.
+_CENTRE_SHARE = 0.01
 # Weak prior on the logarithm of the focal length (standard deviation): without it, what is seen of a wall alone fixes none.
 _PRIOR = 0.7
 
@@ -64,7 +67,8 @@ def estimate_pose_and_focal(
         return None
     inliers = pose.inliers
     information, _ = _normal_equations(points_img[inliers], points_world[inliers], point_covariances[inliers], pose, camera, rough, config)
-    return replace(pose, covariance=_whatever_the_focal(pose.covariance, information)), camera
+    covariance = _whatever_the_focal(pose.covariance, information)
+    return replace(pose, covariance=covariance + _whatever_the_centre(points_world[inliers], pose, camera)), camera
 
 
 def _search(
@@ -130,3 +134,17 @@ def _whatever_the_focal(covariance: Float[np.ndarray, "6 6"], information: Float
     scale = float(np.trace(covariance @ information[:6, :6])) / 6.0
     variance = scale / max(information[6, 6] + float(information[:6, 6] @ by_focal), 1e-12)
     return covariance + variance * np.outer(by_focal, by_focal)
+
+
+def _whatever_the_centre(points_world: Float[np.ndarray, "n 3"], pose: AbsolutePose, camera: Camera) -> Float[np.ndarray, "6 6"]:
+    """What a principal point away from the middle adds to the pose's covariance: the pose moves so as to shift all pixels alike."""
+    x, y, z = pose.cam_from_world.apply(points_world).T
+    u, v, w = x / z, y / z, 1.0 / z
+    zero = np.zeros_like(u)
+    by_x = np.column_stack([w, zero, -u * w, -u * v, 1.0 + u * u, -v])
+    by_y = np.column_stack([zero, w, -v * w, -(1.0 + v * v), u * v, u])
+    jacobian = np.concatenate([by_x, by_y])
+    shifts = np.zeros((2 * len(u), 2))
+    shifts[: len(u), 0] = shifts[len(u) :, 1] = 1.0 / camera.fx
+    by_centre = np.linalg.lstsq(jacobian, shifts, rcond=None)[0]
+    return (_CENTRE_SHARE * max(camera.width, camera.height)) ** 2 * by_centre @ by_centre.T

@@ -26,7 +26,7 @@ class GuidedConfig:
     num_nodes: int = 3
     """Nodes nearest to the first pose (Eq. 1) whose points are sought; 0 keeps the first pose as it is."""
     radius_px: float = 10.0
-    """How far from its projection a map point is sought, in an image of 640 pixels' width; grows with the width."""
+    """How far from its projection a map point is sought, in an image whose longer side is 640 pixels; grows with that."""
     max_scale: float = 1.6
     """Largest ratio of a key point's size to the one expected, or the other way round."""
     max_turn: float = 0.6
@@ -69,7 +69,7 @@ def _find(
         features.descriptors,
         float(camera.width),
         float(camera.height),
-        float(config.radius_px * max(camera.width / 640.0, 0.5)),
+        float(config.radius_px * max(max(camera.width, camera.height) / 640.0, 0.5)),
         np.float32(config.max_scale),
         np.float32(np.cos(config.max_turn)),
         np.float32(config.min_similarity),

@@ -36,7 +36,8 @@ from topoloc.localization.seen_points import SeenPoints
 from topoloc.localization.shared_errors import SharedErrorsConfig, measure_shared_errors
 from topoloc.localization.stages import StageClock
 from topoloc.localization.verification import VerificationConfig
-from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.localization.viewing import viewing_distances
+from topoloc.mapping.nodes import NodePoses
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.places.coarse import Image, NodeScore, open_coarse
 from topoloc.sequences.pictures import grey_image
@@ -175,7 +176,7 @@ class Localizer:
 
     def _nodes_near(self, world_from_cam: Rigid3) -> list[NodeScore]:
         """As many nodes as the coarse step would name; nearer ones (Eq. 1) score higher."""
-        distances = node_distances(world_from_cam, self._node_poses, self._lambda_rot)
+        distances = viewing_distances(world_from_cam, self._node_poses, self._lambda_rot)
         nearest = np.argsort(distances, kind="stable")[: self.config.num_candidates]
         return [NodeScore(int(i), -float(distances[i])) for i in nearest]
 
@@ -194,7 +195,7 @@ class Localizer:
             return first
         with clock.stage("matching"):
             cam_from_world = first.pose.cam_from_world
-            distances = node_distances(cam_from_world.inverse(), self._node_poses, self._lambda_rot)
+            distances = viewing_distances(cam_from_world.inverse(), self._node_poses, self._lambda_rot)
             nearest = np.argsort(distances, kind="stable")[: self.config.guided.num_nodes]
             local_map = self._pooled([int(i) for i in nearest])
             matches = match_guided(first.features, local_map, cam_from_world, first.camera, self.config.guided)

@@ -18,6 +18,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.attempt import Judgement
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.stages import StageClock
+from topoloc.localization.viewing import viewing_distances
 from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.places.coarse import NodeScore
 
@@ -65,7 +66,7 @@ def rival_groups(
     least = config.min_score_share[0 if is_clear else 1] * ranked[0].score if ranked else 0.0
     left = [candidate.node_id for candidate in ranked if candidate.score >= least]
     if found is not None:
-        far = node_distances(found, nodes, lambda_rot) > reach
+        far = viewing_distances(found, nodes, lambda_rot) > reach
         left = [node_id for node_id in left if far[node_id]]
     groups: list[list[int]] = []
     while left and len(groups) < config.max_groups:
