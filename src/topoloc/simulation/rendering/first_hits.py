@@ -96,7 +96,8 @@ def _recorded(function: Callable[..., Any]) -> Callable[..., Any]:
     """The same, but Python runs it only once for a scene: its kernels are recorded and launched again, which saves half of the time."""
     import drjit as dr
 
-    return dr.freeze(function)
+    # Where lamps are weighed anew for each picture (light that is not known beforehand), a recording serves but one picture.
+    return dr.freeze(function, limit=8, warn_after=1_000_000_000)
 
 
 def _first_hits(columns: list[np.ndarray], rays: Float32[np.ndarray, "n 3"], haze_range: float) -> FirstHits:
