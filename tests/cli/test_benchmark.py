@@ -50,9 +50,9 @@ def test_the_paper_is_made_again_and_only_once(room: Path, capsys: pytest.Captur
     assert not re.search(r'(src|href)="http', page), "the page must stand alone"
     names = {path.name for path in (room / "figures").iterdir()}
     assert {"lab_from_above.svg", "nodes.png", "times.svg", "topological_accuracy.png", "posenet_lab.svg", "lab_normalized.png"} <= names
-    assert main(["benchmark", "paper", "--quick", "--out", str(room)]) == 0
+    assert main(["benchmark", "nodes", "--quick", "--out", str(room)]) == 0
     assert "stages: 0 done" in capsys.readouterr().out
-    assert json.loads((room / "results.json").read_text()) == results
+    assert json.loads((room / "results.json").read_text())["nodes"] == results["nodes"]
 
 
 def test_a_part_makes_its_own_tables_alone(room: Path, capsys: pytest.CaptureFixture[str]):
