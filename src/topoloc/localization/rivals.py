@@ -27,17 +27,17 @@ from topoloc.places.coarse import NodeScore
 class RivalsConfig:
     """When another part of the map is asked, and what makes an answer ambiguous."""
 
-    num_ranked: int = 24
+    num_ranked: int = 48
     """Nodes that the coarse localizer ranks, the candidates among them; rivals come from these."""
     clear_log_odds: float = 5.5
     """A pose with more for it (logarithm of its odds) is clear: only parts of the map that look nearly the same are asked then."""
     min_score_share: tuple[float, float] = (0.85, 0.4)
     """A rival's score is at least this share of the best one's: where the pose is clear, and where it is not."""
-    reach: float = 10.0
+    reach: float = 5.0
     """Nodes within so many D_thresh of a pose (Eq. 1) belong to it; rivals are farther away."""
     agreement: float = 3.0
     """Two poses within so many D_thresh are one."""
-    max_groups: int = 3
+    max_groups: int = 6
     """Parts of the map that are asked on their own, at most; 0 asks none."""
     share_weight: float = 4.0
     """How much the share found counts between two poses, beside their odds, in logarithms."""
