@@ -82,9 +82,7 @@ class SurfVlad:
         """The inverse of `to_model`."""
         a = model.arrays
         projection, vectors = a["projection"].astype(np.float32), a["vectors"].astype(np.float32)
-        return SurfVlad(
-            a["words"], a["mean"], projection, vectors, a["node_ids"], VladConfig(**{"position_weight": 0.0, **model.settings})
-        )
+        return SurfVlad(a["words"], a["mean"], projection, vectors, a["node_ids"], VladConfig(**{"position_weight": 0.0, **model.settings}))
 
 
 def open_model(model: CoarseModel) -> SurfVlad:
