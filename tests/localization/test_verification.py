@@ -71,7 +71,7 @@ def test_no_single_part_of_the_evidence_carries_a_pose(weaker: dict[str, float])
 
 
 def test_a_pose_that_is_only_imprecise_is_told_from_one_that_has_nothing_to_stand_on():
-    small = replace(STRONG, num_inliers=16, num_matches=40, num_found=80, num_visible=900, num_by_chance=12, spread=0.2, doubt=30.0)
+    small = replace(STRONG, num_inliers=24, num_matches=40, num_found=110, num_visible=900, num_by_chance=12, spread=0.2, doubt=30.0)
     assert probability_of(small, CONFIG) < CONFIG.min_probability
     assert is_only_imprecise(small, CONFIG)
     assert not is_only_imprecise(MANY_OF_VERY_MANY, CONFIG)
