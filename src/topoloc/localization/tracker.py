@@ -57,10 +57,10 @@ class TrackerConfig:
     """Seconds to the next attempt where that failed and the points are still there."""
     max_doubt: float = 0.3
     """Where the prediction leaves open by more than this where points are seen (three sigma, radians), the coarse search is asked."""
-    covariance_scale: float = 3.0
-    """By how much errors of localization exceed their sigma: points share the errors of the map ..."""
+    covariance_scale: float = 1.0
+    """Sigma of a localization is taken this many times as large as it says ..."""
     floor_share: float = 0.004
-    """... which do not vanish with their number: sigma, as a share of the points' depth."""
+    """... and at least this share of the points' depth."""
     blend_time: float = 0.2
     """Seconds (to 1/e) in which what a new localization corrects is worked into the smoothed pose, so that it does not jump."""
     followed_share: float = 0.1
