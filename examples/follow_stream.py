@@ -14,6 +14,8 @@ import numpy as np
 
 import topoloc
 from topoloc.geometry.alignment import translation_error
+from topoloc.localization.motion import MotionConfig
+from topoloc.localization.motion_gate import GateConfig
 from topoloc.simulation.demo_recordings import SHIPPED
 
 COVERED, MISPLACED = range(8, 10), 20
@@ -25,7 +27,9 @@ def main(map_file: Path | None, recording: str | None) -> None:
     else:
         topomap = topoloc.TopoMetricMap.load(map_file)
     walk = topoloc.open_sequence(recording or SHIPPED / "day")
-    tracker = topoloc.Tracker(topoloc.Localizer(topomap))
+    # A cart at walking pace, two pictures a second: what a hand could do within half a second, it cannot.
+    slow = GateConfig(motion=MotionConfig(sigma_acceleration=0.5, sigma_angular_acceleration=1.5))
+    tracker = topoloc.Tracker(topoloc.Localizer(topomap), topoloc.TrackerConfig(gate=slow))
     states: Counter[str] = Counter()
     errors_cm = []
     for i in range(len(walk)):
