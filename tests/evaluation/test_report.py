@@ -14,9 +14,10 @@ from hand_made import MAP_INFO, answer, elsewhere, lost, two_nodes
 from topoloc.errors import TopolocError, UnreadableImageError
 from topoloc.evaluation.map_figure import _horizontal_axes, _with_gaps, draw_map
 from topoloc.evaluation.metrics import Answer, summarize
-from topoloc.evaluation.query_gallery import typical_queries, worst_queries
+from topoloc.evaluation.query_gallery import gallery, typical_queries, worst_queries
 from topoloc.evaluation.report import write_report
 from topoloc.evaluation.report_tables import PublishedResult, ReportWords
+from topoloc.localization.result import Localization
 
 GOOD = [answer(f"good{i}", 0.1 * i, error_m=0.001 * (i + 1), error_deg=0.1) for i in range(9)]
 MIXED = [*GOOD, lost("lost", 0.4), answer("far", 0.5, 40.0, 2.0, node_id=1), elsewhere("moon", True), elsewhere("mars", False)]
@@ -89,6 +90,15 @@ def test_the_worst_are_shown_beside_the_node_they_were_matched_with(page: str):
     assert "nearest to the truth is node 0" in far
     assert "off by 40.00 m, 2.00°" in far
     assert far.count("data:image/jpeg;base64,") == 1
+
+
+@pytest.mark.parametrize("x", [0.0, 100.0])
+def test_the_deviation_shown_is_the_cameras_own_wherever_the_world_begins(x: float):
+    asked = answer("a", x, 0.0, 0.0)
+    assert isinstance(asked.result, Localization)
+    adjoint = asked.result.world_from_cam.adjoint()
+    result = replace(asked.result, covariance=adjoint @ (1e-4 * np.eye(6)) @ adjoint.T)
+    assert "standard deviation 1.73 cm" in gallery([replace(asked, result=result)], two_nodes())
 
 
 def test_a_picture_that_is_gone_leaves_a_gap(tmp_path: Path):

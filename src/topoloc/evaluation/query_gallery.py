@@ -61,7 +61,7 @@ def _article(answer: Answer, topomap: TopoMetricMap) -> str:
     node = None if node_id is None else topomap.nodes[node_id]
     evidence = f"{result.num_inliers} inliers of {result.num_matches} matches"
     if isinstance(result, Localization):
-        sigma = float(np.sqrt(max(np.trace(result.covariance[:3, :3]), 0.0)))
+        sigma = float(np.sqrt(max(np.trace(result.camera_covariance[:3, :3]), 0.0)))
         evidence += f", probability {result.probability:.2f}, its own standard deviation {length_text(sigma)}"
     if answer.nearest_node_id is not None and answer.nearest_node_id != node_id:
         evidence += f"; nearest to the truth is node {answer.nearest_node_id}"

@@ -28,8 +28,10 @@ from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.sequences.atomic import write_bytes, write_text
 
 _STYLE = """
+.page { max-width: 1240px; }
 .results { min-width: 860px; font-size: 13.5px; }
-.results th { width: auto; font-size: 13px; white-space: nowrap; }
+.results th { width: auto; font-size: 13px; }
+.results td:last-child { min-width: 200px; }
 .results td { padding: 5px 14px 5px 0; }
 h3 { margin: 22px 0 6px; font-size: 15px; font-weight: 600; }
 img.figure { display: block; width: 100%; height: auto; margin: 6px 0 22px; }
