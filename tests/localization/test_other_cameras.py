@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +44,24 @@ def test_other_lenses_and_other_sizes(factor: float, size: tuple[int, int], loca
     results = [(localizer.localize(render(panels, path_pose(i), camera)[0], camera), path_pose(i)) for i in INDICES]
     assert sum(_is_right(result, truth) for result, truth in results) >= 2
     assert all(result.focal_length_px is None for result, _ in results if isinstance(result, Localization))
+
+
+@pytest.mark.parametrize("lens", ["calibrated", "focal length noted", "unknown"])
+def test_a_camera_of_many_more_pixels_is_as_good_as_the_map_s_own(lens: str, localizer: Localizer):
+    """Three times the pixels a radian: all that the map knows is too small to be found among them, unless the picture is reduced."""
+    factor = 3
+    camera = CAMERA.rescaled(factor * CAMERA.width, factor * CAMERA.height)
+    known = {"calibrated": camera, "focal length noted": RoughCamera.noted(camera.width, camera.height, 1.05 * camera.fx), "unknown": None}
+    panels = room()
+    pictures = [(render(panels, path_pose(i), camera)[0], path_pose(i)) for i in INDICES]
+    results = [(localizer.localize(picture, known[lens]), truth) for picture, truth in pictures]
+    assert all(_is_right(result, truth, metres=0.03 if lens == "calibrated" else 0.15) for result, truth in results)
+    whole = Localizer(localizer.topomap, replace(localizer.config, max_finer=math.inf))
+    not_reduced = [whole.localize(picture, known[lens]) for picture, _ in pictures]
+    assert all(one.num_inliers > 1.2 * other.num_inliers for (one, _), other in zip(results, not_reduced, strict=True))
+    focals = [result.focal_length_px for result, _ in results if isinstance(result, Localization) and result.focal_length_px is not None]
+    assert len(focals) == (0 if lens == "calibrated" else len(INDICES))
+    assert focals == [pytest.approx(camera.fx, rel=0.05)] * len(focals)
 
 
 @pytest.mark.parametrize("degrees", [90, 180, 270])

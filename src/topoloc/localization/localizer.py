@@ -15,7 +15,6 @@ from collections import OrderedDict
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
-import cv2
 import numpy as np
 
 from topoloc.errors import EmptyMapError, MapError, QueryError
@@ -30,6 +29,7 @@ from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.attempt import Attempt, Judgement, judge
 from topoloc.localization.guided import GuidedConfig, match_guided
 from topoloc.localization.local_map import LocalMap
+from topoloc.localization.query_size import reduced_query
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.rivals import RivalsConfig, decide, rival_groups
 from topoloc.localization.seen_points import SeenPoints
@@ -64,6 +64,9 @@ class LocalizerConfig:
     verification: VerificationConfig = field(default_factory=VerificationConfig)
     rivals: RivalsConfig = field(default_factory=RivalsConfig)
     shared_errors: SharedErrorsConfig = field(default_factory=SharedErrorsConfig)
+    max_finer: float = 1.15
+    """An image of more than so many times the pixels a radian (focal length in pixels) of the map's finest camera is reduced to that
+    camera's first: at larger sizes its key points find none alike in the map."""
     max_side_px: int = 1600
     """Larger images are reduced to this width or height first: nothing is gained from more, but time and memory."""
 
@@ -118,9 +121,9 @@ class Localizer:
         height, width = image.shape[:2]
         if (camera.width, camera.height) != (width, height):
             raise QueryError(f"the image is {width}x{height}, its camera {camera.width}x{camera.height}")
-        shared_errors = self.shared_errors  # of the first query alone; it is the map's time, not the query's
+        shared_errors, map_focal = self.shared_errors, self._map_focal  # of the first query alone; the map's time, not the query's
         clock = StageClock()
-        image, lens = _reduced(image, camera, self.config.max_side_px)
+        image, lens = reduced_query(image, camera, map_focal, self.config.max_finer, self.config.max_side_px)
         scale = width / lens.width
         features = self._extract(image, clock)
         if near is not None:
@@ -152,6 +155,12 @@ class Localizer:
             self.config.pose,
             self.config.shared_errors,
         )
+
+    @cached_property
+    def _map_focal(self) -> float:
+        """Focal length (pixels) of the finest camera that mapped; each recording is taken to have one camera."""
+        first_nodes = {summary.recording: summary.node_id for summary in reversed(self.topomap.summaries)}
+        return max(self.topomap.nodes[node_id].camera.fx for node_id in first_nodes.values())
 
     def _extract(self, image: Image, clock: StageClock) -> Features:
         """Patch normalisation, then the local features."""
@@ -270,13 +279,3 @@ class Localizer:
 def _usual(lens: Camera | RoughCamera) -> Camera:
     """The camera, of a rough one that with the focal length in the middle of its range."""
     return lens.with_focal(math.sqrt(lens.min_focal * lens.max_focal)) if isinstance(lens, RoughCamera) else lens
-
-
-def _reduced(image: Image, camera: Camera | RoughCamera, max_side_px: int) -> tuple[np.ndarray, Camera | RoughCamera]:
-    """The image with its camera, smaller where a side is longer than `max_side_px`."""
-    height, width = image.shape[:2]
-    scale = max_side_px / max(width, height)
-    if scale >= 1.0:
-        return image, camera
-    width, height = max(1, round(width * scale)), max(1, round(height * scale))
-    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), camera.rescaled(width, height)
