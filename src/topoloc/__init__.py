@@ -12,11 +12,12 @@ if TYPE_CHECKING:
     from topoloc.errors import TopolocError
     from topoloc.geometry.camera import Camera
     from topoloc.geometry.rigid import Rigid3
+    from topoloc.localization.building import build_map
     from topoloc.localization.localizer import Localizer, LocalizerConfig
     from topoloc.localization.result import Localization, NotLocalized
     from topoloc.localization.stream_result import StreamedPose
     from topoloc.localization.tracker import Tracker, TrackerConfig
-    from topoloc.mapping.build import BuildConfig, build_map
+    from topoloc.mapping.build import BuildConfig
     from topoloc.mapping.topomap import TopoMetricMap
     from topoloc.sequences.open import open_sequence
 
@@ -53,7 +54,7 @@ _MODULES = {
     "TopolocError": "topoloc.errors",
     "Tracker": "topoloc.localization.tracker",
     "TrackerConfig": "topoloc.localization.tracker",
-    "build_map": "topoloc.mapping.build",
+    "build_map": "topoloc.localization.building",
     "open_sequence": "topoloc.sequences.open",
 }
 

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+import topoloc
 from built_room import built_room
+from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.localization import shared_errors
+from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.shared_errors import SharedErrorsConfig, inflation
 from topoloc.mapping.topomap import TopoMetricMap
@@ -36,6 +41,66 @@ def test_nodes_out_of_place_share_errors_and_nodes_in_place_do_not(tiny_recordin
     exact = _rho(topomap)
     assert exact < 0.03
     assert _rho(_disturbed(topomap, 0.02, 0.005)) > 10.0 * max(exact, CONFIG.least)
+
+
+@pytest.fixture
+def measurings(monkeypatch: pytest.MonkeyPatch) -> list[TopoMetricMap]:
+    """The maps that were measured since."""
+    measured: list[TopoMetricMap] = []
+    measure = shared_errors.measure_shared_errors
+
+    def told(topomap: TopoMetricMap, *settings: Any) -> float:
+        measured.append(topomap)
+        return measure(topomap, *settings)
+
+    monkeypatch.setattr(shared_errors, "measure_shared_errors", told)
+    return measured
+
+
+@pytest.fixture
+def saved(tiny_recording: Path, tmp_path: Path) -> Path:
+    path = tmp_path / "room.topo"
+    topoloc.build_map(topoloc.open_sequence(tiny_recording)).save(path)
+    return path
+
+
+def test_a_map_knows_what_was_measured_when_it_was_built(saved: Path, measurings: list[TopoMetricMap]):
+    loaded = TopoMetricMap.load(saved)
+    known = Localizer(loaded).shared_errors
+    assert not measurings
+    unknown = replace(loaded, shared_errors=None)
+    assert Localizer(unknown).shared_errors == pytest.approx(known, rel=0.3)  # the file's points are rounded
+    assert measurings == [unknown]
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        LocalizerConfig(shared_errors=SharedErrorsConfig(factor=4.0)),
+        LocalizerConfig(guided=GuidedConfig(radius_px=7.0)),
+        LocalizerConfig(pose=AbsolutePoseConfig(max_reprojection_error_px=5.0)),
+    ],
+    ids=["shared errors", "guided", "pose"],
+)
+def test_with_other_settings_it_is_measured_anew(config: LocalizerConfig, saved: Path, measurings: list[TopoMetricMap]):
+    loaded = TopoMetricMap.load(saved)
+    rho = Localizer(loaded, config).shared_errors
+    assert measurings == [loaded]
+    assert rho == Localizer(replace(loaded, shared_errors=None), config).shared_errors
+
+
+def test_settings_that_it_does_not_depend_on_may_change(saved: Path, measurings: list[TopoMetricMap]):
+    loaded = TopoMetricMap.load(saved)
+    assert loaded.shared_errors is not None
+    assert Localizer(loaded, LocalizerConfig(num_candidates=2)).shared_errors == loaded.shared_errors.rho
+    assert not measurings
+
+
+def test_of_other_nodes_it_is_measured_anew(saved: Path, measurings: list[TopoMetricMap]):
+    moved = _disturbed(TopoMetricMap.load(saved), 0.02, 0.005)
+    assert moved.shared_errors is not None
+    assert Localizer(moved).shared_errors > moved.shared_errors.rho
+    assert measurings == [moved]
 
 
 def test_a_map_of_one_node_is_taken_to_be_of_middling_quality(tiny_recording: Path):

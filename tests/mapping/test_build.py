@@ -93,7 +93,7 @@ def test_two_recordings_make_one_map_without_an_edge_between_them(tiny_recording
 
 def test_two_builds_give_the_same_bytes(tiny_recording: Path, tiny_map: TopoMetricMap, tmp_path: Path):
     tiny_map.save(tmp_path / "one.topo")
-    build_map(topoloc.open_sequence(f"{tiny_recording}@0::2")).save(tmp_path / "two.topo")
+    topoloc.build_map(topoloc.open_sequence(f"{tiny_recording}@0::2")).save(tmp_path / "two.topo")
     assert (tmp_path / "one.topo").read_bytes() == (tmp_path / "two.topo").read_bytes()
 
 

@@ -38,6 +38,7 @@ def test_everything_comes_back(tiny_map: TopoMetricMap, saved: Path):
     assert list(loaded.edges) == list(tiny_map.edges)
     assert loaded.config == json.loads(json.dumps(tiny_map.config))
     assert loaded.length_m == tiny_map.length_m
+    assert loaded.shared_errors == tiny_map.shared_errors is not None
     assert len(loaded.nodes) == len(loaded.summaries) == len(tiny_map.nodes)
     for one, other, summary in zip(loaded.nodes, tiny_map.nodes, loaded.summaries, strict=True):
         for s in (one.summary, summary):
@@ -127,6 +128,11 @@ def test_opening_reads_no_node(saved: Path):
     assert "node_points" not in opening
     assert "place_images" not in opening
     assert later.count("FROM nodes JOIN") == 1
+
+
+def test_a_map_that_never_measured_its_shared_errors_says_so(tiny_map: TopoMetricMap, tmp_path: Path):
+    replace(tiny_map, shared_errors=None).save(tmp_path / "older.topo")
+    assert TopoMetricMap.load(tmp_path / "older.topo").shared_errors is None
 
 
 def stop(error: BaseException) -> Callable[..., None]:
@@ -234,6 +240,8 @@ SPOILT = {
     "no node points": "DELETE FROM node_points",
     "no configuration": "DELETE FROM map",
     "a configuration that is no JSON": "UPDATE map SET value = 'x'",
+    "shared errors that are no number": 'UPDATE map SET value = \'{"rho": "much", "digest": ""}\' WHERE key = \'shared_errors\'',
+    "shared errors below zero": 'UPDATE map SET value = \'{"rho": -1, "digest": ""}\' WHERE key = \'shared_errors\'',
     "a coarse model cut off": "UPDATE coarse_models SET arrays = substr(arrays, 1, 1000)",
     "a coarse model of nothing": "UPDATE coarse_models SET arrays = x''",
     "a gap in the images": "UPDATE place_images SET image_id = image_id + 100",

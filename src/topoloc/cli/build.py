@@ -11,7 +11,8 @@ import tyro
 from topoloc.cli.info import describe_map
 from topoloc.cli.output import UsageError, check_outputs, progress_bar, write_json
 from topoloc.errors import RecordingError
-from topoloc.mapping.build import BuildConfig, Progress, build_map
+from topoloc.localization.building import build_map
+from topoloc.mapping.build import BuildConfig, Progress
 from topoloc.mapping.coarse_training import train_coarse
 from topoloc.places.classifier_config import BackboneName
 from topoloc.places.coarse import CoarseName

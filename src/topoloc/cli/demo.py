@@ -17,9 +17,9 @@ from topoloc.cli.recordings_table import print_recordings
 from topoloc.errors import TopolocError
 from topoloc.evaluation.experiments import answer_elsewhere, answer_queries
 from topoloc.evaluation.metrics import Answer, by_recording, summarize
+from topoloc.localization.building import build_map
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization
-from topoloc.mapping.build import build_map
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.sequences.atomic import write_text
 from topoloc.sequences.frame import StereoSequence

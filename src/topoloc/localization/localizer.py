@@ -33,7 +33,7 @@ from topoloc.localization.query_size import reduced_query
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.rivals import RivalsConfig, decide, rival_groups
 from topoloc.localization.seen_points import SeenPoints
-from topoloc.localization.shared_errors import SharedErrorsConfig, measure_shared_errors
+from topoloc.localization.shared_errors import SharedErrorsConfig, shared_errors_of
 from topoloc.localization.stages import StageClock
 from topoloc.localization.verification import VerificationConfig
 from topoloc.localization.viewing import viewing_distances
@@ -145,16 +145,7 @@ class Localizer:
     @cached_property
     def shared_errors(self) -> float:
         """rho of the map: the share of a match's variance that its points have in common (see `shared_errors.py`)."""
-        return measure_shared_errors(
-            lambda node_id: self.topomap.nodes[node_id],
-            self._pooled,
-            self._node_poses,
-            self._lambda_rot,
-            self._d_thresh,
-            self.config.guided,
-            self.config.pose,
-            self.config.shared_errors,
-        )
+        return shared_errors_of(self.topomap, self.config.guided, self.config.pose, self.config.shared_errors)
 
     @cached_property
     def _map_focal(self) -> float:

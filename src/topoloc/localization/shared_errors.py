@@ -6,24 +6,27 @@ that is common to all of them, the variance of what n matches say together is no
 samples taken in clusters (Kish, *Survey Sampling*, 1965). So PnP's covariance is multiplied by 1 + n rho.
 
 rho is the map's own, and the map knows it: a node is localized by nodes a few steps away, as if it were a query, and its recorded
-pose is compared with the pose found.
+pose is compared with the pose found. That takes a second; a map's file keeps what came out, with a digest of what it was measured
+of and with, and where that is not what is asked for, it is measured anew.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import hashlib
+import json
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.localization.guided import GuidedConfig, match_guided
 from topoloc.localization.local_map import LocalMap
 from topoloc.mapping.nodes import NodePoses, node_distances
-from topoloc.mapping.topomap import TopoNode
+from topoloc.mapping.topomap import SharedErrors, TopoMetricMap, TopoNode
 
 _MEDIAN_CHI_SQUARE_6 = 5.348
+_METHOD = 1  # part of the digest: one more whenever the same settings come to give another rho
 
 
 @dataclass(frozen=True)
@@ -53,32 +56,37 @@ def inflation(num_inliers: int, rho: float) -> float:
     return 1.0 + num_inliers * rho
 
 
-def measure_shared_errors(
-    node_of: Callable[[int], TopoNode],
-    local_map_of: Callable[[list[int]], LocalMap],
-    poses: NodePoses,
-    lambda_rot: float,
-    d_thresh: float,
-    guided: GuidedConfig,
-    pose: AbsolutePoseConfig,
-    config: SharedErrorsConfig,
-) -> float:
-    """rho of the map: see above.
+def shared_errors_of(topomap: TopoMetricMap, guided: GuidedConfig, pose: AbsolutePoseConfig, config: SharedErrorsConfig) -> float:
+    """rho as the map tells it, where it was measured of these nodes and with these settings; else measured now.
 
     Args:
-        local_map_of: the pooled points of these nodes.
         guided, pose: as queries are matched and localized.
     """
-    num_nodes = len(poses.centres)
-    node_ids = np.unique(np.linspace(0, num_nodes - 1, config.num_nodes).round().astype(int))
+    known = topomap.shared_errors
+    if known is not None and known.digest == _digest(topomap, guided, pose, config):
+        return known.rho
+    return measure_shared_errors(topomap, guided, pose, config)
+
+
+def with_shared_errors(topomap: TopoMetricMap, guided: GuidedConfig, pose: AbsolutePoseConfig, config: SharedErrorsConfig) -> TopoMetricMap:
+    """The map, rho measured, so that who opens its file need not."""
+    rho = measure_shared_errors(topomap, guided, pose, config)
+    return replace(topomap, shared_errors=SharedErrors(rho, _digest(topomap, guided, pose, config)))
+
+
+def measure_shared_errors(topomap: TopoMetricMap, guided: GuidedConfig, pose: AbsolutePoseConfig, config: SharedErrorsConfig) -> float:
+    """rho of the map: see above."""
+    poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
+    lambda_rot, d_thresh = (float(topomap.config["nodes"][name]) for name in ("lambda_rot", "d_thresh"))
+    node_ids = np.unique(np.linspace(0, len(topomap.summaries) - 1, config.num_nodes).round().astype(int))
     for min_distance in config.min_distances:
         rhos = []
         for node_id in node_ids:
-            node = node_of(int(node_id))
+            node = topomap.nodes[int(node_id)]
             distances = node_distances(node.summary.world_from_cam, poses, lambda_rot)
             order = np.argsort(distances, kind="stable")
             helpers = order[distances[order] > min_distance * d_thresh][: config.num_helpers]
-            rho = _rho_of_node(node, helpers, local_map_of, guided, pose, config.min_inliers)
+            rho = _rho_of_node(node, [topomap.nodes[int(k)] for k in helpers], guided, pose, config.min_inliers)
             if rho is not None:
                 rhos.append(rho)
         if len(rhos) >= config.min_nodes:
@@ -86,19 +94,27 @@ def measure_shared_errors(
     return config.unknown
 
 
+def _digest(topomap: TopoMetricMap, guided: GuidedConfig, pose: AbsolutePoseConfig, config: SharedErrorsConfig) -> str:
+    """A short name for all that rho follows from: the settings, and the nodes by their poses and numbers of points."""
+    settings = {"guided": asdict(guided), "pose": asdict(pose), "config": asdict(config), "nodes": topomap.config["nodes"]}
+    digest = hashlib.sha256(json.dumps([_METHOD, settings], sort_keys=True).encode())
+    for summary in topomap.summaries:
+        digest.update(summary.world_from_cam.matrix().astype("<f8").tobytes() + summary.num_points.to_bytes(4, "little"))
+    return digest.hexdigest()[:16]
+
+
 def _rho_of_node(
     node: TopoNode,
-    helpers: Int[np.ndarray, " k"],
-    local_map_of: Callable[[list[int]], LocalMap],
+    helpers: list[TopoNode],
     guided: GuidedConfig,
     config: AbsolutePoseConfig,
     min_inliers: int,
 ) -> float | None:
-    """rho by which the node's pose differs from what its neighbours say; None where they do not see what it sees."""
-    if len(helpers) == 0:
+    """rho by which the node's pose differs from what its neighbours (`helpers`) say; None where they do not see what it sees."""
+    if not helpers:
         return None
     cam_from_world = node.summary.world_from_cam.inverse()
-    local_map = local_map_of([int(k) for k in helpers])
+    local_map = LocalMap.pooled([LocalMap.of_node(helper) for helper in helpers])
     matches = match_guided(node.features, local_map, cam_from_world, node.camera, guided)
     if len(matches) < min_inliers:
         return None

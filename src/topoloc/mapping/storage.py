@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import os
 import sqlite3
 import threading
@@ -15,6 +16,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
@@ -25,7 +27,7 @@ from topoloc.errors import MapError, MapVersionError, TopolocError
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.mapping.topomap import Edge, NodeSummary, PlaceImage, TopoMetricMap, TopoNode
+from topoloc.mapping.topomap import Edge, NodeSummary, PlaceImage, SharedErrors, TopoMetricMap, TopoNode
 from topoloc.places.coarse import CoarseModel
 
 APPLICATION_ID = 0x544F504F  # "TOPO", in the database's header
@@ -90,6 +92,8 @@ def _write_database(topomap: TopoMetricMap, path: Path) -> None:
         database.executescript(_SCHEMA)
         info = {"config": json.dumps(topomap.config, sort_keys=True), "length_m": json.dumps(topomap.length_m)}
         info["default_coarse"] = json.dumps(topomap.default_coarse)
+        if topomap.shared_errors is not None:
+            info["shared_errors"] = json.dumps(asdict(topomap.shared_errors))
         database.executemany("INSERT INTO map VALUES (?, ?)", info.items())
         for node in topomap.nodes:
             _insert_node(database, node)
@@ -145,7 +149,17 @@ def open_map(path: Path) -> TopoMetricMap:
             config=json.loads(info["config"]),
             length_m=float(json.loads(info["length_m"])),
             default_coarse=json.loads(info.get("default_coarse", '"surf-vlad"')),
+            shared_errors=_shared_errors_of(info),
         )
+
+
+def _shared_errors_of(info: Mapping[str, str]) -> SharedErrors | None:
+    if "shared_errors" not in info:
+        return None
+    facts = json.loads(info["shared_errors"])
+    if not 0.0 <= facts["rho"] < math.inf:
+        raise ValueError("shared errors that are no share")
+    return SharedErrors(float(facts["rho"]), str(facts["digest"]))
 
 
 # What SQLite, JSON, NumPy, its zip container and the types of this house say about bytes that are not what they should be.

@@ -71,13 +71,24 @@ class Edge:
     target_id: int
 
 
+@dataclass(frozen=True)
+class SharedErrors:
+    """rho, the share of a match's variance that the map's points have in common, as `localization/shared_errors.py` measured it.
+
+    `digest` stands for the nodes and the settings that it was measured of and with: of others it says nothing.
+    """
+
+    rho: float
+    digest: str
+
+
 @dataclass(frozen=True, eq=False)
 class TopoMetricMap:
     """The map. In a map that was loaded, every sequence and mapping reads the file only when an entry is asked for.
 
     `summaries[i]` describes `nodes[i]`, and ``nodes[i].summary.node_id == i``. `config` is the effective configuration it
     was built with, `length_m` the metres of trajectory that were mapped. `default_coarse` names the coarse localizer that answers
-    where the user names none.
+    where the user names none. `shared_errors` is None where nobody has measured them.
     """
 
     summaries: Sequence[NodeSummary]
@@ -88,6 +99,7 @@ class TopoMetricMap:
     config: Mapping[str, Any] = field(default_factory=dict)
     length_m: float = 0.0
     default_coarse: str = "surf-vlad"
+    shared_errors: SharedErrors | None = None
 
     def save(self, path: str | Path) -> None:
         """Write the map file at once or not at all. Raises MapError."""
