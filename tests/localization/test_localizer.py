@@ -11,11 +11,13 @@ import pytest
 from built_room import built_room, unseen_views
 from tiny_world import CAMERA
 from topoloc.errors import EmptyMapError, MapError, QueryError
+from topoloc.features.features import Features
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.places.coarse import NodeScore
 
 PICTURE, TRUTH = unseen_views()[2]
 
@@ -125,6 +127,24 @@ def test_a_camera_of_another_size_is_an_error(localizer: Localizer):
 def test_a_map_without_nodes_cannot_be_asked(localizer: Localizer):
     with pytest.raises(EmptyMapError, match="no nodes"):
         Localizer(replace(localizer.topomap, summaries=[], nodes=[]))
+
+
+class _FromBelow:
+    """A coarse localizer that knows nothing but the nodes' order, and was asked so often."""
+
+    num_asked = 0
+
+    def rank(self, image: np.ndarray, features: Features, num_candidates: int) -> list[NodeScore]:
+        self.num_asked += 1
+        return [NodeScore(node_id, -float(node_id)) for node_id in range(num_candidates)]
+
+
+def test_a_coarse_localizer_of_one_s_own_answers_instead_of_the_map_s(localizer: Localizer):
+    own = _FromBelow()
+    without = replace(localizer.topomap, coarse_models={})
+    result = Localizer(without, LocalizerConfig(num_candidates=2, coarse="netvlad"), coarse=own).localize(PICTURE, CAMERA)
+    assert own.num_asked == 1
+    assert [candidate.node_id for candidate in result.candidates] == [0, 1]
 
 
 def test_an_unknown_coarse_localizer_names_those_there_are(localizer: Localizer):

@@ -39,7 +39,7 @@ from topoloc.localization.verification import VerificationConfig
 from topoloc.localization.viewing import viewing_distances
 from topoloc.mapping.nodes import NodePoses
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.places.coarse import Image, NodeScore, open_coarse
+from topoloc.places.coarse import CoarseLocalizer, Image, NodeScore, open_coarse
 from topoloc.sequences.pictures import grey_image
 
 NODES_IN_MEMORY = 256
@@ -74,21 +74,21 @@ class LocalizerConfig:
 class Localizer:
     """Holds an open map, its coarse localizer and the nodes used lately.
 
+    Args:
+        coarse: names the candidate nodes instead of one of the map's own coarse localizers: any object with `CoarseLocalizer.rank`
+            (`topoloc/places/coarse.py`), such as retrieval of another kind or a prior from elsewhere. `config.coarse` is then left aside.
+
     Raises:
         EmptyMapError: the map has no node.
         MapError: the map has no such coarse localizer.
     """
 
-    def __init__(self, topomap: TopoMetricMap, config: LocalizerConfig | None = None) -> None:
+    def __init__(self, topomap: TopoMetricMap, config: LocalizerConfig | None = None, coarse: CoarseLocalizer | None = None) -> None:
         self.config = config or LocalizerConfig()
         self.topomap = topomap
         if len(topomap.summaries) == 0:
             raise EmptyMapError("the map has no nodes")
-        coarse = self.config.coarse or topomap.default_coarse
-        if coarse not in topomap.coarse_models:
-            available = ", ".join(topomap.coarse_models) or "none"
-            raise MapError(f"the map has no coarse localizer {coarse!r} (it has: {available})")
-        self._coarse = open_coarse(topomap.coarse_models[coarse])
+        self._coarse = _coarse_of(topomap, self.config.coarse or topomap.default_coarse) if coarse is None else coarse
         self._feature_config = FeatureConfig(**topomap.config["features"])
         self._node_poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
         self._lambda_rot = float(topomap.config["nodes"]["lambda_rot"])
@@ -265,6 +265,13 @@ class Localizer:
                 self._local_maps.popitem(last=False)
         self._local_maps.move_to_end(node_id)
         return self._local_maps[node_id]
+
+
+def _coarse_of(topomap: TopoMetricMap, name: str) -> CoarseLocalizer:
+    if name not in topomap.coarse_models:
+        available = ", ".join(topomap.coarse_models) or "none"
+        raise MapError(f"the map has no coarse localizer {name!r} (it has: {available})")
+    return open_coarse(topomap.coarse_models[name])
 
 
 def _usual(lens: Camera | RoughCamera) -> Camera:

@@ -53,7 +53,8 @@ def asked(bench: Bench, dataset: Dataset, label: str, way: Way) -> Done:
     sequence = queries_of(bench, dataset, label)
 
     def ask() -> list[dict[str, Any]]:
-        localizer = Localizer(topomap, replace(way.config, coarse=way.coarse))
+        config = replace(way.config, coarse=way.coarse)
+        localizer = Localizer(topomap, config)
         for i in range(min(WARM_UP, len(sequence))):
             frame = sequence[i]
             if frame.camera is not None:
@@ -61,7 +62,8 @@ def asked(bench: Bench, dataset: Dataset, label: str, way: Way) -> Done:
         told = f"{dataset.name} {label}: {way.name}"
         known = dataset.map_from_query_truth()
         if way.knows_node:
-            _tell_truth(localizer, [known @ pose for pose in sequence.poses if pose is not None])
+            truths = [known @ pose for pose in sequence.poses if pose is not None]
+            localizer = Localizer(topomap, config, _KnownNodes(topomap, truths))
         return rows_of(answer_queries(localizer, sequence, known, lambda _, done, total: bench.progress(told, done, total), label))
 
     settings = {"map": digest, "config": asdict(way.config), "knows_node": way.knows_node, "queries": sequence_digest(sequence)}
@@ -111,7 +113,7 @@ def false_accepts(bench: Bench, dataset: Dataset, way: Way) -> dict[str, int]:
 
 
 class _KnownNodes:
-    """A coarse localizer that is told the truth: the nodes nearest by Eq. 1, query after query."""
+    """A coarse localizer that is told the truth: the nodes nearest by Eq. 1, query after query. What is still wrong is not its doing."""
 
     def __init__(self, topomap: TopoMetricMap, world_from_cams: list[Rigid3]) -> None:
         self._nodes = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
@@ -121,8 +123,3 @@ class _KnownNodes:
     def rank(self, image: Any, features: Any, num_candidates: int) -> list[NodeScore]:
         distances = node_distances(next(self._truths), self._nodes, self._lambda_rot)
         return [NodeScore(int(i), -float(distances[i])) for i in np.argsort(distances, kind="stable")[:num_candidates]]
-
-
-def _tell_truth(localizer: Localizer, world_from_cams: list[Rigid3]) -> None:
-    """Put the truth in the place of the coarse localizer: what is still wrong is not its doing."""
-    localizer._coarse = _KnownNodes(localizer.topomap, world_from_cams)
