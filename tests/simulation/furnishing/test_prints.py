@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from topoloc.simulation.furnishing import interiors, prints
+from topoloc.simulation.furnishing import interiors, printed_things, prints
 from topoloc.simulation.furnishing.lettering import blank, write
 from topoloc.simulation.furnishing.pictures import painting, photograph, plot
 from topoloc.simulation.furnishing.screens import screen_content
@@ -17,13 +17,13 @@ MAKERS: dict[str, Callable[[np.random.Generator], Picture]] = {
     "poster": prints.poster,
     "notice": prints.notice,
     "notice board": prints.notice_board,
-    "door sign": prints.door_sign,
+    "door sign": printed_things.door_sign,
     "whiteboard": prints.whiteboard,
-    "carton": prints.carton,
-    "label": prints.label,
+    "carton": printed_things.carton,
+    "label": printed_things.label,
     "calendar": prints.calendar,
     "screen": screen_content,
-    "books": lambda rng: prints.book_spines(rng, [20, 31, 14]),
+    "books": lambda rng: printed_things.book_spines(rng, [20, 31, 14]),
     "photograph": lambda rng: photograph(rng, (90, 131)),
     "painting": lambda rng: painting(rng, (80, 61)),
     "plot": lambda rng: plot(rng, (80, 121)),

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from topoloc.simulation.corridor.plan import DOOR_HEIGHT, DOOR_WIDTH, HEIGHT, WALL_THICKNESS, Opening, shifted, solid
-from topoloc.simulation.furnishing import interiors, prints
+from topoloc.simulation.furnishing import interiors, printed_things
 from topoloc.simulation.noise import rng_of
 from topoloc.simulation.scene import Color, Material, Mesh, Picture, Surface
 from topoloc.simulation.shapes import box, cylinder, join, panel, placed, tube
@@ -88,7 +88,9 @@ def door_leaf(fittings: Fittings, angle: float = 0.0, name: str = "door leaf") -
 def door_plate(rng: np.random.Generator) -> list[Surface]:
     """The plate beside a door, to the left of its frame."""
     return [
-        Surface("door plate", box((-0.27, -0.008, 1.45), (-0.09, 0.0, 1.57), faces="sewtb"), interiors.laminated(prints.door_sign(rng)))
+        Surface(
+            "door plate", box((-0.27, -0.008, 1.45), (-0.09, 0.0, 1.57), faces="sewtb"), interiors.laminated(printed_things.door_sign(rng))
+        )
     ]
 
 
@@ -178,7 +180,7 @@ def extinguisher(fittings: Fittings, rng: np.random.Generator) -> list[Surface]:
     return [
         solid("extinguisher", fittings.red, body),
         solid("extinguisher valve", fittings.black, neck, grip, *hose),
-        Surface("extinguisher label", tag, interiors.printed(prints.label(rng))),
+        Surface("extinguisher label", tag, interiors.printed(printed_things.label(rng))),
         Surface("extinguisher sign", box((-0.1, -0.006, 1.7), (0.1, 0.0, 1.9), faces="sewtb"), interiors.laminated(_fire_sign())),
     ]
 

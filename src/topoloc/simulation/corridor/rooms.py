@@ -8,7 +8,7 @@ from topoloc.simulation.conditions import Condition
 from topoloc.simulation.corridor.parts import Fittings, ceiling_lamp, framed
 from topoloc.simulation.corridor.plan import DOOR_HEIGHT, DOOR_WIDTH, HEIGHT, WALL_THICKNESS, Opening, shifted, solid
 from topoloc.simulation.corridor.things import copier, paper_shelf, vending_machine, visitor_chair, waste_bin
-from topoloc.simulation.furnishing import interiors, prints
+from topoloc.simulation.furnishing import interiors, printed_things, prints
 from topoloc.simulation.noise import rng_of
 from topoloc.simulation.scene import Surface
 from topoloc.simulation.shapes import box, panel
@@ -83,7 +83,7 @@ def _office(fittings: Fittings, rng: np.random.Generator, depth: float) -> list[
     rows = []
     for level in (0.1, 0.48, 0.86, 1.24, 1.58):
         books = panel((-1.355, depth - 0.45, level + 0.26), (0.0, -1.4, 0.0), (0.0, 0.0, -0.26))
-        rows.append(Surface("books", books, interiors.printed(prints.book_spines(rng, [int(w) for w in rng.integers(14, 46, 26)]))))
+        rows.append(Surface("books", books, interiors.printed(printed_things.book_spines(rng, [int(w) for w in rng.integers(14, 46, 26)]))))
     chair = shifted(visitor_chair(fittings, rng, (0.16, 0.17, 0.2)), (0.8, depth - 1.15, 0.0))
     return [
         solid("desk", fittings.wood, top, case),

@@ -8,7 +8,7 @@ from jaxtyping import Float64
 
 from topoloc.simulation.corridor.parts import Fittings
 from topoloc.simulation.corridor.plan import shifted, solid
-from topoloc.simulation.furnishing import interiors, prints
+from topoloc.simulation.furnishing import interiors, printed_things, prints
 from topoloc.simulation.scene import Color, Material, Mesh, Picture, Surface
 from topoloc.simulation.shapes import box, cylinder, panel, placed, prism, tube
 
@@ -96,7 +96,7 @@ def cartons(rng: np.random.Generator, count: int) -> list[Surface]:
     for _ in range(count):
         w, d, h = rng.uniform(0.3, 0.48), rng.uniform(0.28, 0.4), rng.uniform(0.2, 0.38)
         carton = box((-w / 2, -d / 2, 0.0), (w / 2, d / 2, h))
-        material = interiors.printed(prints.carton(rng))
+        material = interiors.printed(printed_things.carton(rng))
         surfaces.append(Surface("carton", placed(carton, (rng.uniform(-0.03, 0.03), -0.26, level), rng.uniform(-0.15, 0.15)), material))
         level += h
     return surfaces
@@ -171,8 +171,8 @@ def paper_shelf(fittings: Fittings, rng: np.random.Generator) -> list[Surface]:
     widths = [int(w) for w in rng.integers(28, 48, 18)]
     return [
         solid("paper shelf", fittings.wood, *boards, *sides),
-        solid("paper packs", interiors.printed(prints.label(rng, (90, 150))), *packs),
-        solid("folders", interiors.printed(prints.book_spines(rng, widths)), *folders),
+        solid("paper packs", interiors.printed(printed_things.label(rng, (90, 150))), *packs),
+        solid("folders", interiors.printed(printed_things.book_spines(rng, widths)), *folders),
         *shifted(cartons(rng, 1), (-0.2, 0.04, 1.275)),
     ]
 
@@ -187,7 +187,7 @@ def vending_machine(fittings: Fittings, rng: np.random.Generator) -> list[Surfac
         solid("vending machine", interiors.plastic((0.16, 0.2, 0.32)), body),
         Surface("vending front", shown, Material("light", _goods(rng), radiance=0.12)),
         solid("vending trim", fittings.black, slot, box((0.2, -0.762, 0.9), (0.4, -0.75, 1.1))),
-        Surface("vending keys", side, interiors.printed(prints.label(rng, (150, 80)))),
+        Surface("vending keys", side, interiors.printed(printed_things.label(rng, (150, 80)))),
     ]
 
 

@@ -35,7 +35,7 @@ from topoloc.simulation.corridor.plan import (
     walls_of,
 )
 from topoloc.simulation.corridor.rooms import niche, room
-from topoloc.simulation.furnishing import interiors, prints
+from topoloc.simulation.furnishing import interiors, printed_things, prints
 from topoloc.simulation.noise import rng_of
 from topoloc.simulation.scene import Color, Material, Scene, Surface
 from topoloc.simulation.shapes import panel
@@ -170,7 +170,7 @@ def _fixtures(seed: int, walls: dict[str, Wall], fittings: Fittings) -> list[Sur
     ]
     surfaces = [surface for name, x, put_up in at for surface in on_wall(walls[name], x, put_up)]
     surfaces += shifted(parts.fire_door(fittings, NORTH), (12.6, WIDTH - NORTH / 2, 0.0))
-    picture = prints.exit_sign()
+    picture = printed_things.exit_sign()
     for x, y, yaw in ((12.35, LOOP[2][1], 0.0), (20.2, LOOP[0][1], 0.0), (LOOP[1][0], 4.6, np.pi / 2), (LOOP[0][0], 5.2, np.pi / 2)):
         surfaces += shifted(parts.hung_sign(picture, True, fittings), (x, y, 0.0), yaw)
     for x, y in _OVERHEAD:

@@ -8,7 +8,7 @@ import numpy as np
 
 from topoloc.simulation.furnishing.interiors import Finishes, laminated, painted_metal, plastic, printed, wood
 from topoloc.simulation.furnishing.lettering import vivid
-from topoloc.simulation.furnishing.prints import book_spines, carton, label
+from topoloc.simulation.furnishing.printed_things import book_spines, carton, label
 from topoloc.simulation.scene import Material, Mesh, Picture, Surface
 from topoloc.simulation.shapes import bent_tube, box, cylinder, join, lathe, panel, placed, surfaces_placed, tube, turned
 

@@ -40,7 +40,8 @@ from topoloc.simulation.furnishing.furniture import (
 )
 from topoloc.simulation.furnishing.interiors import Finishes, finishes_of, plastic, printed
 from topoloc.simulation.furnishing.pictures import photograph
-from topoloc.simulation.furnishing.prints import calendar, door_sign, exit_sign, notice, notice_board, poster
+from topoloc.simulation.furnishing.printed_things import door_sign, exit_sign
+from topoloc.simulation.furnishing.prints import calendar, notice, notice_board, poster
 from topoloc.simulation.lab.shell import CEILING_LAMPS, DARK, LENGTH, SILL, WIDTH, light_shafts, shell, sky_above
 from topoloc.simulation.lab.things import (
     computer_case,
