@@ -1,6 +1,6 @@
 """The topo-metric map of the paper (section III-A): nodes with features and their 3-D positions, edges, place images.
 
-Data only: `build.py` makes it, `storage.py` reads and writes it, `localization` asks it.
+Data only: `build.py` makes it, `storage.py` writes and `stored_map.py` reads it, `localization` asks it.
 """
 
 from __future__ import annotations
@@ -110,6 +110,6 @@ class TopoMetricMap:
     @staticmethod
     def load(path: str | Path) -> TopoMetricMap:
         """Open a map file; nodes are read when asked for. Raises MapError, MapVersionError."""
-        from topoloc.mapping.storage import open_map
+        from topoloc.mapping.stored_map import open_map
 
         return open_map(Path(path))
