@@ -42,6 +42,25 @@ def _prepare(image, x, y, half, patch, slope_x, slope_y):
 
 
 @njit(**_OPTIONS)
+def _compare(image, x, y, scale, half, patch, window):
+    """Fill `window` with the zero-mean patch around (x, y), `scale` times as large; returns its sum of squares and product with `patch`."""
+    side = 2 * half + 1
+    mean = np.float32(0)
+    for j in range(side):
+        for i in range(side):
+            window[j, i] = sample_bilinear(image, x + scale * (i - half), y + scale * (j - half))
+            mean += window[j, i]
+    mean /= side * side
+    squares, dot = np.float32(0), np.float32(0)
+    for j in range(side):
+        for i in range(side):
+            window[j, i] -= mean
+            squares += window[j, i] ** 2
+            dot += window[j, i] * patch[j, i]
+    return squares, dot
+
+
+@njit(**_OPTIONS)
 def refine_tracks(reference, image, points_ref, points, scales, half, num_iterations, max_shift, first, last, refined, scores):
     """Fill `refined` and `scores` for the rows first .. last - 1.
 
@@ -74,18 +93,7 @@ def refine_tracks(reference, image, points_ref, points, scales, half, num_iterat
             if not (x >= margin and y >= margin and x < width - margin - 1 and y < height - margin - 1):
                 scores[n] = np.float32(-1)
                 break
-            mean = np.float32(0)
-            for j in range(side):
-                for i in range(side):
-                    window[j, i] = sample_bilinear(image, x + scale * (i - half), y + scale * (j - half))
-                    mean += window[j, i]
-            mean /= side * side
-            squares, dot = np.float32(0), np.float32(0)
-            for j in range(side):
-                for i in range(side):
-                    window[j, i] -= mean
-                    squares += window[j, i] ** 2
-                    dot += window[j, i] * patch[j, i]
+            squares, dot = _compare(image, x, y, scale, half, patch, window)
             if squares < 1.0:
                 scores[n] = np.float32(-1)
                 break
