@@ -7,7 +7,10 @@ from pathlib import Path
 import pytest
 
 from topoloc.errors import TopolocError
-from topoloc.evaluation.paper.stages import StageStore, code_digest
+from topoloc.evaluation.paper.stage_code import StageCode
+from topoloc.evaluation.paper.stages import StageStore
+
+RIGID = StageCode(("geometry/rigid.py",))
 
 
 class Counter:
@@ -21,18 +24,18 @@ class Counter:
 
 def test_a_stage_is_done_once_and_found_by_the_next_run(tmp_path: Path):
     work = Counter()
-    first = StageStore(tmp_path).get("map", {"d_thresh": 2.0}, work)
-    again = StageStore(tmp_path).get("map", {"d_thresh": 2.0}, work)
+    first = StageStore(tmp_path).get("map", {"d_thresh": 2.0}, work, RIGID)
+    again = StageStore(tmp_path).get("map", {"d_thresh": 2.0}, work, RIGID)
     assert work.calls == 1
     assert first == again
 
 
-@pytest.mark.parametrize(("settings", "floors"), [({"d_thresh": 1.0}, ("geometry",)), ({"d_thresh": 2.0}, ("features",))])
-def test_other_settings_or_other_code_are_another_result(tmp_path: Path, settings: dict[str, float], floors: tuple[str, ...]):
+@pytest.mark.parametrize(("settings", "code"), [({"d_thresh": 1.0}, RIGID), ({"d_thresh": 2.0}, StageCode(("features/sift.py",)))])
+def test_other_settings_or_other_code_are_another_result(tmp_path: Path, settings: dict[str, float], code: StageCode):
     work = Counter()
     store = StageStore(tmp_path)
-    first = store.get("map", {"d_thresh": 2.0}, work, ("geometry",))
-    other = store.get("map", settings, work, floors)
+    first = store.get("map", {"d_thresh": 2.0}, work, RIGID)
+    other = store.get("map", settings, work, code)
     assert other.result == {"calls": 2}
     assert other.digest != first.digest
 
@@ -45,13 +48,13 @@ def test_a_lost_file_or_a_damaged_stage_is_made_again(tmp_path: Path):
         file.write_text("map")
         return work()
 
-    store.get("map", {}, write, files=[file])
-    store.get("map", {}, write, files=[file])
+    store.get("map", {}, write, RIGID, files=[file])
+    store.get("map", {}, write, RIGID, files=[file])
     assert work.calls == 1
     file.unlink()
-    store.get("map", {}, write, files=[file])
+    store.get("map", {}, write, RIGID, files=[file])
     (tmp_path / "stages" / "map.json").write_text('{"origin": ')
-    store.get("map", {}, write, files=[file])
+    store.get("map", {}, write, RIGID, files=[file])
     assert work.calls == 3
     assert (store.num_done, store.num_kept) == (3, 1)
 
@@ -63,10 +66,5 @@ def test_a_stage_that_fails_leaves_nothing(tmp_path: Path):
         raise TopolocError("no")
 
     with pytest.raises(TopolocError):
-        store.get("map", {}, fail)
+        store.get("map", {}, fail, RIGID)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_the_code_of_a_module_counts_alone():
-    assert code_digest(("evaluation/posenet.py",)) != code_digest(("evaluation/pose_losses.py",))
-    assert code_digest(("geometry",)) != code_digest(("geometry", "features"))

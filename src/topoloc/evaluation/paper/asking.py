@@ -5,20 +5,16 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-import numpy as np
-
 from topoloc.evaluation.experiments import answer_elsewhere, answer_queries
 from topoloc.evaluation.metrics import Answer, summarize
 from topoloc.evaluation.paper.datasets import Dataset
+from topoloc.evaluation.paper.known_nodes import KnownNodes
 from topoloc.evaluation.paper.maps import MapKind, opened
 from topoloc.evaluation.paper.settings import Bench, evenly, sequence_digest
+from topoloc.evaluation.paper.stage_code import StageCode, asking
 from topoloc.evaluation.paper.stages import Done, digest_of
 from topoloc.evaluation.paper.stored_answers import answers_of, rows_of
-from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.mapping.nodes import NodePoses, node_distances
-from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.places.coarse import NodeScore
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import open_sequence
 from topoloc.sequences.selection import sequence_subset
@@ -42,6 +38,11 @@ class Way:
         coarse = "known-node" if self.knows_node else self.coarse
         return f"{self.kind.name}-{coarse}" + (f"-{digest_of(asdict(self.config))[:6]}" if special else "")
 
+    @property
+    def code(self) -> StageCode:
+        """What its answers follow from."""
+        return asking(self.coarse, *(("evaluation/paper/known_nodes.py",) if self.knows_node else ()))
+
 
 def asked(bench: Bench, dataset: Dataset, label: str, way: Way) -> Done:
     """Rows (`stored_answers`) of every query of one recording.
@@ -63,11 +64,11 @@ def asked(bench: Bench, dataset: Dataset, label: str, way: Way) -> Done:
         known = dataset.map_from_query_truth()
         if way.knows_node:
             truths = [known @ pose for pose in sequence.poses if pose is not None]
-            localizer = Localizer(topomap, config, _KnownNodes(topomap, truths))
+            localizer = Localizer(topomap, config, KnownNodes(topomap, truths))
         return rows_of(answer_queries(localizer, sequence, known, lambda _, done, total: bench.progress(told, done, total), label))
 
     settings = {"map": digest, "config": asdict(way.config), "knows_node": way.knows_node, "queries": sequence_digest(sequence)}
-    return bench.store.get(f"answers-{dataset.name}-{label.replace(' ', '_')}-{way.name}", settings, ask)
+    return bench.store.get(f"answers-{dataset.name}-{label.replace(' ', '_')}-{way.name}", settings, ask, way.code)
 
 
 def answers(bench: Bench, dataset: Dataset, label: str, way: Way) -> list[Answer]:
@@ -109,17 +110,4 @@ def false_accepts(bench: Bench, dataset: Dataset, way: Way) -> dict[str, int]:
         return {"num_elsewhere": len(given), "accepted": sum(a.result.localized for a in given)}
 
     settings = {"map": digest, "config": asdict(way.config), "others": [sequence_digest(s) for _, s in others]}
-    return bench.store.get(f"elsewhere-{dataset.name}-{way.name}", settings, ask).result
-
-
-class _KnownNodes:
-    """A coarse localizer that is told the truth: the nodes nearest by Eq. 1, query after query. What is still wrong is not its doing."""
-
-    def __init__(self, topomap: TopoMetricMap, world_from_cams: list[Rigid3]) -> None:
-        self._nodes = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
-        self._lambda_rot = float(topomap.config["nodes"]["lambda_rot"])
-        self._truths = iter(world_from_cams)
-
-    def rank(self, image: Any, features: Any, num_candidates: int) -> list[NodeScore]:
-        distances = node_distances(next(self._truths), self._nodes, self._lambda_rot)
-        return [NodeScore(int(i), -float(distances[i])) for i in np.argsort(distances, kind="stable")[:num_candidates]]
+    return bench.store.get(f"elsewhere-{dataset.name}-{way.name}", settings, ask, way.code).result

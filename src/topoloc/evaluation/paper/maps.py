@@ -13,7 +13,8 @@ import numpy as np
 from topoloc.errors import MissingExtraError
 from topoloc.evaluation.paper.datasets import Dataset
 from topoloc.evaluation.paper.settings import LEARNED, Bench, sequence_digest
-from topoloc.evaluation.paper.stages import LEARNING_CODE, MAPPING_FLOORS, Done, digest_of
+from topoloc.evaluation.paper.stage_code import COARSE_MODULES, MAPPING, learning
+from topoloc.evaluation.paper.stages import Done, digest_of
 from topoloc.evaluation.paper.stored_answers import pose_json
 from topoloc.features.extraction import FeatureConfig
 from topoloc.mapping.build import BuildConfig, build_map
@@ -81,7 +82,7 @@ def built(bench: Bench, dataset: Dataset, kind: MapKind) -> Done:
         return facts | {"bytes": path.stat().st_size, "place_bytes": place_bytes, "nodes": nodes}
 
     settings = {"config": asdict(kind.config()), "recordings": [sequence_digest(sequence) for sequence in sequences]}
-    return bench.store.get(f"map-{name}", settings, build, MAPPING_FLOORS, [path])
+    return bench.store.get(f"map-{name}", settings, build, MAPPING, [path])
 
 
 def taught(bench: Bench, dataset: Dataset, kind: MapKind, method: str) -> Done:
@@ -113,7 +114,7 @@ def taught(bench: Bench, dataset: Dataset, kind: MapKind, method: str) -> Done:
             checkpoint.unlink(missing_ok=True)
         return {"settings": dict(model.settings), "bytes": target.stat().st_size}
 
-    return bench.store.get(f"coarse-{dataset.name}-{kind.name}-{method}", settings, train, LEARNING_CODE, [target])
+    return bench.store.get(f"coarse-{dataset.name}-{kind.name}-{method}", settings, train, learning(COARSE_MODULES[method]), [target])
 
 
 def opened(bench: Bench, dataset: Dataset, kind: MapKind, method: str = "surf-vlad") -> tuple[TopoMetricMap, str]:

@@ -15,7 +15,7 @@ from topoloc.evaluation.paper.peer_colmap import Colmap
 from topoloc.evaluation.paper.peer_paper_step import PaperStep
 from topoloc.evaluation.paper.peer_retrieval import Retrieval
 from topoloc.evaluation.paper.settings import Bench, sequence_digest
-from topoloc.evaluation.paper.stages import ASKING_FLOORS
+from topoloc.evaluation.paper.stage_code import answering
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.sequences.frame import StereoFrame
 
@@ -78,8 +78,7 @@ def _peer_rows(bench: Bench, dataset: Dataset, name: str, kind: MapKind) -> list
     heads = [_head(dataset, label, name, kind) for label in dataset.queries]
     try:
         stage = f"peer-{dataset.name}-{kind.name}-{name.replace(' ', '_').replace(',', '').replace(chr(39), '')}"
-        code = (*ASKING_FLOORS, *(f"evaluation/paper/{module}.py" for module in _CODE[name]))
-        result = bench.store.get(stage, settings, ask, code).result
+        result = bench.store.get(stage, settings, ask, answering(*_CODE[name])).result
     except MissingExtraError as error:
         return [head | {"missing": str(error)} for head in heads]
     elsewhere = result["elsewhere"]
@@ -110,7 +109,7 @@ _MAKERS: dict[str, Callable[[Bench, Dataset, MapKind], Peer]] = {
     "retrieval only": lambda bench, dataset, kind: Retrieval(_opened(bench, dataset, kind)),
 }
 _CODE: dict[str, Sequence[str]] = {
-    "the paper's step": ("peer_paper_step", "peer_retrieval"),
-    "pycolmap, SIFT": ("peer_colmap", "colmap_worker", "peer_retrieval"),
-    "retrieval only": ("peer_retrieval",),
+    "the paper's step": ("evaluation/paper/peer_paper_step.py",),
+    "pycolmap, SIFT": ("evaluation/paper/peer_colmap.py", "evaluation/paper/colmap_worker.py"),
+    "retrieval only": ("evaluation/paper/peer_retrieval.py",),
 }

@@ -16,7 +16,8 @@ from topoloc.evaluation.paper.asking import queries_of
 from topoloc.evaluation.paper.datasets import Dataset
 from topoloc.evaluation.paper.maps import MapKind, built, path_of
 from topoloc.evaluation.paper.settings import Bench, sequence_digest
-from topoloc.evaluation.paper.stages import LEARNING_CODE, Done, digest_of
+from topoloc.evaluation.paper.stage_code import learning
+from topoloc.evaluation.paper.stages import Done, digest_of
 from topoloc.evaluation.paper.stored_answers import pose_json, pose_of
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.mapping.topomap import TopoMetricMap
@@ -25,7 +26,7 @@ from topoloc.places.classifier_config import PictureConfig
 if TYPE_CHECKING:
     from topoloc.evaluation.posenet import PoseNet, PoseNetConfig
 
-_CODE = (*LEARNING_CODE, "evaluation/posenet.py", "evaluation/pose_losses.py")
+_CODE = learning("evaluation/posenet.py")
 
 
 def trained(bench: Bench, dataset: Dataset) -> Done:

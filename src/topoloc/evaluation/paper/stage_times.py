@@ -14,6 +14,7 @@ from topoloc.evaluation.paper.datasets import Dataset
 from topoloc.evaluation.paper.maps import MapKind, opened, why_not
 from topoloc.evaluation.paper.published import TABLE_THREE
 from topoloc.evaluation.paper.settings import LEARNED, Bench, sequence_digest
+from topoloc.evaluation.paper.stage_code import COARSE_MODULES, asking
 from topoloc.localization.localizer import Localizer
 from topoloc.mapping.topomap import TopoMetricMap
 
@@ -64,7 +65,7 @@ def _rows(bench: Bench, dataset: Dataset) -> list[dict[str, Any]]:
         return {"times": {method: _quartiles(rows) for method, rows in kept.items()}, "num_queries": len(sequence), "load": load}
 
     settings = {"maps": {method: digest for method, (_, digest) in maps.items()}, "queries": sequence_digest(sequence)}
-    done = bench.store.get(f"times-{dataset.name}", settings, ask).result
+    done = bench.store.get(f"times-{dataset.name}", settings, ask, asking("surf-vlad", *(COARSE_MODULES[method] for method in maps))).result
     facts = {"num_queries": done["num_queries"], "load": done["load"]}
     return [head | ({"quartiles_s": done["times"][method]} | facts if method in maps else {}) for method, head in heads.items()]
 

@@ -1,7 +1,7 @@
 """Stages whose results are kept: a run that was interrupted, or is asked again, goes on from what is there.
 
 A stage is one JSON file, written when it is done, with all that its result follows from: its settings (which name the stages
-that it builds on) and the code of the floors that it runs. Where either has changed it is done again.
+that it builds on) and the code that it runs (`stage_code.py`). Where either has changed it is done again.
 """
 
 from __future__ import annotations
@@ -11,17 +11,12 @@ import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
-import topoloc
 from topoloc.errors import TopolocError
+from topoloc.evaluation.paper.stage_code import StageCode
 from topoloc.sequences.atomic import write_text
-
-MAPPING_FLOORS = ("features", "geometry", "mapping", "places", "sequences", "slam")
-LEARNING_CODE = ("places", "mapping/coarse_training.py")
-ASKING_FLOORS = (*MAPPING_FLOORS, "localization")
 
 
 @dataclass(frozen=True)
@@ -52,17 +47,16 @@ class StageStore:
         name: str,
         settings: Mapping[str, Any],
         compute: Callable[[], Any],
-        floors: Sequence[str] = ASKING_FLOORS,
+        code: StageCode,
         files: Sequence[Path] = (),
     ) -> Done:
         """The result of the stage `name`: the kept one if it follows from the same, else that of `compute`, as JSON gives it back.
 
         Args:
-            floors: packages or modules of topoloc, as paths, whose code the result depends on.
             files: what the stage writes beside its result; where one is missing it is done again.
         """
         path = self.folder / f"{name}.json"
-        origin = json.loads(json.dumps({"settings": settings, "code": code_digest(tuple(floors))}))
+        origin = json.loads(json.dumps({"settings": settings, "code": code.digest()}))
         kept = _read(path)
         if kept is not None and kept.get("origin") == origin and all(file.exists() for file in files):
             self.num_kept += 1
@@ -78,17 +72,6 @@ class StageStore:
 def digest_of(value: Any) -> str:
     """A short name for a JSON value, the same for equal values."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
-
-
-@cache
-def code_digest(floors: tuple[str, ...]) -> str:
-    """A short name for the code of these packages (or modules, by their path) of topoloc as it is now."""
-    root = Path(topoloc.__file__).parent
-    digest = hashlib.sha256()
-    for floor in floors:
-        for path in [root / floor] if (root / floor).is_file() else sorted((root / floor).rglob("*.py")):
-            digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
-    return digest.hexdigest()[:16]
 
 
 def _read(path: Path) -> dict[str, Any] | None:
