@@ -5,9 +5,20 @@
 Maps one recording (or part of one) and streams another: 7-Scenes' kitchen, one frame in four mapped and the others streamed; the
 ZED camera's second session in a map of its first; the demo's lab by day, pictures half a second apart. Further pairs are
 named by `--stream`.
-Errors are those of the smoothed pose against the recording's truth, jitter is the root mean square of the error of the step
-from frame to frame, for the stream and for the same pictures localized one by one. Where the truth trembles itself
-(7-Scenes), so does every figure of jitter. Milliseconds are processor time of one process, which a busy machine does not change.
+Errors are those of the smoothed pose against the recording's truth, "inside" counts those within the 95 % ellipsoid of its covariance.
+Jitter is the root mean square of the error of the step from frame to frame, for the stream and for the same pictures localized one by one.
+Milliseconds are processor time of one process, which a busy machine does not change.
+
+Where the truth trembles itself (7-Scenes, ZED), a jitter measured against it is the truth's as well. So where the streamed
+recording has a second view or depth, which the tracker does not get, SLAM says what the steps were, from corners and depths of its own:
+
+- the same share of jitters is given against SLAM's steps, and beside it what the truth's steps would get: nothing is subtracted
+  here, but SLAM's own errors are in both jitters, and it sees the noise of the same pictures;
+- three witnesses of the same steps whose errors are independent tell how large each one's are (the three-cornered hat: Gray and
+  Allan, *A method for estimating the frequency stability of an individual oscillator*, 1974). With the truth, SLAM and the single
+  pictures that gives the trembling of the truth, which is then taken out of both jitters. What pictures and SLAM are wrong by
+  together counts as the truth's. The numbers after +- are standard errors (jackknife, ten pieces of the stream): where they are
+  large, the witnesses cannot tell.
 """
 
 from __future__ import annotations
@@ -17,6 +28,7 @@ import json
 import os
 import time
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,7 +45,9 @@ from topoloc.mapping.build import build_map
 from topoloc.sequences.frame import StereoFrame
 from topoloc.sequences.open import open_sequence
 from topoloc.sequences.recording import single_pictures
+from topoloc.slam.slam import run_slam
 
+CHI_SQUARE_6_AT_95 = 12.592
 DEMO = Path(__file__).parents[1] / "src" / "topoloc" / "simulation" / "lab_demo"
 
 
@@ -95,7 +109,9 @@ def judge(pair: Pair) -> None:
     ratio = jitter_mm(smoothed, truths) / jitter_mm(alone, truths)
     row("share of frames with a measured pose", ">= 99 %", f"{100 * np.mean(measured):.1f} %")
     row("largest error", "<= 0.5 m", f"{max(errors):.3f} m")
+    row("smoothed poses inside their 95 % ellipsoid", "88-99 %", f"{100 * share_inside(answers, truths):.1f} %")
     row("jitter, share of that of single pictures", "<= 0.5", f"{ratio:.2f}")
+    report_trembling(smoothed, alone, truths, motion_of_camera(pair))
     row("processor time of a tracked frame, median", "<= 12 ms", f"{np.median(tracked):.1f} ms" if tracked else "none tracked")
     row("processor time of all frames, mean", "", f"{np.mean(cpu_ms):.1f} ms")
     row("frames a second, pictures in memory", "", f"{len(frames) / seconds:.1f}")
@@ -125,15 +141,70 @@ def stream(localizer: Localizer, frames: list[StereoFrame], config: TrackerConfi
     return answers, cpu_ms, time.perf_counter() - start
 
 
-def jitter_mm(poses: list[Rigid3 | None], truths: list[Rigid3]) -> float:
-    """Root mean square of the error of each step between two frames that both have a pose, millimetres."""
-    errors = []
+def step_errors(poses: Sequence[Rigid3 | None], truths: Sequence[Rigid3 | None]) -> np.ndarray:
+    """Distance (metres) between the steps of both, of each frame from the one before; NaN where one of the four poses is missing."""
+    errors = np.full(len(poses) - 1, np.nan)
     for k in range(1, len(poses)):
-        before, after = poses[k - 1], poses[k]
-        if before is not None and after is not None:
-            step, truth = before.inverse() @ after, truths[k - 1].inverse() @ truths[k]
-            errors.append(np.linalg.norm((truth.inverse() @ step).translation))
-    return 1e3 * float(np.sqrt(np.mean(np.square(errors))))
+        before, after, truth_before, truth_after = poses[k - 1], poses[k], truths[k - 1], truths[k]
+        if before is not None and after is not None and truth_before is not None and truth_after is not None:
+            step, truth = before.inverse() @ after, truth_before.inverse() @ truth_after
+            errors[k - 1] = np.linalg.norm((truth.inverse() @ step).translation)
+    return errors
+
+
+def jitter_mm(poses: Sequence[Rigid3 | None], truths: Sequence[Rigid3 | None]) -> float:
+    """Root mean square of the errors of the steps, millimetres."""
+    return 1e3 * float(np.sqrt(np.nanmean(np.square(step_errors(poses, truths)))))
+
+
+def share_inside(answers: list[StreamedPose], truths: list[Rigid3]) -> float:
+    """Of the smoothed poses, those whose error is within the 95 % ellipsoid of their covariance."""
+    squares = []
+    for answer, truth in zip(answers, truths, strict=True):
+        if answer.smoothed is not None and answer.smoothed_covariance is not None:
+            error = (truth @ answer.smoothed.inverse()).log()
+            squares.append(error @ np.linalg.solve(answer.smoothed_covariance, error))
+    return float(np.mean(np.array(squares) < CHI_SQUARE_6_AT_95))
+
+
+def motion_of_camera(pair: Pair) -> list[Rigid3 | None] | None:
+    """SLAM's pose of each streamed frame that has a truth, in a world of its own; None where there are single pictures only."""
+    sequence = open_sequence(pair.streamed)
+    first = sequence[0]
+    if first.right is None and first.depth is None:
+        return None
+    poses = run_slam(sequence).poses[0]
+    return [pose for pose, truth in zip(poses, sequence.poses, strict=True) if truth is not None]
+
+
+def report_trembling(
+    smoothed: list[Rigid3 | None], alone: list[Rigid3 | None], truths: list[Rigid3], camera: list[Rigid3 | None] | None
+) -> None:
+    """Jitter where the truth is not what limits it; see above."""
+    if camera is None:
+        row("the same without the trembling of the truth", "<= 0.5", "single pictures only: not known")
+        return
+    pairs = [(smoothed, truths), (alone, truths), (alone, camera), (truths, camera), (smoothed, camera)]
+    squares = np.array([np.square(1e3 * step_errors(*pair)) for pair in pairs])
+    squares = squares[:, np.all(np.isfinite(squares), axis=0)]
+    _, _, by_slam, of_truth, of_stream = np.sqrt(squares.mean(axis=1))
+    row("the same against SLAM's steps", "<= 0.5", f"{of_stream / by_slam:.2f} (the truth's own: {of_truth / by_slam:.2f})")
+    pieces = np.array_split(np.arange(squares.shape[1]), 10)
+    errors = np.sqrt((len(pieces) - 1) * np.var([_hat(np.delete(squares, piece, axis=1)) for piece in pieces], axis=0))
+    shown = [f"{value:.1f} +- {error:.1f} mm^2" for value, error in zip(_hat(squares), errors, strict=True)]
+    row("trembling of the truth, squared", "", shown[0])
+    row("squared jitter without it, stream", "", shown[1])
+    row("squared jitter without it, single pictures", "", shown[2])
+    row("the same without the trembling of the truth", "<= 0.5", f"{_hat(squares)[3]:.2f} +- {errors[3]:.2f}")
+
+
+def _hat(squares: np.ndarray) -> np.ndarray:
+    """Mean squared errors (mm^2) of truth, stream and single pictures from the squared differences of `report_trembling`, and
+    the share of the stream's jitter."""
+    stream_truth, alone_truth, alone_camera, truth_camera, _ = squares.mean(axis=1)
+    truth = (alone_truth + truth_camera - alone_camera) / 2.0
+    stream, alone = stream_truth - truth, alone_truth - truth
+    return np.array([truth, stream, alone, np.sqrt(max(stream, 0.0) / alone) if alone > 0 else np.nan])
 
 
 def report_poses(name: str, poses: list[Rigid3 | None], truths: list[Rigid3]) -> None:

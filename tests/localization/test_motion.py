@@ -40,6 +40,17 @@ def test_a_steady_motion_is_predicted():
     assert rotation_error(predicted.world_from_cam, truth) < 0.005
 
 
+def test_a_wrong_velocity_is_forgotten_where_poses_are_exact_and_times_uneven():
+    exact = np.diag(np.full(6, 1e-12))
+    state = start_motion(0, pose_at(0.0), exact, CONFIG)
+    state = MotionState(0, state.world_from_cam, VELOCITY + np.array([2.0, 0.0, 0.0, 0.0, 0.0, 0.0]), np.diag(np.repeat([1e-12, 1.0], 6)))
+    t_ns = 0
+    for number in range(40):
+        t_ns += (5 if number % 2 else 10) * STEP_NS
+        state = update_motion(predict_motion(state, t_ns, CONFIG), pose_at(t_ns / 1e9), exact)
+    np.testing.assert_allclose(state.velocity, VELOCITY, atol=1e-3)
+
+
 def test_an_unmeasured_camera_becomes_less_certain_and_stays_after_a_second():
     state = followed(20)
     sigmas = [np.sqrt(np.trace(predict_motion(state, state.t_ns + k * STEP_NS, CONFIG).pose_covariance)) for k in range(1, 60)]
@@ -54,7 +65,7 @@ def test_surprise_tells_noise_from_a_jump_whatever_the_origin():
     assert surprise(state, truth, SIGMA) < 33.0
     aside = truth @ Rigid3(np.eye(3), np.array([0.3, 0.0, 0.0]))
     turned = truth @ Rigid3(exp_so3(np.array([0.0, 0.2, 0.0])), np.zeros(3))
-    assert min(surprise(state, aside, SIGMA), surprise(state, turned, SIGMA)) > 100.0
+    assert min(surprise(state, aside, SIGMA), surprise(state, turned, SIGMA)) > 66.0
 
 
 def test_a_camera_seen_once_may_be_on_a_car():

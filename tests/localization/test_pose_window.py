@@ -27,17 +27,17 @@ def test_noise_shrinks_with_the_number_of_pictures():
     for truth in truths(60):
         measured = Rigid3.exp(rng.multivariate_normal(np.zeros(6), MEASURED)) @ truth
         step = Rigid3.exp(rng.multivariate_normal(np.zeros(6), MOVED)) @ STEP
-        smoothed.append(translation_error(window.add(measured, MEASURED, step, MOVED).inverse(), truth.inverse()))
+        smoothed.append(translation_error(window.add(measured, MEASURED, step, MOVED)[0].inverse(), truth.inverse()))
         raw.append(translation_error(measured.inverse(), truth.inverse()))
     assert np.mean(smoothed[10:]) < 0.5 * np.mean(raw[10:])
 
 
 def test_an_outlier_is_outvoted():
-    window = PoseWindow(PoseWindowConfig())
+    window, smoothed = PoseWindow(PoseWindowConfig()), FIRST
     for number, truth in enumerate(truths(8)):
         wrong = Rigid3(np.eye(3), np.array([0.5, 0.0, 0.0])) if number == 7 else Rigid3.identity()
-        smoothed = window.add(wrong @ truth, MEASURED, STEP, MOVED)
-    assert translation_error(smoothed.inverse(), truth.inverse()) < 0.02
+        smoothed, _ = window.add(wrong @ truth, MEASURED, STEP, MOVED)
+    assert translation_error(smoothed.inverse(), truths(8)[-1].inverse()) < 0.02
 
 
 def test_a_cleared_window_begins_where_it_is_told():
@@ -46,4 +46,21 @@ def test_a_cleared_window_begins_where_it_is_told():
         window.add(truth, MEASURED, STEP, MOVED)
     window.clear()
     elsewhere = Rigid3(np.eye(3), np.array([-20.0, 0.0, 0.0]))
-    assert translation_error(window.add(elsewhere, MEASURED, STEP, MOVED), elsewhere) < 1e-6
+    smoothed, covariance = window.add(elsewhere, MEASURED, STEP, MOVED)
+    assert translation_error(smoothed, elsewhere) < 1e-6
+    np.testing.assert_array_equal(covariance, MEASURED)
+
+
+def test_the_covariance_is_that_of_the_errors():
+    rng = np.random.default_rng(2)
+    squares = []
+    for _ in range(40):
+        window, smoothed, covariance = PoseWindow(PoseWindowConfig()), FIRST, MEASURED
+        for truth in truths(8):
+            measured = Rigid3.exp(rng.multivariate_normal(np.zeros(6), MEASURED)) @ truth
+            step = Rigid3.exp(rng.multivariate_normal(np.zeros(6), MOVED)) @ STEP
+            smoothed, covariance = window.add(measured, MEASURED, step, MOVED)
+        error = (truths(8)[-1] @ smoothed.inverse()).log()
+        squares.append(error @ np.linalg.solve(covariance, error))
+    # mean of 40 times 6 squared normals: 6 with a standard error of 0.55
+    assert 4.4 < np.mean(squares) < 7.7

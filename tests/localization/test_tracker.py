@@ -97,6 +97,20 @@ def test_the_smoothed_covariance_is_of_the_size_of_the_error(answers: list[Strea
         assert error @ np.linalg.solve(answer.smoothed_covariance, error) < 33.0
 
 
+def test_what_the_map_is_wrong_by_is_no_noise(tiny_recording: Path, answers: list[StreamedPose]):
+    """A map that says more of its own errors is followed as closely, and the answers say as much more."""
+    doubtful = Localizer(built_room(tiny_recording))
+    vars(doubtful)["shared_errors"] = 0.5
+    others = _stream(Tracker(doubtful), 0, 30)
+    for other, answer in zip(others, answers, strict=False):
+        assert translation_error(_smoothed(other), _smoothed(answer)) < 0.01
+        assert other.smoothed_covariance is not None
+        assert answer.smoothed_covariance is not None
+        assert np.trace(other.smoothed_covariance) > 10 * np.trace(answer.smoothed_covariance)
+    for other, (_, _, truth) in zip(others[10:], room_stream()[10:], strict=False):
+        assert translation_error(_smoothed(other), truth) < 0.02
+
+
 def test_what_cannot_be_seen_is_predicted_and_said_to_be_then_lost_then_found(localizer: Localizer):
     tracker = Tracker(localizer)
     _stream(tracker, 0, 10)

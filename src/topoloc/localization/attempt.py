@@ -95,7 +95,8 @@ def judge(
         return Judgement(NotLocalized("too_few_matches", candidates, len(first.matches), 0, clock.times_ms()), final)
     if first.pose is None or final.pose is None or first.num_inliers < config.min_inliers or final.num_inliers < config.min_found:
         return Judgement(NotLocalized("too_few_inliers", candidates, num_matches, final.num_inliers, clock.times_ms()), final)
-    covariance = inflation(final.num_inliers, shared_errors) * final.pose.covariance
+    inflated = inflation(final.num_inliers, shared_errors)
+    covariance = inflated * final.pose.covariance
     evidence = _evidence(first, final, covariance, guided, config)
     log_odds, probability = log_odds_of(evidence, config), probability_of(evidence, config)
     if probability < config.min_probability:
@@ -116,6 +117,7 @@ def judge(
         times_ms=clock.times_ms(),
         evidence=evidence,
         focal_length_px=final.camera.fx if isinstance(final.lens, RoughCamera) else None,
+        noise_share=1.0 / inflated,
     )
     return Judgement(answer, final, evidence, log_odds)
 

@@ -65,12 +65,14 @@ def predict_motion(state: MotionState, t_ns: int, config: MotionConfig, before_f
     transition = np.eye(12)
     transition[:6, :6] = step.inverse().adjoint()
     acceleration = np.diag(np.repeat([config.sigma_acceleration**2, config.sigma_angular_acceleration**2], 3))
+    # A white acceleration, which leads as far in a step as one that is constant throughout. Constant it must not be: pose and velocity
+    # would be tied so firmly that an error of the velocity turned its sign with each exact pose and never faded.
     noise = np.zeros((12, 12))
-    noise[6:, 6:] = seconds**2 * acceleration
+    noise[6:, 6:] = 0.75 * seconds**2 * acceleration
     if before_from_cam is None:
         transition[:6, 6:] = min(seconds, config.max_step) * np.eye(6)
         noise[:6, :6] = seconds**4 / 4.0 * acceleration
-        noise[:6, 6:] = noise[6:, :6] = seconds**3 / 2.0 * acceleration
+        noise[:6, 6:] = noise[6:, :6] = seconds**3 * 3.0 / 8.0 * acceleration
         velocity = state.velocity
     else:
         way, turn = float(np.linalg.norm(step.translation)), step.angle()

@@ -42,6 +42,7 @@ class PoseWindow:
         self._config = config
         self._entries: deque[_Entry] = deque(maxlen=config.size)
         self._smoothed: deque[Rigid3] = deque(maxlen=config.size)
+        self._covariance = np.zeros((6, 6))  # of the last one of these
 
     def clear(self) -> None:
         self._entries.clear()
@@ -53,13 +54,17 @@ class PoseWindow:
         covariance: Float[np.ndarray, "6 6"],
         cam_from_before: Rigid3,
         motion_covariance: Float[np.ndarray, "6 6"],
-    ) -> Rigid3:
-        """The smoothed cam_from_world of a picture that was localized at `cam_from_world`, `cam_from_before` after the last one added.
-
-        A motion that is known no better than the picture's own pose says nothing of it: the window then begins anew.
+    ) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
+        """The smoothed cam_from_world of a picture that was localized at `cam_from_world`, `cam_from_before` after the last one
+        added, and the covariance of its left perturbation.
         """
-        if np.trace(motion_covariance) >= np.trace(covariance):
-            self.clear()
+        if self._smoothed:
+            adjoint = cam_from_before.adjoint()
+            before = adjoint @ self._covariance @ adjoint.T + motion_covariance
+            both = before @ np.linalg.solve(before + covariance, covariance)
+            self._covariance = (both + both.T) / 2.0  # symmetric but for rounding
+        else:
+            self._covariance = covariance
         self._smoothed.append(cam_from_before @ self._smoothed[-1] if self._smoothed else cam_from_world)
         self._entries.append(_Entry(cam_from_world, covariance, cam_from_before, motion_covariance))
         edges = [Edge(0, k, entry.cam_from_world, entry.covariance, is_loop=True) for k, entry in enumerate(self._entries, start=1)]
@@ -70,4 +75,4 @@ class PoseWindow:
         ]
         poses = optimise_graph([Rigid3.identity(), *self._smoothed], edges, self._config.graph)
         self._smoothed = deque(poses[1:], maxlen=self._config.size)
-        return self._smoothed[-1]
+        return self._smoothed[-1], self._covariance

@@ -22,7 +22,8 @@ class Localization:
     `covariance` (6, 6) is that of the left perturbation xi of world_from_cam, ``true_world_from_cam = exp(xi) @ world_from_cam``:
     order (translation, rotation), metres and radians, axes of the world. It counts the noise of the image, the uncertainty of each map
     point, and what the map's points are wrong by together (`shared_errors.py`). Its translation part is that of the world's origin,
-    as it is moved by xi; `camera_covariance` is that of the camera itself.
+    as it is moved by xi; `camera_covariance` is that of the camera itself. `noise_share` of it differs from picture to picture; the rest
+    is the map's, and a picture taken close by shares it.
 
     `probability` is that of the pose being within 0.25 m and 2 degrees, or within 5 % of the distance of what is seen where that is
     less than 0.25 m; weighed from `evidence`. `node_id` is the node that most inliers come from; `times_ms` the milliseconds of each
@@ -39,6 +40,7 @@ class Localization:
     times_ms: dict[str, float] = field(default_factory=dict)
     evidence: Evidence | None = None
     focal_length_px: float | None = None
+    noise_share: float = 1.0
 
     @property
     def localized(self) -> Literal[True]:

@@ -25,6 +25,7 @@ from topoloc.localization.following import Followed, FollowingConfig, PointFollo
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.motion import MotionState
 from topoloc.localization.motion_gate import GateConfig, MotionGate
+from topoloc.localization.pose_errors import errors_of, lasting_change, noise_floor
 from topoloc.localization.pose_window import PoseWindow, PoseWindowConfig
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.seen_points import SeenPoints
@@ -47,23 +48,23 @@ class TrackerConfig:
     window: PoseWindowConfig = field(default_factory=PoseWindowConfig)
     max_side_px: int = 800
     """Points are followed in pictures reduced to this width or height."""
-    localize_every: float = 0.4
+    localize_every: float = 0.25
     """Seconds after which a picture that could be tracked is localized in full all the same ..."""
     min_share_left: float = 0.6
     """... as it is where fewer of the followed points are left ..."""
-    max_shift: float = 0.06
+    max_shift: float = 0.04
     """... or where these have moved by this share of the picture's width."""
     retry_after: float = 0.1
     """Seconds to the next attempt where that failed and the points are still there."""
     max_doubt: float = 0.3
     """Where the prediction leaves open by more than this where points are seen (three sigma, radians), the coarse search is asked."""
-    covariance_scale: float = 1.0
-    """Sigma of a localization is taken this many times as large as it says ..."""
-    floor_share: float = 0.004
-    """... and at least this share of the points' depth."""
+    floor_share: float = 0.001
+    """Sigma of a localization's noise is at least this share of the points' depth, and so many radians."""
+    reach: float = 2.0
+    """How far (way in depths of the points, plus radians) what the map is wrong by lasts (to 1/e)."""
     blend_time: float = 0.2
     """Seconds (to 1/e) in which what a new localization corrects is worked into the smoothed pose, so that it does not jump."""
-    followed_share: float = 0.1
+    followed_share: float = 0.05
     """Sigma of a followed motion, as a share of its way and turn, beside what the points say."""
 
 
@@ -165,7 +166,8 @@ class Tracker:
         if followed is None:
             return None
         world_from_cam = self._blended(followed, picture.t_ns).inverse()
-        return followed if self._gate.follows(predicted, world_from_cam, followed.covariance + self._floor(reference.depth)) else None
+        floor = noise_floor(reference.errors.depth, self.config.floor_share)
+        return followed if self._gate.follows(predicted, world_from_cam, followed.covariance + floor) else None
 
     def _is_due(self, followed: Followed, picture: StreamPicture) -> bool:
         """Whether it is time to localize in full."""
@@ -185,7 +187,7 @@ class Tracker:
         if reference is not None and followed is not None:
             near = (followed.cam_from_ref @ reference.cam_from_world).inverse()
             return self.localizer.localize_near(picture.image, picture.camera, near)
-        if reference is not None and predicted is not None and doubt_of(predicted, reference.depth) <= self.config.max_doubt:
+        if reference is not None and predicted is not None and doubt_of(predicted, reference.errors.depth) <= self.config.max_doubt:
             found, seen = self.localizer.localize_near(picture.image, picture.camera, predicted.world_from_cam)
             if isinstance(found, Localization):
                 return found, seen
@@ -203,28 +205,30 @@ class Tracker:
         assert isinstance(found, Localization), "points are seen where a pose was found"
         cam_from_world = found.world_from_cam.inverse()
         depth = float(np.median(cam_from_world.apply(seen.points_world)[:, 2]))
-        adjoint = cam_from_world.adjoint()
-        covariance = self.config.covariance_scale**2 * adjoint @ found.covariance @ adjoint.T + self._floor(depth)
+        errors = errors_of(found, depth, self.config.floor_share)
         t_ns, odom_from_cam = picture.t_ns, picture.odom_from_cam
-        if predicted is None or not self._gate.follows(predicted, found.world_from_cam, covariance):
-            if predicted is not None and not self._gate.is_overruled(t_ns, found.world_from_cam, covariance, odom_from_cam):
+        if predicted is None or not self._gate.follows(predicted, found.world_from_cam, errors.whole):
+            if predicted is not None and not self._gate.is_overruled(t_ns, found.world_from_cam, errors.whole, odom_from_cam):
                 return None
             self._window.clear()
-            smoothed = self._window.add(cam_from_world, covariance, Rigid3.identity(), covariance)
+            smoothed, doubt = self._window.add(cam_from_world, errors.noise, Rigid3.identity(), errors.noise)
             offset = Rigid3.identity()
-            state = self._gate.begin(t_ns, found.world_from_cam, covariance, odom_from_cam)
+            state = self._gate.begin(t_ns, found.world_from_cam, errors.noise, odom_from_cam)
         else:
             motion, motion_covariance = self._motion(predicted, followed)
+            motion_covariance = motion_covariance + lasting_change(errors, motion, self.config.reach)
             before = self._blended(followed, t_ns) if followed is not None else None
-            smoothed = self._window.add(cam_from_world, covariance, motion, motion_covariance)
+            if followed is None and np.trace(motion_covariance) >= np.trace(errors.noise):
+                self._window.clear()  # a guess from the poses before says nothing new of this one
+            smoothed, doubt = self._window.add(cam_from_world, errors.noise, motion, motion_covariance)
             offset = Rigid3.identity() if before is None else self._faded(before @ smoothed.inverse(), self._gate.seconds_since(t_ns))
-            measured = covariance if followed is None else followed.covariance
+            measured = errors.noise if followed is None else followed.covariance
             state = self._gate.correct(predicted, (offset @ smoothed).inverse(), measured, odom_from_cam)
             self._gate.drop_rival()
         points = seen.in_image(picture.grey_camera.width / picture.camera.width)
         follower = PointFollower(picture.grey, points, cam_from_world, picture.grey_camera, self.config.following)
-        self._reference = Reference(t_ns, found, cam_from_world, covariance, smoothed, offset, depth, follower)
-        return StreamedPose(t_ns, "localized", found, state.world_from_cam, self._covariance(state))
+        self._reference = Reference(t_ns, found, cam_from_world, errors, smoothed, doubt + errors.lasting, offset, follower)
+        return StreamedPose(t_ns, "localized", found, state.world_from_cam, self._covariance(self._reference))
 
     def _blended(self, followed: Followed, t_ns: int) -> Rigid3:
         """The smoothed cam_from_world of a followed picture."""
@@ -249,7 +253,7 @@ class Tracker:
         state = self._gate.correct(predicted, smoothed, followed.covariance, picture.odom_from_cam)
         world_from_cam = (followed.cam_from_ref @ reference.cam_from_world).inverse()
         adjoint, motion = world_from_cam.adjoint(), followed.cam_from_ref.adjoint()
-        covariance = adjoint @ (motion @ reference.covariance @ motion.T + followed.covariance) @ adjoint.T
+        covariance = adjoint @ (motion @ reference.errors.whole @ motion.T + followed.covariance) @ adjoint.T
         found = reference.found
         result = Localization(
             world_from_cam=world_from_cam,
@@ -261,7 +265,7 @@ class Tracker:
             num_inliers=followed.num_agreeing,
             times_ms=clock.times_ms(),
         )
-        return StreamedPose(picture.t_ns, "tracked", result, state.world_from_cam, self._covariance(state))
+        return StreamedPose(picture.t_ns, "tracked", result, state.world_from_cam, self._covariance(reference, state))
 
     def _without_pose(self, result: NotLocalized, predicted: MotionState | None, t_ns: int) -> StreamedPose:
         """Predicted for a while, then lost."""
@@ -269,23 +273,23 @@ class Tracker:
             self._reference = None
             self._gate.forget()
             return StreamedPose(t_ns, "lost", result)
-        return StreamedPose(t_ns, "predicted", result, predicted.world_from_cam, self._covariance(predicted))
+        assert self._reference is not None
+        return StreamedPose(t_ns, "predicted", result, predicted.world_from_cam, self._covariance(self._reference, predicted))
 
-    def _covariance(self, state: MotionState) -> Float[np.ndarray, "6 6"]:
-        """Of the left perturbation of world_from_cam; the map's own errors do not vanish with the number of pictures."""
-        depth = self._reference.depth if self._reference is not None else 1.0
-        adjoint = state.world_from_cam.adjoint()
-        return adjoint @ (state.pose_covariance + self._floor(depth)) @ adjoint.T
+    def _covariance(self, reference: Reference, since: MotionState | None = None) -> Float[np.ndarray, "6 6"]:
+        """Of the left perturbation of world_from_cam: what the picture localized last is wrong by, and the motion since."""
+        adjoint = reference.smoothed.inverse().adjoint()
+        covariance = adjoint @ reference.covariance @ adjoint.T
+        if since is None:
+            return covariance
+        adjoint = since.world_from_cam.adjoint()
+        return covariance + adjoint @ since.pose_covariance @ adjoint.T
 
     def _followed_covariance(self, followed: Followed) -> Float[np.ndarray, "6 6"]:
         """Of a followed motion: what the points say, and what wrong depths make of it, in proportion to the motion."""
         way, turn = float(np.linalg.norm(followed.cam_from_ref.translation)), followed.cam_from_ref.angle()
         share = np.diag(np.repeat([way**2, turn**2], 3)) * self.config.followed_share**2
-        return self.config.covariance_scale**2 * followed.covariance + share
-
-    def _floor(self, depth: float) -> Float[np.ndarray, "6 6"]:
-        """The covariance that the map's own errors leave, of points at this depth (metres), in the camera's axes."""
-        return np.diag(np.repeat([(self.config.floor_share * depth) ** 2, self.config.floor_share**2], 3))
+        return followed.covariance + share
 
 
 def _refused(found: Localization) -> NotLocalized:

@@ -12,6 +12,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.following import PointFollower
 from topoloc.localization.motion import MotionState
+from topoloc.localization.pose_errors import PoseErrors
 from topoloc.localization.result import Localization
 from topoloc.places.coarse import Image
 
@@ -30,18 +31,19 @@ class StreamPicture:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """The picture that was localized last: its pose raw (with covariance, of the left perturbation) and smoothed, and its points.
+    """The picture that was localized last: its pose raw and smoothed, what these are wrong by, and its points.
 
+    `covariance` is of the left perturbation of `smoothed`, what the map is wrong by included.
     `offset` (left of `smoothed`) is what the smoothed poses before it were off by; it fades.
     """
 
     t_ns: int
     found: Localization
     cam_from_world: Rigid3
-    covariance: Float[np.ndarray, "6 6"]
+    errors: PoseErrors
     smoothed: Rigid3
+    covariance: Float[np.ndarray, "6 6"]
     offset: Rigid3
-    depth: float
     follower: PointFollower
 
 
