@@ -53,7 +53,7 @@ def main() -> None:
             of_place.append(place.name)
     x, y = np.array(rows), np.array(right)
     print(f"{len(y)} poses, {np.count_nonzero(~y)} of them wrong")
-    print("weights (found, chance, inliers, inlier share, spread; bias):", fit(x, y).round(2))
+    print("weights (even share, chance, inliers, inlier share, spread; bias):", fit(x, y).round(2))
     for family in sorted({family_of(name) for name in of_place}):
         here = np.array([family_of(name) == family for name in of_place])
         odds = log_odds(x[here], fit(x[~here], y[~here]))

@@ -10,7 +10,7 @@ import pytest
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization.guided import GuidedConfig, count_by_chance, count_visible, match_guided
+from topoloc.localization.guided import GuidedConfig, count_by_chance, match_guided, visible_pixels
 from topoloc.localization.local_map import LocalMap
 from topoloc.mapping.topomap import NodeSummary, TopoNode
 
@@ -54,7 +54,7 @@ def test_every_point_in_view_is_matched_with_itself(cam_from_world: Rigid3):
     node = _node(np.random.default_rng(0))
     local_map = LocalMap.of_node(node)
     matches = match_guided(_seen(node, cam_from_world), local_map, cam_from_world, CAMERA, GuidedConfig())
-    num_visible = count_visible(local_map, cam_from_world, CAMERA)
+    num_visible = len(visible_pixels(local_map, cam_from_world, CAMERA))
     assert num_visible > 100
     assert len(matches) > 0.95 * num_visible
     assert np.array_equal(matches.query_idx, matches.train_idx)
@@ -77,7 +77,7 @@ def test_a_key_point_is_matched_once_though_two_nodes_hold_it():
 def test_nothing_is_visible_behind_the_camera():
     local_map = LocalMap.of_node(_node(np.random.default_rng(3)))
     backwards = Rigid3(exp_so3(np.array([0.0, np.pi, 0.0])), np.zeros(3))
-    assert count_visible(local_map, backwards, CAMERA) == 0
+    assert len(visible_pixels(local_map, backwards, CAMERA)) == 0
 
 
 def test_chance_finds_next_to_nothing_among_descriptors_that_differ():

@@ -13,6 +13,7 @@ from topoloc.localization.verification import (
     Evidence,
     VerificationConfig,
     doubt_of,
+    even_share_of,
     is_only_imprecise,
     probability_of,
     spread_of,
@@ -20,13 +21,25 @@ from topoloc.localization.verification import (
 )
 
 CONFIG = VerificationConfig()
-STRONG = Evidence(num_matches=150, num_inliers=90, num_found=300, num_visible=1700, num_by_chance=20, spread=0.8, doubt=0.1)
+STRONG = Evidence(
+    num_matches=150, num_inliers=90, num_found=300, num_visible=1700, num_by_chance=20, spread=0.8, doubt=0.1, even_share=0.15
+)
 # What peers accept: scores of inliers, though nearly all that the pose predicts is missing, and chance finds as many.
-MANY_OF_VERY_MANY = Evidence(num_matches=40, num_inliers=6, num_found=70, num_visible=2000, num_by_chance=60, spread=0.5, doubt=0.3)
+MANY_OF_VERY_MANY = Evidence(
+    num_matches=40, num_inliers=6, num_found=70, num_visible=2000, num_by_chance=60, spread=0.5, doubt=0.3, even_share=0.02
+)
 
 counts = st.integers(0, 2000)
 evidences = st.builds(
-    Evidence, counts, counts, counts, counts, counts, st.floats(0.0, 1.0, allow_nan=False), st.floats(0.0, 1e3, allow_nan=False)
+    Evidence,
+    counts,
+    counts,
+    counts,
+    counts,
+    counts,
+    st.floats(0.0, 1.0, allow_nan=False),
+    st.floats(0.0, 1e3, allow_nan=False),
+    st.floats(0.0, 1.0, allow_nan=False),
 )
 
 
@@ -37,11 +50,11 @@ def test_what_speaks_for_a_pose_never_makes_it_less_probable(evidence: Evidence)
     for better in (
         replace(evidence, num_found=evidence.num_found + 5),
         replace(evidence, spread=min(evidence.spread + 0.1, 1.0)),
+        replace(evidence, even_share=min(evidence.even_share + 0.01, 1.0)),
         replace(evidence, num_inliers=evidence.num_inliers + 1),
     ):
         assert probability_of(better, CONFIG) >= probability
     for worse in (
-        replace(evidence, num_visible=evidence.num_visible + 50),
         replace(evidence, num_by_chance=evidence.num_by_chance + 5),
         replace(evidence, num_matches=evidence.num_matches + 5),
         replace(evidence, doubt=evidence.doubt * 2.0),
@@ -71,7 +84,7 @@ def test_no_single_part_of_the_evidence_carries_a_pose(weaker: dict[str, float])
 
 
 def test_a_pose_that_is_only_imprecise_is_told_from_one_that_has_nothing_to_stand_on():
-    small = replace(STRONG, num_inliers=24, num_matches=40, num_found=110, num_visible=900, num_by_chance=12, spread=0.2, doubt=30.0)
+    small = replace(STRONG, num_inliers=24, num_matches=40, num_found=110, num_by_chance=12, spread=0.2, doubt=30.0, even_share=0.08)
     assert probability_of(small, CONFIG) < CONFIG.min_probability
     assert is_only_imprecise(small, CONFIG)
     assert not is_only_imprecise(MANY_OF_VERY_MANY, CONFIG)
@@ -96,3 +109,13 @@ def test_spread_counts_cells_not_points():
     assert spread_of(corner, 640, 480) == pytest.approx(1 / 48)
     assert spread_of(everywhere, 640, 480) == 1.0
     assert spread_of(np.array([[-0.5, -0.5], [639.5, 479.5]]), 640, 480) == pytest.approx(2 / 48)
+
+
+def test_points_found_everywhere_are_a_larger_even_share_than_as_many_in_one_half():
+    visible = np.random.default_rng(0).uniform([0.0, 0.0], [640.0, 480.0], (2000, 2))
+    everywhere, in_left_half = visible[:200], visible[visible[:, 0] < 320.0][:200]
+    even, uneven = even_share_of(everywhere, visible, 640, 480), even_share_of(in_left_half, visible, 640, 480)
+    assert even == pytest.approx(0.1, rel=0.15)
+    assert uneven < 0.6 * even
+    assert even_share_of(np.zeros((0, 2)), visible, 640, 480) < 0.02
+    assert even_share_of(everywhere, np.zeros((0, 2)), 640, 480) == 0.0

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from topoloc.features.features import Features, Matches
+from topoloc.features.matching import MatchingConfig, match_pooled
 from topoloc.geometry.absolute_pose import AbsolutePose
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.pose_covariance import covariance_of_inverse
+from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
-from topoloc.localization.guided import GuidedConfig, count_by_chance, count_visible
+from topoloc.localization.guided import GuidedConfig, count_by_chance, visible_pixels
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.seen_points import SeenPoints
@@ -22,6 +24,7 @@ from topoloc.localization.verification import (
     Evidence,
     VerificationConfig,
     doubt_of,
+    even_share_of,
     is_only_imprecise,
     log_odds_of,
     probability_of,
@@ -43,6 +46,8 @@ class Attempt:
     local_map: LocalMap
     matches: Matches
     pose: AbsolutePose | None
+    is_guided: bool = False
+    """Were the matches sought where a pose expects them? Then they are no evidence for it."""
 
     @property
     def num_inliers(self) -> int:
@@ -80,14 +85,18 @@ def judge(
     candidates: list[NodeScore],
     shared_errors: float,
     min_matches: int,
+    matching: MatchingConfig,
     guided: GuidedConfig,
     config: VerificationConfig,
     clock: StageClock,
 ) -> Judgement:
     """A pose is an answer only where the evidence for it is strong.
 
+    Evidence are matches that no pose guided. The first ones will do where they make the pose clear; where they do not, the nodes around
+    the final pose are asked, which are often nearer than those that the coarse search named.
+
     Args:
-        first: what most of the features say, unguided. `final`: what is found around that pose.
+        first: where a first pose comes from. `final`: what is found around that pose.
         shared_errors: rho of the map, see `shared_errors.py`.
     """
     num_matches = len(final.matches)
@@ -97,7 +106,9 @@ def judge(
         return Judgement(NotLocalized("too_few_inliers", candidates, num_matches, final.num_inliers, clock.times_ms()), final)
     inflated = inflation(final.num_inliers, shared_errors)
     covariance = inflated * final.pose.covariance
-    evidence = _evidence(first, final, covariance, guided, config)
+    evidence = None if first.is_guided else _evidence(first, final, covariance, guided, config)
+    if evidence is None or log_odds_of(evidence, config) <= config.clear_log_odds:
+        evidence = _evidence(_unguided(final, matching), final, covariance, guided, config)
     log_odds, probability = log_odds_of(evidence, config), probability_of(evidence, config)
     if probability < config.min_probability:
         reason, detail = "not_in_map", ""
@@ -123,18 +134,37 @@ def judge(
 
 
 def _evidence(
-    first: Attempt, final: Attempt, covariance: Float[np.ndarray, "6 6"], guided: GuidedConfig, config: VerificationConfig
+    unguided: Attempt, final: Attempt, covariance: Float[np.ndarray, "6 6"], guided: GuidedConfig, config: VerificationConfig
 ) -> Evidence:
     """`covariance` is that of the left perturbation of cam_from_world."""
     pose, camera = final.pose, final.camera
     assert pose is not None
     depths = pose.cam_from_world.apply(final.local_map.points_world[final.matches.train_idx[pose.inliers]])[:, 2]
+    found_img = final.features.points_img[final.matches.query_idx[pose.inliers]].astype(np.float64)
+    visible_img = visible_pixels(final.local_map, pose.cam_from_world, camera)
     return Evidence(
-        num_matches=len(first.matches),
-        num_inliers=first.num_inliers,
+        num_matches=len(unguided.matches),
+        num_inliers=_num_agreeing(unguided, pose.cam_from_world, camera, config),
         num_found=final.num_inliers,
-        num_visible=count_visible(final.local_map, pose.cam_from_world, camera),
+        num_visible=len(visible_img),
         num_by_chance=count_by_chance(final.features, final.local_map, pose.cam_from_world, camera, guided),
-        spread=spread_of(final.features.points_img[final.matches.query_idx[pose.inliers]].astype(np.float64), camera.width, camera.height),
+        spread=spread_of(found_img, camera.width, camera.height),
+        even_share=even_share_of(found_img, visible_img, camera.width, camera.height),
         doubt=doubt_of(covariance, float(np.median(depths)), config),
     )
+
+
+def _unguided(final: Attempt, config: MatchingConfig) -> Attempt:
+    """Matches with the points around the final pose that owe nothing to it."""
+    local_map = final.local_map
+    matches = match_pooled(final.features.descriptors, local_map.descriptors, local_map.points_world, local_map.radii, config)
+    return replace(final, matches=matches, pose=None)
+
+
+def _num_agreeing(unguided: Attempt, cam_from_world: Rigid3, camera: Camera, config: VerificationConfig) -> int:
+    """How many of these matches agree with a pose that is not theirs."""
+    points_cam = cam_from_world.apply(unguided.local_map.points_world[unguided.matches.train_idx])
+    with np.errstate(invalid="ignore"):
+        offsets = camera.img_from_cam(points_cam) - unguided.features.points_img[unguided.matches.query_idx]
+        is_near = np.linalg.norm(offsets, axis=1) < config.agreement_px * max(max(camera.width, camera.height) / 640.0, 0.5)
+    return int(np.count_nonzero(is_near))

@@ -77,9 +77,10 @@ def _find(
     )
 
 
-def count_visible(local_map: LocalMap, cam_from_world: Rigid3, camera: Camera) -> int:
-    """How many map points lie in the camera's view."""
-    return int(np.isfinite(_pixels_in_view(cam_from_world.apply(local_map.points_world), camera)[:, 0]).sum())
+def visible_pixels(local_map: LocalMap, cam_from_world: Rigid3, camera: Camera) -> Float[np.ndarray, "v 2"]:
+    """Where the map points that lie in the camera's view must be seen."""
+    pixels = _pixels_in_view(cam_from_world.apply(local_map.points_world), camera)
+    return pixels[np.isfinite(pixels[:, 0])]
 
 
 def _pixels_in_view(points_cam: Float[np.ndarray, "n 3"], camera: Camera) -> Float[np.ndarray, "n 2"]:

@@ -35,6 +35,7 @@ from topoloc.localization.rivals import RivalsConfig, decide, rival_groups
 from topoloc.localization.seen_points import SeenPoints
 from topoloc.localization.shared_errors import SharedErrorsConfig, shared_errors_of
 from topoloc.localization.stages import StageClock
+from topoloc.localization.standpoints import StandpointsConfig, strongest_and_distinct
 from topoloc.localization.verification import VerificationConfig
 from topoloc.localization.viewing import viewing_distances
 from topoloc.mapping.nodes import NodePoses
@@ -63,6 +64,7 @@ class LocalizerConfig:
     """With fewer first matches no pose is sought."""
     verification: VerificationConfig = field(default_factory=VerificationConfig)
     rivals: RivalsConfig = field(default_factory=RivalsConfig)
+    standpoints: StandpointsConfig = field(default_factory=StandpointsConfig)
     shared_errors: SharedErrorsConfig = field(default_factory=SharedErrorsConfig)
     max_finer: float = 1.15
     """An image of more than so many times the pixels a radian (focal length in pixels) of the map's finest camera is reduced to that
@@ -209,6 +211,7 @@ class Localizer:
         matches: Matches,
         start: tuple[Rigid3, Camera] | None,
         clock: StageClock,
+        config: AbsolutePoseConfig | None = None,
     ) -> Attempt:
         """Robust PnP, or the refinement of `start` (cam_from_world and the camera); with the focal length, of a rough camera."""
         camera = start[1] if start else _usual(lens)
@@ -216,7 +219,7 @@ class Localizer:
             return Attempt(features, lens, camera, local_map, matches, None)
         points_img = features.points_img[matches.query_idx].astype(np.float64)
         points_world, covariances = local_map.points_world[matches.train_idx], local_map.covariances[matches.train_idx]
-        config = self.config.pose
+        config = config or self.config.pose
         with clock.stage("pnp"):
             if isinstance(lens, RoughCamera):
                 found = estimate_pose_and_focal(points_img, points_world, lens, config, point_covariances=covariances, start=start)
@@ -230,8 +233,8 @@ class Localizer:
         """What is found around the first pose, and whether it is believed."""
         final = self._localize_around(first, clock)
         with clock.stage("verification"):
-            demanded = self.config.verification
-            return judge(first, final, candidates, shared_errors, self.config.min_matches, self.config.guided, demanded, clock)
+            c = self.config
+            return judge(first, final, candidates, shared_errors, c.min_matches, c.matching, c.guided, c.verification, clock)
 
     def _against_rivals(
         self,
@@ -245,7 +248,8 @@ class Localizer:
         """Other parts of the map that look like the image are asked on their own."""
         result, config = judgement.result, self.config.rivals
         found = result.world_from_cam if isinstance(result, Localization) else None
-        asked, is_clear = [candidate.node_id for candidate in result.candidates], judgement.log_odds > config.clear_log_odds
+        asked = [candidate.node_id for candidate in result.candidates]
+        is_clear = judgement.log_odds > self.config.verification.clear_log_odds
         groups = rival_groups(
             ranked, asked, found, is_clear, self._node_poses, self._lambda_rot, self._d_thresh, self.config.num_candidates, config
         )
@@ -253,7 +257,22 @@ class Localizer:
         for group in groups:
             first = self._localize_in(self._pooled(group), features, lens, clock)
             judgements.append(self._judge(first, result.candidates, shared_errors, clock))
-        return decide(judgements, self._lambda_rot, self._d_thresh, config, clock) if groups else judgement
+        if not is_clear and config.max_groups > 0:
+            attempts = self._from_nodes(ranked, features, lens, clock)
+            judgements += [self._judge(first, result.candidates, shared_errors, clock) for first in attempts]
+        return decide(judgements, self._lambda_rot, self._d_thresh, config, clock) if len(judgements) > 1 else judgement
+
+    def _from_nodes(self, ranked: list[NodeScore], features: Features, lens: Camera | RoughCamera, clock: StageClock) -> list[Attempt]:
+        """First poses of what the nodes saw, see `standpoints.py`."""
+        config, attempts = self.config.standpoints, []
+        quick = replace(self.config.pose, max_iterations=config.max_iterations)
+        for candidate in ranked[: config.num_nodes]:
+            local_map, world_from_node = self._pooled([candidate.node_id]), self.topomap.summaries[candidate.node_id].world_from_cam
+            with clock.stage("matching"):
+                matches = match_guided(features, local_map, world_from_node.inverse(), _usual(lens), config.matching)
+            attempts.append(replace(self._attempt(features, lens, local_map, matches, None, clock, quick), is_guided=True))
+        reach = self.config.rivals.agreement * self._d_thresh
+        return strongest_and_distinct(attempts, self._lambda_rot, reach, config.max_poses)
 
     def _pooled(self, node_ids: list[int]) -> LocalMap:
         return LocalMap.pooled([self._local_map(node_id) for node_id in node_ids])

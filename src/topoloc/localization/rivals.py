@@ -2,9 +2,13 @@
 
 The pool of the best candidates hides a second place: where its nodes are in the pool, points that are in both fail the ratio
 test; where they are not, nobody asks. So nodes that look as much like the image as the best one does, but stand far from the
-pose found, are asked once more on their own. Two poses exclude each other, and the one that explains more of the image is the more
-likely by more than its odds against nothing at all say: the share of the points in view that were found counts once more. With
-odds o1 and o2 (that of the lesser one so lowered) against "neither", the first is right with the probability o1 / (1 + o1 + o2).
+pose found, are asked once more on their own, and so are the poses that comparison with what nodes saw suggests (`standpoints.py`).
+
+Two poses exclude each other, and their odds against nothing at all say little of which of them it is: a place that repeats itself
+has most of its things twice. What tells them apart is the part of the picture where the two differ, in which the wrong pose finds
+nothing (the even share found), and that the wrong pose, which has only some of the picture to stand on, is less precise (the doubt).
+The weights of both are set by pairs of a right and a wrong pose of one picture. With odds o of the best pose against "neither" and odds
+of e^d against each other one, by which it leads that, it is right with the probability 1 / (1 + 1/o + sum of e^-d).
 """
 
 from __future__ import annotations
@@ -29,8 +33,6 @@ class RivalsConfig:
 
     num_ranked: int = 48
     """Nodes that the coarse localizer ranks, the candidates among them; rivals come from these."""
-    clear_log_odds: float = 5.5
-    """A pose with more for it (logarithm of its odds) is clear: only parts of the map that look nearly the same are asked then."""
     min_score_share: tuple[float, float] = (0.85, 0.4)
     """A rival's score is at least this share of the best one's: where the pose is clear, and where it is not."""
     reach: float = 5.0
@@ -38,9 +40,11 @@ class RivalsConfig:
     agreement: float = 3.0
     """Two poses within so many D_thresh are one."""
     max_groups: int = 6
-    """Parts of the map that are asked on their own, at most; 0 asks none."""
-    share_weight: float = 4.0
-    """How much the share found counts between two poses, beside their odds, in logarithms."""
+    """Parts of the map that are asked on their own, at most; 0 asks none, and compares no picture with what nodes saw."""
+    odds_weight: float = 0.3
+    even_share_weight: float = 6.0
+    doubt_weight: float = -3.0
+    """How much the odds, the even share found and the doubt count between two poses, in logarithms."""
     min_lead: float = 2.0
     """By how much the best pose must lead the next one, in logarithms of odds."""
 
@@ -102,7 +106,8 @@ def _strength(judgement: Judgement, config: RivalsConfig) -> float:
     evidence = judgement.evidence
     if evidence is None:
         return float("-inf")
-    return judgement.log_odds + config.share_weight * math.log((evidence.num_found + 1) / (evidence.num_visible + 20))
+    odds, even = config.odds_weight * judgement.log_odds, config.even_share_weight * math.log(evidence.even_share + 0.002)
+    return odds + even + config.doubt_weight * math.log(max(evidence.doubt, 0.01))
 
 
 def _agree(a: Judgement, b: Judgement, lambda_rot: float, d_thresh: float, config: RivalsConfig) -> bool:
