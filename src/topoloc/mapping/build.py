@@ -21,6 +21,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.landmarks import LandmarkConfig, Observations, observe_points, refine_points
 from topoloc.mapping.nodes import NodeConfig, NodePoses, node_distances, place_nodes
+from topoloc.mapping.side_nodes import SideNodesConfig, describe_sides, gather_sides, nodes_with_sides
 from topoloc.mapping.topomap import Edge, NodeSummary, PlaceImage, TopoMetricMap, TopoNode
 from topoloc.mapping.views import MappingView, mapping_view
 from topoloc.places.vlad import SurfVlad, VladConfig, learn_words, placed, vlad
@@ -40,6 +41,7 @@ class BuildConfig:
     points: MetricPointsConfig = field(default_factory=MetricPointsConfig)
     landmarks: LandmarkConfig = field(default_factory=LandmarkConfig)
     vlad: VladConfig = field(default_factory=VladConfig)
+    sides: SideNodesConfig = field(default_factory=SideNodesConfig)
     max_node_points: int = 800
     """Features that a node keeps, the strongest ones."""
     min_node_points: int = 20
@@ -85,6 +87,7 @@ class _NodeDraft:
     points_cam: Float[np.ndarray, "n 3"]
     covariances: Float[np.ndarray, "n 3 3"]
     observations: list[Observations]
+    sides: list[TopoNode]
 
     @property
     def features(self) -> Features:
@@ -118,6 +121,7 @@ def build_map(
         coarse_models={SurfVlad.name: coarse.to_model()},
         config=asdict(config) | {"nodes": asdict(node_config)},
         length_m=_trajectory_length(frames),
+        sides=gather_sides([side for draft in drafts for side in draft.sides], config.sides),
     )
 
 
@@ -148,9 +152,10 @@ def _resolve_node_config(frames: list[_MappingFrame], config: BuildConfig) -> No
 def _draft_nodes(frames: list[_MappingFrame], node_config: NodeConfig, config: BuildConfig, progress: Progress) -> list[_NodeDraft]:
     """The trajectory discretised by Eq. 1; a picture with too few points (dark, blurred, blank) becomes no node."""
     frame_idx = place_nodes([frame.world_from_cam for frame in frames], node_config)
+    with_sides = nodes_with_sides([frames[i].world_from_cam for i in frame_idx], node_config, config.sides)
     drafts: list[_NodeDraft] = []
     for done, i in enumerate(frame_idx):
-        draft = _draft_node(frames[i], config)
+        draft = _draft_node(frames[i], done in with_sides, config)
         if len(draft.rows) >= config.min_node_points:
             drafts.append(draft)
         progress("nodes", done + 1, len(frame_idx))
@@ -159,13 +164,15 @@ def _draft_nodes(frames: list[_MappingFrame], node_config: NodeConfig, config: B
     return drafts
 
 
-def _draft_node(frame: _MappingFrame, config: BuildConfig) -> _NodeDraft:
+def _draft_node(frame: _MappingFrame, with_sides: bool, config: BuildConfig) -> _NodeDraft:
     view = frame.view()
     image = _mapping_image(view, config)
     located = locate_points(image.features, view, config.points)
     rows = np.flatnonzero(located.valid)
     template_jpeg = _encode_jpeg(view.picture, config.template_side_px, quality=75)
-    return _NodeDraft(frame, image, template_jpeg, rows, located.points_cam[rows], located.covariances[rows], [])
+    summary = NodeSummary(-1, frame.sequence.name, frame.name, frame.t_ns, image.world_from_cam, len(rows))
+    sides = describe_sides(summary, view, config.features, config.points, config.sides) if with_sides else []
+    return _NodeDraft(frame, image, template_jpeg, rows, located.points_cam[rows], located.covariances[rows], [], sides)
 
 
 def _mapping_image(view: MappingView, config: BuildConfig) -> _MappingImage:

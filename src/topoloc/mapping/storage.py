@@ -19,7 +19,7 @@ import numpy as np
 
 from topoloc.errors import MapError, MapVersionError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.mapping.topomap import TopoMetricMap, TopoNode
+from topoloc.mapping.topomap import SideNodes, TopoMetricMap, TopoNode
 from topoloc.places.coarse import CoarseModel
 
 APPLICATION_ID = 0x544F504F  # "TOPO", in the database's header
@@ -29,16 +29,20 @@ DESCRIPTOR_SCALE = 200.0  # components of unit descriptors stay below 127 / 200 
 _SCHEMA = """
 CREATE TABLE map (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE cameras (camera_id INTEGER PRIMARY KEY, json TEXT NOT NULL UNIQUE);
-CREATE TABLE nodes (node_id INTEGER PRIMARY KEY, recording TEXT NOT NULL, name TEXT NOT NULL, t_ns INTEGER NOT NULL,
-    camera_id INTEGER NOT NULL REFERENCES cameras, world_from_cam BLOB NOT NULL, num_points INTEGER NOT NULL);
-CREATE TABLE node_points (node_id INTEGER PRIMARY KEY REFERENCES nodes, descriptor_size INTEGER NOT NULL, points_img BLOB NOT NULL,
-    shapes BLOB NOT NULL, descriptors BLOB NOT NULL, points_cam BLOB NOT NULL, sqrt_covs BLOB NOT NULL);
 CREATE TABLE node_templates (node_id INTEGER PRIMARY KEY REFERENCES nodes, jpeg BLOB NOT NULL);
 CREATE TABLE edges (source_id INTEGER NOT NULL REFERENCES nodes, target_id INTEGER NOT NULL REFERENCES nodes);
 CREATE TABLE place_images (image_id INTEGER PRIMARY KEY, recording TEXT NOT NULL, name TEXT NOT NULL,
     node_id INTEGER NOT NULL REFERENCES nodes, world_from_cam BLOB NOT NULL, jpeg BLOB NOT NULL);
-CREATE TABLE coarse_models (name TEXT PRIMARY KEY, settings TEXT NOT NULL, arrays BLOB NOT NULL);
 """
+# Of the map's nodes, and once more of its side nodes, where it has any.
+_NODE_TABLES = """
+CREATE TABLE {prefix}nodes (node_id INTEGER PRIMARY KEY, recording TEXT NOT NULL, name TEXT NOT NULL, t_ns INTEGER NOT NULL,
+    camera_id INTEGER NOT NULL REFERENCES cameras, world_from_cam BLOB NOT NULL, num_points INTEGER NOT NULL);
+CREATE TABLE {prefix}node_points (node_id INTEGER PRIMARY KEY REFERENCES {prefix}nodes, descriptor_size INTEGER NOT NULL,
+    points_img BLOB NOT NULL, shapes BLOB NOT NULL, descriptors BLOB NOT NULL, points_cam BLOB NOT NULL, sqrt_covs BLOB NOT NULL);
+CREATE TABLE {prefix}coarse_models (name TEXT PRIMARY KEY, settings TEXT NOT NULL, arrays BLOB NOT NULL);
+"""
+SIDE = "side_"
 
 
 def save_map(topomap: TopoMetricMap, path: Path) -> None:
@@ -79,7 +83,7 @@ def _write_database(topomap: TopoMetricMap, path: Path) -> None:
         database.execute("PRAGMA page_size = 4096")
         database.execute(f"PRAGMA application_id = {APPLICATION_ID}")
         database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
-        database.executescript(_SCHEMA)
+        database.executescript(_NODE_TABLES.format(prefix="") + _SCHEMA)
         info = {"config": json.dumps(topomap.config, sort_keys=True), "length_m": json.dumps(topomap.length_m)}
         info["default_coarse"] = json.dumps(topomap.default_coarse)
         if topomap.shared_errors is not None:
@@ -87,37 +91,46 @@ def _write_database(topomap: TopoMetricMap, path: Path) -> None:
         database.executemany("INSERT INTO map VALUES (?, ?)", info.items())
         for node in topomap.nodes:
             _insert_node(database, node)
+            database.execute("INSERT INTO node_templates VALUES (?, ?)", (node.summary.node_id, node.template_jpeg))
         database.executemany("INSERT INTO edges VALUES (?, ?)", ((e.source_id, e.target_id) for e in topomap.edges))
         rows = ((p.recording, p.name, p.node_id, _pose_bytes(p.world_from_cam), p.jpeg) for p in topomap.place_images)
         database.executemany("INSERT INTO place_images (recording, name, node_id, world_from_cam, jpeg) VALUES (?, ?, ?, ?, ?)", rows)
         for model in topomap.coarse_models.values():
             insert_model(database, model)
+        if topomap.sides is not None:
+            _insert_sides(database, topomap.sides)
         database.commit()
     finally:
         database.close()
 
 
-def _insert_node(database: sqlite3.Connection, node: TopoNode) -> None:
+def _insert_sides(database: sqlite3.Connection, sides: SideNodes) -> None:
+    database.executescript(_NODE_TABLES.format(prefix=SIDE))
+    for node in sides.nodes:
+        _insert_node(database, node, SIDE)
+    for model in sides.coarse_models.values():
+        insert_model(database, model, SIDE)
+
+
+def _insert_node(database: sqlite3.Connection, node: TopoNode, prefix: str = "") -> None:
     camera_json = json.dumps(node.camera.to_json(), sort_keys=True)
     database.execute("INSERT OR IGNORE INTO cameras (json) VALUES (?)", (camera_json,))
     (camera_id,) = database.execute("SELECT camera_id FROM cameras WHERE json = ?", (camera_json,)).fetchone()
     s = node.summary
     row = (s.node_id, s.recording, s.name, s.t_ns, camera_id, _pose_bytes(s.world_from_cam), len(node.features))
-    database.execute("INSERT INTO nodes VALUES (?, ?, ?, ?, ?, ?, ?)", row)
+    database.execute(f"INSERT INTO {prefix}nodes VALUES (?, ?, ?, ?, ?, ?, ?)", row)
     f = node.features
     quantised = np.clip(np.rint(f.descriptors * DESCRIPTOR_SCALE), -127, 127).astype(np.int8)
     shapes = np.stack([f.sizes_px, f.angles, f.responses], axis=1).astype("<f4")
     blobs = (f.points_img.astype("<f4"), shapes, quantised, node.points_cam.astype("<f4"), node.point_sqrt_covs.astype("<f2"))
-    database.execute(
-        "INSERT INTO node_points VALUES (?, ?, ?, ?, ?, ?, ?)", (s.node_id, f.descriptors.shape[1], *(blob.tobytes() for blob in blobs))
-    )
-    database.execute("INSERT INTO node_templates VALUES (?, ?)", (s.node_id, node.template_jpeg))
+    row = (s.node_id, f.descriptors.shape[1], *(blob.tobytes() for blob in blobs))
+    database.execute(f"INSERT INTO {prefix}node_points VALUES (?, ?, ?, ?, ?, ?, ?)", row)
 
 
-def insert_model(database: sqlite3.Connection, model: CoarseModel) -> None:
+def insert_model(database: sqlite3.Connection, model: CoarseModel, prefix: str = "") -> None:
     """Add a coarse localizer, or put it in the place of the one of its name."""
     row = (model.name, json.dumps(model.settings, sort_keys=True), _arrays_bytes(model.arrays))
-    database.execute("INSERT OR REPLACE INTO coarse_models VALUES (?, ?, ?)", row)
+    database.execute(f"INSERT OR REPLACE INTO {prefix}coarse_models VALUES (?, ?, ?)", row)
 
 
 def check_header(path: Path) -> None:

@@ -21,8 +21,8 @@ from topoloc.errors import MapError, TopolocError
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.mapping.storage import check_header
-from topoloc.mapping.topomap import Edge, NodeSummary, PlaceImage, SharedErrors, TopoMetricMap, TopoNode
+from topoloc.mapping.storage import SIDE, check_header
+from topoloc.mapping.topomap import Edge, NodeSummary, PlaceImage, SharedErrors, SideNodes, TopoMetricMap, TopoNode
 from topoloc.places.coarse import CoarseModel
 
 T = TypeVar("T")
@@ -48,7 +48,13 @@ def open_map(path: Path) -> TopoMetricMap:
             length_m=float(json.loads(info["length_m"])),
             default_coarse=json.loads(info.get("default_coarse", '"surf-vlad"')),
             shared_errors=_shared_errors_of(info),
+            sides=_sides_of(file) if file.has_table(f"{SIDE}nodes") else None,
         )
+
+
+def _sides_of(file: _MapFile) -> SideNodes:
+    nodes = _StoredRows(file, f"{SIDE}nodes", lambda k: file.read_node(k, SIDE))
+    return SideNodes(_StoredSummaries(file, SIDE), nodes, _StoredModels(file, SIDE))
 
 
 def _shared_errors_of(info: Mapping[str, str]) -> SharedErrors | None:
@@ -90,14 +96,20 @@ class _MapFile:
         with self.reading():
             return int(self.database.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
 
-    def read_node(self, node_id: int) -> TopoNode:
+    def has_table(self, table: str) -> bool:
+        query = "SELECT COUNT(*) FROM sqlite_master WHERE type = 'table' AND name = ?"
+        return self.database.execute(query, (table,)).fetchone()[0] > 0
+
+    def read_node(self, node_id: int, prefix: str = "") -> TopoNode:
+        """A node; with the prefix `SIDE` a side node, which has no template."""
+        template = ("x''", "") if prefix else ("jpeg", " JOIN node_templates USING (node_id)")
         query = (
             "SELECT recording, name, t_ns, world_from_cam, num_points, json, descriptor_size, points_img, shapes, descriptors,"
-            " points_cam, sqrt_covs, jpeg FROM nodes JOIN cameras USING (camera_id) JOIN node_points USING (node_id)"
-            " JOIN node_templates USING (node_id) WHERE node_id = ?"
+            f" points_cam, sqrt_covs, {template[0]} FROM {prefix}nodes JOIN cameras USING (camera_id)"
+            f" JOIN {prefix}node_points USING (node_id){template[1]} WHERE node_id = ?"
         )
         with self.reading():
-            row = self._one_row(query, node_id, f"node {node_id}")
+            row = self._one_row(query, node_id, f"{prefix}node {node_id}")
             recording, name, t_ns, pose, num_points, camera, descriptor_size, *blobs, jpeg = row
             points_img = np.frombuffer(blobs[0], "<f4").reshape(num_points, 2)
             sizes, angles, responses = np.ascontiguousarray(np.frombuffer(blobs[1], "<f4").reshape(num_points, 3).T)
@@ -150,12 +162,13 @@ class _StoredRows(Sequence[T]):
 class _StoredSummaries(Sequence[NodeSummary]):
     """The summaries of all nodes, read together at the first question: a few dozen bytes a node."""
 
-    def __init__(self, file: _MapFile) -> None:
-        self._file = file
+    def __init__(self, file: _MapFile, prefix: str = "") -> None:
+        self._file, self._prefix = file, prefix
 
     @cached_property
     def _rows(self) -> list[NodeSummary]:
-        query = "SELECT node_id, recording, name, t_ns, world_from_cam, num_points FROM nodes ORDER BY node_id"
+        columns = "node_id, recording, name, t_ns, world_from_cam, num_points"
+        query = f"SELECT {columns} FROM {self._prefix}nodes ORDER BY node_id"
         with self._file.reading():
             rows = self._file.database.execute(query)
             return [NodeSummary(i, rec, name, t_ns, _pose_from_bytes(pose), n) for i, rec, name, t_ns, pose, n in rows]
@@ -168,13 +181,13 @@ class _StoredSummaries(Sequence[NodeSummary]):
 
 
 class _StoredModels(Mapping[str, CoarseModel]):
-    def __init__(self, file: _MapFile) -> None:
-        self._file = file
+    def __init__(self, file: _MapFile, prefix: str = "") -> None:
+        self._file, self._table = file, f"{prefix}coarse_models"
 
     @cached_property
     def _names(self) -> list[str]:
         with self._file.reading():
-            return [name for (name,) in self._file.database.execute("SELECT name FROM coarse_models ORDER BY name")]
+            return [name for (name,) in self._file.database.execute(f"SELECT name FROM {self._table} ORDER BY name")]
 
     def __len__(self) -> int:
         return len(self._names)
@@ -186,7 +199,7 @@ class _StoredModels(Mapping[str, CoarseModel]):
         if name not in self._names:
             raise KeyError(name)
         with self._file.reading():
-            row = self._file.database.execute("SELECT settings, arrays FROM coarse_models WHERE name = ?", (name,)).fetchone()
+            row = self._file.database.execute(f"SELECT settings, arrays FROM {self._table} WHERE name = ?", (name,)).fetchone()
             with np.load(io.BytesIO(row[1]), allow_pickle=False) as arrays:
                 return CoarseModel(name, json.loads(row[0]), dict(arrays))
 

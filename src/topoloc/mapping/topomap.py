@@ -63,6 +63,20 @@ class PlaceImage:
     jpeg: bytes
 
 
+@dataclass(frozen=True, eq=False)
+class SideNodes:
+    """Nodes seen once more by cameras turned to the left and to the right (`side_nodes.py`).
+
+    `summaries[i]` and `nodes[i]` describe side node i: recording, name and time are those of the node whose picture it comes
+    from, the pose is that of the side camera, and there is no template. The one model of `coarse_models` ranks side nodes by
+    looks; its array `centres` (n, 3) holds the world points (metres) in the middle of what each of them shows.
+    """
+
+    summaries: Sequence[NodeSummary]
+    nodes: Sequence[TopoNode]
+    coarse_models: Mapping[str, CoarseModel]
+
+
 @dataclass(frozen=True)
 class Edge:
     """The robot went from node `source_id` to node `target_id`."""
@@ -88,7 +102,8 @@ class TopoMetricMap:
 
     `summaries[i]` describes `nodes[i]`, and ``nodes[i].summary.node_id == i``. `config` is the effective configuration it
     was built with, `length_m` the metres of trajectory that were mapped. `default_coarse` names the coarse localizer that answers
-    where the user names none. `shared_errors` is None where nobody has measured them.
+    where the user names none. `shared_errors` is None where nobody has measured them,
+    `sides` where no mapping picture is wide enough to show the walls along the way.
     """
 
     summaries: Sequence[NodeSummary]
@@ -100,6 +115,7 @@ class TopoMetricMap:
     length_m: float = 0.0
     default_coarse: str = "surf-vlad"
     shared_errors: SharedErrors | None = None
+    sides: SideNodes | None = None
 
     def save(self, path: str | Path) -> None:
         """Write the map file at once or not at all. Raises MapError."""
