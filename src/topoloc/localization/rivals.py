@@ -39,7 +39,7 @@ class RivalsConfig:
     """Nodes within so many D_thresh of a pose (Eq. 1) belong to it; rivals are farther away."""
     agreement: float = 3.0
     """Two poses within so many D_thresh are one."""
-    max_groups: int = 6
+    max_groups: int = 3
     """Parts of the map that are asked on their own, at most; 0 asks none, and compares no picture with what nodes saw."""
     odds_weight: float = 0.3
     even_share_weight: float = 6.0
