@@ -232,6 +232,8 @@ class Localizer:
     def _judge(self, first: Attempt, candidates: list[NodeScore], shared_errors: float, clock: StageClock) -> Judgement:
         """What is found around the first pose, and whether it is believed."""
         final = self._localize_around(first, clock)
+        if first.num_inliers < self.config.num_clear_inliers:  # it may have been too poor to be found from all at once
+            final = max(final, self._localize_around(final, clock), key=lambda attempt: attempt.num_inliers)
         with clock.stage("verification"):
             c = self.config
             return judge(first, final, candidates, shared_errors, c.min_matches, c.matching, c.guided, c.verification, clock)
