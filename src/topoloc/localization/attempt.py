@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -106,9 +107,11 @@ def judge(
         return Judgement(NotLocalized("too_few_inliers", candidates, num_matches, final.num_inliers, clock.times_ms()), final)
     inflated = inflation(final.num_inliers, shared_errors)
     covariance = inflated * final.pose.covariance
-    evidence = None if first.is_guided else _evidence(first, final, covariance, guided, config)
+    # points that share errors differ by them from node to node, so that even true matches agree with a pose less well
+    agreement_px = config.agreement_px * math.sqrt(1.0 + shared_errors)
+    evidence = None if first.is_guided else _evidence(first, final, covariance, agreement_px, guided, config)
     if evidence is None or log_odds_of(evidence, config) <= config.clear_log_odds:
-        evidence = _evidence(_unguided(final, matching), final, covariance, guided, config)
+        evidence = _evidence(_unguided(final, matching), final, covariance, agreement_px, guided, config)
     log_odds, probability = log_odds_of(evidence, config), probability_of(evidence, config)
     if probability < config.min_probability:
         reason, detail = "not_in_map", ""
@@ -134,7 +137,12 @@ def judge(
 
 
 def _evidence(
-    unguided: Attempt, final: Attempt, covariance: Float[np.ndarray, "6 6"], guided: GuidedConfig, config: VerificationConfig
+    unguided: Attempt,
+    final: Attempt,
+    covariance: Float[np.ndarray, "6 6"],
+    agreement_px: float,
+    guided: GuidedConfig,
+    config: VerificationConfig,
 ) -> Evidence:
     """`covariance` is that of the left perturbation of cam_from_world."""
     pose, camera = final.pose, final.camera
@@ -144,7 +152,7 @@ def _evidence(
     visible_img = visible_pixels(final.local_map, pose.cam_from_world, camera)
     return Evidence(
         num_matches=len(unguided.matches),
-        num_inliers=_num_agreeing(unguided, pose.cam_from_world, camera, config),
+        num_inliers=_num_agreeing(unguided, pose.cam_from_world, camera, agreement_px),
         num_found=final.num_inliers,
         num_visible=len(visible_img),
         num_by_chance=count_by_chance(final.features, final.local_map, pose.cam_from_world, camera, guided),
@@ -161,10 +169,10 @@ def _unguided(final: Attempt, config: MatchingConfig) -> Attempt:
     return replace(final, matches=matches, pose=None)
 
 
-def _num_agreeing(unguided: Attempt, cam_from_world: Rigid3, camera: Camera, config: VerificationConfig) -> int:
+def _num_agreeing(unguided: Attempt, cam_from_world: Rigid3, camera: Camera, agreement_px: float) -> int:
     """How many of these matches agree with a pose that is not theirs."""
     points_cam = cam_from_world.apply(unguided.local_map.points_world[unguided.matches.train_idx])
     with np.errstate(invalid="ignore"):
         offsets = camera.img_from_cam(points_cam) - unguided.features.points_img[unguided.matches.query_idx]
-        is_near = np.linalg.norm(offsets, axis=1) < config.agreement_px * max(max(camera.width, camera.height) / 640.0, 0.5)
+        is_near = np.linalg.norm(offsets, axis=1) < agreement_px * max(max(camera.width, camera.height) / 640.0, 0.5)
     return int(np.count_nonzero(is_near))
