@@ -53,3 +53,8 @@ class RoughCamera:
         """The same camera for its image resized to width x height."""
         scale = math.sqrt(width * height / (self.width * self.height))
         return RoughCamera(width, height, self.min_focal * scale, self.max_focal * scale)
+
+
+def usual_camera(lens: Camera | RoughCamera) -> Camera:
+    """The camera, of a rough one that with the focal length in the middle of its range."""
+    return lens.with_focal(math.sqrt(lens.min_focal * lens.max_focal)) if isinstance(lens, RoughCamera) else lens

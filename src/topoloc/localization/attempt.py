@@ -120,20 +120,34 @@ def judge(
             reason, detail = "too_few_inliers", f"in the map, but where is known to {metres:.2f} m only"
         refusal = NotLocalized(reason, candidates, num_matches, final.num_inliers, clock.times_ms(), detail)
         return Judgement(refusal, final, evidence, log_odds)
-    answer = Localization(
+    answer = answer_of(final, covariance, 1.0 / inflated, probability, candidates, evidence, clock)
+    return Judgement(answer, final, evidence, log_odds)
+
+
+def answer_of(
+    final: Attempt,
+    covariance: Float[np.ndarray, "6 6"],
+    noise_share: float,
+    probability: float,
+    candidates: list[NodeScore],
+    evidence: Evidence,
+    clock: StageClock,
+) -> Localization:
+    """The pose of `final` as a result. `covariance` is that of the left perturbation of cam_from_world."""
+    assert final.pose is not None
+    return Localization(
         world_from_cam=final.pose.cam_from_world.inverse(),
         covariance=covariance_of_inverse(final.pose.cam_from_world, covariance),
         probability=probability,
         node_id=final.node_id,
         candidates=candidates,
-        num_matches=num_matches,
+        num_matches=len(final.matches),
         num_inliers=final.num_inliers,
         times_ms=clock.times_ms(),
         evidence=evidence,
         focal_length_px=final.camera.fx if isinstance(final.lens, RoughCamera) else None,
-        noise_share=1.0 / inflated,
+        noise_share=noise_share,
     )
-    return Judgement(answer, final, evidence, log_odds)
 
 
 def _evidence(

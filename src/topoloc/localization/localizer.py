@@ -4,20 +4,19 @@ The coarse localizer names the nodes that the image may belong to; the image is 
 matched with those of the nodes; PnP on the matches gives the camera's global pose. Unlike the paper's blind first choice,
 several candidate nodes pool their points; the nodes nearest to the pose so found, whose points are sought where they must
 be seen, make it exact; and it is reported only where the evidence is strong and no other part of the map explains the image as
-well. One candidate, no guided step and no rivals (`num_candidates=1`, `guided.num_nodes=0`, `rivals.max_groups=0`) give the paper's own
-behaviour.
+well. Where nothing is clear, the walls along the way are asked from the other side. One candidate, no guided step, no rivals and no walls
+(`num_candidates=1`, `guided.num_nodes=0`, `rivals.max_groups=0`, `sides.num_ranked=0`) give the paper's own behaviour.
 """
 
 from __future__ import annotations
 
-import math
 from collections import OrderedDict
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
-from topoloc.errors import EmptyMapError, MapError, QueryError
+from topoloc.errors import EmptyMapError, QueryError
 from topoloc.features.extraction import FeatureConfig, extract_normalized, normalize_image
 from topoloc.features.features import Features, Matches
 from topoloc.features.matching import MatchingConfig, match_pooled
@@ -25,7 +24,7 @@ from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute
 from topoloc.geometry.absolute_pose_focal import estimate_pose_and_focal
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.rough_camera import RoughCamera
+from topoloc.geometry.rough_camera import RoughCamera, usual_camera
 from topoloc.localization.attempt import Attempt, Judgement, judge
 from topoloc.localization.guided import GuidedConfig, match_guided
 from topoloc.localization.local_map import LocalMap
@@ -34,13 +33,15 @@ from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.rivals import RivalsConfig, decide, rival_groups
 from topoloc.localization.seen_points import SeenPoints
 from topoloc.localization.shared_errors import SharedErrorsConfig, shared_errors_of
+from topoloc.localization.side_localizer import SideLocalizer, SidesConfig
+from topoloc.localization.side_verdict import decide_with_sides
 from topoloc.localization.stages import StageClock
 from topoloc.localization.standpoints import StandpointsConfig, strongest_and_distinct
 from topoloc.localization.verification import VerificationConfig
 from topoloc.localization.viewing import viewing_distances
 from topoloc.mapping.nodes import NodePoses
-from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.places.coarse import CoarseLocalizer, Image, NodeScore, open_coarse
+from topoloc.mapping.topomap import TopoMetricMap, open_coarse_of
+from topoloc.places.coarse import CoarseLocalizer, Image, NodeScore
 from topoloc.sequences.pictures import grey_image
 
 NODES_IN_MEMORY = 256
@@ -65,6 +66,7 @@ class LocalizerConfig:
     verification: VerificationConfig = field(default_factory=VerificationConfig)
     rivals: RivalsConfig = field(default_factory=RivalsConfig)
     standpoints: StandpointsConfig = field(default_factory=StandpointsConfig)
+    sides: SidesConfig = field(default_factory=SidesConfig)
     shared_errors: SharedErrorsConfig = field(default_factory=SharedErrorsConfig)
     max_finer: float = 1.15
     """An image of more than so many times the pixels a radian (focal length in pixels) of the map's finest camera is reduced to that
@@ -90,7 +92,7 @@ class Localizer:
         self.topomap = topomap
         if len(topomap.summaries) == 0:
             raise EmptyMapError("the map has no nodes")
-        self._coarse = _coarse_of(topomap, self.config.coarse or topomap.default_coarse) if coarse is None else coarse
+        self._coarse = open_coarse_of(topomap, self.config.coarse or topomap.default_coarse) if coarse is None else coarse
         self._feature_config = FeatureConfig(**topomap.config["features"])
         self._node_poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
         self._lambda_rot = float(topomap.config["nodes"]["lambda_rot"])
@@ -137,6 +139,7 @@ class Localizer:
             first = self._localize_among(candidates, features, lens, clock)
             judgement = self._judge(first, candidates, shared_errors, clock)
             judgement = self._against_rivals(judgement, ranked, features, lens, shared_errors, clock)
+            judgement = self._against_sides(judgement, image, lens, shared_errors, clock)
         result = judgement.result
         if not isinstance(result, Localization):
             return result, None
@@ -148,6 +151,12 @@ class Localizer:
     def shared_errors(self) -> float:
         """rho of the map: the share of a match's variance that its points have in common (see `shared_errors.py`)."""
         return shared_errors_of(self.topomap, self.config.guided, self.config.pose, self.config.shared_errors)
+
+    @cached_property
+    def _sides(self) -> SideLocalizer | None:
+        if self.topomap.sides is None or self.config.sides.num_ranked == 0:
+            return None
+        return SideLocalizer(self.topomap, self.topomap.sides, self._node_poses, self.config.verification, self.config.sides)
 
     @cached_property
     def _map_focal(self) -> float:
@@ -214,7 +223,7 @@ class Localizer:
         config: AbsolutePoseConfig | None = None,
     ) -> Attempt:
         """Robust PnP, or the refinement of `start` (cam_from_world and the camera); with the focal length, of a rough camera."""
-        camera = start[1] if start else _usual(lens)
+        camera = start[1] if start else usual_camera(lens)
         if start is None and len(matches) < self.config.min_matches:
             return Attempt(features, lens, camera, local_map, matches, None)
         points_img = features.points_img[matches.query_idx].astype(np.float64)
@@ -264,6 +273,18 @@ class Localizer:
             judgements += [self._judge(first, result.candidates, shared_errors, clock) for first in attempts]
         return decide(judgements, self._lambda_rot, self._d_thresh, config, clock) if len(judgements) > 1 else judgement
 
+    def _against_sides(
+        self, judgement: Judgement, image: Image, lens: Camera | RoughCamera, shared_errors: float, clock: StageClock
+    ) -> Judgement:
+        """Where no pose is clear, the walls to both sides are asked: they may be seen from the other side."""
+        config = self.config.sides
+        is_clear = isinstance(judgement.result, Localization) and judgement.log_odds > config.verdict.rival_log_odds
+        if self._sides is None or is_clear or isinstance(lens, RoughCamera):
+            return judgement
+        with clock.stage("sides"):
+            sides = self._sides.localize(grey_image(image), lens, judgement.result.candidates, shared_errors, clock)
+        return decide_with_sides(judgement, sides, config.verdict, clock)
+
     def _from_nodes(self, ranked: list[NodeScore], features: Features, lens: Camera | RoughCamera, clock: StageClock) -> list[Attempt]:
         """First poses of what the nodes saw, see `standpoints.py`."""
         config, attempts = self.config.standpoints, []
@@ -271,7 +292,7 @@ class Localizer:
         for candidate in ranked[: config.num_nodes]:
             local_map, world_from_node = self._pooled([candidate.node_id]), self.topomap.summaries[candidate.node_id].world_from_cam
             with clock.stage("matching"):
-                matches = match_guided(features, local_map, world_from_node.inverse(), _usual(lens), config.matching)
+                matches = match_guided(features, local_map, world_from_node.inverse(), usual_camera(lens), config.matching)
             attempts.append(replace(self._attempt(features, lens, local_map, matches, None, clock, quick), is_guided=True))
         reach = self.config.rivals.agreement * self._d_thresh
         return strongest_and_distinct(attempts, self._lambda_rot, reach, config.max_poses)
@@ -286,15 +307,3 @@ class Localizer:
                 self._local_maps.popitem(last=False)
         self._local_maps.move_to_end(node_id)
         return self._local_maps[node_id]
-
-
-def _coarse_of(topomap: TopoMetricMap, name: str) -> CoarseLocalizer:
-    if name not in topomap.coarse_models:
-        available = ", ".join(topomap.coarse_models) or "none"
-        raise MapError(f"the map has no coarse localizer {name!r} (it has: {available})")
-    return open_coarse(topomap.coarse_models[name])
-
-
-def _usual(lens: Camera | RoughCamera) -> Camera:
-    """The camera, of a rough one that with the focal length in the middle of its range."""
-    return lens.with_focal(math.sqrt(lens.min_focal * lens.max_focal)) if isinstance(lens, RoughCamera) else lens

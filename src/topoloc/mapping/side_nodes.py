@@ -28,7 +28,7 @@ class SideNodesConfig:
     """Which nodes have side nodes, and what these keep."""
 
     spacing: float = 3.0
-    """Eq. 1 with so many times the map's D_thresh chooses among the nodes; 0 makes no side nodes."""
+    """Eq. 1 with so many times the map's D_thresh chooses among the nodes, a turn counting half; 0 makes no side nodes."""
     views: SideViewConfig = field(default_factory=SideViewConfig)
     max_points: int = 400
     """Features that a side node keeps, the strongest ones."""
@@ -43,7 +43,8 @@ def nodes_with_sides(world_from_nodes: list[Rigid3], node_config: NodeConfig, co
     if config.spacing == 0.0:
         return set()
     assert node_config.d_thresh is not None, "resolve the configuration first"
-    spaced = replace(node_config, d_thresh=config.spacing * node_config.d_thresh)
+    assert node_config.lambda_rot is not None, "resolve the configuration first"
+    spaced = NodeConfig(config.spacing * node_config.d_thresh, node_config.lambda_rot / 2.0)
     return {int(k) for k in place_nodes(world_from_nodes, spaced)}
 
 

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
+from topoloc.errors import MapError
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.places.coarse import CoarseModel
+from topoloc.places.coarse import CoarseLocalizer, CoarseModel, open_coarse
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,3 +130,11 @@ class TopoMetricMap:
         from topoloc.mapping.stored_map import open_map
 
         return open_map(Path(path))
+
+
+def open_coarse_of(topomap: TopoMetricMap, name: str) -> CoarseLocalizer:
+    """A map's coarse localizer. Raises MapError where the map has none of this name."""
+    if name not in topomap.coarse_models:
+        available = ", ".join(topomap.coarse_models) or "none"
+        raise MapError(f"the map has no coarse localizer {name!r} (it has: {available})")
+    return open_coarse(topomap.coarse_models[name])

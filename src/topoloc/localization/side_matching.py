@@ -1,0 +1,116 @@
+"""A picture's views to both sides, matched together with the side nodes around a pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from topoloc.features.features import Features, Matches
+from topoloc.features.side_views import SideView
+from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.guided import GuidedConfig, count_by_chance, match_guided, visible_pixels
+from topoloc.localization.local_map import LocalMap
+
+_CELL_PX = 8
+
+
+@dataclass(frozen=True, eq=False)
+class SeenSide:
+    """One side of a picture: its view, what was found in it, and the same features at the pixels of the picture."""
+
+    view: SideView
+    features: Features
+    in_picture: Features
+
+
+@dataclass(frozen=True, eq=False)
+class SideMatches:
+    """Features of both sides, at pixels of the picture, matched with points of side nodes around a pose.
+
+    `num_visible` counts cells of 8 pixels in which a point must be seen, since neighbouring side nodes hold the same wall; `num_by_chance`
+    the matches that would be found were the pose wrong.
+    """
+
+    features: Features
+    local_map: LocalMap
+    matches: Matches
+    num_visible: int
+    num_by_chance: int
+
+
+def match_sides(sides: list[tuple[SeenSide, LocalMap]], cam_from_world: Rigid3, config: GuidedConfig) -> SideMatches | None:
+    """Both sides' guided matches, each with the points that it is given. None without any."""
+    features, maps, query_idx, train_idx, distances = [], [], [], [], []
+    num_features = num_points = num_visible = num_by_chance = 0
+    for side, local_map in sides:
+        side_from_world = side.view.cam_from_side.inverse() @ cam_from_world
+        matches = match_guided(side.features, local_map, side_from_world, side.view.camera, config)
+        features.append(side.in_picture)
+        maps.append(local_map)
+        query_idx.append(matches.query_idx + num_features)
+        train_idx.append(matches.train_idx + num_points)
+        distances.append(matches.distances)
+        num_features, num_points = num_features + len(side.features), num_points + len(local_map.radii)
+        num_visible += _num_visible_cells(side.view, local_map, side_from_world)
+        num_by_chance += count_by_chance(side.features, local_map, side_from_world, side.view.camera, config)
+    if not sides or sum(map(len, query_idx)) == 0:
+        return None
+    matches = Matches(
+        *(
+            np.concatenate(part).astype(dtype)
+            for part, dtype in zip((query_idx, train_idx, distances), (np.int32, np.int32, np.float32), strict=True)
+        )
+    )
+    return SideMatches(Features.concatenate(features), LocalMap.pooled(maps), matches, num_visible, num_by_chance)
+
+
+def estimate_pose(found: SideMatches, camera: Camera, config: AbsolutePoseConfig, start: Rigid3 | None) -> AbsolutePose | None:
+    """cam_from_world of the picture from the matches of both sides together; refined from `start`, or sought anew."""
+    rows = found.matches.train_idx
+    return estimate_absolute_pose(
+        found.features.points_img[found.matches.query_idx].astype(np.float64),
+        found.local_map.points_world[rows],
+        camera,
+        config,
+        point_covariances=found.local_map.covariances[rows],
+        start=start,
+    )
+
+
+def nearest_sides(
+    view: SideView,
+    cam_from_world: Rigid3,
+    centres: Float[np.ndarray, "nodes 3"],
+    axes: Float[np.ndarray, "nodes 3"],
+    num_nodes: int,
+) -> list[int]:
+    """Side nodes that look the same way at what lies in the view, those in its middle first.
+
+    Where a side node stands says little: it shows what lies well ahead of it, and who comes the other way sees that from beyond.
+
+    Args:
+        centres: the world points (metres) in the middle of what the side nodes show; axes: the directions in which they look.
+    """
+    side_from_world = view.cam_from_side.inverse() @ cam_from_world
+    looks_alike = side_from_world.rotation[2] @ axes.T > 0.7
+    size = np.array([view.camera.width, view.camera.height])
+    off_middle = np.linalg.norm((view.camera.img_from_cam(side_from_world.apply(centres)) - size / 2.0) / size[0], axis=1)
+    off_middle = np.where(looks_alike & np.isfinite(off_middle), off_middle, np.inf)
+    return [int(k) for k in np.argsort(off_middle, kind="stable")[:num_nodes] if off_middle[k] < 1.0]
+
+
+def _num_visible_cells(view: SideView, local_map: LocalMap, side_from_world: Rigid3) -> int:
+    columns, rows = np.rint(visible_pixels(local_map, side_from_world, view.camera)).astype(int).T
+    columns, rows = np.clip(columns, 0, view.camera.width - 1), np.clip(rows, 0, view.camera.height - 1)
+    inside = view.inside[rows, columns]
+    cells = (rows[inside] // _CELL_PX) * view.camera.width + columns[inside] // _CELL_PX
+    return len(np.unique(cells))
+
+
+def of_picture(local_map: LocalMap, node_id: int) -> LocalMap:
+    """The same points as those of the ordinary node whose picture shows them."""
+    return replace(local_map, node_ids=np.full_like(local_map.node_ids, node_id))

@@ -1,0 +1,79 @@
+"""Is a pose that the walls let expect believed, beside what the map's nodes say?
+
+Much of what speaks for a pose is the same as in `verification.py`, with weights of its own: a wall repeats itself more than a room
+does, and less of it is recognised at a slant. The weights are set by hand, on a rendered corridor and a rendered street that were mapped
+in one direction and walked in the other, and on queries from elsewhere, of which none came near (docs/journal.md, "The other way round").
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from topoloc.localization.attempt import Judgement
+from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.stages import StageClock
+from topoloc.localization.verification import Evidence
+
+
+@dataclass(frozen=True)
+class SideVerdictConfig:
+    """The weights of the evidence, and what is asked of an answer; all in logarithms of odds."""
+
+    found_weight: float = 0.89
+    chance_weight: float = 1.47
+    inliers_weight: float = 0.54
+    inlier_share_weight: float = 2.16
+    spread_weight: float = 0.6
+    doubt_weight: float = -0.5
+    distinct_weight: float = 0.8
+    bias: float = 1.46
+    min_lead: float = 2.0
+    """By how much the best of the walls' poses must lead the next one."""
+    min_lead_over_nodes: float = 3.0
+    """By how much it must lead a pose found by the nodes, or that it."""
+    rival_log_odds: float = 2.5
+    """A pose found by the nodes with more for it is not called in question."""
+
+
+def side_log_odds(e: Evidence, num_distinct: int, config: SideVerdictConfig) -> float:
+    """Logarithm of the odds that a pose is right.
+
+    Args:
+        num_distinct: inliers that look more like the map's point here than like any elsewhere.
+    """
+    return (
+        config.found_weight * math.log((e.num_found + 1) / (e.num_visible + 20))
+        + config.chance_weight * math.log((e.num_found + 1) / (e.num_by_chance + 5))
+        + config.inliers_weight * math.log(e.num_inliers + 1)
+        + config.inlier_share_weight * math.log((e.num_inliers + 1) / (e.num_matches + 10))
+        + config.spread_weight * math.log(e.spread + 0.02)
+        + config.doubt_weight * math.log(max(e.doubt, 0.01))
+        + config.distinct_weight * math.log(num_distinct + 1)
+        + config.bias
+    )
+
+
+def decide_with_sides(judgement: Judgement, sides: list[Judgement], config: SideVerdictConfig, clock: StageClock) -> Judgement:
+    """What the nodes say, or the best of what the walls say (`sides`, best first), or "ambiguous".
+
+    The walls' poses are far from all nodes that look alike, so the two never agree.
+    """
+    times_ms = clock.times_ms()
+    of_nodes = replace(judgement, result=replace(judgement.result, times_ms=times_ms))
+    if not sides:
+        return of_nodes
+    best, next_best = sides[0].log_odds, sides[1].log_odds if len(sides) > 1 else -math.inf
+    is_localized = isinstance(judgement.result, Localization)
+    if is_localized and judgement.log_odds - best >= config.min_lead_over_nodes:
+        return of_nodes
+    is_ahead = best - next_best >= config.min_lead and (not is_localized or best - judgement.log_odds >= config.min_lead_over_nodes)
+    answer = sides[0].result
+    if best > 0.0 and is_ahead and isinstance(answer, Localization):
+        others = math.exp(-best) + math.exp(next_best - best)
+        return replace(sides[0], result=replace(answer, probability=1.0 / (1.0 + others), times_ms=times_ms))
+    if not is_localized and best <= 0.0:
+        return of_nodes
+    r = judgement.result
+    refusal = NotLocalized("ambiguous", r.candidates, r.num_matches, r.num_inliers, times_ms, "the walls to both sides say otherwise")
+    return replace(of_nodes, result=refusal)
