@@ -58,7 +58,7 @@ class SidesConfig:
     is not yet right towards itself."""
     sigma_px: float = 2.0
     """Standard deviation of a key point found at such a slant."""
-    least_shared_errors: float = 0.05
+    least_shared_errors: float = 0.2
     """rho (`shared_errors.py`) is at least this: what is wrong with a wall seen at a slant is wrong with all points on it."""
     min_found: int = 20
     verdict: SideVerdictConfig = field(default_factory=SideVerdictConfig)

@@ -27,13 +27,17 @@ class SideVerdictConfig:
     spread_weight: float = 0.6
     doubt_weight: float = -0.5
     distinct_weight: float = 0.8
-    bias: float = 1.46
+    bias: float = 2.96
     min_lead: float = 2.0
     """By how much the best of the walls' poses must lead the next one."""
     min_lead_over_nodes: float = 3.0
-    """By how much it must lead a pose found by the nodes, or that it."""
+    """By how much it must lead a pose found by the nodes, be that believed or not ..."""
+    min_lead_of_nodes: float = 2.0
+    """... and by how much a believed one must lead it, not to be called in question."""
     rival_log_odds: float = 2.5
-    """A pose found by the nodes with more for it is not called in question."""
+    """Of a pose found by the nodes with more for it, the walls are not asked."""
+    min_probability: float = 0.5
+    """Of the right place and a precise pose together: less probable poses are not reported."""
 
 
 def side_log_odds(e: Evidence, num_distinct: int, config: SideVerdictConfig) -> float:
@@ -65,14 +69,18 @@ def decide_with_sides(judgement: Judgement, sides: list[Judgement], config: Side
         return of_nodes
     best, next_best = sides[0].log_odds, sides[1].log_odds if len(sides) > 1 else -math.inf
     is_localized = isinstance(judgement.result, Localization)
-    if is_localized and judgement.log_odds - best >= config.min_lead_over_nodes:
+    if is_localized and judgement.log_odds - best >= config.min_lead_of_nodes:
         return of_nodes
-    is_ahead = best - next_best >= config.min_lead and (not is_localized or best - judgement.log_odds >= config.min_lead_over_nodes)
-    answer = sides[0].result
-    if best > 0.0 and is_ahead and isinstance(answer, Localization):
-        others = math.exp(-best) + math.exp(next_best - best)
-        return replace(sides[0], result=replace(answer, probability=1.0 / (1.0 + others), times_ms=times_ms))
-    if not is_localized and best <= 0.0:
+    is_ahead = best - next_best >= config.min_lead and best - judgement.log_odds >= config.min_lead_over_nodes
+    answer, evidence = sides[0].result, sides[0].evidence
+    assert isinstance(answer, Localization)
+    assert evidence is not None
+    # a wall alone may leave a pose imprecise though the place is beyond doubt
+    is_precise = math.erf(1.0 / (math.sqrt(2.0) * evidence.doubt))
+    probability = is_precise / (1.0 + math.exp(-best) + math.exp(next_best - best))
+    if is_ahead and probability >= config.min_probability:
+        return replace(sides[0], result=replace(answer, probability=probability, times_ms=times_ms))
+    if not is_localized:
         return of_nodes
     r = judgement.result
     refusal = NotLocalized("ambiguous", r.candidates, r.num_matches, r.num_inliers, times_ms, "the walls to both sides say otherwise")
