@@ -29,11 +29,8 @@ class SideVerdictConfig:
     distinct_weight: float = 0.8
     bias: float = 2.96
     min_lead: float = 2.0
-    """By how much the best of the walls' poses must lead the next one."""
-    min_lead_over_nodes: float = 3.0
-    """By how much it must lead a pose found by the nodes, be that believed or not ..."""
-    min_lead_of_nodes: float = 2.0
-    """... and by how much a believed one must lead it, not to be called in question."""
+    """By how much the best of the walls' poses must lead the next one, and that of the nodes, be that believed or not; and by how much
+    a believed one of the nodes must lead it, not to be called in question."""
     rival_log_odds: float = 2.5
     """Of a pose found by the nodes with more for it, the walls are not asked."""
     min_probability: float = 0.5
@@ -69,9 +66,9 @@ def decide_with_sides(judgement: Judgement, sides: list[Judgement], config: Side
         return of_nodes
     best, next_best = sides[0].log_odds, sides[1].log_odds if len(sides) > 1 else -math.inf
     is_localized = isinstance(judgement.result, Localization)
-    if is_localized and judgement.log_odds - best >= config.min_lead_of_nodes:
+    if is_localized and judgement.log_odds - best >= config.min_lead:
         return of_nodes
-    is_ahead = best - next_best >= config.min_lead and best - judgement.log_odds >= config.min_lead_over_nodes
+    is_ahead = best - max(next_best, judgement.log_odds) >= config.min_lead
     answer, evidence = sides[0].result, sides[0].evidence
     assert isinstance(answer, Localization)
     assert evidence is not None
