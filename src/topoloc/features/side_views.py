@@ -76,9 +76,8 @@ def side_views(camera: Camera, config: SideViewConfig) -> tuple[SideView, ...]:
 def _side_view(camera: Camera, name: str, sign: float, config: SideViewConfig) -> SideView | None:
     """`sign` is that of x in the camera's frame; the side camera's own x axis points ahead on the left, back on the right."""
     cam_from_side = Rigid3(np.array([[0.0, 0.0, sign], [0.0, 1.0, 0.0], [-sign, 0.0, 0.0]]), np.zeros(3))
-    border = np.array([[camera.width - 1.0 if sign > 0 else 0.0, camera.cy]])
-    tangent = abs(float(camera.normalized_from_img(border)[0, 0]))
-    if not np.isfinite(tangent) or tangent * config.nearest < 1.0:
+    tangent = _widest_tangent(camera, sign)
+    if tangent * config.nearest < 1.0:
         return None
     nearest, focal = 1.0 / tangent, camera.fx
     extent = np.array([config.farthest - nearest, 2.0 * config.half_height])
@@ -93,6 +92,12 @@ def _side_view(camera: Camera, name: str, sign: float, config: SideViewConfig) -
     kernel = np.ones((2 * config.margin_px + 1,) * 2, np.uint8)
     inside = cv2.erode(np.asarray(reach, np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0).astype(bool)  # pyright: ignore
     return SideView(name, side, cam_from_side, points_img.astype(np.float32), inside)
+
+
+def _widest_tangent(camera: Camera, sign: float) -> float:
+    """How far to the side the lens sees; what it sees behind itself, at the ends of its rows, has no tangent and does not count."""
+    row = np.column_stack([np.arange(camera.width, dtype=np.float64), np.full(camera.width, camera.cy)])
+    return float(np.nanmax(sign * camera.normalized_from_img(row)[:, 0]))
 
 
 def _points_img(camera: Camera, side: Camera, cam_from_side: Rigid3) -> Float[np.ndarray, "a b 2"]:
