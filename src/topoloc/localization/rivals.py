@@ -7,8 +7,9 @@ pose found, are asked once more on their own, and so are the poses that comparis
 Two poses exclude each other, and their odds against nothing at all say little of which of them it is: a place that repeats itself
 has most of its things twice. What tells them apart is the part of the picture where the two differ, in which the wrong pose finds
 nothing (the even share found), and that the wrong pose, which has only some of the picture to stand on, is less precise (the doubt).
-The weights of both are set by pairs of a right and a wrong pose of one picture. With odds o of the best pose against "neither" and odds
-of e^d against each other one, by which it leads that, it is right with the probability 1 / (1 + 1/o + sum of e^-d).
+The weights of both were chosen by hand on pairs of a right and a wrong pose of one picture (`benchmarks/rival_weights.py`). With odds o
+of the best pose against "neither" and odds of e^d against each other one, by which it leads that, it is right with the probability
+1 / (1 + 1/o + sum of e^-d).
 """
 
 from __future__ import annotations
