@@ -28,7 +28,7 @@ class SideViewConfig:
     """Farther ahead walls are too slanted to be seen well."""
     half_height: float = 0.9
     """How far up and down."""
-    nearest: float = 2.0
+    nearest: float = 1.5
     """A lens so narrow that it sees nothing nearer than this has no side views."""
     max_side_px: int = 700
     """The longer side of a side view, at most."""

@@ -29,6 +29,8 @@ class SideNodesConfig:
 
     spacing: float = 3.0
     """Eq. 1 with so many times the map's D_thresh chooses among the nodes, a turn counting half; 0 makes no side nodes."""
+    opposite: float = 10.0
+    """Nodes that have another one looking the other way within so many D_thresh need no side nodes."""
     views: SideViewConfig = field(default_factory=SideViewConfig)
     max_points: int = 400
     """Features that a side node keeps, the strongest ones."""
@@ -44,8 +46,16 @@ def nodes_with_sides(world_from_nodes: list[Rigid3], node_config: NodeConfig, co
         return set()
     assert node_config.d_thresh is not None, "resolve the configuration first"
     assert node_config.lambda_rot is not None, "resolve the configuration first"
+    reach = config.opposite * node_config.d_thresh
     spaced = NodeConfig(config.spacing * node_config.d_thresh, node_config.lambda_rot / 2.0)
-    return {int(k) for k in place_nodes(world_from_nodes, spaced)}
+    centres = np.array([pose.translation for pose in world_from_nodes])
+    axes = np.array([pose.rotation[:, 2] for pose in world_from_nodes])
+
+    def is_seen_back(k: int) -> bool:
+        near = np.linalg.norm(centres - centres[k], axis=1) < reach
+        return bool((near & (axes @ axes[k] < -0.7)).any())
+
+    return {int(k) for k in place_nodes(world_from_nodes, spaced) if not is_seen_back(int(k))}
 
 
 def describe_sides(
