@@ -1,0 +1,106 @@
+"""A corridor walked in one direction, as a map, and pictures of its way back; each made once a test run.
+
+Its walls run along the world's +y, 2.2 m apart, with the textures of `tiny_world`, above a plain floor: who comes back sees the same
+walls at the opposite slant, and nothing else that the map knows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from tiny_world import BASELINE, LEVEL_FROM_CAM, Panel, render, right_pose, smooth_texture
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rig import StereoRig
+from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.localization.building import build_map
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.sequences.frame import StereoFrame
+
+WIDE = Camera.pinhole(480, 320, 240.0, 240.0, 239.5, 159.5)
+"""45 degrees to either side, as a phone or a stereo camera of a robot sees them."""
+NUM_PAIRS, STEP = 14, 0.3
+
+
+@cache
+def corridor(seed: int = 0) -> list[Panel]:
+    """Two walls, a floor and two ends; another seed is another place of the same shape."""
+    floor = np.full((2, 2), 90.0, np.float32)
+    up_down, along = np.array([0.0, 0.0, -1.0]), np.array([0.0, 1.0, 0.0])
+    shapes = [
+        (np.array([-1.1, 4.0, 0.0]), along, up_down, (8.0, 1.3)),
+        (np.array([1.1, 4.0, 0.0]), -along, up_down, (8.0, 1.3)),
+        (np.array([0.0, 4.0, -1.3]), np.array([1.0, 0.0, 0.0]), -along, (1.1, 8.0)),
+        (np.array([0.0, 12.0, 0.0]), np.array([1.0, 0.0, 0.0]), up_down, (1.1, 1.3)),
+        (np.array([0.0, -4.0, 0.0]), np.array([-1.0, 0.0, 0.0]), up_down, (1.1, 1.3)),
+    ]
+    return [
+        Panel(centre, right, down, half, floor if number == 2 else smooth_texture(1000 + 100 * seed + number, half))
+        for number, (centre, right, down, half) in enumerate(shapes)
+    ]
+
+
+def ahead(y: float, x: float = 0.0, yaw: float = 0.0) -> Rigid3:
+    """world_from_cam in the mapped direction, `y` metres along the corridor, turned to the left by `yaw` radians."""
+    return Rigid3(exp_so3(np.array([0.0, 0.0, yaw])) @ LEVEL_FROM_CAM, np.array([x, y, 0.0]))
+
+
+def back(y: float, x: float = 0.0, yaw: float = 0.0) -> Rigid3:
+    """world_from_cam of the way back."""
+    return ahead(y, x, np.pi + yaw)
+
+
+@dataclass(frozen=True, eq=False)
+class WalkAhead:
+    """A recording of stereo pairs from the corridor's one end towards the other."""
+
+    seed: int
+    name: str = "walk"
+    num_pairs: int = NUM_PAIRS
+    camera: Camera = WIDE
+
+    @property
+    def names(self) -> list[str]:
+        return [f"{number:03d}" for number in range(self.num_pairs)]
+
+    @property
+    def t_ns(self) -> list[int]:
+        return [number * 100_000_000 for number in range(self.num_pairs)]
+
+    @property
+    def poses(self) -> list[Rigid3 | None]:
+        return [ahead(STEP * number, x=0.04 * np.sin(number), yaw=0.02 * np.cos(number)) for number in range(self.num_pairs)]
+
+    def __len__(self) -> int:
+        return self.num_pairs
+
+    def __getitem__(self, index: int) -> StereoFrame:
+        pose = self.poses[index]
+        assert pose is not None
+        left, right = (
+            render(corridor(self.seed), p, self.camera, noise_seed=2 * index + k)[0] for k, p in enumerate((pose, right_pose(pose)))
+        )
+        rig = StereoRig.rectified(self.camera, BASELINE)
+        return StereoFrame(self.names[index], self.t_ns[index], left, self.camera, right=right, rig=rig, world_from_cam=pose)
+
+
+@cache
+def built_corridor() -> TopoMetricMap:
+    """The map of the walk ahead, with side nodes."""
+    return build_map(WalkAhead(0))
+
+
+@cache
+def seen_on_the_way_back(seed: int = 0) -> list[tuple[np.ndarray, Rigid3]]:
+    """Grey pictures of WIDE, with world_from_cam; another seed is another corridor."""
+    poses = [back(y, x=0.15 * np.sin(y), yaw=0.05 * np.cos(3.0 * y)) for y in np.arange(4.0, 7.1, 0.6)]
+    return [(render(corridor(seed), pose, WIDE, noise_seed=500 + k)[0], pose) for k, pose in enumerate(poses)]
+
+
+@cache
+def seen_ahead() -> list[tuple[np.ndarray, Rigid3]]:
+    """Grey pictures of WIDE in the mapped direction, between the frames of the map."""
+    poses = [ahead(y, x=0.1, yaw=-0.03) for y in (0.5, 2.0, 3.8)]
+    return [(render(corridor(), pose, WIDE, noise_seed=700 + k)[0], pose) for k, pose in enumerate(poses)]
