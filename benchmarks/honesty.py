@@ -18,7 +18,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from acceptance import BEYOND, calibration_error, family_of
 from real_recordings import PLACES, Place, darkened, drawn_pictures, read_rigid
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
@@ -32,6 +31,7 @@ from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.sequences.open import open_sequence
 from topoloc.simulation.demo_recordings import SHIPPED
 
+BEYOND = Place("kitchen, beyond the map", "seven_scenes/kitchen@0:120", "seven_scenes/kitchen@120::2", 0.5)
 CHI_SQUARE_6_AT_95 = 12.592
 FACTORS = (0.6, 1.3, 1.8)
 NUM_DRAWN, NUM_ELSEWHERE = 60, 25
@@ -191,6 +191,18 @@ def summary(groups: dict[str, Asked]) -> None:
     for kind, wanted in [*((f"focal x {factor}", 90) for factor in FACTORS), ("rolled 90", 90), ("focal unknown", 80)]:
         share = 100 * sum(len(a.probability) for a in of(kind)) / usual
         print(f"{kind}: {share:.1f} % of what the map's camera localizes; asked: >= {wanted} %")
+
+
+def family_of(name: str) -> str:
+    """Maps and queries of one place go together."""
+    return name.split(",")[0]
+
+
+def calibration_error(probability: np.ndarray, y: np.ndarray, num_bins: int = 10) -> float:
+    """Expected calibration error: the mean distance of the probability told from the share that is right."""
+    bins = np.minimum((probability * num_bins).astype(int), num_bins - 1)
+    errors = [abs(probability[bins == k].mean() - y[bins == k].mean()) * np.mean(bins == k) for k in range(num_bins) if np.any(bins == k)]
+    return float(sum(errors))
 
 
 def separation(probability: np.ndarray, is_right: np.ndarray) -> float:

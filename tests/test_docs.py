@@ -90,6 +90,8 @@ def test_result_and_evaluation_keys_are_documented():
 
 def test_every_table_and_column_of_the_map_is_documented():
     with closing(sqlite3.connect(":memory:")) as database:
+        for prefix in ("", storage.SIDE):
+            database.executescript(storage._NODE_TABLES.format(prefix=prefix))
         database.executescript(storage._SCHEMA)
         tables = [name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
         for table in tables:

@@ -65,6 +65,7 @@ MAP_INFO = {
     "bytes": 1_234_567,
     "num_nodes": 2,
     "num_points": 0,
+    "num_side_nodes": 0,
     "num_place_images": 0,
     "length_m": 1.0,
     "extent_m": [1.0, 0.1, 0.5],
