@@ -279,7 +279,7 @@ class Localizer:
         """Where no pose is clear, the walls to both sides are asked: they may be seen from the other side."""
         config = self.config.sides
         is_clear = isinstance(judgement.result, Localization) and judgement.log_odds > config.verdict.rival_log_odds
-        if self._sides is None or is_clear or isinstance(lens, RoughCamera):
+        if is_clear or isinstance(lens, RoughCamera) or self._sides is None:  # the last opens the side nodes
             return judgement
         with clock.stage("sides"):
             sides = self._sides.localize(grey_image(image), lens, judgement.result.candidates, shared_errors, clock)

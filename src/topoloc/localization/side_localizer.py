@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from topoloc.errors import MapError
 from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.matching import MatchingConfig, match_pooled
 from topoloc.features.side_views import SideViewConfig, side_views
@@ -69,14 +70,16 @@ class SideLocalizer:
 
     Args:
         node_poses: of the map's ordinary nodes; `lambda_rot` and `d_thresh` (metres) are those of its Eq. 1.
+
+    Raises:
+        MapError: what ranks the side nodes is missing or not of them.
     """
 
     def __init__(
         self, topomap: TopoMetricMap, sides: SideNodes, node_poses: NodePoses, verification: VerificationConfig, config: SidesConfig
     ) -> None:
         self.config, self._verification, self._sides, self._node_poses = config, verification, sides, node_poses
-        (model,) = sides.coarse_models.values()
-        self._coarse, self._centres = SurfVlad.from_model(model), model.arrays["centres"]
+        self._coarse, self._centres = _ranking_of(sides)
         self._axes = np.array([summary.world_from_cam.rotation[:, 2] for summary in sides.summaries])
         self._feature_config = FeatureConfig(**topomap.config["features"])
         self._view_config = SideViewConfig(**topomap.config["sides"]["views"])
@@ -243,6 +246,15 @@ class SideLocalizer:
                 self._local_maps.popitem(last=False)
         self._local_maps.move_to_end(side_id)
         return self._local_maps[side_id]
+
+
+def _ranking_of(sides: SideNodes) -> tuple[SurfVlad, Float[np.ndarray, "nodes 3"]]:
+    """What names the side nodes that look most like a view, and the middles (metres, world) of what they show."""
+    models = list(sides.coarse_models.values())
+    centres = models[0].arrays.get("centres") if len(models) == 1 else None
+    if centres is None or centres.shape != (len(sides.summaries), 3):
+        raise MapError("the map's side nodes come without what ranks them; build it again")
+    return SurfVlad.from_model(models[0]), centres
 
 
 def _pose(judgement: Judgement) -> Rigid3:

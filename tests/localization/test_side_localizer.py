@@ -1,0 +1,171 @@
+"""Who comes back along a corridor that was mapped in one direction is localized by its walls, and nobody else is."""
+
+from __future__ import annotations
+
+import sqlite3
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from built_corridor import WIDE, back, built_corridor, corridor, seen_ahead, seen_on_the_way_back
+from tiny_world import path_pose, render, room
+from topoloc.errors import MapError
+from topoloc.geometry.alignment import rotation_error, translation_error
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.side_localizer import SidesConfig
+from topoloc.mapping.topomap import SideNodes, TopoMetricMap
+
+NO_SIDES = LocalizerConfig(sides=SidesConfig(num_ranked=0))
+DISTORTED = Camera("OPENCV", 560, 400, (260.0, 262.0, 283.0, 197.0, -0.12, 0.02, 0.0005, -0.0003))
+
+
+@pytest.fixture(scope="module")
+def localizer() -> Localizer:
+    return Localizer(built_corridor())
+
+
+@cache
+def _found_on_the_way_back() -> list[tuple[Localization | NotLocalized, Rigid3]]:
+    localizer = Localizer(built_corridor())
+    return [(localizer.localize(picture, WIDE), truth) for picture, truth in seen_on_the_way_back()]
+
+
+def _is_right(result: Localization | NotLocalized, truth: Rigid3) -> bool:
+    if not isinstance(result, Localization):
+        return False
+    return translation_error(result.world_from_cam, truth) < 0.3 and rotation_error(result.world_from_cam, truth) < np.deg2rad(5.0)
+
+
+def test_the_way_back_is_localized_by_the_walls_alone():
+    assert all(_is_right(result, truth) for result, truth in _found_on_the_way_back())
+    without = Localizer(built_corridor(), NO_SIDES)
+    assert not any(isinstance(without.localize(picture, WIDE), Localization) for picture, _ in seen_on_the_way_back())
+
+
+def test_an_answer_by_the_walls_says_what_it_stands_on(localizer: Localizer):
+    node_ids = range(len(localizer.topomap.nodes))
+    for result, truth in _found_on_the_way_back():
+        assert isinstance(result, Localization)
+        assert localizer.config.sides.min_found <= result.num_inliers <= result.num_matches
+        assert 0.5 <= result.probability <= 1.0
+        assert result.node_id in node_ids  # an ordinary node, not a side node
+        assert len(result.candidates) == localizer.config.num_candidates
+        assert result.times_ms["sides"] > 0.0
+        assert sum(ms for stage, ms in result.times_ms.items() if stage != "total") <= result.times_ms["total"]
+        # the covariance covers the error, and would not cover a wrong corridor's length
+        assert np.linalg.eigvalsh(result.covariance).min() > 0.0
+        xi = (result.world_from_cam.inverse() @ truth).log()
+        assert float(xi @ np.linalg.solve(result.camera_covariance, xi)) < 30.0
+        assert np.sqrt(np.linalg.eigvalsh(result.camera_covariance[:3, :3])[-1]) < 0.3
+
+
+def test_the_points_seen_are_handed_on(localizer: Localizer):
+    """Streams follow them: each is a point of the walls, at the pixel of the picture."""
+    picture, truth = seen_on_the_way_back()[2]
+    result, seen = localizer.localize_near(picture, WIDE, None)
+    assert isinstance(result, Localization)
+    assert seen is not None
+    assert len(seen.points_img) == result.num_inliers
+    offsets = np.linalg.norm(WIDE.img_from_cam(truth.inverse().apply(seen.points_world)) - seen.points_img, axis=1)
+    assert np.median(offsets) < 3.0
+
+
+def test_another_camera_with_distortion_is_localized_on_the_way_back(localizer: Localizer):
+    truth = back(5.2, x=0.1, yaw=0.04)
+    picture, _ = render(corridor(), truth, DISTORTED, noise_seed=3)
+    assert _is_right(localizer.localize(picture, DISTORTED), truth)
+
+
+def test_pictures_in_the_map_s_own_direction_are_answered_as_without_walls(localizer: Localizer):
+    without = Localizer(built_corridor(), NO_SIDES)
+    for picture, _ in seen_ahead():
+        one, other = localizer.localize(picture, WIDE), without.localize(picture, WIDE)
+        assert isinstance(one, Localization)
+        assert isinstance(other, Localization)
+        np.testing.assert_array_equal(one.world_from_cam.matrix(), other.world_from_cam.matrix())
+        np.testing.assert_array_equal(one.covariance, other.covariance)
+        assert one.probability == other.probability
+        assert "sides" not in one.times_ms  # nor did they wait
+
+
+def _elsewhere() -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    pictures = {"noise": rng.integers(0, 256, (WIDE.height, WIDE.width), dtype=np.uint8)}
+    pictures["blank"] = np.full((WIDE.height, WIDE.width), 120, np.uint8)
+    pictures["half blank"] = np.where(np.arange(WIDE.width) < 240, pictures["noise"], pictures["blank"])
+    pictures |= {f"room {k}": render(room(), path_pose(k), WIDE)[0] for k in (1, 9)}
+    return pictures | {f"another corridor {k}": picture for k, (picture, _) in enumerate(seen_on_the_way_back(seed=5)[::2])}
+
+
+def test_pictures_from_elsewhere_are_refused(localizer: Localizer):
+    answered = [name for name, picture in _elsewhere().items() if isinstance(localizer.localize(picture, WIDE), Localization)]
+    assert answered == []
+
+
+def test_a_wall_in_a_mirror_is_no_wall_of_the_map(localizer: Localizer):
+    for picture, _ in seen_on_the_way_back()[::3]:
+        assert isinstance(localizer.localize(np.ascontiguousarray(picture[:, ::-1]), WIDE), NotLocalized)
+
+
+def test_a_camera_that_is_not_known_or_sees_no_walls_gets_no_answer_by_them(localizer: Localizer):
+    picture, truth = seen_on_the_way_back()[0]
+    assert "sides" not in localizer.localize(picture, None).times_ms
+    narrow = Camera.pinhole(480, 320, 900.0, 900.0, 239.5, 159.5)
+    assert isinstance(localizer.localize(render(corridor(), truth, narrow)[0], narrow), NotLocalized)
+
+
+def _twice(topomap: TopoMetricMap, apart: float) -> TopoMetricMap:
+    """A map whose walls stand a second time so many metres farther along."""
+    sides = topomap.sides
+    assert sides is not None
+    moved = Rigid3(np.eye(3), np.array([0.0, apart, 0.0]))
+    count, (model,) = len(sides.nodes), sides.coarse_models.values()
+    copies = [
+        replace(node, summary=replace(node.summary, node_id=count + k, world_from_cam=moved @ node.summary.world_from_cam))
+        for k, node in enumerate(sides.nodes)
+    ]
+    nodes, ids = [*sides.nodes, *copies], model.arrays["node_ids"]
+    arrays = dict(model.arrays) | {
+        "vectors": np.concatenate([model.arrays["vectors"]] * 2),
+        "node_ids": np.concatenate([ids, ids + count]).astype(ids.dtype),
+        "centres": np.concatenate([model.arrays["centres"], model.arrays["centres"] + moved.translation]),
+    }
+    return replace(topomap, sides=SideNodes([node.summary for node in nodes], nodes, {model.name: replace(model, arrays=arrays)}))
+
+
+def test_walls_that_stand_in_two_places_are_no_answer():
+    localizer = Localizer(_twice(built_corridor(), apart=60.0))
+    results = [localizer.localize(picture, WIDE) for picture, _ in seen_on_the_way_back()[::2]]
+    assert not any(isinstance(result, Localization) for result in results)
+
+
+def test_from_a_file_the_same_is_answered_and_side_nodes_are_read_only_where_they_are_asked(tmp_path: Path):
+    path = tmp_path / "corridor.topo"
+    built_corridor().save(path)
+    picture, truth = seen_on_the_way_back()[1]
+    assert _is_right(Localizer(TopoMetricMap.load(path)).localize(picture, WIDE), truth)
+
+
+SPOILT = {
+    "no coarse model": "DELETE FROM side_coarse_models",
+    "the model of the nodes": "UPDATE side_coarse_models SET arrays = (SELECT arrays FROM coarse_models)",
+}
+
+
+@pytest.mark.parametrize("change", SPOILT.values(), ids=SPOILT.keys())
+def test_side_nodes_that_cannot_be_ranked_are_a_map_error(tmp_path: Path, change: str):
+    path = tmp_path / "corridor.topo"
+    built_corridor().save(path)
+    database = sqlite3.connect(path)
+    database.executescript(change)
+    database.close()
+    localizer = Localizer(TopoMetricMap.load(path))
+    assert isinstance(localizer.localize(seen_ahead()[0][0], WIDE), Localization)
+    with pytest.raises(MapError, match="side nodes"):
+        localizer.localize(seen_on_the_way_back()[0][0], WIDE)
