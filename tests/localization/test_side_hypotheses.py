@@ -32,8 +32,8 @@ class Wall:
 
 def _features(points_img: np.ndarray, sizes_px: np.ndarray, angles: np.ndarray) -> Features:
     one = np.ones(len(points_img), np.float32)
-    kept = (array.astype(np.float32) for array in (points_img, sizes_px, angles))
-    return Features(*kept, one, np.ones((len(one), 1), np.float32))
+    points_img, sizes_px, angles = (array.astype(np.float32) for array in (points_img, sizes_px, angles))
+    return Features(points_img, sizes_px, angles, one, np.ones((len(one), 1), np.float32))
 
 
 def _wall(side_from_node: Rigid3, share_wrong: float = 0.0, seed: int = 0, tilt: float = 0.0) -> Wall:

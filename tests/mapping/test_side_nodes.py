@@ -155,6 +155,16 @@ def test_no_node_is_far_from_one_with_sides_and_these_are_far_from_each_other(st
             assert np.delete(distances, chosen.index(k)).min(initial=np.inf) > spacing * 0.3
 
 
+def test_a_way_that_was_mapped_in_both_directions_needs_no_sides():
+    there = [Rigid3(np.eye(3), np.array([0.0, 0.0, 0.3 * k])) for k in range(80)]
+    back_again = [Rigid3(exp_so3(np.array([0.0, np.pi, 0.0])), np.array([0.5, 0.0, 0.3 * k])) for k in reversed(range(40))]
+    config = SideNodesConfig()
+    alone, both = (nodes_with_sides(poses, SPACED, config) for poses in (there, there + back_again))
+    assert both < alone
+    assert all(0.3 * k > 0.3 * 39 for k in both)  # only beyond where anybody came back
+    assert {k for k in alone if k > 39 + config.opposite} == {k for k in both if k > 39 + config.opposite}
+
+
 def test_a_narrow_lens_makes_a_map_without_sides():
     narrow = Camera.pinhole(320, 240, 600.0, 600.0, 159.5, 119.5)
     topomap = build_map(replace(WalkAhead(0), num_pairs=2, camera=narrow))
