@@ -45,7 +45,8 @@ def _wall(side_from_node: Rigid3, share_wrong: float = 0.0, seed: int = 0, tilt:
     points_node = (on_wall - [2.75, 0.0, 0.0]) @ exp_so3(np.array([0.0, tilt, 0.0])).T + middle
     points_side = side_from_node.apply(points_node)
     turn = np.arctan2(side_from_node.rotation[1, 0], side_from_node.rotation[0, 0])
-    metres, angles = rng.uniform(0.05, 0.4, NUM_POINTS), rng.uniform(-np.pi, np.pi, NUM_POINTS)
+    # alike in size and orientation, as things on walls are: where they lie must tell wrong matches from right ones
+    metres, angles = rng.uniform(0.1, 0.2, NUM_POINTS), rng.uniform(-0.25, 0.25, NUM_POINTS)
     wrong = rng.random(NUM_POINTS) < share_wrong
     train_idx = np.arange(NUM_POINTS)
     train_idx[wrong] = rng.integers(0, NUM_POINTS, np.count_nonzero(wrong))
@@ -93,9 +94,9 @@ def test_the_pose_is_found_among_wrong_matches(turn: float, along: float, up: fl
     assert found is not None
     assert num_right <= found[0] <= NUM_POINTS
     apart = _side_from_node(found) @ truth.inverse()
-    assert np.rad2deg(apart.angle()) < 3.0
+    assert np.rad2deg(apart.angle()) < 5.0
     at_wall = _side_from_node(found).apply(np.array([[2.75, 0.0, NODE_DEPTH]])) - truth.apply(np.array([[2.75, 0.0, NODE_DEPTH]]))
-    assert np.linalg.norm(at_wall) < 0.1 * (NODE_DEPTH - nearer)
+    assert np.linalg.norm(at_wall) < 0.25 * (NODE_DEPTH - nearer)
     assert found[0] - num_right < 0.25 * NUM_POINTS
 
 

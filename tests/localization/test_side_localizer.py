@@ -16,9 +16,13 @@ from topoloc.errors import MapError
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.attempt import Judgement
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.localization.side_localizer import SidesConfig
+from topoloc.localization.side_localizer import SideLocalizer, SidesConfig
+from topoloc.localization.stages import StageClock
+from topoloc.localization.verification import VerificationConfig
+from topoloc.mapping.nodes import NodePoses
 from topoloc.mapping.topomap import SideNodes, TopoMetricMap
 
 NO_SIDES = LocalizerConfig(sides=SidesConfig(num_ranked=0))
@@ -49,12 +53,16 @@ def test_the_way_back_is_localized_by_the_walls_alone():
 
 
 def test_an_answer_by_the_walls_says_what_it_stands_on(localizer: Localizer):
-    node_ids = range(len(localizer.topomap.nodes))
+    topomap = localizer.topomap
+    assert topomap.sides is not None
+    with_sides = {summary.name for summary in topomap.sides.summaries}
     for result, truth in _found_on_the_way_back():
         assert isinstance(result, Localization)
         assert localizer.config.sides.min_found <= result.num_inliers <= result.num_matches
         assert 0.5 <= result.probability <= 1.0
-        assert result.node_id in node_ids  # an ordinary node, not a side node
+        node = topomap.summaries[result.node_id]  # an ordinary one, which saw the same wall from its other side
+        assert node.name in with_sides
+        assert 2.0 < truth.translation[1] - node.world_from_cam.translation[1] < 7.5
         assert len(result.candidates) == localizer.config.num_candidates
         assert result.times_ms["sides"] > 0.0
         assert sum(ms for stage, ms in result.times_ms.items() if stage != "total") <= result.times_ms["total"]
@@ -145,7 +153,34 @@ def test_walls_that_stand_in_two_places_are_no_answer():
     assert not any(isinstance(result, Localization) for result in results)
 
 
-def test_from_a_file_the_same_is_answered_and_side_nodes_are_read_only_where_they_are_asked(tmp_path: Path):
+def _by_the_walls(topomap: TopoMetricMap, picture: np.ndarray, config: SidesConfig | None = None) -> list[Judgement]:
+    """What the walls let expect, whatever the nodes say."""
+    assert topomap.sides is not None
+    node_poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
+    walls = SideLocalizer(topomap, topomap.sides, node_poses, VerificationConfig(), config or SidesConfig())
+    return walls.localize(picture, WIDE, [], 0.1, StageClock())
+
+
+def test_poses_where_nodes_look_the_same_way_are_left_to_the_nodes():
+    picture, truth = seen_ahead()[1]
+    assert _by_the_walls(built_corridor(), picture) == []
+    (found,) = _by_the_walls(built_corridor(), picture, SidesConfig(min_distance=0.0))[:1]
+    assert _is_right(found.result, truth)
+
+
+def test_walls_that_look_alike_elsewhere_have_less_for_them():
+    """The points there are the same, and so tell nothing; and each place is named once."""
+    picture, truth = seen_on_the_way_back()[2]
+    once, twice = (_by_the_walls(m, picture) for m in (built_corridor(), _twice(built_corridor(), apart=60.0)))
+    assert _is_right(once[0].result, truth)
+    assert len(twice) >= 2
+    assert once[0].log_odds > twice[0].log_odds + 0.5
+    assert twice[0].log_odds >= twice[1].log_odds
+    ways = [judgement.result.world_from_cam.translation[1] for judgement in twice if isinstance(judgement.result, Localization)]
+    assert sorted(round((way - truth.translation[1]) / 60.0) for way in ways[:2]) == [0, 1]
+
+
+def test_from_a_file_the_same_is_answered(tmp_path: Path):
     path = tmp_path / "corridor.topo"
     built_corridor().save(path)
     picture, truth = seen_on_the_way_back()[1]
@@ -159,7 +194,7 @@ SPOILT = {
 
 
 @pytest.mark.parametrize("change", SPOILT.values(), ids=SPOILT.keys())
-def test_side_nodes_that_cannot_be_ranked_are_a_map_error(tmp_path: Path, change: str):
+def test_side_nodes_that_cannot_be_ranked_are_a_map_error_where_they_are_asked(tmp_path: Path, change: str):
     path = tmp_path / "corridor.topo"
     built_corridor().save(path)
     database = sqlite3.connect(path)
