@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import sqlite3
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -203,6 +205,33 @@ def test_a_loaded_map_keeps_its_sides_when_it_is_saved_again(sides: SideNodes, s
     again = TopoMetricMap.load(saved_corridor).sides
     assert again is not None
     assert [len(node.features) for node in again.nodes] == [len(node.features) for node in sides.nodes]
+
+
+QUERIES_OF_OPENING = """
+import sqlite3, sys
+from topoloc.mapping import stored_map
+connect, asked = sqlite3.connect, []
+def traced(*args, **kwargs):
+    database = connect(*args, **kwargs)
+    database.set_trace_callback(asked.append)
+    return database
+stored_map.sqlite3.connect = traced
+topomap = stored_map.open_map(stored_map.Path(sys.argv[1]))
+print(asked)
+topomap.sides.nodes[1]
+print(asked)
+"""
+
+
+def test_opening_reads_no_side_node(saved_corridor: Path):
+    """In a process of its own, since checking the types of a map's entries reads them."""
+    answer = subprocess.run([sys.executable, "-c", QUERIES_OF_OPENING, str(saved_corridor)], capture_output=True, text=True, check=True)
+    opening, later = answer.stdout.splitlines()
+    assert "FROM map" in opening
+    for table in ("side_nodes", "side_node_points", "side_coarse_models"):
+        assert f"FROM {table}" not in opening
+        assert f"JOIN {table}" not in opening
+    assert later.count("FROM side_nodes JOIN") == 1
 
 
 def changed(path: Path, script: str) -> Path:
