@@ -91,6 +91,11 @@ def open_towards(scene: Any, points: Float64[np.ndarray, "n 3"], direction_world
     return np.array(_recorded(let_through)(scene, ray), np.float32)
 
 
+def forget_recordings() -> None:
+    """To be called before a scene is loaded: it may come to lie where another one was, and be taken for that by its recording."""
+    _recorded.cache_clear()
+
+
 @cache
 def _recorded(function: Callable[..., Any]) -> Callable[..., Any]:
     """The same, but Python runs it only once for a scene: its kernels are recorded and launched again, which saves half of the time."""

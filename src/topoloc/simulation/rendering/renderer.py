@@ -12,7 +12,7 @@ from jaxtyping import Float32, Float64
 from topoloc.errors import CalibrationError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.simulation.rendering.first_hits import FirstHits, find_first_hits
+from topoloc.simulation.rendering.first_hits import FirstHits, find_first_hits, forget_recordings
 from topoloc.simulation.rendering.light_bake import LightBakeConfig, Progress, bake_light
 from topoloc.simulation.rendering.light_cache import cached_light
 from topoloc.simulation.rendering.light_cells import LightCells, divide_space
@@ -83,6 +83,7 @@ class Renderer:
 
         self._haze = scene.haze
         self._lights = LightChoice(scene)
+        forget_recordings()
         self._scene = load_scene(scene, self._lights.lamps)
         self._parameters = mitsuba.traverse(self._scene)
         self._integrator = _integrator(scene, self._config)
