@@ -10,9 +10,8 @@ well. Where nothing is clear, the walls along the way are asked from the other s
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -97,7 +96,7 @@ class Localizer:
         self._node_poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
         self._lambda_rot = float(topomap.config["nodes"]["lambda_rot"])
         self._d_thresh = float(topomap.config["nodes"]["d_thresh"])
-        self._local_maps: OrderedDict[int, LocalMap] = OrderedDict()
+        self._local_map = lru_cache(maxsize=NODES_IN_MEMORY)(lambda node_id: LocalMap.of_node(topomap.nodes[node_id]))
 
     def localize(self, image: Image, camera: Camera | RoughCamera | None) -> Localization | NotLocalized:
         """Where was this image (grey or RGB, uint8) taken, by a camera of this calibration?
@@ -299,11 +298,3 @@ class Localizer:
 
     def _pooled(self, node_ids: list[int]) -> LocalMap:
         return LocalMap.pooled([self._local_map(node_id) for node_id in node_ids])
-
-    def _local_map(self, node_id: int) -> LocalMap:
-        if node_id not in self._local_maps:
-            self._local_maps[node_id] = LocalMap.of_node(self.topomap.nodes[node_id])
-            if len(self._local_maps) > NODES_IN_MEMORY:
-                self._local_maps.popitem(last=False)
-        self._local_maps.move_to_end(node_id)
-        return self._local_maps[node_id]

@@ -10,8 +10,8 @@ that look the same way, they would have been recognised, so poses there are not 
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -24,7 +24,7 @@ from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.attempt import Attempt, Judgement, answer_of
-from topoloc.localization.guided import GuidedConfig
+from topoloc.localization.guided import GuidedConfig, visible_pixels
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.shared_errors import inflation
 from topoloc.localization.side_hypotheses import SideHypothesis, agreeing_pose
@@ -86,7 +86,7 @@ class SideLocalizer:
         self._lambda_rot, self._d_thresh = (float(topomap.config["nodes"][name]) for name in ("lambda_rot", "d_thresh"))
         ids = {(summary.recording, summary.name): summary.node_id for summary in topomap.summaries}
         self._node_ids = [ids.get((summary.recording, summary.name), 0) for summary in sides.summaries]
-        self._local_maps: OrderedDict[int, tuple[TopoNode, LocalMap]] = OrderedDict()
+        self._local_map = lru_cache(maxsize=_NODES_IN_MEMORY)(self._read)
 
     def localize(
         self, grey: UInt8[np.ndarray, "h w"], camera: Camera, candidates: list[NodeScore], shared_errors: float, clock: StageClock
@@ -147,10 +147,10 @@ class SideLocalizer:
     def _follow_up(self, hypothesis: SideHypothesis, seen: list[SeenSide], camera: Camera) -> tuple[SideMatches, AbsolutePose] | None:
         """What both sides show around the first pose, and the pose that follows."""
         cam_from_world, found, pose = hypothesis.cam_from_world, None, None
-        for radius_px, max_error_px in self.config.rounds:
+        for k, (radius_px, max_error_px) in enumerate(self.config.rounds, start=1):
             if self._is_mapped(cam_from_world):
                 return None
-            found = self._matched(hypothesis, seen, cam_from_world, radius_px)
+            found = self._matched(hypothesis, seen, cam_from_world, radius_px, with_counts=k == len(self.config.rounds))
             pose = self._estimate(found, camera, cam_from_world, max_error_px) if found is not None else None
             if pose is None or np.count_nonzero(pose.inliers) < self._verification.min_inliers:
                 return None
@@ -178,12 +178,14 @@ class SideLocalizer:
         answer = answer_of(attempt, inflated * pose.covariance, 1.0 / inflated, probability, candidates, evidence, clock)
         return Judgement(answer, attempt, evidence, log_odds)
 
-    def _matched(self, hypothesis: SideHypothesis, seen: list[SeenSide], cam_from_world: Rigid3, radius_px: float) -> SideMatches | None:
+    def _matched(
+        self, hypothesis: SideHypothesis, seen: list[SeenSide], cam_from_world: Rigid3, radius_px: float, with_counts: bool
+    ) -> SideMatches | None:
         """The matches of the hypothesis itself, or, with a radius, those of both sides around the pose."""
         if radius_px == 0.0:
             return SideMatches(seen[hypothesis.view].in_picture, self._local_map(hypothesis.side_id)[1], hypothesis.matches, 0, 0)
         sides = [(side, local_map) for side in seen if (local_map := self._around(side, cam_from_world)) is not None]
-        return match_sides(sides, cam_from_world, GuidedConfig(radius_px=radius_px))
+        return match_sides(sides, cam_from_world, GuidedConfig(radius_px=radius_px), with_counts)
 
     def _estimate(self, found: SideMatches, camera: Camera, near: Rigid3, max_error_px: float) -> AbsolutePose | None:
         """The pose refined, or sought anew where that has more inliers and is near: a wall has a second pose."""
@@ -198,6 +200,7 @@ class SideLocalizer:
         camera, inliers = attempt.camera, attempt.pose.inliers
         depths = attempt.pose.cam_from_world.apply(found.local_map.points_world[found.matches.train_idx[inliers]])[:, 2]
         points_img = found.features.points_img[found.matches.query_idx[inliers]].astype(np.float64)
+        visible_img = visible_pixels(found.local_map, attempt.pose.cam_from_world, camera)
         return Evidence(
             num_matches=len(hypothesis.matches),
             num_inliers=hypothesis.num_agreeing,
@@ -206,7 +209,7 @@ class SideLocalizer:
             num_by_chance=found.num_by_chance,
             spread=spread_of(points_img, camera.width, camera.height),
             doubt=doubt_of(covariance, float(np.median(depths)), self._verification),
-            even_share=even_share_of(points_img, points_img, camera.width, camera.height),
+            even_share=even_share_of(points_img, visible_img, camera.width, camera.height),
         )
 
     def _num_distinct(self, attempt: Attempt, ranked: list[list[int]]) -> int:
@@ -238,14 +241,9 @@ class SideLocalizer:
         way = float(np.linalg.norm(a_from_world.inverse().translation - b_from_world.inverse().translation))
         return way < 1.5 * self._d_thresh and apart.angle() < math.radians(20.0)
 
-    def _local_map(self, side_id: int) -> tuple[TopoNode, LocalMap]:
-        if side_id not in self._local_maps:
-            node = self._sides.nodes[side_id]
-            self._local_maps[side_id] = node, of_picture(LocalMap.of_node(node), self._node_ids[side_id])
-            if len(self._local_maps) > _NODES_IN_MEMORY:
-                self._local_maps.popitem(last=False)
-        self._local_maps.move_to_end(side_id)
-        return self._local_maps[side_id]
+    def _read(self, side_id: int) -> tuple[TopoNode, LocalMap]:
+        node = self._sides.nodes[side_id]
+        return node, of_picture(LocalMap.of_node(node), self._node_ids[side_id])
 
 
 def _ranking_of(sides: SideNodes) -> tuple[SurfVlad, Float[np.ndarray, "nodes 3"]]:

@@ -42,8 +42,13 @@ class SideMatches:
     num_by_chance: int
 
 
-def match_sides(sides: list[tuple[SeenSide, LocalMap]], cam_from_world: Rigid3, config: GuidedConfig) -> SideMatches | None:
-    """Both sides' guided matches, each with the points that it is given. None without any."""
+def match_sides(
+    sides: list[tuple[SeenSide, LocalMap]], cam_from_world: Rigid3, config: GuidedConfig, with_counts: bool = True
+) -> SideMatches | None:
+    """Both sides' guided matches, each with the points that it is given. None without any.
+
+    `with_counts` also counts what must be seen and what chance finds, which takes as long again.
+    """
     features, maps, query_idx, train_idx, distances = [], [], [], [], []
     num_features = num_points = num_visible = num_by_chance = 0
     for side, local_map in sides:
@@ -55,8 +60,9 @@ def match_sides(sides: list[tuple[SeenSide, LocalMap]], cam_from_world: Rigid3, 
         train_idx.append(matches.train_idx + num_points)
         distances.append(matches.distances)
         num_features, num_points = num_features + len(side.features), num_points + len(local_map.radii)
-        num_visible += _num_visible_cells(side.view, local_map, side_from_world)
-        num_by_chance += count_by_chance(side.features, local_map, side_from_world, side.view.camera, config)
+        if with_counts:
+            num_visible += _num_visible_cells(side.view, local_map, side_from_world)
+            num_by_chance += count_by_chance(side.features, local_map, side_from_world, side.view.camera, config)
     if not sides or sum(map(len, query_idx)) == 0:
         return None
     matches = Matches(

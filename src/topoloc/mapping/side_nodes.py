@@ -107,8 +107,7 @@ def _side_node(
 
 def _centre(node: TopoNode) -> Float[np.ndarray, " 3"]:
     """The world point in the middle of what the node shows."""
-    world_from_cam: Rigid3 = node.summary.world_from_cam
-    return world_from_cam.apply(np.median(node.points_cam.astype(np.float64), axis=0)[None])[0]
+    return node.summary.world_from_cam.apply(np.median(node.points_cam.astype(np.float64), axis=0)[None])[0]
 
 
 def _coarse(nodes: list[TopoNode], config: VladConfig) -> SurfVlad:
