@@ -1,4 +1,4 @@
-# make demo      maps a rendered room by day, asks it by day and by night, writes topoloc-demo/report.html; installs the core if nothing is there
+# make demo      maps a rendered room by day, asks it by day and by night, writes topoloc-demo/report.html; installs what that needs
 # make install   the program with all its extras and the tests' tools, into .venv, at the versions of constraints.txt
 # make test      all checks: ruff, import contract, types, tests; installs into .venv only what these need
 # make lint      the same without the tests
@@ -36,18 +36,19 @@ docs: $(VENV)/installed-docs
 	@echo "docs/_build/html/index.html"
 
 # What each kind of installation brings; one that brings more has brought the others, too.
-$(VENV)/installed-core: EXTRAS :=
+$(VENV)/installed-core: EXTRAS := [report]
 $(VENV)/installed-core: BRINGS := core
 $(VENV)/installed-docs: EXTRAS := [docs]
 $(VENV)/installed-docs: BRINGS := core docs
-$(VENV)/installed-test: EXTRAS := [sim,test]
+$(VENV)/installed-test: EXTRAS := [test]
+$(VENV)/installed-test $(VENV)/installed-all: WORKSHOP := --editable ./worlds --editable ./paper
 $(VENV)/installed-test: BRINGS := core docs test
 $(VENV)/installed-all: EXTRAS := [all,test]
 $(VENV)/installed-all: BRINGS := core docs test all
-$(VENV)/installed-core $(VENV)/installed-docs $(VENV)/installed-test $(VENV)/installed-all: pyproject.toml constraints.txt $(BIN)/python
+$(VENV)/installed-core $(VENV)/installed-docs $(VENV)/installed-test $(VENV)/installed-all: pyproject.toml worlds/pyproject.toml paper/pyproject.toml constraints.txt $(BIN)/python
 	@echo "installing topoloc$(EXTRAS) into $(VENV) ..."
 	@$(PIP) hatchling editables
-	@$(PIP) --no-build-isolation --editable '.$(EXTRAS)'
+	@$(PIP) --no-build-isolation --editable '.$(EXTRAS)' $(WORKSHOP)
 	@touch $(BRINGS:%=$(VENV)/installed-%)
 
 $(BIN)/python:

@@ -35,9 +35,9 @@ from topoloc.localization.attempt import Attempt, Judgement, judge
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.stages import StageClock
 from topoloc.localization.verification import Evidence, VerificationConfig, log_odds_of, score_features, tolerated_translation
-from topoloc.mapping.build import BuildConfig, build_map
-from topoloc.mapping.side_nodes import SideNodesConfig
-from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.map.build import BuildConfig, build_map
+from topoloc.map.side_nodes import SideNodesConfig
+from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.coarse import NodeScore
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import open_sequence

@@ -23,9 +23,9 @@ import numpy as np
 
 from topoloc.evaluation.experiments import neighbours_of
 from topoloc.features.extraction import FeatureConfig, extract_features
-from topoloc.mapping.coarse_training import CoarseTrainingConfig, train_coarse
-from topoloc.mapping.nodes import NodePoses, node_distances
-from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.map.coarse_training import CoarseTrainingConfig, train_coarse
+from topoloc.map.nodes import NodePoses, node_distances
+from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.classifier_config import CnnFcConfig, PictureConfig
 from topoloc.places.coarse import CoarseLocalizer, open_coarse
 from topoloc.sequences.frame import StereoSequence

@@ -19,17 +19,17 @@ import cv2
 import numpy as np
 
 from real_recordings import PLACES, Place, darkened, drawn_pictures, read_rigid
+from topoloc.demo.recordings import SHIPPED
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.verification import VerificationConfig, tolerated_translation
-from topoloc.mapping.build import BuildConfig, build_map
-from topoloc.mapping.nodes import NodeConfig
-from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.map.build import BuildConfig, build_map
+from topoloc.map.nodes import NodeConfig
+from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.open import open_sequence
-from topoloc.simulation.demo_recordings import SHIPPED
 
 BEYOND = Place("kitchen, beyond the map", "seven_scenes/kitchen@0:120", "seven_scenes/kitchen@120::2", 0.5)
 CHI_SQUARE_6_AT_95 = 12.592

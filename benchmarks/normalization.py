@@ -28,7 +28,7 @@ from topoloc.features.surf import SurfConfig, extract_surf
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.rigid import Rigid3
-from topoloc.mapping.views import MappingView, mapping_view
+from topoloc.map.views import MappingView, mapping_view
 from topoloc.sequences.open import open_sequence
 from topoloc.slam.metric_points import MetricPointsConfig, locate_points
 

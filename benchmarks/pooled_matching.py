@@ -20,7 +20,7 @@ import tyro
 from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.matching import MatchingConfig, match_features, match_pooled
 from topoloc.geometry.absolute_pose import estimate_absolute_pose
-from topoloc.mapping.views import mapping_view
+from topoloc.map.views import mapping_view
 from topoloc.sequences.open import open_sequence
 from topoloc.slam.metric_points import MetricPointsConfig, locate_points
 

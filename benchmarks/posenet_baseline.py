@@ -17,13 +17,13 @@ import numpy as np
 
 from topoloc.evaluation.experiments import answer_queries
 from topoloc.evaluation.metrics import summarize
-from topoloc.evaluation.posenet import PoseNet, PoseNetConfig, train_posenet
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.classifier_config import PictureConfig, TrainingConfig
 from topoloc.places.weights import find_weights
 from topoloc.sequences.open import open_sequence
+from topoloc_paper.posenet import PoseNet, PoseNetConfig, train_posenet
 
 LOSSES = ("beta", "learnt", "reprojection")
 LEARNING_RATES = (3e-4, 1e-3)

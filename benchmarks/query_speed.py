@@ -20,8 +20,8 @@ from topoloc.features.matching import MatchingConfig
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.mapping.build import BuildConfig, build_map
-from topoloc.mapping.nodes import NodeConfig
+from topoloc.map.build import BuildConfig, build_map
+from topoloc.map.nodes import NodeConfig
 from topoloc.sequences.open import open_sequence
 
 PEER = "the paper's scheme on OpenCV"

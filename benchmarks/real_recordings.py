@@ -25,9 +25,9 @@ import numpy as np
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
-from topoloc.mapping.build import BuildConfig, build_map
-from topoloc.mapping.nodes import NodeConfig
-from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.map.build import BuildConfig, build_map
+from topoloc.map.nodes import NodeConfig
+from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.frame import StereoFrame
 from topoloc.sequences.open import open_sequence
 

@@ -16,10 +16,10 @@ import numpy as np
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.simulation.conditions import find_condition
-from topoloc.simulation.rendering.renderer import RenderConfig, Renderer
-from topoloc.simulation.rendering.variant import LLVM, SCALAR, use_best_variant
-from topoloc.simulation.worlds import WORLDS, World
+from topoloc_worlds.conditions import find_condition
+from topoloc_worlds.rendering.renderer import RenderConfig, Renderer
+from topoloc_worlds.rendering.variant import LLVM, SCALAR, use_best_variant
+from topoloc_worlds.worlds import WORLDS, World
 
 QUALITIES = {"default": RenderConfig(), "draft": RenderConfig.draft()}
 

@@ -39,16 +39,16 @@ from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization
-from topoloc.localization.stream_result import StreamedPose
-from topoloc.localization.tracker import Tracker, TrackerConfig
-from topoloc.mapping.build import build_map
+from topoloc.map.build import build_map
 from topoloc.sequences.frame import StereoFrame
 from topoloc.sequences.open import open_sequence
 from topoloc.sequences.recording import single_pictures
 from topoloc.slam.slam import run_slam
+from topoloc.tracking.stream_result import StreamedPose
+from topoloc.tracking.tracker import Tracker, TrackerConfig
 
 CHI_SQUARE_6_AT_95 = 12.592
-DEMO = Path(__file__).parents[1] / "src" / "topoloc" / "simulation" / "lab_demo"
+DEMO = Path(__file__).parents[1] / "src" / "topoloc" / "demo" / "lab"
 
 
 @dataclass(frozen=True)

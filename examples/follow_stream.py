@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 import topoloc
+from topoloc.demo.recordings import SHIPPED
 from topoloc.geometry.alignment import translation_error
-from topoloc.localization.motion import MotionConfig
-from topoloc.localization.motion_gate import GateConfig
-from topoloc.simulation.demo_recordings import SHIPPED
+from topoloc.tracking.motion import MotionConfig
+from topoloc.tracking.motion_gate import GateConfig
 
 COVERED, MISPLACED = range(8, 10), 20
 

@@ -12,9 +12,9 @@ from collections import Counter
 from pathlib import Path
 
 import topoloc
+from topoloc.demo.recordings import SHIPPED
 from topoloc.errors import UnreadableImageError
 from topoloc.sequences.trajectory import Trajectory, write_tum
-from topoloc.simulation.demo_recordings import SHIPPED
 
 
 def main(map_file: Path | None, folder: str, out: Path) -> None:

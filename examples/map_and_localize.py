@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 import topoloc
+from topoloc.demo.recordings import SHIPPED
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.pose_covariance import covariance_of_inverse, position_covariance
-from topoloc.simulation.demo_recordings import SHIPPED
 
 
 def main(map_from: str, ask: str, out: Path) -> None:

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 
 import topoloc
+from topoloc.demo.recordings import SHIPPED
 from topoloc.geometry.alignment import translation_error
-from topoloc.simulation.demo_recordings import SHIPPED
 
 # A lens with barrel distortion: f, c in pixels, (k1, k2, p1, p2) as OpenCV's calibration gives them.
 LENS = topoloc.Camera("OPENCV", 640, 400, (380.0, 380.0, 319.5, 199.5, -0.28, 0.07, 0.001, -0.0005))

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 import topoloc
-from topoloc.simulation.demo_recordings import SHIPPED
+from topoloc.demo.recordings import SHIPPED
 
 ASKED = ("day@0::4", "night@0::4", "corridor", "street")
 

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 import topoloc
+from topoloc.demo.recordings import SHIPPED
 from topoloc.geometry.trajectory_error import absolute_trajectory_errors
 from topoloc.sequences.trajectory import Trajectory, with_trajectory, write_tum
-from topoloc.simulation.demo_recordings import SHIPPED
 from topoloc.slam.slam import run_slam
 
 

@@ -10,13 +10,13 @@ import argparse
 from pathlib import Path
 
 import topoloc
+from topoloc.demo.recordings import SHIPPED
 from topoloc.evaluation.experiments import answer_queries
 from topoloc.evaluation.metrics import summarize
-from topoloc.mapping.coarse_storage import store_coarse
-from topoloc.mapping.coarse_training import CoarseTrainingConfig, train_coarse
-from topoloc.mapping.nodes import NodeConfig
+from topoloc.map.coarse_storage import store_coarse
+from topoloc.map.coarse_training import CoarseTrainingConfig, train_coarse
+from topoloc.map.nodes import NodeConfig
 from topoloc.places.classifier_config import CnnFcConfig, PictureConfig, TrainingConfig
-from topoloc.simulation.demo_recordings import SHIPPED
 
 
 def main(map_file: Path | None, weights: str | None, epochs: int, out: Path) -> None:

@@ -16,7 +16,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.building import build_map
-from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.frame import StereoFrame
 
 WIDE = Camera.pinhole(480, 320, 240.0, 240.0, 239.5, 159.5)

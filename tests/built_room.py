@@ -12,7 +12,7 @@ import numpy as np
 from tiny_world import CAMERA, path_pose, render, room, tum_line
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.building import build_map
-from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.open import open_sequence
 
 

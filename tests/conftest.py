@@ -7,18 +7,25 @@ import pkgutil
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 from jaxtyping import install_import_hook
 
 import topoloc
+import topoloc_paper
+import topoloc_worlds
 
 
 def _modules_with_checked_shapes() -> list[str]:
     """All leaf modules but the Numba kernels, whose compiler cannot take a wrapped function."""
-    modules = pkgutil.walk_packages(topoloc.__path__, "topoloc.")
+    packages = (topoloc, topoloc_worlds, topoloc_paper)
+    modules = [m for package in packages for m in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")]
     return [m.name for m in modules if not m.ispkg and not m.name.endswith("_kernels")]
 
 
 _hook = install_import_hook(_modules_with_checked_shapes(), "beartype.beartype")
+
+settings.register_profile("busy machine", deadline=None)
+settings.load_profile("busy machine")
 
 SHARED = Path(os.environ.get("TOPOLOC_SHARED", Path(__file__).parents[2] / "shared")).resolve()
 

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 import topoloc
-from topoloc.cli import COMMANDS, main
+from topoloc.cli import all_commands, main
 from topoloc.evaluation.metrics import Answer, summarize
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.mapping import storage
+from topoloc.map import storage
 from topoloc.places.coarse import NodeScore
 
 ROOT = Path(__file__).parents[1]
@@ -49,7 +49,7 @@ def _code_blocks(text: str, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", all_commands())
 def test_every_command_and_setting_is_in_the_docs(command: str, capsys: pytest.CaptureFixture[str]):
     assert f"topoloc {command}" in README
     settings = {setting for setting in _settings(command, capsys) if not setting.startswith("--config.")}
@@ -59,17 +59,17 @@ def test_every_command_and_setting_is_in_the_docs(command: str, capsys: pytest.C
 
 
 def test_commands_in_code_blocks_exist(capsys: pytest.CaptureFixture[str]):
-    settings = {command: _settings(command, capsys) for command in COMMANDS}
+    settings = {command: _settings(command, capsys) for command in all_commands()}
     lines = [
         line for page in PAGES for block in _code_blocks(page.read_text(encoding="utf-8"), "(?:sh|bash)") for line in block.splitlines()
     ]
     calls = [line for line in lines if re.match(r"(?:\S*/)?topoloc ", line)]
-    assert len(calls) >= len(COMMANDS)
+    assert len(calls) >= len(all_commands())
     for call in calls:
         command, *words = call.partition("#")[0].split()[1:]
         if command.startswith("--"):
             continue
-        assert command in COMMANDS, call
+        assert command in all_commands(), call
         used = {word.partition("=")[0] for word in words if word.startswith("--")}
         assert used <= settings[command] | {"--help"}, call
 

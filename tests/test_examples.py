@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 import pytest
 
-from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.demo.recordings import SHIPPED
+from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.trajectory import read_trajectory
-from topoloc.simulation.demo_recordings import SHIPPED
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 MAX_LINES = 60

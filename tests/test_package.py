@@ -13,12 +13,25 @@ from pathlib import Path
 import pytest
 
 import topoloc
-from topoloc.cli import COMMANDS, main
+from topoloc.cli import COMMANDS, all_commands, main
 
 ROOT = Path(__file__).parents[1]
 HEAVY = ("cv2", "faiss", "matplotlib", "numba", "numpy", "poselib", "torch", "tyro")
 # What the core runs without: the extras, and the tests' own tools.
-FOREIGN = ("torch", "torchvision", "mitsuba", "fastapi", "uvicorn", "pydantic", "viser", "scipy", "hypothesis", "beartype", "pytest")
+FOREIGN = (
+    "torch",
+    "torchvision",
+    "mitsuba",
+    "matplotlib",
+    "fastapi",
+    "uvicorn",
+    "pydantic",
+    "viser",
+    "scipy",
+    "hypothesis",
+    "beartype",
+    "pytest",
+)
 _IMPORT_ALL = """
 import importlib, json, pkgutil, sys
 
@@ -37,7 +50,7 @@ for name in names:
     try:
         importlib.import_module(name)
     except ModuleNotFoundError as error:
-        assert error.name == "torch", (name, error)
+        assert error.name in ("torch", "matplotlib"), (name, error)
         learning.append(name)
 print(json.dumps([names, learning, sorted(Barred.asked)]))
 """
@@ -92,7 +105,8 @@ def test_the_version_is_the_one_of_the_package(installed: Path):
 
 
 @pytest.mark.parametrize(
-    ("args", "complaint"), [((), ""), (("fly",), "error: unknown command 'fly'"), (("info", "x.topo", "--fly"), "--fly")]
+    ("args", "complaint"),
+    [((), ""), (("fly",), "error: unknown command 'fly'"), (("simulate", "--fly"), "--fly"), (("info", "x.topo", "--fly"), "--fly")],
 )
 def test_wrong_usage_exits_with_2(args: tuple[str, ...], complaint: str):
     answer = _run(sys.executable, "-m", "topoloc", *args, **os.environ)
@@ -101,7 +115,13 @@ def test_wrong_usage_exits_with_2(args: tuple[str, ...], complaint: str):
     assert "Traceback" not in answer.stderr
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+def test_commands_of_other_distributions_are_named_where_they_are_missing(installed: Path):
+    answer = _run(installed / "topoloc", "simulate", "lab", "out")
+    assert (answer.returncode, answer.stdout) == (2, "")
+    assert answer.stderr == "error: `topoloc simulate` comes with topoloc-worlds, which is not installed\n"
+
+
+@pytest.mark.parametrize("command", all_commands())
 def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit) as stopped:
         main([command, "--help"])
@@ -116,13 +136,14 @@ def test_nothing_heavy_is_loaded_before_it_is_needed(statement: str):
     assert answer.stdout.splitlines()[-1] == "[]", answer.stderr
 
 
-def test_every_module_loads_without_extras_but_the_learned_classifiers():
+def test_every_module_loads_without_extras_but_learned_classifiers_and_figures():
     answer = _run(sys.executable, "-c", f"FOREIGN = {FOREIGN}\n{_IMPORT_ALL}", **os.environ)
     assert answer.returncode == 0, answer.stderr
     modules, learning, asked = json.loads(answer.stdout)
     assert "topoloc.localization.localizer" in modules
     assert "topoloc.places.cnn_fc" in learning
-    assert [name for name in learning if not name.startswith("topoloc.places.") and not name.startswith("topoloc.evaluation.pose")] == []
+    drawing = {f"topoloc.evaluation.{name}" for name in ("figures", "map_figure", "report")}
+    assert [name for name in learning if not name.startswith("topoloc.places.") and name not in drawing] == []
     assert "torchvision" not in asked
 
 

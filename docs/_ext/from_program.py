@@ -15,11 +15,11 @@ class CommandHelp(SphinxDirective):
     """What every command prints for `--help`, a section each: the reference that no hand writes."""
 
     def run(self) -> list[nodes.Node]:
-        from topoloc.cli import COMMANDS
+        from topoloc.cli import all_commands
 
         os.environ["COLUMNS"] = "82"  # as wide as a page
         sections: list[nodes.Node] = []
-        for command in COMMANDS:
+        for command in all_commands():
             section = nodes.section(ids=[f"topoloc-{command}"])
             section += nodes.title("", f"topoloc {command}")
             text = _printed([command, "--help"])

@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from topoloc.localization.building import build_map
     from topoloc.localization.localizer import Localizer, LocalizerConfig
     from topoloc.localization.result import Localization, NotLocalized
-    from topoloc.localization.stream_result import StreamedPose
-    from topoloc.localization.tracker import Tracker, TrackerConfig
-    from topoloc.mapping.build import BuildConfig
-    from topoloc.mapping.topomap import TopoMetricMap
+    from topoloc.map.build import BuildConfig
+    from topoloc.map.topomap import TopoMetricMap
     from topoloc.sequences.open import open_sequence
+    from topoloc.tracking.stream_result import StreamedPose
+    from topoloc.tracking.tracker import Tracker, TrackerConfig
 
     __version__: str
 
@@ -42,18 +42,18 @@ __all__ = [
 ]
 
 _MODULES = {
-    "BuildConfig": "topoloc.mapping.build",
+    "BuildConfig": "topoloc.map.build",
     "Camera": "topoloc.geometry.camera",
     "Localization": "topoloc.localization.result",
     "Localizer": "topoloc.localization.localizer",
     "LocalizerConfig": "topoloc.localization.localizer",
     "NotLocalized": "topoloc.localization.result",
     "Rigid3": "topoloc.geometry.rigid",
-    "StreamedPose": "topoloc.localization.stream_result",
-    "TopoMetricMap": "topoloc.mapping.topomap",
+    "StreamedPose": "topoloc.tracking.stream_result",
+    "TopoMetricMap": "topoloc.map.topomap",
     "TopolocError": "topoloc.errors",
-    "Tracker": "topoloc.localization.tracker",
-    "TrackerConfig": "topoloc.localization.tracker",
+    "Tracker": "topoloc.tracking.tracker",
+    "TrackerConfig": "topoloc.tracking.tracker",
     "build_map": "topoloc.localization.building",
     "open_sequence": "topoloc.sequences.open",
 }

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from topoloc.cli import main
-from topoloc.mapping.storage import SCHEMA_VERSION
+from topoloc.map.storage import SCHEMA_VERSION
 
 Complaint = Callable[..., str]
 
@@ -141,7 +141,7 @@ def test_ctrl_c_in_mid_build(recording: Path, tmp_path: Path, complaint: Complai
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("topoloc.mapping.build.extract_features", interrupted)
+    monkeypatch.setattr("topoloc.map.build.extract_features", interrupted)
     assert complaint("build", recording, target) == "error: interrupted; every file is as it was or whole\n"
 
 

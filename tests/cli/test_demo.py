@@ -13,10 +13,9 @@ import pytest
 from built_room import unseen_views, write_pictures
 from tiny_world import write_stereo_recording
 from topoloc.cli import main
-from topoloc.cli.demo_words import elsewhere_in_words, night_in_words
-from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.demo.recordings import SHIPPED, missing_recordings
+from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.trajectory import read_trajectory
-from topoloc.simulation.demo_recordings import RECORDINGS, SHIPPED, missing_recordings
 
 SETS = ["day", "night", "other camera", "elsewhere"]
 
@@ -31,6 +30,7 @@ def room(tiny_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
         write_pictures(folder / name, views)
     for name, seed in (("corridor", 1), ("street", 2)):
         write_pictures(folder / name, unseen_views(seed=seed, step=6.0))
+    shutil.copytree(SHIPPED / "pictures_of_nothing", folder / "pictures_of_nothing")
     return folder
 
 
@@ -90,45 +90,3 @@ def test_a_folder_that_cannot_be_written_is_told_before_the_work(room: Path, tmp
     assert "cannot write" in complaint("demo", "--recordings", room, "--out", tmp_path / "file" / "below")
     (tmp_path / "out" / "report.html").mkdir(parents=True)
     assert "it is a folder" in complaint("demo", "--recordings", room, "--out", tmp_path / "out")
-
-
-def _row(name: str, num: int, localized: int, false: int = 0, num_elsewhere: int = 0) -> dict[str, Any]:
-    reasons = {"not_in_map": num - localized} if num > localized else {}
-    medians = {"median_translation_m": 0.012 if localized else None, "median_rotation_deg": 0.3 if localized else None}
-    return {
-        "name": name,
-        "num_queries": num,
-        "num_localized": localized,
-        "false_accepts": false,
-        "num_elsewhere": num_elsewhere,
-        "not_localized": reasons,
-        **medians,
-    }
-
-
-@pytest.mark.parametrize(
-    ("night", "said"),
-    [
-        (_row("night", 40, 40), "100 % get a pose, by day 100 %; the median error is 1.20 cm and 0.30 degrees instead of 1.20 cm"),
-        (_row("night", 40, 30), '75 % get a pose, by day 100 %; the median error is 1.20 cm and 0.30 degrees instead of 1.20 cm and 0.30 '
-         'degrees. 10 are answered with "not localized" (10 not in map). No pose is wrong.'),
-        (_row("night", 40, 0), '0 % get a pose, by day 100 %. 40 are answered with "not localized" (40 not in map). No pose is wrong.'),
-        (_row("night", 40, 39, false=1), '1 is answered with "not localized" (1 not in map). 1 pose is '
-         'wrong by more than 0.5 m or 10 degrees.'),
-    ],
-    ids=["as by day", "some lost", "all lost", "one wrong"],
-)  # fmt: skip
-def test_the_cost_of_the_night_is_told_as_it_is(night: dict[str, Any], said: str):
-    assert said in night_in_words({"recordings": [_row("day", 20, 20), night]})
-
-
-@pytest.mark.parametrize(("false", "said"), [(0, "none is given a pose"), (2, "2 wrongly get a pose")])
-def test_wrong_acceptances_are_told(false: int, said: str):
-    evaluation = {"num_elsewhere": 30, "recordings": [_row("day", 20, 20), _row("elsewhere", 0, 0, false, 30)]}
-    assert said in elsewhere_in_words(evaluation)
-
-
-def test_every_recording_is_named_once():
-    names = [recording.name for recording in RECORDINGS]
-    assert len(set(names)) == len(names)
-    assert {recording.role for recording in RECORDINGS} == {"map", "queries", "elsewhere"}

@@ -14,8 +14,8 @@ import pytest
 import torch
 
 from topoloc.cli import main
-from topoloc.mapping.coarse_storage import list_coarse
-from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.map.coarse_storage import list_coarse
+from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.backbones import Backbone
 
 SMALL = ("--config.cnn-nn.picture.width-px", "64", "--config.cnn-nn.picture.height-px", "48")

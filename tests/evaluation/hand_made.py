@@ -10,7 +10,7 @@ from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.mapping.topomap import Edge, NodeSummary, TopoMetricMap, TopoNode
+from topoloc.map.topomap import Edge, NodeSummary, TopoMetricMap, TopoNode
 from topoloc.places.coarse import NodeScore
 
 TIMES_MS = {"patch_normalization": 2.0, "features": 10.0, "coarse": 1.0, "matching": 4.0, "pnp": 3.0, "total": 21.0}

@@ -12,7 +12,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.guided import GuidedConfig, count_by_chance, match_guided, visible_pixels
 from topoloc.localization.local_map import LocalMap
-from topoloc.mapping.topomap import NodeSummary, TopoNode
+from topoloc.map.topomap import NodeSummary, TopoNode
 
 CAMERA = Camera.pinhole(640, 480, 500.0, 500.0, 320.0, 240.0)
 NUM_POINTS = 200

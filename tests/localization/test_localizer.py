@@ -16,7 +16,7 @@ from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.coarse import NodeScore
 
 PICTURE, TRUTH = unseen_views()[2]

@@ -15,7 +15,7 @@ from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.rivals import RivalsConfig
-from topoloc.mapping.topomap import TopoMetricMap, TopoNode
+from topoloc.map.topomap import TopoMetricMap, TopoNode
 from topoloc.places.vlad import SurfVlad
 
 ELSEWHERE = Rigid3(exp_so3(np.array([0.0, 0.0, 1.0])), np.array([40.0, -15.0, 0.0]))

@@ -17,7 +17,7 @@ from topoloc.localization import shared_errors
 from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.shared_errors import SharedErrorsConfig, inflation
-from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.map.topomap import TopoMetricMap
 
 CONFIG = SharedErrorsConfig(min_nodes=3)
 

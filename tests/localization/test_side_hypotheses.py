@@ -13,7 +13,7 @@ from topoloc.features.features import Features, Matches
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.side_hypotheses import agreeing_pose
-from topoloc.mapping.topomap import NodeSummary, TopoNode
+from topoloc.map.topomap import NodeSummary, TopoNode
 
 NODE_CAMERA = Camera.pinhole(480, 430, 240.0, 240.0, -240.0, 216.0)
 QUERY_CAMERA = Camera.pinhole(600, 500, 310.0, 310.0, 900.0, 250.0)

@@ -22,8 +22,8 @@ from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.side_localizer import SideLocalizer, SidesConfig
 from topoloc.localization.stages import StageClock
 from topoloc.localization.verification import VerificationConfig
-from topoloc.mapping.nodes import NodePoses
-from topoloc.mapping.topomap import SideNodes, TopoMetricMap
+from topoloc.map.nodes import NodePoses
+from topoloc.map.topomap import SideNodes, TopoMetricMap
 
 NO_SIDES = LocalizerConfig(sides=SidesConfig(num_ranked=0))
 DISTORTED = Camera("OPENCV", 560, 400, (260.0, 262.0, 283.0, 197.0, -0.12, 0.02, 0.0005, -0.0003))

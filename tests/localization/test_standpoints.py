@@ -19,7 +19,7 @@ from topoloc.localization.local_map import LocalMap
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.result import Localization
 from topoloc.localization.standpoints import StandpointsConfig, strongest_and_distinct
-from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.map.topomap import TopoMetricMap
 
 LIGHTS = (0.055, 0.05, 0.045)
 

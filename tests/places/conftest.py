@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from built_room import built_room
-from topoloc.mapping.coarse_training import training_set_of
+from topoloc.map.coarse_training import training_set_of
 from topoloc.places.backbones import Backbone
 from topoloc.places.training_set import TrainingSet
 

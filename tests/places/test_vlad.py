@@ -12,8 +12,8 @@ import tiny_world
 import topoloc
 from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.features import Features
-from topoloc.mapping.build import BuildConfig, build_map
-from topoloc.mapping.nodes import NodeConfig, NodePoses, node_distances
+from topoloc.map.build import BuildConfig, build_map
+from topoloc.map.nodes import NodeConfig, NodePoses, node_distances
 from topoloc.places.coarse import CoarseLocalizer, open_coarse
 from topoloc.places.vlad import SurfVlad, VladConfig, learn_words, placed, vlad
 from topoloc.sequences.pictures import grey_image

@@ -1,4 +1,7 @@
-"""The command line: `topoloc COMMAND`. Each command is a module of this package, imported only when it is called."""
+"""The command line: `topoloc COMMAND`. Each command is a module, imported only when it is called.
+
+Other distributions add commands by an entry point of the group `topoloc.commands`: a dictionary like `COMMANDS`.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +9,18 @@ import importlib
 import os
 import sys
 
-# name -> what `topoloc --help` says of it; the module of the same name holds a dataclass of the settings, `Command`, with `run`
+# name -> the module, which holds a dataclass of the settings, `Command`, with `run`; and what `topoloc --help` says of it
 COMMANDS = {
-    "demo": "the whole pipeline on the built-in lab: mapped by day, asked by day, by night and with another camera",
-    "simulate": "render a recording of a built-in world (lab, corridor, street) with exact truth",
-    "slam": "where did the camera go? a stereo or RGB-D recording becomes a trajectory",
-    "build": "map a place: a stereo or RGB-D recording becomes one map file",
-    "train": "add a learned coarse localizer to a map, or train it anew",
-    "localize": "where were these images taken? 6-DoF poses of images, folders, recordings",
-    "evaluate": "localize a recording with known truth and judge the poses",
-    "benchmark": "the paper's tables and figures, ours and others' beside them",
-    "info": "what a map file holds",
+    "demo": ("topoloc.cli.demo", "the whole pipeline on the built-in lab: mapped by day, asked by day, by night and with another camera"),
+    "slam": ("topoloc.cli.slam", "where did the camera go? a stereo or RGB-D recording becomes a trajectory"),
+    "build": ("topoloc.cli.build", "map a place: a stereo or RGB-D recording becomes one map file"),
+    "train": ("topoloc.cli.train", "add a learned coarse localizer to a map, or train it anew"),
+    "localize": ("topoloc.cli.localize", "where were these images taken? 6-DoF poses of images, folders, recordings"),
+    "evaluate": ("topoloc.cli.evaluate", "localize a recording with known truth and judge the poses"),
+    "info": ("topoloc.cli.info", "what a map file holds"),
 }
+_BROUGHT = {"simulate": "topoloc-worlds", "benchmark": "topoloc-paper"}
+_IN_HELP = ("demo", "simulate", "slam", "build", "train", "localize", "evaluate", "benchmark", "info")
 
 
 def main(args: list[str] | None = None) -> int:
@@ -32,13 +35,30 @@ def main(args: list[str] | None = None) -> int:
         print(version("topoloc"))
         return 0
     name, *rest = args
-    if name not in COMMANDS:
-        print(f"error: unknown command {name!r}; commands: {', '.join(COMMANDS)}", file=sys.stderr)
-        return 2
-    return _run(name, rest)
+    commands = COMMANDS if name in COMMANDS else all_commands()
+    if name in commands:
+        return _run(name, *commands[name], rest)
+    known = f"commands: {', '.join(commands)}"
+    brought = (
+        f"`topoloc {name}` comes with {_BROUGHT[name]}, which is not installed"
+        if name in _BROUGHT
+        else f"unknown command {name!r}; {known}"
+    )
+    print(f"error: {brought}", file=sys.stderr)
+    return 2
 
 
-def _run(name: str, args: list[str]) -> int:
+def all_commands() -> dict[str, tuple[str, str]]:
+    """Our commands and those that other distributions bring, as `COMMANDS`; a name of ours is ours."""
+    from importlib.metadata import entry_points
+
+    brought: dict[str, tuple[str, str]] = {}
+    for entry_point in entry_points(group="topoloc.commands"):
+        brought |= entry_point.load()
+    return brought | COMMANDS
+
+
+def _run(name: str, module_name: str, summary: str, args: list[str]) -> int:
     from topoloc.errors import TopolocError
 
     try:
@@ -46,8 +66,7 @@ def _run(name: str, args: list[str]) -> int:
 
         from topoloc.cli.output import UsageError, interruptible
 
-        module = importlib.import_module(f"topoloc.cli.{name}")
-        summary = COMMANDS[name]
+        module = importlib.import_module(module_name)
         command = tyro.cli(module.Command, args=args, prog=f"topoloc {name}", description=summary[0].upper() + summary[1:])
         try:
             with interruptible():
@@ -68,9 +87,14 @@ def _print_error(text: str) -> None:
     print("error: " + " ".join(text.split()), file=sys.stderr)
 
 
+def _place_in_help(name: str) -> int:
+    return _IN_HELP.index(name) if name in _IN_HELP else len(_IN_HELP)
+
+
 def _help() -> str:
-    width = max(map(len, COMMANDS))
-    commands = "\n".join(f"  {name:<{width}}  {summary}" for name, summary in COMMANDS.items())
+    listed = all_commands()
+    width = max(map(len, listed))
+    commands = "\n".join(f"  {name:<{width}}  {listed[name][1]}" for name in sorted(listed, key=_place_in_help))
     return (
         "usage: topoloc COMMAND ...\n\n"
         "Walk through a place once with a stereo or RGB-D camera; afterwards any single image of it gets a 6-DoF pose.\n\n"

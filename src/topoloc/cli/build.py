@@ -12,8 +12,8 @@ from topoloc.cli.info import describe_map
 from topoloc.cli.output import UsageError, check_outputs, progress_bar, write_json
 from topoloc.errors import RecordingError
 from topoloc.localization.building import build_map
-from topoloc.mapping.build import BuildConfig, Progress
-from topoloc.mapping.coarse_training import train_coarse
+from topoloc.map.build import BuildConfig, Progress
+from topoloc.map.coarse_training import train_coarse
 from topoloc.places.classifier_config import BackboneName
 from topoloc.places.coarse import CoarseName
 from topoloc.sequences.frame import StereoSequence

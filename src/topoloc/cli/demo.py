@@ -12,20 +12,21 @@ from typing import Annotated, Any
 import tyro
 
 from topoloc.cli.info import describe_map
-from topoloc.cli.output import UsageError, check_outputs, interruptible, progress_bar, write_json
+from topoloc.cli.output import UsageError, check_outputs, progress_bar, report_writer, write_json
 from topoloc.cli.recordings_table import print_recordings
-from topoloc.errors import TopolocError
+from topoloc.demo.recordings import ROLES, SHIPPED, Role, missing_recordings
+from topoloc.demo.words import PAPER_LAB, night_in_words, words_of
+from topoloc.errors import MissingExtraError, TopolocError
 from topoloc.evaluation.experiments import answer_elsewhere, answer_queries
 from topoloc.evaluation.metrics import Answer, by_recording, summarize
 from topoloc.localization.building import build_map
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization
-from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.atomic import write_text
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import open_sequence
 from topoloc.sequences.trajectory import Trajectory, write_tum
-from topoloc.simulation.demo_recordings import RECORDINGS, SHIPPED, Role, draw_pictures_of_nothing, missing_recordings, render_recordings
 
 Progress = Callable[[str, int, int], None]
 ELSEWHERE = "elsewhere"
@@ -37,50 +38,41 @@ class Command:
 
     out: Annotated[str, tyro.conf.arg(metavar="DIR")] = "topoloc-demo"
     """Where map, results, trajectories and report.html are written."""
-    render: bool = False
-    """Render the recordings anew, with Mitsuba (the extra `sim`), instead of taking those that topoloc brings along."""
     recordings: Annotated[str | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="(default: those that topoloc brings along)")] = None
-    """Take the recordings from here; with --render, render them into here."""
+    """Take the recordings from here, as `topoloc simulate demo` renders them."""
     json: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
     """Write the evaluation as JSON to this file (- for standard output)."""
 
     def run(self) -> int:
-        from topoloc.cli.demo_words import words_of  # loads matplotlib, which --help need not
-        from topoloc.evaluation.report import write_report
-
         start = time.perf_counter()
         out = _made_folder(Path(self.out))
         check_outputs([str(out / "lab.topo"), str(out / "results.jsonl"), str(out / "report.html"), self.json])
         with progress_bar() as progress:
-            folder = self._recordings(out, progress)
+            folder = self._recordings()
             topomap = _map_the_lab(folder, out / "lab.topo", progress)
             mapped = time.perf_counter()
-            answers = _ask(topomap, folder, out, progress)
+            answers = _ask(topomap, folder, progress)
         evaluation = summarize(answers) | {"map": describe_map(topomap, out / "lab.topo")}
         _write_results(out, folder, answers)
-        write_report(out / "report.html", evaluation, answers, topomap, words_of(evaluation))
+        try:
+            report_writer()(out / "report.html", evaluation, answers, topomap, words_of(evaluation))
+            report = str(out / "report.html")
+        except MissingExtraError as missing:
+            report = f"none; {missing}"
         write_json(self.json, evaluation)
         if self.json != "-":
             seconds = f"{time.perf_counter() - start:.0f} s in all, {mapped - start:.0f} s of them until the map was there"
-            _print(out, evaluation, seconds)
+            _print(out, evaluation, seconds, report)
         return 0
 
-    def _recordings(self, out: Path, progress: Progress) -> Path:
-        """The folder of the recordings, rendered now if that is asked for."""
-        if self.render:
-            folder = Path(self.recordings) if self.recordings else out / "recordings"
-            try:
-                with interruptible():
-                    render_recordings(folder, progress)
-            except KeyboardInterrupt:
-                raise TopolocError(f"interrupted; the same command goes on from what is in {folder}") from None
-            return folder
+    def _recordings(self) -> Path:
+        """The folder of the recordings, whole."""
         folder = Path(self.recordings) if self.recordings else SHIPPED
-        if self.recordings and not folder.is_dir():
-            raise TopolocError(f"{folder}: no such folder; with --render the recordings are rendered into it")
+        if not folder.is_dir():
+            raise TopolocError(f"{folder}: no such folder; `topoloc simulate demo {folder}` renders the recordings into it")
         if missing := missing_recordings(folder):
             what = "this installation of topoloc lacks the demo's recordings" if folder == SHIPPED else f"{folder} lacks recordings"
-            raise TopolocError(f"{what} ({', '.join(missing)}); `topoloc demo --render` renders them, with Mitsuba (the extra `sim`)")
+            raise TopolocError(f"{what} ({', '.join(missing)}); `topoloc simulate demo DIR` renders them")
         return folder
 
 
@@ -97,7 +89,7 @@ def _made_folder(folder: Path) -> Path:
 
 
 def _open(folder: Path, role: Role) -> list[StereoSequence]:
-    return [open_sequence(folder / recording.name) for recording in RECORDINGS if recording.role == role]
+    return [open_sequence(folder / name) for name, its_role in ROLES.items() if its_role == role]
 
 
 def _map_the_lab(folder: Path, path: Path, progress: Progress) -> TopoMetricMap:
@@ -106,15 +98,13 @@ def _map_the_lab(folder: Path, path: Path, progress: Progress) -> TopoMetricMap:
     return TopoMetricMap.load(path)
 
 
-def _ask(topomap: TopoMetricMap, folder: Path, out: Path, progress: Progress) -> list[Answer]:
+def _ask(topomap: TopoMetricMap, folder: Path, progress: Progress) -> list[Answer]:
     """Every query of the lab, then every picture of somewhere else."""
     localizer = Localizer(topomap)
     answers: list[Answer] = []
     for sequence in _open(folder, "queries"):
         answers += answer_queries(localizer, sequence, progress=progress, label=_label(sequence))
-    nothing = out / "pictures_of_nothing"
-    draw_pictures_of_nothing(nothing)
-    for sequence in [*_open(folder, "elsewhere"), open_sequence(nothing)]:
+    for sequence in _open(folder, "elsewhere"):
         answers += answer_elsewhere(localizer, sequence, progress, ELSEWHERE)
     return answers
 
@@ -134,12 +124,10 @@ def _write_results(out: Path, folder: Path, answers: Sequence[Answer]) -> None:
         write_tum(out / f"{sequence.name}.tum", Trajectory([pose for _, pose in found], [t for t, _ in found]))
 
 
-def _print(out: Path, evaluation: dict[str, Any], seconds: str) -> None:
-    from topoloc.cli.demo_words import PAPER_LAB, night_in_words
-
+def _print(out: Path, evaluation: dict[str, Any], seconds: str, report: str) -> None:
     print_recordings(evaluation, [PAPER_LAB])
     m = evaluation["map"]
     print(f"\n{night_in_words(evaluation)}\n")
     print(f"map: {out / 'lab.topo'} ({m['num_nodes']} nodes, {m['bytes'] / 1e6:.1f} MB, {m['length_m']:.1f} m mapped; {seconds})")
     print(f"poses: {out / 'results.jsonl'}, and a .tum file for each recording beside it")
-    print(f"report: {out / 'report.html'}")
+    print(f"report: {report}")

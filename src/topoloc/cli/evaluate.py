@@ -12,14 +12,14 @@ import numpy as np
 import tyro
 
 from topoloc.cli.info import describe_map
-from topoloc.cli.output import UsageError, check_outputs, print_facts, progress_bar, write_json
+from topoloc.cli.output import UsageError, check_outputs, print_facts, progress_bar, report_writer, write_json
 from topoloc.cli.recordings_table import print_recordings
 from topoloc.errors import TrajectoryError
 from topoloc.evaluation.experiments import answer_elsewhere, answer_queries
 from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION, Answer, summarize
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import open_sequence
 
@@ -52,6 +52,7 @@ class Command:
         if not self.sequences and not self.elsewhere:
             raise UsageError("evaluate takes a map and at least one recording, with truth or --elsewhere")
         check_outputs([self.json, self.report], inputs=[self.map, *([self.map_from_truth] if self.map_from_truth else [])])
+        write_report = report_writer() if self.report else None
         topomap = TopoMetricMap.load(self.map)
         info = describe_map(topomap, Path(self.map))
         map_from_truth = _read_rigid(Path(self.map_from_truth)) if self.map_from_truth else None
@@ -69,9 +70,7 @@ class Command:
         if self.json != "-":
             _print(evaluation)
         write_json(self.json, evaluation)
-        if self.report:
-            from topoloc.evaluation.report import write_report
-
+        if write_report and self.report:
             write_report(Path(self.report), evaluation, answers, topomap)
             if self.json != "-":
                 print(f"report: {self.report}")

@@ -22,7 +22,7 @@ class Command:
     """Write the same as JSON to this file (- for standard output)."""
 
     def run(self) -> int:
-        from topoloc.mapping.topomap import TopoMetricMap
+        from topoloc.map.topomap import TopoMetricMap
 
         check_outputs([self.json], inputs=[self.map])
         info = describe_map(TopoMetricMap.load(self.map), Path(self.map))
@@ -40,7 +40,7 @@ def describe_map(topomap: Any, path: Path) -> dict[str, Any]:
     """
     import numpy as np
 
-    from topoloc.mapping.coarse_storage import list_coarse
+    from topoloc.map.coarse_storage import list_coarse
 
     if len(topomap.summaries) == 0:
         raise EmptyMapError(f"map {path} has no nodes")

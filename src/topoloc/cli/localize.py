@@ -19,13 +19,13 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.result import NotLocalized
-from topoloc.localization.tracker import Tracker, TrackerConfig
-from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.camera_json import read_camera_json
 from topoloc.sequences.frame import StereoFrame, StereoSequence
 from topoloc.sequences.open import find_format, open_sequence
 from topoloc.sequences.recording import single_pictures
 from topoloc.sequences.trajectory import frame_poses, read_trajectory, write_tum
+from topoloc.tracking.tracker import Tracker, TrackerConfig
 
 # The camera of a picture of this width and height (pixels).
 CameraOfSize = Callable[[int, int], Camera | RoughCamera]

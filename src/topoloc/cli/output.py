@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from topoloc.errors import TopolocError
+from topoloc.errors import MissingExtraError, TopolocError
 from topoloc.sequences.atomic import write_text
 
 
@@ -84,6 +84,15 @@ def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
             progress.update(tasks[stage], completed=done, total=total, speed=f"{speed:.1f}/s" if speed else "")
 
         yield update
+
+
+def report_writer() -> Callable[..., None]:
+    """`write_report`, of the extra `report`. Raises MissingExtraError where that is not installed."""
+    try:
+        from topoloc.evaluation.report import write_report
+    except ModuleNotFoundError as error:
+        raise MissingExtraError("a report needs matplotlib: pip install 'topoloc[report]'") from error
+    return write_report
 
 
 def print_facts(facts: Sequence[tuple[str, str]]) -> None:

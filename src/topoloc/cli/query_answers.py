@@ -10,8 +10,8 @@ from typing import Any
 
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.localization.stream_result import StreamedPose
 from topoloc.sequences.trajectory import Trajectory
+from topoloc.tracking.stream_result import StreamedPose
 
 
 @dataclass(frozen=True, eq=False)

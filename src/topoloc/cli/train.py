@@ -11,9 +11,9 @@ from typing import Annotated, Literal
 import tyro
 
 from topoloc.cli.output import UsageError, check_outputs, progress_bar, write_json
-from topoloc.mapping.coarse_storage import list_coarse, store_coarse
-from topoloc.mapping.coarse_training import CoarseTrainingConfig, train_coarse
-from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.map.coarse_storage import list_coarse, store_coarse
+from topoloc.map.coarse_training import CoarseTrainingConfig, train_coarse
+from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.classifier_config import BackboneName
 from topoloc.places.coarse import CoarseModel
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import matplotlib
-from matplotlib.figure import Figure
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 INK, GREY, NODE, ERROR, BAD = "#1f2a37", "#6b7786", "#9db2ca", "#f0a202", "#d1345b"
 # One colour a recording, told apart also by people who see no red or no green; none is near ERROR or BAD.
@@ -41,6 +41,8 @@ def recording_colours(names: Sequence[str]) -> dict[str, str]:
 
 def svg_text(figure: Figure, title: str) -> str:
     """The figure as an `svg` element without a header; names inside are made from the title, so that figures on one page do not mix."""
+    import matplotlib
+
     buffer = io.StringIO()
     with matplotlib.rc_context({"svg.hashsalt": title}):
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})

@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from topoloc.evaluation.figure_style import BAD, ERROR, GREY, MAX_MARKS, NODE, STYLE, recording_colours, svg_text
 from topoloc.evaluation.metrics import Answer, by_recording
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.map.topomap import TopoMetricMap
 
 # Height over width of the map.
 MIN_ASPECT, MAX_ASPECT = 0.3, 0.8

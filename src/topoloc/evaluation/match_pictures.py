@@ -19,7 +19,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.localization.guided import GuidedConfig, match_guided
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.result import Localization
-from topoloc.mapping.topomap import TopoNode
+from topoloc.map.topomap import TopoNode
 from topoloc.sequences.frame import Image
 from topoloc.sequences.pictures import grey_image
 

@@ -14,7 +14,7 @@ from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION, Answer
 from topoloc.evaluation.units import length_text
 from topoloc.features.extraction import FeatureConfig
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.mapping.topomap import TopoMetricMap, TopoNode
+from topoloc.map.topomap import TopoMetricMap, TopoNode
 from topoloc.sequences.frame import Image
 
 NUM_WORST = 6

@@ -13,7 +13,7 @@ from topoloc.evaluation.map_figure import draw_map
 from topoloc.evaluation.metrics import Answer
 from topoloc.evaluation.query_gallery import gallery, typical_queries, worst_queries
 from topoloc.evaluation.report_tables import ReportWords, cards, numbers_tables, recordings_table, what_counts
-from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.atomic import write_text
 
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from topoloc.localization.localizer import LocalizerConfig
 from topoloc.localization.shared_errors import with_shared_errors
-from topoloc.mapping import build
-from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.map import build
+from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.frame import StereoSequence
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from topoloc.mapping.topomap import TopoNode
+from topoloc.map.topomap import TopoNode
 
 
 @dataclass(frozen=True, eq=False)

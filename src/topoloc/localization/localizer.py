@@ -38,8 +38,8 @@ from topoloc.localization.stages import StageClock
 from topoloc.localization.standpoints import StandpointsConfig, strongest_and_distinct
 from topoloc.localization.verification import VerificationConfig
 from topoloc.localization.viewing import viewing_distances
-from topoloc.mapping.nodes import NodePoses
-from topoloc.mapping.topomap import TopoMetricMap, open_coarse_of
+from topoloc.map.nodes import NodePoses
+from topoloc.map.topomap import TopoMetricMap, open_coarse_of
 from topoloc.places.coarse import CoarseLocalizer, Image, NodeScore
 from topoloc.sequences.pictures import grey_image
 

@@ -24,7 +24,7 @@ from topoloc.localization.attempt import Judgement
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.stages import StageClock
 from topoloc.localization.viewing import viewing_distances
-from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.map.nodes import NodePoses, node_distances
 from topoloc.places.coarse import NodeScore
 
 

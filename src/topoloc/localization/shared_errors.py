@@ -22,8 +22,8 @@ from jaxtyping import Float
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.localization.guided import GuidedConfig, match_guided
 from topoloc.localization.local_map import LocalMap
-from topoloc.mapping.nodes import NodePoses, node_distances
-from topoloc.mapping.topomap import SharedErrors, TopoMetricMap, TopoNode
+from topoloc.map.nodes import NodePoses, node_distances
+from topoloc.map.topomap import SharedErrors, TopoMetricMap, TopoNode
 
 _MEDIAN_CHI_SQUARE_6 = 5.348
 _METHOD = 1  # part of the digest: one more whenever the same settings come to give another rho

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from topoloc.features.features import Features, Matches
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.mapping.topomap import TopoNode
+from topoloc.map.topomap import TopoNode
 
 _LARGEST_TURN, _LARGEST_SCALE = 0.5, 4.0
 _TOLERANCE, _TOLERANCE_SHARE, _TOLERANCE_LOG_SCALE = 0.05, 0.15, 0.5

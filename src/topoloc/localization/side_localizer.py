@@ -33,8 +33,8 @@ from topoloc.localization.side_verdict import SideVerdictConfig, side_log_odds
 from topoloc.localization.stages import StageClock
 from topoloc.localization.verification import Evidence, VerificationConfig, doubt_of, even_share_of, spread_of
 from topoloc.localization.viewing import viewing_distances
-from topoloc.mapping.nodes import NodePoses
-from topoloc.mapping.topomap import SideNodes, TopoMetricMap, TopoNode
+from topoloc.map.nodes import NodePoses
+from topoloc.map.topomap import SideNodes, TopoMetricMap, TopoNode
 from topoloc.places.coarse import NodeScore
 from topoloc.places.vlad import SurfVlad
 

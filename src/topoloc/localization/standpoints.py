@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.attempt import Attempt
 from topoloc.localization.guided import GuidedConfig
-from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.map.nodes import NodePoses, node_distances
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.map.nodes import NodePoses, node_distances
 
 QUARTER = Rigid3(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
 """A quarter turn about the optical axis."""

@@ -1,0 +1,161 @@
+"""The maps of the benchmark: built once, given the learned coarse localizers once, and opened from their files."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from topoloc.errors import MissingExtraError
+from topoloc.features.extraction import FeatureConfig
+from topoloc.map.build import BuildConfig, build_map
+from topoloc.map.coarse_training import CoarseTrainingConfig, train_coarse
+from topoloc.map.nodes import NodeConfig
+from topoloc.map.topomap import TopoMetricMap
+from topoloc.places.classifier_config import CnnFcConfig, PictureConfig
+from topoloc.places.coarse import CoarseModel
+from topoloc.sequences.atomic import write_bytes
+from topoloc_paper.datasets import Dataset
+from topoloc_paper.settings import LEARNED, Bench, sequence_digest
+from topoloc_paper.stage_code import COARSE_MODULES, MAPPING, learning
+from topoloc_paper.stages import Done, digest_of
+from topoloc_paper.stored_answers import pose_json
+
+Normalization = Literal["none", "paper", "wide"]
+
+
+@dataclass(frozen=True)
+class MapKind:
+    """How a data set is mapped. `d_thresh` and `lambda_rot` None: topoloc's own defaults, by the scene's depth."""
+
+    d_thresh: float | None
+    lambda_rot: float | None
+    normalization: Normalization = "wide"
+    kind: Literal["surf", "sift"] = "surf"
+
+    @staticmethod
+    def as_paper(dataset: Dataset, normalization: Normalization = "wide") -> MapKind:
+        """The paper's D_thresh and lambda."""
+        return MapKind(dataset.d_thresh, dataset.lambda_rot, normalization)
+
+    @staticmethod
+    def as_topoloc(normalization: Normalization = "wide") -> MapKind:
+        """What `topoloc build` does by itself."""
+        return MapKind(None, None, normalization)
+
+    @property
+    def name(self) -> str:
+        nodes = "default" if self.d_thresh is None else f"d{self.d_thresh:g}"
+        return f"{nodes}-{self.kind}-{self.normalization}"
+
+    @property
+    def words(self) -> str:
+        """For tables: how the nodes are placed."""
+        return "default nodes" if self.d_thresh is None else f"D_thresh {self.d_thresh:g} m"
+
+    def config(self) -> BuildConfig:
+        features = FeatureConfig(kind=self.kind, normalization=self.normalization)
+        return BuildConfig(nodes=NodeConfig(self.d_thresh, self.lambda_rot), features=features)
+
+
+def built(bench: Bench, dataset: Dataset, kind: MapKind) -> Done:
+    """The facts of the data set's map of this kind, which lies at `path_of` afterwards.
+
+    Raises:
+        EmptyMapError, TrajectoryError, RecordingError: see `build_map`.
+    """
+    name = f"{dataset.name}-{kind.name}"
+    path = path_of(bench, dataset, kind)
+    sequences = dataset.open_mapping()
+
+    def build() -> dict[str, Any]:
+        topomap = build_map(sequences, kind.config(), lambda stage, done, total: bench.progress(f"map {name}: {stage}", done, total))
+        topomap.save(path)
+        facts = {"num_nodes": len(topomap.summaries), "num_images": len(topomap.place_images), "length_m": topomap.length_m}
+        place_bytes = sum(len(image.jpeg) for image in topomap.place_images)
+        nodes = topomap.config["nodes"]
+        facts["images_digest"] = images_digest(topomap)
+        return facts | {"bytes": path.stat().st_size, "place_bytes": place_bytes, "nodes": nodes}
+
+    settings = {"config": asdict(kind.config()), "recordings": [sequence_digest(sequence) for sequence in sequences]}
+    return bench.store.get(f"map-{name}", settings, build, MAPPING, [path])
+
+
+def taught(bench: Bench, dataset: Dataset, kind: MapKind, method: str) -> Done:
+    """The facts of a learned coarse localizer: what it was trained from and for how long. `opened` gives the map with it.
+
+    It learns from the mapping images and their nodes alone, so it is kept where only the map's points have changed.
+
+    Raises:
+        MissingExtraError: torch is not installed.
+        WeightsError, TrainingError: see `train_coarse`.
+    """
+    map_done = built(bench, dataset, kind)
+    target = _model_path(bench, dataset, kind, method)
+    backbone, weights = bench.config.weights.choice(method)
+    config = _training_config(bench, map_done.result["num_images"])
+    settings = {"images": map_done.result["images_digest"], "weights": bench.config.weights.digest(method), "config": asdict(config)}
+
+    def train() -> dict[str, Any]:
+        checkpoint = target.with_suffix(f".{digest_of(settings)}.checkpoint") if method == "cnn-fc" else None
+        topomap, label = TopoMetricMap.load(path_of(bench, dataset, kind)), f"{method} of {dataset.name}"
+        model = train_coarse(
+            topomap, method, backbone, weights, config, lambda stage, done, total: bench.progress(label, done, total), checkpoint
+        )
+        buffer = io.BytesIO()
+        arrays: dict[str, Any] = dict(model.arrays)
+        np.savez(buffer, **arrays)
+        write_bytes(target, buffer.getvalue())
+        if checkpoint is not None:
+            checkpoint.unlink(missing_ok=True)
+        return {"settings": dict(model.settings), "bytes": target.stat().st_size}
+
+    return bench.store.get(f"coarse-{dataset.name}-{kind.name}-{method}", settings, train, learning(COARSE_MODULES[method]), [target])
+
+
+def opened(bench: Bench, dataset: Dataset, kind: MapKind, method: str = "surf-vlad") -> tuple[TopoMetricMap, str]:
+    """The map with this coarse localizer as its default, and what stands for both (`Done.digest`). Raises as `taught` does."""
+    map_done = built(bench, dataset, kind)
+    topomap = TopoMetricMap.load(path_of(bench, dataset, kind))
+    if method not in LEARNED:
+        return topomap, map_done.digest
+    done = taught(bench, dataset, kind, method)
+    with np.load(_model_path(bench, dataset, kind, method)) as arrays:
+        model = CoarseModel(method, done.result["settings"], dict(arrays))
+    return replace(topomap, coarse_models={method: model}, default_coarse=method), digest_of([map_done.digest, done.digest])
+
+
+def path_of(bench: Bench, dataset: Dataset, kind: MapKind) -> Path:
+    """The map's file."""
+    return bench.folder("maps") / f"{dataset.name}-{kind.name}.topo"
+
+
+def _model_path(bench: Bench, dataset: Dataset, kind: MapKind, method: str) -> Path:
+    return bench.folder("models") / f"{dataset.name}-{kind.name}-{method}.npz"
+
+
+def images_digest(topomap: TopoMetricMap) -> str:
+    """A short name for what classifiers learn from: the mapping images, their poses and their nodes."""
+    rows = [[hashlib.sha256(i.jpeg).hexdigest(), i.node_id, pose_json(i.world_from_cam)] for i in topomap.place_images]
+    return digest_of([rows, [pose_json(summary.world_from_cam) for summary in topomap.summaries]])
+
+
+def why_not(bench: Bench, method: str) -> str | None:
+    """What is missing for a method, in words; None where nothing is."""
+    if method not in (*LEARNED, "posenet"):
+        return None
+    try:
+        import torch  # noqa: F401
+    except ModuleNotFoundError:
+        return str(MissingExtraError("PyTorch is not installed: pip install 'topoloc[deep]'"))
+    return None
+
+
+def _training_config(bench: Bench, num_images: int) -> CoarseTrainingConfig:
+    picture = PictureConfig(112, 84)  # a quarter of the work of the default; tables show what it costs
+    training = bench.config.training(bench.config.epochs, num_images)
+    return replace(CoarseTrainingConfig(), cnn_fc=CnnFcConfig(picture=picture, training=training))

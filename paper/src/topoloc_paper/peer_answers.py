@@ -1,0 +1,64 @@
+"""What every peer gives: a pose or none for each query, and how long it took; judged as our own answers are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION
+from topoloc.geometry.alignment import rotation_error, translation_error
+from topoloc.geometry.rigid import Rigid3
+from topoloc.sequences.frame import StereoFrame
+from topoloc_paper.stored_answers import pose_json, pose_of
+
+
+@dataclass(frozen=True, eq=False)
+class PeerAnswer:
+    """`world_from_cam` is None where the peer gave no pose."""
+
+    world_from_cam: Rigid3 | None
+    ms: float
+
+
+@runtime_checkable
+class Peer(Protocol):
+    """A localizer of another make, with its map ready."""
+
+    map_bytes: int
+
+    def localize(self, frames: Sequence[StereoFrame]) -> list[PeerAnswer]:
+        """An answer for each frame, of which only the picture and its camera are looked at."""
+        ...
+
+
+def rows_of(frames: Sequence[StereoFrame], answers: Sequence[PeerAnswer], map_from_truth: Rigid3) -> list[dict[str, Any]]:
+    """Rows as JSON; frames without a pose are from elsewhere."""
+    rows = []
+    for frame, answer in zip(frames, answers, strict=True):
+        truth = None if frame.world_from_cam is None else pose_json(map_from_truth @ frame.world_from_cam)
+        pose = None if answer.world_from_cam is None else pose_json(answer.world_from_cam)
+        rows.append({"query": frame.name, "pose": pose, "truth": truth, "ms": answer.ms})
+    return rows
+
+
+def summarize_peer(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """As `metrics.summarize` counts: medians of what was localized; `far_off` and `accepted` (from elsewhere) are false accepts."""
+    asked = [row for row in rows if row["truth"] is not None]
+    localized = [(pose_of(row["pose"]), pose_of(row["truth"])) for row in asked if row["pose"] is not None]
+    metres = np.array([translation_error(found, truth) for found, truth in localized])
+    degrees = np.array([float(np.rad2deg(rotation_error(found, truth))) for found, truth in localized])
+    elsewhere = [row for row in rows if row["truth"] is None]
+    return {
+        "num_queries": len(asked),
+        "num_localized": len(localized),
+        "median_translation_m": float(np.median(metres)) if len(metres) else None,
+        "median_rotation_deg": float(np.median(degrees)) if len(degrees) else None,
+        "recall_25cm": float(np.sum((metres <= 0.25) & (degrees <= 2.0)) / max(len(asked), 1)),
+        "far_off": int(np.sum((metres > MAX_TRANSLATION) | (degrees > MAX_ROTATION_DEG))),
+        "num_elsewhere": len(elsewhere),
+        "accepted": sum(row["pose"] is not None for row in elsewhere),
+        "ms": float(np.median([row["ms"] for row in asked])) if asked else None,
+    }

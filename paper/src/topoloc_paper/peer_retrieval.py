@@ -1,0 +1,40 @@
+"""Retrieval alone: the pose of the node that the coarse localizer names first.
+
+This is what place recognition by itself gives, and what pipelines that never say "not here" fall back to (hloc writes the pose
+of the nearest image where PnP fails). It shows what the fine step adds, and answers every query.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+from topoloc.features.extraction import FeatureConfig, extract_features
+from topoloc.map.topomap import TopoMetricMap
+from topoloc.places.coarse import open_coarse
+from topoloc.sequences.frame import Image, StereoFrame
+from topoloc.sequences.pictures import grey_image
+from topoloc_paper.peer_answers import PeerAnswer
+
+
+class Retrieval:
+    """The coarse localizer of a map, `surf-vlad`."""
+
+    def __init__(self, topomap: TopoMetricMap) -> None:
+        self._features = FeatureConfig(**topomap.config["features"])
+        self._world_from_nodes = [summary.world_from_cam for summary in topomap.summaries]
+        model = topomap.coarse_models["surf-vlad"]
+        self._coarse = open_coarse(model)
+        self.map_bytes = sum(array.nbytes for array in model.arrays.values())
+
+    def nodes(self, image: Image, num: int) -> list[int]:
+        """The `num` best nodes, best first."""
+        return [score.node_id for score in self._coarse.rank(image, extract_features(grey_image(image), self._features), num)]
+
+    def localize(self, frames: Sequence[StereoFrame]) -> list[PeerAnswer]:
+        answers = []
+        for frame in frames:
+            start = time.perf_counter()
+            (node_id,) = self.nodes(frame.image, 1)
+            answers.append(PeerAnswer(self._world_from_nodes[node_id], 1e3 * (time.perf_counter() - start)))
+        return answers

@@ -1,0 +1,69 @@
+"""The README's table of the paper's experiments: a block between two markers, generated from the results and from nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from topoloc.errors import TopolocError
+from topoloc.sequences.atomic import write_text
+from topoloc_paper.settings import LEARNED
+from topoloc_paper.text_tables import MISSING, Row, Table, about, error_words, paper_words
+
+BEGIN, END = "<!-- benchmark paper -->", "<!-- /benchmark paper -->"
+PEERS = ("the paper's step", "pycolmap, SIFT")
+
+
+def block_of(results: Mapping[str, Any]) -> str:
+    """The block with its markers: a line for each recording, its methods and the peers side by side, and the command that makes it."""
+    accuracy, peers, command = results.get("accuracy", []), results.get("peers", []), results["settings"]["command"]
+    places = dict.fromkeys((row["dataset"], row["queries"]) for row in accuracy)
+    lines = []
+    for place in places:
+        mine = [row for row in accuracy if (row["dataset"], row["queries"]) == place]
+        others = [row for row in peers if (row["dataset"], row["queries"]) == place]
+        lines.append([", ".join(place), *_cells(mine, others), _of_part(command, mine[0])])
+    own = "surf-vlad (no weights)"
+    columns = ["place, queries", "the paper's best", "PoseNet", *LEARNED, own, f"{own}, own nodes, ms", *PEERS, "command"]
+    how = "All but the last of ours have the paper's D_thresh; in brackets how many queries were localized, where not all."
+    return f"{BEGIN}\n{about(results)} {how}\n\n{Table(columns, lines).markdown()}\n{END}"
+
+
+def update_readme(path: Path, results: Mapping[str, Any]) -> None:
+    """Replace the block of this file.
+
+    Raises:
+        TopolocError: the file cannot be read or written, or has no such block.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise TopolocError(f"cannot read {path}: {error.strerror}") from error
+    before, begin, rest = text.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise TopolocError(f"{path} has no lines {BEGIN} and {END} to write between")
+    write_text(path, before + block_of(results) + after)
+
+
+def _cells(mine: Sequence[Row], others: Sequence[Row]) -> list[str]:
+    """The paper's best, then every method by the paper's D_thresh, surf-vlad on topoloc's own nodes, and the peers."""
+    printed = [row for row in mine if row["paper_m"] is not None and row["method"] != "posenet"]
+    cells = [paper_words(min(printed, key=lambda row: row["paper_m"])) if printed else MISSING]
+    for method in ("posenet", *LEARNED, "surf-vlad"):
+        cells.append(_cell([row for row in mine if row["method"] == method and row["nodes"].startswith("D_thresh")]))
+    own = [row for row in mine if not row["nodes"].startswith("D_thresh")]
+    cells.append(_cell(own) + (f", {own[0]['ms']:.0f} ms" if own and own[0].get("ms") is not None else ""))
+    return cells + [_cell([row for row in others if row["peer"] == peer]) for peer in PEERS]
+
+
+def _cell(rows: Sequence[Row]) -> str:
+    return error_words(rows[0]) if rows else MISSING
+
+
+def _of_part(command: str, row: Row) -> str:
+    """The parts that make the line."""
+    if row.get("real"):
+        return f"`{command.replace(' paper', ' recordings', 1)}`"
+    return f"`{command.replace(' paper', ' conditions', 1)}`; others: `peers` in its place"

@@ -1,0 +1,255 @@
+"""Constructing the topo-metric map: section III-A of the paper, read from the top.
+
+The trajectory is discretised into nodes (Eq. 1). Each node keeps its template image, its global pose, and its features
+with their 3-D positions. All mapping images, labelled with their node, teach the coarse localizer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from itertools import pairwise
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int
+
+from topoloc.errors import EmptyMapError, TrajectoryError
+from topoloc.features.extraction import FeatureConfig, extract_features
+from topoloc.features.features import Features
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.map.landmarks import LandmarkConfig, Observations, observe_points, refine_points
+from topoloc.map.nodes import NodeConfig, NodePoses, node_distances, place_nodes
+from topoloc.map.side_nodes import SideNodesConfig, describe_sides, gather_sides, nodes_with_sides
+from topoloc.map.topomap import Edge, NodeSummary, PlaceImage, TopoMetricMap, TopoNode
+from topoloc.map.views import MappingView, mapping_view
+from topoloc.places.vlad import SurfVlad, VladConfig, learn_words, placed, vlad
+from topoloc.sequences.frame import Image, StereoSequence
+from topoloc.slam.metric_points import MetricPointsConfig, keypoint_sigmas, locate_points
+
+Progress = Callable[[str, int, int], None]
+"""Called with a stage's name, steps done and steps in all."""
+
+
+@dataclass(frozen=True)
+class BuildConfig:
+    """All that decides what a map looks like; stored in the map."""
+
+    nodes: NodeConfig = field(default_factory=NodeConfig)
+    features: FeatureConfig = field(default_factory=FeatureConfig)
+    points: MetricPointsConfig = field(default_factory=MetricPointsConfig)
+    landmarks: LandmarkConfig = field(default_factory=LandmarkConfig)
+    vlad: VladConfig = field(default_factory=VladConfig)
+    sides: SideNodesConfig = field(default_factory=SideNodesConfig)
+    max_node_points: int = 800
+    """Features that a node keeps, the strongest ones."""
+    min_node_points: int = 20
+    """A picture with fewer located features becomes no node."""
+    template_side_px: int = 240
+    """Shorter side of the template picture that a node keeps, at most."""
+    place_side_px: int = 160
+    """Shorter side of the other mapping images, at most: what the coarse localizers of section III-B are trained with."""
+
+
+@dataclass(frozen=True, eq=False)
+class _MappingFrame:
+    """A frame with a pose, not yet read."""
+
+    sequence: StereoSequence
+    index: int
+    name: str
+    t_ns: int
+    world_from_cam: Rigid3
+
+    def view(self, with_depth: bool = True) -> MappingView:
+        return mapping_view(self.sequence[self.index], with_depth)
+
+
+@dataclass(frozen=True, eq=False)
+class _MappingImage:
+    """What the map needs of a frame once its pixels are let go. The pose is that of `camera`, which rectification may have turned."""
+
+    camera: Camera
+    world_from_cam: Rigid3
+    features: Features
+    place_jpeg: bytes
+
+
+@dataclass(eq=False)
+class _NodeDraft:
+    """A node in the making: its points (features `rows` of its image) as first measured, and what other images saw of them so far."""
+
+    frame: _MappingFrame
+    image: _MappingImage
+    template_jpeg: bytes
+    rows: Int[np.ndarray, " n"]
+    points_cam: Float[np.ndarray, "n 3"]
+    covariances: Float[np.ndarray, "n 3 3"]
+    observations: list[Observations]
+    sides: list[TopoNode]
+
+    @property
+    def features(self) -> Features:
+        return self.image.features.select(self.rows)
+
+
+def build_map(
+    sequences: StereoSequence | Sequence[StereoSequence], config: BuildConfig | None = None, progress: Progress | None = None
+) -> TopoMetricMap:
+    """Build a topo-metric map from one or several recordings of one place whose poses share one world.
+
+    Raises:
+        TrajectoryError: no frame of a recording has a pose.
+        EmptyMapError: no picture gave a usable node.
+        RecordingError, CalibrationError, UnreadableImageError: from reading the recordings.
+    """
+    config = config or BuildConfig()
+    progress = progress or (lambda stage, done, total: None)
+    if isinstance(sequences, StereoSequence):
+        sequences = [sequences]
+    frames = [frame for sequence in sequences for frame in _posed_frames(sequence)]
+    node_config = _resolve_node_config(frames, config)
+    drafts = _draft_nodes(frames, node_config, config, progress)
+    place_images, coarse = _visit_all_images(frames, drafts, node_config, config, progress)
+    nodes = [_finish_node(node_id, draft, config) for node_id, draft in enumerate(drafts)]
+    return TopoMetricMap(
+        summaries=[node.summary for node in nodes],
+        nodes=nodes,
+        edges=_edges_along(frames, [image.node_id for image in place_images]),
+        place_images=place_images,
+        coarse_models={SurfVlad.name: coarse.to_model()},
+        config=asdict(config) | {"nodes": asdict(node_config)},
+        length_m=_trajectory_length(frames),
+        sides=gather_sides([side for draft in drafts for side in draft.sides], config.sides),
+    )
+
+
+def _posed_frames(sequence: StereoSequence) -> list[_MappingFrame]:
+    described = enumerate(zip(sequence.names, sequence.t_ns, sequence.poses, strict=True))
+    frames = [_MappingFrame(sequence, i, name, t_ns, pose) for i, (name, t_ns, pose) in described if pose is not None]
+    if not frames:
+        raise TrajectoryError(f"{sequence.name}: no frame has a pose; give a trajectory (TUM or KITTI rows) of this recording")
+    return frames
+
+
+def _resolve_node_config(frames: list[_MappingFrame], config: BuildConfig) -> NodeConfig:
+    """D_thresh from the scene, where the user named none."""
+    if config.nodes.d_thresh is not None:
+        return config.nodes.resolved(0.0)
+    samples = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, 7).astype(int))]
+    depths = []
+    for frame in samples:
+        view = frame.view()
+        located = locate_points(extract_features(view.grey, config.features), view, config.points)
+        depths.append(located.points_cam[located.valid, 2])
+    all_depths = np.concatenate(depths)
+    if len(all_depths) == 0:
+        raise EmptyMapError(f"{frames[0].sequence.name}: no feature with a 3-D position in {len(samples)} pictures tried")
+    return config.nodes.resolved(float(np.median(all_depths)))
+
+
+def _draft_nodes(frames: list[_MappingFrame], node_config: NodeConfig, config: BuildConfig, progress: Progress) -> list[_NodeDraft]:
+    """The trajectory discretised by Eq. 1; a picture with too few points (dark, blurred, blank) becomes no node."""
+    frame_idx = place_nodes([frame.world_from_cam for frame in frames], node_config)
+    with_sides = nodes_with_sides([frames[i].world_from_cam for i in frame_idx], node_config, config.sides)
+    drafts: list[_NodeDraft] = []
+    for done, i in enumerate(frame_idx):
+        draft = _draft_node(frames[i], done in with_sides, config)
+        if len(draft.rows) >= config.min_node_points:
+            drafts.append(draft)
+        progress("nodes", done + 1, len(frame_idx))
+    if not drafts:
+        raise EmptyMapError(f"{frames[0].sequence.name}: no picture has {config.min_node_points} features with a 3-D position")
+    return drafts
+
+
+def _draft_node(frame: _MappingFrame, with_sides: bool, config: BuildConfig) -> _NodeDraft:
+    view = frame.view()
+    image = _mapping_image(view, config)
+    located = locate_points(image.features, view, config.points)
+    rows = np.flatnonzero(located.valid)
+    template_jpeg = _encode_jpeg(view.picture, config.template_side_px, quality=75)
+    summary = NodeSummary(-1, frame.sequence.name, frame.name, frame.t_ns, image.world_from_cam, len(rows))
+    sides = describe_sides(summary, view, config.features, config.points, config.sides) if with_sides else []
+    return _NodeDraft(frame, image, template_jpeg, rows, located.points_cam[rows], located.covariances[rows], [], sides)
+
+
+def _mapping_image(view: MappingView, config: BuildConfig) -> _MappingImage:
+    jpeg = _encode_jpeg(view.picture, config.place_side_px, quality=60)
+    return _MappingImage(view.camera, view.world_from_cam, extract_features(view.grey, config.features), jpeg)
+
+
+def _visit_all_images(
+    frames: list[_MappingFrame], drafts: list[_NodeDraft], node_config: NodeConfig, config: BuildConfig, progress: Progress
+) -> tuple[list[PlaceImage], SurfVlad]:
+    """Label every mapping image with its nearest node, let it observe the points of the nodes around, and teach the
+    coarse localizer with it."""
+    assert node_config.lambda_rot is not None
+    words = learn_words(np.concatenate([_placed(draft.features, draft.image, config) for draft in drafts]), config.vlad)
+    node_poses = NodePoses.of([draft.image.world_from_cam for draft in drafts])
+    drafted = {draft.frame: draft.image for draft in drafts}  # read already
+    images: list[PlaceImage] = []
+    vlads = []
+    for done, frame in enumerate(frames):
+        image = drafted.get(frame) or _mapping_image(frame.view(with_depth=False), config)
+        nearest = np.argsort(node_distances(image.world_from_cam, node_poses, node_config.lambda_rot), kind="stable")
+        for node_id in nearest[: config.landmarks.nodes_per_image]:
+            if drafts[node_id].frame is not frame:
+                _observe(drafts[node_id], image, config)
+        vlads.append(vlad(_placed(image.features, image, config), words))
+        images.append(PlaceImage(frame.sequence.name, frame.name, int(nearest[0]), image.world_from_cam, image.place_jpeg))
+        progress("images", done + 1, len(frames))
+    node_ids = np.array([image.node_id for image in images])
+    return images, SurfVlad.fit(words, np.stack(vlads), node_ids, config.vlad)
+
+
+def _placed(features: Features, image: _MappingImage, config: BuildConfig) -> np.ndarray:
+    return placed(features, image.camera.width, image.camera.height, config.vlad)
+
+
+def _observe(draft: _NodeDraft, image: _MappingImage, config: BuildConfig) -> None:
+    cam_from_node = image.world_from_cam.inverse() @ draft.image.world_from_cam
+    sigmas_px = keypoint_sigmas(image.features, config.points)
+    seen = observe_points(
+        draft.features, draft.points_cam, draft.covariances, image.features, sigmas_px, image.camera, cam_from_node, config.landmarks
+    )
+    draft.observations.append(seen)
+
+
+def _finish_node(node_id: int, draft: _NodeDraft, config: BuildConfig) -> TopoNode:
+    """Refine the points by what was observed; keep those seen again first, the strongest among them."""
+    refined = refine_points(draft.points_cam, draft.covariances, draft.observations, config.landmarks)
+    rows = np.flatnonzero(refined.agrees)
+    rows = np.sort(rows[np.argsort(-np.minimum(refined.num_observations[rows], 2), kind="stable")][: config.max_node_points])
+    sqrt_covs = np.linalg.cholesky(refined.covariances[rows])[:, *np.tril_indices(3)]
+    frame, image = draft.frame, draft.image
+    return TopoNode(
+        NodeSummary(node_id, frame.sequence.name, frame.name, frame.t_ns, image.world_from_cam, len(rows)),
+        image.camera,
+        draft.features.select(rows),
+        refined.points_cam[rows].astype(np.float32),
+        sqrt_covs.astype(np.float32),
+        draft.template_jpeg,
+    )
+
+
+def _edges_along(frames: list[_MappingFrame], node_ids: list[int]) -> list[Edge]:
+    """An edge wherever a recording went from one node to another."""
+    steps = pairwise(zip(frames, node_ids, strict=True))
+    edges = {(source, target) for (a, source), (b, target) in steps if a.sequence is b.sequence and source != target}
+    return [Edge(source, target) for source, target in sorted(edges)]
+
+
+def _trajectory_length(frames: list[_MappingFrame]) -> float:
+    steps = [b.world_from_cam.translation - a.world_from_cam.translation for a, b in pairwise(frames) if a.sequence is b.sequence]
+    return float(sum(np.linalg.norm(step) for step in steps))
+
+
+def _encode_jpeg(picture: Image, side_px: int, quality: int) -> bytes:
+    """The picture as JPEG, its shorter side at most `side_px`."""
+    scale = side_px / min(picture.shape[:2])
+    if scale < 1.0:
+        picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    bgr = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()

@@ -1,0 +1,74 @@
+"""Teaching a map a learned coarse localizer, from the mapping images that it keeps: no recording is needed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from topoloc.errors import EmptyMapError, TrainingError
+from topoloc.map.nodes import NodePoses, node_distances
+from topoloc.map.topomap import TopoMetricMap
+from topoloc.places.classifier_config import BackboneName, CnnFcConfig, CnnNnConfig, VladNnConfig
+from topoloc.places.coarse import CoarseModel, module_of
+from topoloc.places.training_set import Progress, TrainingSet
+
+
+@dataclass(frozen=True)
+class CoarseTrainingConfig:
+    """Settings of each learned coarse localizer."""
+
+    cnn_fc: CnnFcConfig = field(default_factory=CnnFcConfig)
+    cnn_nn: CnnNnConfig = field(default_factory=CnnNnConfig)
+    vlad_nn: VladNnConfig = field(default_factory=VladNnConfig)
+
+
+def train_coarse(
+    topomap: TopoMetricMap,
+    name: str,
+    backbone: BackboneName,
+    weights: str | None,
+    config: CoarseTrainingConfig | None = None,
+    progress: Progress | None = None,
+    checkpoint: Path | None = None,
+) -> CoarseModel:
+    """Train the coarse localizer `name` (cnn-fc, cnn-nn or vlad-nn) for this map.
+
+    Args:
+        weights: a file, ``scratch``, or None for the published weights of the backbone.
+        checkpoint: cnn-fc writes its state here after each epoch, and goes on from it if it is there.
+
+    Raises:
+        MissingExtraError: torch is not installed.
+        WeightsError: see `find_weights`.
+        TrainingError: `name` does not learn, or the training failed.
+        EmptyMapError, MapError: the map holds no images, or is damaged.
+    """
+    if name == "surf-vlad":
+        raise TrainingError("surf-vlad learns from the recording's local features: `topoloc build` makes it")
+    module = module_of(name)
+    from topoloc.places.weights import find_weights  # needs torch
+
+    config = config or CoarseTrainingConfig()
+    of_name = {"cnn-fc": config.cnn_fc, "cnn-nn": config.cnn_nn, "vlad-nn": config.vlad_nn}[name]
+    found = find_weights(backbone, weights)
+    arguments = (training_set_of(topomap), backbone, found, of_name, progress or (lambda stage, done, total: None))
+    return module.train(*arguments, checkpoint) if name == "cnn-fc" else module.train(*arguments)
+
+
+def training_set_of(topomap: TopoMetricMap) -> TrainingSet:
+    """The map's images with their distances to its nodes. Raises EmptyMapError."""
+    images = list(topomap.place_images)
+    if not images or len(topomap.summaries) == 0:
+        raise EmptyMapError("the map holds no mapping images to learn from")
+    nodes = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
+    lambda_rot, d_thresh = (float(topomap.config["nodes"][key]) for key in ("lambda_rot", "d_thresh"))
+    return TrainingSet(
+        jpegs=[image.jpeg for image in images],
+        world_from_cams=[image.world_from_cam for image in images],
+        node_ids=np.array([image.node_id for image in images], np.int64),
+        node_distances=np.stack([node_distances(image.world_from_cam, nodes, lambda_rot) for image in images]),
+        d_thresh=d_thresh,
+        lambda_rot=lambda_rot,
+    )

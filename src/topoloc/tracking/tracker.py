@@ -1,0 +1,296 @@
+"""Localizing a stream of pictures: read from `Tracker.process`.
+
+Where a picture was taken is predicted from the motion so far, or from external odometry. Points of the map that the last
+localized picture showed are followed into it; that alone gives its pose, in a few milliseconds. Every so often, and whenever too
+few points are left, it is localized in full, around the predicted pose instead of by the coarse search. A pose that the motion
+does not allow for is refused (reason `jump`), until several in a row agree that the camera is elsewhere indeed. Localized
+pictures are adjusted together in a sliding window; what comes out of it is the smoothed pose.
+
+`mode="paper"` is the rule of section III-B instead: each picture is localized alone, and where its pose lies further than
+`max_jump` from the one before, that one is copied. Here the copy is said to be one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from topoloc.errors import QueryError
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.localizer import Localizer
+from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.seen_points import SeenPoints
+from topoloc.localization.stages import StageClock
+from topoloc.places.coarse import Image
+from topoloc.sequences.pictures import grey_image
+from topoloc.tracking.following import Followed, FollowingConfig, PointFollower
+from topoloc.tracking.motion import MotionState
+from topoloc.tracking.motion_gate import GateConfig, MotionGate
+from topoloc.tracking.pose_errors import errors_of, lasting_change, noise_floor
+from topoloc.tracking.pose_window import PoseWindow, PoseWindowConfig
+from topoloc.tracking.stream_result import StreamedPose
+from topoloc.tracking.tracker_state import Reference, StreamPicture, doubt_of, reduced
+
+
+@dataclass(frozen=True)
+class TrackerConfig:
+    """When a picture is localized in full, and what is believed."""
+
+    mode: Literal["motion", "paper"] = "motion"
+    max_jump: float = 1.0
+    """mode "paper": metres from one pose to the next beyond which the new one is refused (the paper: 1 to 5, by the size of the place)."""
+    gate: GateConfig = field(default_factory=GateConfig)
+    following: FollowingConfig = field(default_factory=FollowingConfig)
+    window: PoseWindowConfig = field(default_factory=PoseWindowConfig)
+    max_side_px: int = 800
+    """Points are followed in pictures reduced to this width or height."""
+    localize_every: float = 0.25
+    """Seconds after which a picture that could be tracked is localized in full all the same ..."""
+    min_share_left: float = 0.6
+    """... as it is where fewer of the followed points are left ..."""
+    max_shift: float = 0.04
+    """... or where these have moved by this share of the picture's width."""
+    retry_after: float = 0.1
+    """Seconds to the next attempt where that failed and the points are still there."""
+    max_doubt: float = 0.3
+    """Where the prediction leaves open by more than this where points are seen (three sigma, radians), the coarse search is asked."""
+    floor_share: float = 0.001
+    """Sigma of a localization's noise is at least this share of the points' depth, and so many radians."""
+    reach: float = 2.0
+    """How far (way in depths of the points, plus radians) what the map is wrong by lasts (to 1/e)."""
+    blend_time: float = 0.2
+    """Seconds (to 1/e) in which what a new localization corrects is worked into the smoothed pose, so that it does not jump."""
+    followed_share: float = 0.05
+    """Sigma of a followed motion, as a share of its way and turn, beside what the points say."""
+
+
+class Tracker:
+    """The state of one stream; `reset` begins another."""
+
+    def __init__(self, localizer: Localizer, config: TrackerConfig | None = None) -> None:
+        self.localizer, self.config = localizer, config or TrackerConfig()
+        self._gate, self._window = MotionGate(self.config.gate), PoseWindow(self.config.window)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the stream."""
+        self._t_ns: int | None = None
+        self._image: np.ndarray | None = None
+        self._answer: StreamedPose | None = None
+        self._reference: Reference | None = None
+        self._attempt_ns = 0
+        self._gate.forget()
+        self._window.clear()
+
+    def process(self, image: Image, camera: Camera, t_ns: int, odom_from_cam: Rigid3 | None = None) -> StreamedPose:
+        """Where was this picture, the next of the stream, taken?
+
+        Args:
+            t_ns: its time, later than that of the picture before; equal only where it is the same picture again.
+            odom_from_cam: its pose by external odometry, in any frame that does not move; only its change from picture to picture counts.
+
+        Raises:
+            QueryError: the clock goes backwards or stands still; the camera is of another image size.
+        """
+        if (camera.height, camera.width) != image.shape[:2]:
+            raise QueryError(f"the image is {image.shape[1]}x{image.shape[0]}, its camera {camera.width}x{camera.height}")
+        is_same = self._image is not None and np.array_equal(self._image, image)
+        self._advance(t_ns, may_stand_still=is_same)
+        if is_same and self._answer is not None:
+            last = self._answer
+            return StreamedPose(t_ns, last.state, last.result, last.smoothed, last.smoothed_covariance, is_repeated=True)
+        self._image = image.copy()  # who reads a camera may read into the same memory again
+        if self.config.mode == "paper":
+            self._answer = self._by_paper(image, camera, t_ns)
+        else:
+            grey, grey_camera = reduced(grey_image(image), camera, self.config.max_side_px)
+            self._answer = self._by_motion(StreamPicture(image, camera, t_ns, odom_from_cam, grey, grey_camera))
+        return self._answer
+
+    def miss(self, t_ns: int, result: NotLocalized, odom_from_cam: Rigid3 | None = None) -> StreamedPose:
+        """The answer to a picture that could not be read: predicted, where the motion is known.
+
+        Raises:
+            QueryError: the clock goes backwards or stands still.
+        """
+        self._advance(t_ns)
+        self._image = None
+        if self.config.mode == "paper":
+            return self._copied(result, t_ns)
+        return self._without_pose(result, self._gate.predict(t_ns, odom_from_cam), t_ns)
+
+    def _advance(self, t_ns: int, may_stand_still: bool = False) -> None:
+        if self._t_ns is not None and (t_ns < self._t_ns or (t_ns == self._t_ns and not may_stand_still)):
+            what = "stands still" if t_ns == self._t_ns else "goes backwards"
+            raise QueryError(f"the clock of the stream {what}: {t_ns / 1e9:.6f} s comes after {self._t_ns / 1e9:.6f} s")
+        self._t_ns = t_ns
+
+    def _by_paper(self, image: Image, camera: Camera, t_ns: int) -> StreamedPose:
+        """Section III-B: "when such a jump is found, we copy the previous pose from the trajectory"."""
+        result = self.localizer.localize(image, camera)
+        if not isinstance(result, Localization):
+            return self._copied(result, t_ns)
+        previous = self._answer.smoothed if self._answer is not None else None
+        if previous is not None and np.linalg.norm(result.world_from_cam.translation - previous.translation) > self.config.max_jump:
+            return self._copied(_refused(result), t_ns)
+        return StreamedPose(t_ns, "localized", result, result.world_from_cam, result.covariance)
+
+    def _copied(self, result: NotLocalized, t_ns: int) -> StreamedPose:
+        previous = self._answer.smoothed if self._answer is not None else None
+        return StreamedPose(t_ns, "lost" if previous is None else "predicted", result, previous)
+
+    def _by_motion(self, picture: StreamPicture) -> StreamedPose:
+        clock = StageClock()
+        predicted = self._gate.predict(picture.t_ns, picture.odom_from_cam)
+        with clock.stage("tracking"):
+            followed = self._follow(picture, predicted)
+        if followed is None or self._is_due(followed, picture):
+            result, seen = self._localize(picture, predicted, followed)
+            if seen is not None and (answer := self._believe(picture, result, seen, predicted, followed)) is not None:
+                return answer
+            if followed is None:
+                return self._without_pose(_refused(result) if isinstance(result, Localization) else result, predicted, picture.t_ns)
+        assert predicted is not None, "points are followed where the motion is known"
+        return self._tracked(picture, followed, predicted, clock)
+
+    def _follow(self, picture: StreamPicture, predicted: MotionState | None) -> Followed | None:
+        """The points followed into this picture; None where they are lost or lead where the camera cannot be."""
+        reference = self._reference
+        if reference is None or predicted is None or reference.follower.camera != picture.grey_camera:
+            return None
+        followed = reference.follower.follow(picture.grey, predicted.world_from_cam.inverse())
+        if followed is None:
+            return None
+        world_from_cam = self._blended(followed, picture.t_ns).inverse()
+        floor = noise_floor(reference.errors.depth, self.config.floor_share)
+        return followed if self._gate.follows(predicted, world_from_cam, followed.covariance + floor) else None
+
+    def _is_due(self, followed: Followed, picture: StreamPicture) -> bool:
+        """Whether it is time to localize in full."""
+        config, reference = self.config, self._reference
+        assert reference is not None
+        if picture.t_ns - self._attempt_ns < config.retry_after * 1e9:
+            return False
+        is_old = picture.t_ns - reference.t_ns >= config.localize_every * 1e9
+        return is_old or followed.share_left < config.min_share_left or followed.shift_px > config.max_shift * picture.grey_camera.width
+
+    def _localize(
+        self, picture: StreamPicture, predicted: MotionState | None, followed: Followed | None
+    ) -> tuple[Localization | NotLocalized, SeenPoints | None]:
+        """In full: around the pose that is expected where that is known well enough, else, and where that fails, by the coarse search."""
+        self._attempt_ns = picture.t_ns
+        reference = self._reference
+        if reference is not None and followed is not None:
+            near = (followed.cam_from_ref @ reference.cam_from_world).inverse()
+            return self.localizer.localize_near(picture.image, picture.camera, near)
+        if reference is not None and predicted is not None and doubt_of(predicted, reference.errors.depth) <= self.config.max_doubt:
+            found, seen = self.localizer.localize_near(picture.image, picture.camera, predicted.world_from_cam)
+            if isinstance(found, Localization):
+                return found, seen
+        return self.localizer.localize_near(picture.image, picture.camera, None)
+
+    def _believe(
+        self,
+        picture: StreamPicture,
+        found: Localization | NotLocalized,
+        seen: SeenPoints,
+        predicted: MotionState | None,
+        followed: Followed | None,
+    ) -> StreamedPose | None:
+        """The answer that a full localization gives; None where the motion does not allow for it."""
+        assert isinstance(found, Localization), "points are seen where a pose was found"
+        cam_from_world = found.world_from_cam.inverse()
+        depth = float(np.median(cam_from_world.apply(seen.points_world)[:, 2]))
+        errors = errors_of(found, depth, self.config.floor_share)
+        t_ns, odom_from_cam = picture.t_ns, picture.odom_from_cam
+        if predicted is None or not self._gate.follows(predicted, found.world_from_cam, errors.whole):
+            if predicted is not None and not self._gate.is_overruled(t_ns, found.world_from_cam, errors.whole, odom_from_cam):
+                return None
+            self._window.clear()
+            smoothed, doubt = self._window.add(cam_from_world, errors.noise, Rigid3.identity(), errors.noise)
+            offset = Rigid3.identity()
+            state = self._gate.begin(t_ns, found.world_from_cam, errors.noise, odom_from_cam)
+        else:
+            motion, motion_covariance = self._motion(predicted, followed)
+            motion_covariance = motion_covariance + lasting_change(errors, motion, self.config.reach)
+            before = self._blended(followed, t_ns) if followed is not None else None
+            if followed is None and np.trace(motion_covariance) >= np.trace(errors.noise):
+                self._window.clear()  # a guess from the poses before says nothing new of this one
+            smoothed, doubt = self._window.add(cam_from_world, errors.noise, motion, motion_covariance)
+            offset = Rigid3.identity() if before is None else self._faded(before @ smoothed.inverse(), self._gate.seconds_since(t_ns))
+            measured = errors.noise if followed is None else followed.covariance
+            state = self._gate.correct(predicted, (offset @ smoothed).inverse(), measured, odom_from_cam)
+            self._gate.drop_rival()
+        points = seen.in_image(picture.grey_camera.width / picture.camera.width)
+        follower = PointFollower(picture.grey, points, cam_from_world, picture.grey_camera, self.config.following)
+        self._reference = Reference(t_ns, found, cam_from_world, errors, smoothed, doubt + errors.lasting, offset, follower)
+        return StreamedPose(t_ns, "localized", found, state.world_from_cam, self._covariance(self._reference))
+
+    def _blended(self, followed: Followed, t_ns: int) -> Rigid3:
+        """The smoothed cam_from_world of a followed picture."""
+        reference = self._reference
+        assert reference is not None
+        return self._faded(reference.offset, (t_ns - reference.t_ns) / 1e9) @ followed.cam_from_ref @ reference.smoothed
+
+    def _faded(self, offset: Rigid3, seconds: float) -> Rigid3:
+        return Rigid3.exp(np.exp(-seconds / self.config.blend_time) * offset.log())
+
+    def _motion(self, predicted: MotionState, followed: Followed | None) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
+        """cam_from_before, from the picture localized last, with the covariance of its left perturbation."""
+        assert self._reference is not None
+        if followed is not None:
+            return followed.cam_from_ref, self._followed_covariance(followed)
+        return predicted.world_from_cam.inverse() @ self._reference.smoothed.inverse(), predicted.pose_covariance
+
+    def _tracked(self, picture: StreamPicture, followed: Followed, predicted: MotionState, clock: StageClock) -> StreamedPose:
+        reference = self._reference
+        assert reference is not None
+        smoothed = self._blended(followed, picture.t_ns).inverse()
+        state = self._gate.correct(predicted, smoothed, followed.covariance, picture.odom_from_cam)
+        world_from_cam = (followed.cam_from_ref @ reference.cam_from_world).inverse()
+        adjoint, motion = world_from_cam.adjoint(), followed.cam_from_ref.adjoint()
+        covariance = adjoint @ (motion @ reference.errors.whole @ motion.T + followed.covariance) @ adjoint.T
+        found = reference.found
+        result = Localization(
+            world_from_cam=world_from_cam,
+            covariance=covariance,
+            probability=found.probability,
+            node_id=found.node_id,
+            candidates=[],
+            num_matches=followed.num_found,
+            num_inliers=followed.num_agreeing,
+            times_ms=clock.times_ms(),
+        )
+        return StreamedPose(picture.t_ns, "tracked", result, state.world_from_cam, self._covariance(reference, state))
+
+    def _without_pose(self, result: NotLocalized, predicted: MotionState | None, t_ns: int) -> StreamedPose:
+        """Predicted for a while, then lost."""
+        if predicted is None:
+            self._reference = None
+            self._gate.forget()
+            return StreamedPose(t_ns, "lost", result)
+        assert self._reference is not None
+        return StreamedPose(t_ns, "predicted", result, predicted.world_from_cam, self._covariance(self._reference, predicted))
+
+    def _covariance(self, reference: Reference, since: MotionState | None = None) -> Float[np.ndarray, "6 6"]:
+        """Of the left perturbation of world_from_cam: what the picture localized last is wrong by, and the motion since."""
+        adjoint = reference.smoothed.inverse().adjoint()
+        covariance = adjoint @ reference.covariance @ adjoint.T
+        if since is None:
+            return covariance
+        adjoint = since.world_from_cam.adjoint()
+        return covariance + adjoint @ since.pose_covariance @ adjoint.T
+
+    def _followed_covariance(self, followed: Followed) -> Float[np.ndarray, "6 6"]:
+        """Of a followed motion: what the points say, and what wrong depths make of it, in proportion to the motion."""
+        way, turn = float(np.linalg.norm(followed.cam_from_ref.translation)), followed.cam_from_ref.angle()
+        share = np.diag(np.repeat([way**2, turn**2], 3)) * self.config.followed_share**2
+        return followed.covariance + share
+
+
+def _refused(found: Localization) -> NotLocalized:
+    return NotLocalized("jump", found.candidates, found.num_matches, found.num_inliers, found.times_ms)

@@ -1,0 +1,62 @@
+"""What the tracker remembers: the picture at hand, and the one that was localized last."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.result import Localization
+from topoloc.places.coarse import Image
+from topoloc.tracking.following import PointFollower
+from topoloc.tracking.motion import MotionState
+from topoloc.tracking.pose_errors import PoseErrors
+
+
+@dataclass(frozen=True, eq=False)
+class StreamPicture:
+    """The picture at hand, its time and external odometry; in grey, and reduced, with the camera of that."""
+
+    image: Image
+    camera: Camera
+    t_ns: int
+    odom_from_cam: Rigid3 | None
+    grey: UInt8[np.ndarray, "a b"]
+    grey_camera: Camera
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """The picture that was localized last: its pose raw and smoothed, what these are wrong by, and its points.
+
+    `covariance` is of the left perturbation of `smoothed`, what the map is wrong by included.
+    `offset` (left of `smoothed`) is what the smoothed poses before it were off by; it fades.
+    """
+
+    t_ns: int
+    found: Localization
+    cam_from_world: Rigid3
+    errors: PoseErrors
+    smoothed: Rigid3
+    covariance: Float[np.ndarray, "6 6"]
+    offset: Rigid3
+    follower: PointFollower
+
+
+def doubt_of(predicted: MotionState, depth: float) -> float:
+    """Three sigma (radians) of the direction in which points at this depth (metres) are seen."""
+    sigmas = np.sqrt(np.diag(predicted.pose_covariance))
+    return 3.0 * float(np.hypot(sigmas[:3].max() / depth, sigmas[3:].max()))
+
+
+def reduced(grey: UInt8[np.ndarray, "h w"], camera: Camera, max_side_px: int) -> tuple[UInt8[np.ndarray, "a b"], Camera]:
+    """The picture with its camera, smaller where a side is longer than `max_side_px`."""
+    scale = max_side_px / max(grey.shape)
+    if scale >= 1.0:
+        return grey, camera
+    width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
+    return cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA), camera.rescaled(width, height)

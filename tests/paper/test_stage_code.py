@@ -1,0 +1,113 @@
+"""What a stage is done again for: a change of code that its result follows from, and of no other."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from topoloc.places.coarse import _MODULES, COARSE_NAMES
+from topoloc_paper import stage_code
+from topoloc_paper.peers import _CODE
+from topoloc_paper.posenet_baseline import _CODE as POSENET
+from topoloc_paper.stage_code import COARSE_MODULES, MAPPING, ROOTS, StageCode, _file, answering, asking, learning
+
+LEARNING = {f"learning {name}": learning(COARSE_MODULES[name]) for name in COARSE_NAMES if name != "surf-vlad"}
+STAGES: dict[str, StageCode] = {
+    "mapping": MAPPING,
+    "asking surf-vlad": asking("surf-vlad"),
+    "asking cnn-nn": asking("cnn-nn"),
+    **LEARNING,
+    "learning PoseNet": POSENET,
+    **{peer: answering(*modules) for peer, modules in _CODE.items()},
+}
+ASKING, PEERS = {"asking surf-vlad", "asking cnn-nn"}, set(_CODE)
+
+
+@pytest.fixture
+def code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A copy of the program that may be changed."""
+    for package, root in ROOTS.items():
+        shutil.copytree(
+            root / package, tmp_path / package, ignore=lambda folder, names: [n for n in names if Path(n).suffix not in (".py", "")]
+        )
+        monkeypatch.setitem(ROOTS, package, tmp_path)
+    _forget()
+    yield tmp_path
+    _forget()
+
+
+def _forget() -> None:
+    stage_code._imports.cache_clear()
+    stage_code._meaning.cache_clear()
+
+
+def _done_again(change: Callable[[], object]) -> set[str]:
+    """The stages whose code is another after the change."""
+    before = {name: stage.digest() for name, stage in STAGES.items()}
+    change()
+    _forget()
+    return {name for name, stage in STAGES.items() if stage.digest() != before[name]}
+
+
+@pytest.mark.parametrize(
+    ("module", "stages"),
+    [
+        ("topoloc/localization/localizer.py", ASKING),
+        ("topoloc/localization/verification.py", ASKING),
+        ("topoloc/geometry/absolute_pose_kernels.py", ASKING),
+        ("topoloc/tracking/tracker.py", set()),
+        ("topoloc/slam/odometry.py", set()),
+        ("topoloc/evaluation/metrics.py", set()),
+        ("topoloc_paper/tables.py", set()),
+        ("topoloc/errors.py", set()),
+        ("topoloc/places/vlad.py", {"mapping", *ASKING, *PEERS}),
+        ("topoloc/places/cnn_nn.py", {"asking cnn-nn", "learning cnn-nn"}),
+        ("topoloc/places/training.py", {"learning cnn-fc", "learning PoseNet"}),
+        ("topoloc/map/coarse_training.py", {*LEARNING, "learning PoseNet"}),
+        ("topoloc/map/landmarks.py", {"mapping"}),
+        ("topoloc/map/stored_map.py", {"mapping", *ASKING, *PEERS}),
+        ("topoloc/features/surf_detector_kernels.py", {"mapping", *ASKING, *PEERS}),
+        ("topoloc_paper/colmap_worker.py", {"pycolmap, SIFT"}),
+        ("topoloc_paper/pose_losses.py", {"learning PoseNet"}),
+    ],
+)
+def test_a_change_has_those_stages_done_again_that_run_it(module: str, stages: set[str], code: Path):
+    path = code / module
+    assert _done_again(lambda: path.write_text(path.read_text() + "\nCHANGED = 1\n")) == stages
+
+
+def test_comments_and_docstrings_are_no_change(code: Path):
+    path = code / "topoloc/localization/localizer.py"
+    text = path.read_text()
+    reworded = text.replace("section III-B of the paper", "a part of the paper", 1).replace(
+        "import numpy as np", "import numpy as np  # arrays", 1
+    )
+    assert reworded.count("# arrays") == 1
+    assert reworded != text.replace("import numpy as np", "import numpy as np  # arrays", 1)
+    assert _done_again(lambda: path.write_text(reworded)) == set()
+
+
+def test_what_a_stage_comes_to_import_counts(code: Path):
+    path = code / "topoloc/places/vlad.py"
+    before = MAPPING.files()
+    path.write_text(path.read_text().replace("import numpy as np", "import numpy as np\nfrom topoloc.slam import pose_graph", 1))
+    _forget()
+    assert set(MAPPING.files()) - set(before) >= {"topoloc/slam/pose_graph.py"}
+
+
+def test_an_import_for_the_type_checker_alone_does_not_count(code: Path):
+    path = code / "topoloc/places/vlad.py"
+    before = MAPPING.files()
+    guarded = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from topoloc.slam import pose_graph\n"
+    path.write_text(path.read_text().replace("import numpy as np", f"import numpy as np\n{guarded}", 1))
+    _forget()
+    assert MAPPING.files() == before
+
+
+def test_every_module_named_is_there():
+    assert {f"topoloc/places/{module}.py" for module in _MODULES.values()} == set(COARSE_MODULES.values())
+    assert COARSE_MODULES.keys() == set(COARSE_NAMES)
+    assert [name for name, stage in STAGES.items() if not all(_file(module).is_file() for module in stage.modules)] == []

@@ -1,0 +1,40 @@
+"""Answers survive their way through JSON."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from built_room import built_room, unseen_views, write_pictures
+from topoloc.evaluation.experiments import answer_queries
+from topoloc.evaluation.metrics import summarize
+from topoloc.localization.localizer import Localizer
+from topoloc.localization.result import Localization
+from topoloc.sequences.open import open_sequence
+from topoloc_paper.stored_answers import answers_of, rows_of
+
+
+def test_stored_answers_are_the_same_answers(tiny_recording: Path, tmp_path: Path):
+    sequence = open_sequence(write_pictures(tmp_path / "views", [*unseen_views()[:3], *unseen_views(seed=1)[:1]]))
+    answers = answer_queries(Localizer(built_room(tiny_recording)), sequence, label="views")
+    assert {answer.result.localized for answer in answers} == {True, False}
+    rows = json.loads(json.dumps(rows_of(answers)))
+    again = answers_of(rows, "views", sequence)
+    mine, theirs = summarize(again), summarize(answers)
+    mine.pop("median_times_ms"), theirs.pop("median_times_ms")  # rounded when stored
+    for row in (*mine.pop("recordings"), *theirs.pop("recordings")):
+        assert row["name"] == "views"
+    for key in ("median_translation_m", "median_rotation_deg"):
+        assert mine.pop(key) == pytest.approx(theirs.pop(key))
+    assert mine == theirs
+    for before, after in zip(answers, again, strict=True):
+        assert after.read_image is not None
+        assert np.array_equal(after.read_image(), sequence[int(before.query[-6:-4])].image)
+        assert after.camera == before.camera
+        if isinstance(before.result, Localization):
+            assert isinstance(after.result, Localization)
+            assert after.result.evidence == before.result.evidence
+            assert np.allclose(after.result.covariance, before.result.covariance)

@@ -1,0 +1,139 @@
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from topoloc.cli import main
+from topoloc.errors import MissingExtraError
+from topoloc.sequences.open import open_sequence
+from topoloc_worlds import recorder, shots
+from topoloc_worlds.routes import RouteConfig
+from topoloc_worlds.shots import Shot
+
+Complaint = Callable[..., str]
+
+
+@pytest.fixture
+def no_rendering(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Grey pictures instead of rendered ones, so that the command alone is tested."""
+
+    def grey(shooting: shots.Shooting | None, index: int) -> Shot:
+        assert index < 1000
+        picture = np.full((32, 48, 3), 100 + index, np.uint8)
+        return Shot(picture, picture, np.full((32, 48), 2.0, np.float32))
+
+    monkeypatch.setattr(recorder, "use_best_variant", lambda force=None: "none")
+    monkeypatch.setattr(recorder, "version", lambda package: "0")
+    monkeypatch.setattr(recorder, "_shooting", lambda *_: None)
+    monkeypatch.setattr(recorder, "shoot", grey)
+
+
+def simulate(*args: object) -> int:
+    return main(["simulate", *map(str, args), "--size", "48x32", "--processes", "1"])
+
+
+@pytest.mark.usefixtures("no_rendering")
+def test_it_writes_a_recording_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    out, facts = tmp_path / "day", tmp_path / "facts.json"
+    assert simulate("lab", out, "--num-frames", 3, "--json", facts) == 0
+    assert capsys.readouterr().out.startswith(f"{out}: 3 stereo pairs, 0.")
+    data = json.loads(facts.read_text())
+    assert (data["world"], data["condition"], data["num_frames"], data["num_rendered"]) == ("lab", "day", 3, 3)
+    frame = open_sequence(out)[2]
+    assert frame.rig is not None
+    assert frame.camera is not None
+    assert (frame.camera.width, frame.camera.fx) == (48, pytest.approx(380 * 48 / 640))
+    assert simulate("lab", out, "--num-frames", 3) == 0
+    assert "(3 of them were there)" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("no_rendering")
+def test_settings_reach_the_recording(tmp_path: Path):
+    words = "--num-frames 2 --condition clear --seed 3 --take 4 --arrangement 5 --lateral 0.1 --reverse --look 90 --wobble 0.5 --shake 2"
+    words += " --start 1 --spacing 0.3 --speed 0.6 --laps 0.5 --mono --depth --grey --motion-blur --lens-drops 2 --focal-scale 1.5 --draft"
+    assert simulate("lab", tmp_path / "a", *words.split(), "--camera", "40,40,23.5,15.5") == 0
+    settings = json.loads((tmp_path / "a" / "world.json").read_text())
+    assert [settings[name] for name in ("condition", "seed", "arrangement", "grey", "depth", "lens_drops")] == ["day", 3, 5, True, True, 2]
+    assert settings["baseline"] is None
+    assert settings["num_renderings"] > 1
+    assert settings["camera"]["fx"] == 60.0
+    route = RouteConfig(**settings["route"])
+    assert (route.seed, route.lateral, route.reverse, route.wobble, route.shake) == (4, 0.1, True, 0.5, 2.0)
+    assert (route.start, route.spacing, route.speed, route.laps) == (1.0, 0.3, 0.6, 0.5)
+    assert route.look == pytest.approx(np.pi / 2)
+    assert open_sequence(tmp_path / "a")[0].depth is not None
+
+
+@pytest.mark.usefixtures("no_rendering")
+def test_a_camera_file_and_a_length(tmp_path: Path):
+    camera = tmp_path / "camera.json"
+    camera.write_text('{"model": "PINHOLE", "width": 48, "height": 32, "fx": 41, "fy": 41, "cx": 23, "cy": 15}')
+    assert simulate("corridor", tmp_path / "a", "--camera", camera, "--length", 0.9, "--wobble", 0) == 0
+    sequence = open_sequence(tmp_path / "a")
+    assert sequence[0].camera is not None
+    assert sequence[0].camera.fx == 41
+    first, last = sequence.poses[0], sequence.poses[-1]
+    assert first is not None
+    assert last is not None
+    assert 0.4 < np.linalg.norm(first.translation - last.translation) < 0.9
+
+
+@pytest.mark.usefixtures("no_rendering")
+def test_interrupted_it_says_how_to_go_on(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+    whole = recorder.shoot
+
+    def interrupted(shooting: None, index: int) -> Shot:
+        if index == 2:
+            raise KeyboardInterrupt
+        return whole(shooting, index)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(recorder, "shoot", interrupted)
+    assert simulate("lab", tmp_path / "a", "--num-frames", 4) == 1
+    error = capsys.readouterr().err
+    assert error == f"error: interrupted (2 of 4 frames are in {tmp_path / 'a'}; the same command goes on from there)\n"
+    monkeypatch.setattr(recorder, "shoot", whole)
+    assert simulate("lab", tmp_path / "a", "--num-frames", 4) == 0
+    assert "4 stereo pairs (2 of them were there)" in capsys.readouterr().out
+
+
+def test_unknown_worlds_and_conditions_get_the_list(complaint: Complaint, tmp_path: Path):
+    assert "lab, corridor, street" in complaint("simulate", "moon", tmp_path / "a")
+    assert "day, evening, night, cloudy, rain" in complaint("simulate", "lab", tmp_path / "a", "--condition", "fog")
+
+
+@pytest.mark.usefixtures("no_rendering")
+def test_bad_settings_are_named_before_anything_is_written(complaint: Complaint, tmp_path: Path):
+    out = tmp_path / "a"
+    assert "--size" in complaint("simulate", "lab", out, "--size", "40", status=2)
+    assert "--laps and --length" in complaint("simulate", "lab", out, "--laps", 2, "--length", 3, status=2)
+    assert "--baseline" in complaint("simulate", "lab", out, "--mono", "--baseline", 0.1, status=2)
+    assert "--focal-scale" in complaint("simulate", "lab", out, "--focal-scale", 0, status=2)
+    assert "four numbers" in complaint("simulate", "lab", out, "--camera", "1,2,3")
+    assert "no such camera file" in complaint("simulate", "lab", out, "--camera", tmp_path / "none.json")
+    assert "spacing" in complaint("simulate", "lab", out, "--spacing", -1)
+    assert "bends" in complaint("simulate", "lab", out, "--lateral", 40)
+    assert "JPEG" in complaint("simulate", "lab", out, "--jpeg", 200)
+
+
+@pytest.mark.usefixtures("no_rendering")
+def test_folders_of_others_and_other_settings_are_left_alone(complaint: Complaint, tmp_path: Path):
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "thesis.tex").write_text("years of work")
+    assert "holds other files" in complaint("simulate", "lab", mine)
+    assert "cannot write" in complaint("simulate", "lab", mine / "thesis.tex" / "out")
+    assert simulate("lab", tmp_path / "a", "--num-frames", 1) == 0
+    assert "condition was" in complaint("simulate", "lab", tmp_path / "a", "--num-frames", 1, "--condition", "night", "--size", "48x32")
+    assert simulate("lab", tmp_path / "a", "--num-frames", 1, "--condition", "night", "--overwrite") == 0
+
+
+def test_without_mitsuba_the_extra_is_named(complaint: Complaint, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "mitsuba", None)
+    assert "topoloc[sim]" in complaint("simulate", "lab", tmp_path / "a")
+    with pytest.raises(MissingExtraError):
+        recorder.use_best_variant()
