@@ -26,15 +26,15 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
+from topoloc.localization.attempt import Attempt, Judgement, judge
+from topoloc.localization.verification import Evidence, VerificationConfig, log_odds_of, score_features, tolerated_translation
 
 from real_recordings import darkened, drawn_pictures, read_rigid
 from topoloc.errors import RecordingError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.attempt import Attempt, Judgement, judge
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.stages import StageClock
-from topoloc.localization.verification import Evidence, VerificationConfig, log_odds_of, score_features, tolerated_translation
 from topoloc.map.build import BuildConfig, build_map
 from topoloc.map.side_nodes import SideNodesConfig
 from topoloc.map.topomap import TopoMetricMap

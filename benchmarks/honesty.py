@@ -17,6 +17,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from topoloc.localization.verification import VerificationConfig, tolerated_translation
 
 from real_recordings import PLACES, Place, darkened, drawn_pictures, read_rigid
 from topoloc.demo.recordings import SHIPPED
@@ -25,7 +26,6 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.localization.verification import VerificationConfig, tolerated_translation
 from topoloc.map.build import BuildConfig, build_map
 from topoloc.map.nodes import NodeConfig
 from topoloc.map.topomap import TopoMetricMap

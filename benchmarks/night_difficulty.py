@@ -14,12 +14,13 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass
 
+from topoloc.localization.verification import VerificationConfig
+
 from topoloc.evaluation.experiments import answer_queries
 from topoloc.evaluation.metrics import summarize
 from topoloc.features.extraction import FeatureConfig
 from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.localization.verification import VerificationConfig
 from topoloc.map.build import BuildConfig, build_map
 from topoloc.sequences.open import open_sequence
 

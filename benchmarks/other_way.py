@@ -24,9 +24,9 @@ from topoloc.features.side_views import SideViewConfig, side_views
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.building import build_map
+from topoloc.localization.config import WallsConfig
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.result import Localization
-from topoloc.localization.side_localizer import SidesConfig
 from topoloc.sequences.frame import StereoFrame
 from topoloc.sequences.open import open_sequence
 
@@ -51,7 +51,7 @@ def main() -> None:
         f"{len(topomap.nodes)} nodes, {len(topomap.sides.nodes)} side nodes; {len(frames)} queries, {len(seen_twice)} see something twice"
     )
     figures = {"with side nodes": asked(Localizer(topomap), frames)}
-    without = LocalizerConfig(sides=SidesConfig(num_ranked=0))
+    without = LocalizerConfig(walls=WallsConfig(num_ranked=0))
     figures["without"] = asked(Localizer(topomap, without), frames)
     for name, f in figures.items():
         print(

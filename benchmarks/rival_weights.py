@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 from scipy.optimize import minimize
-
-from acceptance import TriedPose, load_poses
 from topoloc.localization.rivals import RivalsConfig
 from topoloc.localization.verification import VerificationConfig, log_odds_of, score_features
+
+from acceptance import TriedPose, load_poses
 
 IN_USE, VERIFICATION = RivalsConfig(), VerificationConfig()
 COULD_BE_TAKEN = -1.5

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from topoloc.localization.query_size import reduced_query
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rough_camera import RoughCamera
-from topoloc.localization.query_size import reduced_query
 
 MAP_FOCAL = 300.0
 IMAGE = np.random.default_rng(0).integers(0, 256, (480, 640), dtype=np.uint8)

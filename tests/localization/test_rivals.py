@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from topoloc.localization.rivals import RivalsConfig
 
 from built_room import built_room, unseen_views
 from tiny_world import CAMERA
@@ -14,7 +15,6 @@ from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.localization.rivals import RivalsConfig
 from topoloc.map.topomap import TopoMetricMap, TopoNode
 from topoloc.places.vlad import SurfVlad
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from topoloc.localization.shared_errors import SharedErrorsConfig, inflation
 
 import topoloc
 from built_room import built_room
@@ -16,7 +17,6 @@ from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization import shared_errors
 from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.localization.shared_errors import SharedErrorsConfig, inflation
 from topoloc.map.topomap import TopoMetricMap
 
 CONFIG = SharedErrorsConfig(min_nodes=3)

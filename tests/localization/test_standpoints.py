@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from topoloc.localization.attempt import Attempt
+from topoloc.localization.standpoints import StandpointsConfig, strongest_and_distinct
 
 from built_room import built_room, unseen_views
 from tiny_world import CAMERA
@@ -14,11 +16,9 @@ from topoloc.features.features import Features, Matches
 from topoloc.geometry.absolute_pose import AbsolutePose
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.attempt import Attempt
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.result import Localization
-from topoloc.localization.standpoints import StandpointsConfig, strongest_and_distinct
 from topoloc.map.topomap import TopoMetricMap
 
 LIGHTS = (0.055, 0.05, 0.045)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from topoloc.localization.localizer import LocalizerConfig
-from topoloc.localization.shared_errors import with_shared_errors
+from topoloc.features.kinds import find_kind
+from topoloc.localization.config import LocalizerConfig
+from topoloc.localization.correlated_errors import with_correlated_errors
+from topoloc.localization.fitted_weights import weights_of
 from topoloc.map import build
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.frame import StereoSequence
@@ -21,7 +23,10 @@ def build_map(
     Raises:
         TrajectoryError: no frame of a recording has a pose.
         EmptyMapError: no picture gave a usable node.
+        FeatureKindError: no features of the kind that `config` names.
         RecordingError, CalibrationError, UnreadableImageError: from reading the recordings.
     """
-    topomap, asked = build.build_map(sequences, config, progress), LocalizerConfig()
-    return with_shared_errors(topomap, asked.guided, asked.pose, asked.shared_errors)
+    config = config or build.BuildConfig()
+    kind = find_kind(config.features.kind)
+    topomap, asked = build.build_map(sequences, config, progress), LocalizerConfig().for_kind(kind)
+    return with_correlated_errors(topomap, asked.guided, asked.pose, asked.correlated_errors, weights_of(kind.name).shared_errors)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.verification import Evidence
+from topoloc.localization.evidence import Evidence
 from topoloc.places.coarse import NodeScore
 
 Reason = Literal["too_few_matches", "too_few_inliers", "ambiguous", "not_in_map", "jump", "unreadable"]
@@ -21,7 +21,7 @@ class Localization:
 
     `covariance` (6, 6) is that of the left perturbation xi of world_from_cam, ``true_world_from_cam = exp(xi) @ world_from_cam``:
     order (translation, rotation), metres and radians, axes of the world. It counts the noise of the image, the uncertainty of each map
-    point, and what the map's points are wrong by together (`shared_errors.py`). Its translation part is that of the world's origin,
+    point, and what the map's points are wrong by together (`correlated_errors.py`). Its translation part is that of the world's origin,
     as it is moved by xi; `camera_covariance` is that of the camera itself. `noise_share` of it differs from picture to picture; the rest
     is the map's, and a picture taken close by shares it.
 
@@ -41,6 +41,7 @@ class Localization:
     evidence: Evidence | None = None
     focal_length_px: float | None = None
     noise_share: float = 1.0
+    calibrated: bool = True
 
     @property
     def localized(self) -> Literal[True]:
@@ -54,11 +55,10 @@ class Localization:
 
     def to_json(self, query: str) -> dict[str, Any]:
         """One line of the result file, see docs/cli.md."""
-        pose = {"translation": self.world_from_cam.translation.tolist(), "quat_wxyz": self.world_from_cam.quat_wxyz().tolist()}
         return {
             "query": query,
             "localized": True,
-            "world_from_cam": pose,
+            "world_from_cam": _pose_json(self.world_from_cam),
             "covariance": self.covariance.tolist(),
             "probability": self.probability,
             "node": self.node_id,
@@ -68,8 +68,23 @@ class Localization:
 
 
 @dataclass(frozen=True, eq=False)
+class Alternative:
+    """A pose that may be the image's, and how probable that is; the rest of all is the probability of none of them."""
+
+    world_from_cam: Rigid3
+    probability: float
+    node_id: int
+
+    def to_json(self) -> dict[str, Any]:
+        return {"world_from_cam": _pose_json(self.world_from_cam), "probability": self.probability, "node": self.node_id}
+
+
+@dataclass(frozen=True, eq=False)
 class NotLocalized:
-    """No pose can be vouched for; `reason` says why."""
+    """No pose can be vouched for; `reason` says why.
+
+    `alternatives` are the poses that an `ambiguous` image may have, the likeliest first.
+    """
 
     reason: Reason
     candidates: list[NodeScore] = field(default_factory=list)
@@ -77,6 +92,7 @@ class NotLocalized:
     num_inliers: int = 0
     times_ms: dict[str, float] = field(default_factory=dict)
     detail: str = ""
+    alternatives: tuple[Alternative, ...] = ()
 
     @property
     def localized(self) -> Literal[False]:
@@ -85,7 +101,12 @@ class NotLocalized:
     def to_json(self, query: str) -> dict[str, Any]:
         """One line of the result file, see docs/cli.md."""
         line = {"query": query, "localized": False, "reason": self.reason, **_evidence_json(self)}
-        return line | ({"detail": self.detail} if self.detail else {})
+        line |= {"detail": self.detail} if self.detail else {}
+        return line | ({"alternatives": [one.to_json() for one in self.alternatives]} if self.alternatives else {})
+
+
+def _pose_json(world_from_cam: Rigid3) -> dict[str, list[float]]:
+    return {"translation": world_from_cam.translation.tolist(), "quat_wxyz": world_from_cam.quat_wxyz().tolist()}
 
 
 def _evidence_json(result: Localization | NotLocalized) -> dict[str, Any]:

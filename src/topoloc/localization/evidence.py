@@ -1,4 +1,4 @@
-"""Is this pose right? The evidence for it, weighed as a probability.
+"""Is this pose right? The evidence for it, weighed as odds.
 
 A count of inliers alone is no test: RANSAC finds a dozen of them in any picture, and poses of repeated patterns collect
 many more. What a wrong pose cannot have is agreement beyond what it was fitted to: most map points that must be in view
@@ -7,10 +7,11 @@ away, where chance alone finds some. So these two ratios count, beside the numbe
 that agree with it all the same, and how much of the picture the points found cover. What a pose from the right place may lack is
 precision: its own covariance, beside what is tolerated, says so.
 
-The weights are those of a logistic regression on 8,152 poses, 1,244 of them right: rooms, streets and corridors asked about
-themselves, in good light and bad, from the other side, about each other, about noise, lettering and repeated patterns
-(`benchmarks/acceptance.py` repeats it). That of the doubt is set by hand: wrong places in a corridor of many doors come with precise
-poses, and a free weight would follow them to zero.
+The weights are those of a logistic regression on poses tried, right and wrong ones; each kind of features has its own
+(`fitted_weights.py`). That of the doubt is set by hand: wrong places in a corridor of many doors come with precise
+poses, and a free weight would follow them to zero. Walls that are seen from the other side (`walls.py`) repeat themselves more than a
+room does, and less of them is recognised at a slant: the same evidence has weights of its own there, and it also counts how many
+of the key points found look more like the map's point here than like any elsewhere.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
+
+from topoloc.localization.fitted_weights import FittedWeights, WallWeights
 
 COLUMNS, ROWS = 8, 6
 """The cells of a picture whose number with an inlier in it measures the inliers' spread."""
@@ -33,7 +36,8 @@ class Evidence:
     must be in view were found where they must be seen; `num_by_chance` of them would be were the pose wrong. `spread` is the
     share of the picture's cells that hold one of them, `even_share` the share found of what must be in view, every part of the view
     asked on its own (`even_share_of`), `doubt` the pose's standard deviation in its worst direction over what
-    is tolerated: 1 where the two are equal.
+    is tolerated: 1 where the two are equal. Of walls only, `num_distinct` of the points found look more like the map's point here than
+    like any elsewhere.
     """
 
     num_matches: int
@@ -44,11 +48,12 @@ class Evidence:
     spread: float
     doubt: float
     even_share: float
+    num_distinct: int | None = None
 
 
 @dataclass(frozen=True)
-class VerificationConfig:
-    """What a right pose is, the weights of the logistic regression, and what is asked of an answer."""
+class EvidenceConfig:
+    """What a right pose is, and what is asked of an answer."""
 
     max_translation: float = 0.25
     """A right pose is no further off than this (metres), nor than `depth_share` of the distance of what is seen, if that is less."""
@@ -62,32 +67,14 @@ class VerificationConfig:
     """Map points found where the pose says they must be, at least."""
     min_probability: float = 0.5
     """Poses less probable than this are not reported."""
-    clear_log_odds: float = 4.5
-    """A pose with more for it (logarithm of its odds) is clear: only parts of the map that look nearly the same are asked then.
-    The clearest of 6,908 wrong poses had 3.9."""
-    even_share_weight: float = 2.13
-    chance_weight: float = 0.73
-    inliers_weight: float = 0.12
-    inlier_share_weight: float = 2.29
-    spread_weight: float = 0.8
-    doubt_weight: float = -0.5
-    bias: float = 7.64
-    """Above the 7.34 of the fit, whose wrong poses are mostly twins in a corridor that repeats itself; those are left to `rivals.py`.
-    Of 3,799 poses of pictures from elsewhere the most probable is then right with the probability 0.35."""
-
-    @property
-    def weights(self) -> tuple[float, ...]:
-        """In the order of `score_features`."""
-        evidence = (self.even_share_weight, self.chance_weight, self.inliers_weight, self.inlier_share_weight)
-        return (*evidence, self.spread_weight, self.doubt_weight)
 
 
-def tolerated_translation(median_depth: float, config: VerificationConfig) -> float:
+def tolerated_translation(median_depth: float, config: EvidenceConfig) -> float:
     """How far (metres) a right pose may be off where the points seen are `median_depth` (metres) away."""
     return min(config.max_translation, config.depth_share * median_depth)
 
 
-def doubt_of(covariance: Float[np.ndarray, "6 6"], median_depth: float, config: VerificationConfig) -> float:
+def doubt_of(covariance: Float[np.ndarray, "6 6"], median_depth: float, config: EvidenceConfig) -> float:
     """`Evidence.doubt`, of the covariance of the left perturbation of cam_from_world (metres, radians)."""
     metres = math.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]) / tolerated_translation(median_depth, config)
     return math.hypot(metres, math.degrees(math.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])) / config.max_rotation_deg)
@@ -130,16 +117,36 @@ def score_features(evidence: Evidence) -> tuple[float, ...]:
     )
 
 
-def log_odds_of(evidence: Evidence, config: VerificationConfig) -> float:
+def log_odds_of(evidence: Evidence, weights: FittedWeights) -> float:
     """Logarithm of the odds that the pose is right."""
-    return sum(weight * x for weight, x in zip(config.weights, score_features(evidence), strict=True)) + config.bias
+    if evidence.num_distinct is not None:
+        return _wall_log_odds(evidence, evidence.num_distinct, weights.walls)
+    w = weights.evidence
+    return sum(weight * x for weight, x in zip(w.in_order, score_features(evidence), strict=True)) + w.bias
 
 
-def probability_of(evidence: Evidence, config: VerificationConfig) -> float:
-    """The probability, in [0, 1], that the pose is right."""
-    return 1.0 / (1.0 + math.exp(-log_odds_of(evidence, config)))
+def _wall_log_odds(e: Evidence, num_distinct: int, weights: WallWeights) -> float:
+    return (
+        weights.found * math.log((e.num_found + 1) / (e.num_visible + 20))
+        + weights.chance * math.log((e.num_found + 1) / (e.num_by_chance + 5))
+        + weights.inliers * math.log(e.num_inliers + 1)
+        + weights.inlier_share * math.log((e.num_inliers + 1) / (e.num_matches + 10))
+        + weights.spread * math.log(e.spread + 0.02)
+        + weights.doubt * math.log(max(e.doubt, 0.01))
+        + weights.distinct * math.log(num_distinct + 1)
+        + weights.bias
+    )
 
 
-def is_only_imprecise(evidence: Evidence, config: VerificationConfig) -> bool:
+def precision_of(evidence: Evidence) -> float:
+    """The probability that a pose from the right place is as precise as is asked; 1 where the odds count that already.
+
+    A wall alone may leave a pose imprecise though the place is beyond doubt.
+    """
+    return 1.0 if evidence.num_distinct is None else math.erf(1.0 / (math.sqrt(2.0) * evidence.doubt))
+
+
+def is_only_imprecise(evidence: Evidence, weights: FittedWeights, config: EvidenceConfig) -> bool:
     """Would the same evidence do if the pose it gives were more precise?"""
-    return probability_of(replace(evidence, doubt=min(evidence.doubt, 0.3)), config) >= config.min_probability
+    log_odds = log_odds_of(replace(evidence, doubt=min(evidence.doubt, 0.3)), weights)
+    return 1.0 / (1.0 + math.exp(-log_odds)) >= config.min_probability

@@ -7,8 +7,6 @@ PnP on these matches does not: the points lie in one plane, and a plane has a se
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float
 
@@ -19,17 +17,6 @@ from topoloc.map.topomap import TopoNode
 
 _LARGEST_TURN, _LARGEST_SCALE = 0.5, 4.0
 _TOLERANCE, _TOLERANCE_SHARE, _TOLERANCE_LOG_SCALE = 0.05, 0.15, 0.5
-
-
-@dataclass(frozen=True, eq=False)
-class SideHypothesis:
-    """Of the `matches` between view `view` of a picture and side node `side_id`, `num_agreeing` agree with the picture's pose."""
-
-    cam_from_world: Rigid3
-    view: int
-    side_id: int
-    matches: Matches
-    num_agreeing: int
 
 
 def agreeing_pose(features: Features, camera: Camera, node: TopoNode, matches: Matches) -> tuple[int, Rigid3] | None:

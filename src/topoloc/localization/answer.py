@@ -1,0 +1,87 @@
+"""What is answered, of what is believed: a pose, "it is one of these", or why there is none."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from topoloc.geometry.pose_covariance import covariance_of_inverse
+from topoloc.geometry.rough_camera import RoughCamera
+from topoloc.localization.belief import MIN_LEAD, Hypothesis, lead
+from topoloc.localization.evidence import is_only_imprecise, precision_of
+from topoloc.localization.result import Alternative, Localization, NotLocalized, Reason
+from topoloc.localization.search import Search
+from topoloc.localization.seen_points import SeenPoints
+
+_MIN_ALTERNATIVE = 0.01  # less probable ones are not named
+
+
+def answer(search: Search) -> tuple[Localization | NotLocalized, SeenPoints | None]:
+    """The result, and the points that its pose stands on, in pixels of the image as it came."""
+    ranked = search.belief.ranked(search.weights.rivals)
+    min_probability = search.config.evidence.min_probability
+    if not ranked or ranked[0].probability < min_probability:
+        return _refusal(search, ranked), None
+    best, leads = ranked[0], [lead(ranked[0], other, search.weights.rivals) for other in ranked[1:]]
+    others = math.exp(-best.log_odds) + sum(math.exp(-one) for one in leads)
+    probability = precision_of(best.evidence) / (1.0 + others)
+    if min(leads, default=math.inf) >= MIN_LEAD and probability >= min_probability:
+        return _localization(search, best, probability), best.fit.seen_points(search.query.scale)
+    return _ambiguity(search, ranked, leads, others), None
+
+
+def _localization(search: Search, best: Hypothesis, probability: float) -> Localization:
+    assert best.fit.pose is not None
+    is_rough = isinstance(best.fit.lens, RoughCamera)
+    return Localization(
+        world_from_cam=best.world_from_cam,
+        covariance=covariance_of_inverse(best.fit.pose.cam_from_world, best.covariance),
+        probability=probability,
+        node_id=best.fit.node_id,
+        candidates=search.candidates,
+        num_matches=len(best.fit.matches),
+        num_inliers=best.fit.num_inliers,
+        times_ms=search.query.clock.times_ms(),
+        evidence=best.evidence,
+        focal_length_px=best.fit.camera.fx * search.query.scale if is_rough else None,
+        noise_share=best.noise_share,
+        calibrated=search.weights.is_calibrated,
+    )
+
+
+def _ambiguity(search: Search, ranked: list[Hypothesis], leads: list[float], others: float) -> NotLocalized:
+    """It is one of these; how probable each is, beside "nowhere"."""
+    best = ranked[0]
+    shares = [1.0 / (1.0 + others), *(math.exp(-one) / (1.0 + others) for one in leads)]
+    named = [(one, share) for one, share in zip(ranked, shares, strict=True) if share >= _MIN_ALTERNATIVE]
+    alternatives = [Alternative(one.world_from_cam, share, one.fit.node_id) for one, share in named]
+    alternatives.sort(key=lambda one: -one.probability)
+    if len(alternatives) > 1:
+        detail = f"as much like node {alternatives[1].node_id} as like node {alternatives[0].node_id}"
+    else:
+        metres = float(np.sqrt(np.linalg.eigvalsh(best.covariance[:3, :3])[-1]))
+        detail = f"in the map, but where is known to {metres:.2f} m only"
+    return _refused(search, "ambiguous" if len(alternatives) > 1 else "too_few_inliers", best, detail, tuple(alternatives))
+
+
+def _refusal(search: Search, ranked: list[Hypothesis]) -> NotLocalized:
+    if not ranked:
+        first = search.first
+        num_matches, num_inliers = (len(first.matches), first.num_inliers) if first is not None else (0, 0)
+        reason: Reason = "too_few_matches" if num_matches < search.config.min_matches else "too_few_inliers"
+        return NotLocalized(reason, search.candidates, num_matches, num_inliers, search.query.clock.times_ms(), _late(search))
+    best = ranked[0]
+    if is_only_imprecise(best.evidence, search.weights, search.config.evidence):
+        metres = float(np.sqrt(np.linalg.eigvalsh(best.covariance[:3, :3])[-1]))
+        return _refused(search, "too_few_inliers", best, f"in the map, but where is known to {metres:.2f} m only")
+    return _refused(search, "not_in_map", best, _late(search))
+
+
+def _refused(search: Search, reason: Reason, best: Hypothesis, detail: str, alternatives: tuple[Alternative, ...] = ()) -> NotLocalized:
+    times_ms = search.query.clock.times_ms()
+    return NotLocalized(reason, search.candidates, len(best.fit.matches), best.fit.num_inliers, times_ms, detail, alternatives)
+
+
+def _late(search: Search) -> str:
+    return "time was up before everything was tried" if search.is_stopped else ""

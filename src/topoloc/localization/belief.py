@@ -1,0 +1,137 @@
+"""What is believed of a query image: hypotheses with their odds, beside "nowhere in the map"; and the answer that follows.
+
+Every hypothesis excludes the others, and its odds against nothing at all say little of which of them is right: a place that repeats itself
+has most of its things twice. What tells two of them apart is the part of the picture where they differ, in which the wrong one finds
+nothing (the even share found), and that the wrong one, which has only some of the picture to stand on, is less precise (the doubt). So
+between two hypotheses the weights of `RivalWeights` count, in logarithms; where one of them comes from walls, whose evidence is of
+another kind, their odds do. With odds o of the best hypothesis against "nowhere" and odds of e^d against each other one, by which it
+leads that, it is right with the probability 1 / (1 + 1/o + sum of e^-d).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.evidence import Evidence, EvidenceConfig, precision_of
+from topoloc.localization.fitted_weights import RivalWeights
+from topoloc.localization.pose_fit import PoseFit
+
+MIN_LEAD = 2.0
+"""By how much the best hypothesis must lead the next one, in logarithms of odds, to be an answer."""
+_CHI_SQUARE_6_AT_95 = 12.592
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A pose with the evidence for it.
+
+    `covariance` is that of the left perturbation of cam_from_world, `noise_share` of it differs from picture to picture; `log_odds` are
+    those of "here" against "nowhere".
+    """
+
+    source: str
+    fit: PoseFit
+    evidence: Evidence
+    covariance: Float[np.ndarray, "6 6"]
+    noise_share: float
+    log_odds: float
+
+    @property
+    def world_from_cam(self) -> Rigid3:
+        assert self.fit.pose is not None
+        return self.fit.pose.cam_from_world.inverse()
+
+    @property
+    def probability(self) -> float:
+        """That of "here" against "nowhere" alone."""
+        return precision_of(self.evidence) / (1.0 + math.exp(-self.log_odds))
+
+    @property
+    def is_from_walls(self) -> bool:
+        return self.evidence.num_distinct is not None
+
+
+def lead(a: Hypothesis, b: Hypothesis, weights: RivalWeights) -> float:
+    """By how much `a` is likelier than `b`, in logarithms of odds."""
+    if a.is_from_walls or b.is_from_walls:
+        return a.log_odds - b.log_odds
+    return _strength(a, weights) - _strength(b, weights)
+
+
+def _strength(hypothesis: Hypothesis, weights: RivalWeights) -> float:
+    evidence = hypothesis.evidence
+    odds, even = weights.odds * hypothesis.log_odds, weights.even_share * math.log(evidence.even_share + 0.002)
+    return odds + even + weights.doubt * math.log(max(evidence.doubt, 0.01))
+
+
+def is_same_pose(a: PoseFit, b: PoseFit, config: EvidenceConfig) -> bool:
+    """Do two poses say the same? They do where they are as near as two right ones can be, or stand on the same points of the map.
+
+    A pose that is not precise yet may be far from the one that it will become, but sees the same things in the same features; two places
+    that look alike explain the same features by different points.
+    """
+    assert a.pose is not None
+    assert b.pose is not None
+    apart = a.pose.cam_from_world @ b.pose.cam_from_world.inverse()
+    way = np.linalg.norm(a.pose.cam_from_world.inverse().translation - b.pose.cam_from_world.inverse().translation)
+    if way < 2.0 * config.max_translation and apart.angle() < math.radians(2.0 * config.max_rotation_deg):
+        return True
+    if a.features is not b.features:
+        return False
+    rows_a, rows_b = (fit.matches.query_idx[fit.pose.inliers] for fit in (a, b) if fit.pose is not None)
+    _, of_a, of_b = np.intersect1d(rows_a, rows_b, return_indices=True)
+    if 2 * len(of_a) < min(len(rows_a), len(rows_b)):
+        return False
+    points_a, points_b = a.local_map.points_world[_columns(a)[of_a]], b.local_map.points_world[_columns(b)[of_b]]
+    radii = np.maximum(a.local_map.radii[_columns(a)[of_a]], b.local_map.radii[_columns(b)[of_b]])
+    return bool(np.mean(np.linalg.norm(points_a - points_b, axis=1) <= radii) > 0.5)
+
+
+def _columns(fit: PoseFit) -> np.ndarray:
+    assert fit.pose is not None
+    return fit.matches.train_idx[fit.pose.inliers]
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """The hypotheses so far, of each pose the one with the most for it."""
+
+    hypotheses: tuple[Hypothesis, ...] = ()
+
+    def given(self, hypothesis: Hypothesis, config: EvidenceConfig, weights: RivalWeights) -> Belief:
+        """With one more hypothesis."""
+        same = [other for other in self.hypotheses if _say_the_same(hypothesis, other, config)]
+        if any(_rank(other, hypothesis, weights) >= _rank(hypothesis, other, weights) for other in same):
+            return self
+        return Belief((*(other for other in self.hypotheses if other not in same), hypothesis))
+
+    def ranked(self, weights: RivalWeights) -> list[Hypothesis]:
+        """The hypotheses, the one that leads all others first."""
+
+        def least_lead(one: Hypothesis) -> float:
+            return min((lead(one, other, weights) for other in self.hypotheses if other is not one), default=math.inf)
+
+        return sorted(self.hypotheses, key=lambda one: (one.probability >= 0.5, least_lead(one)), reverse=True)
+
+    def best(self, weights: RivalWeights) -> Hypothesis | None:
+        """The likeliest hypothesis, believed or not."""
+        return self.ranked(weights)[0] if self.hypotheses else None
+
+
+def _rank(one: Hypothesis, other: Hypothesis, weights: RivalWeights) -> tuple[bool, float]:
+    return one.probability >= 0.5, lead(one, other, weights)
+
+
+def _say_the_same(a: Hypothesis, b: Hypothesis, config: EvidenceConfig) -> bool:
+    """As `is_same_pose`; also where their covariances leave open that both are right."""
+    if is_same_pose(a.fit, b.fit, config):
+        return True
+    assert a.fit.pose is not None
+    assert b.fit.pose is not None
+    apart = (a.fit.pose.cam_from_world @ b.fit.pose.cam_from_world.inverse()).log()
+    return float(apart @ np.linalg.solve(a.covariance + b.covariance, apart)) < _CHI_SQUARE_6_AT_95

@@ -1,0 +1,79 @@
+"""A map opened for queries: where its nodes stand, what names them, and their points in the world. Nodes go by their rows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property, lru_cache
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from topoloc.errors import EmptyMapError
+from topoloc.features.kinds import FeatureConfig, find_kind
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.local_map import LocalMap
+from topoloc.localization.viewing import viewing_distances
+from topoloc.localization.wall_index import WallIndex
+from topoloc.map.nodes import NodePoses
+from topoloc.map.topomap import TopoMetricMap, open_coarse_of
+from topoloc.places.coarse import CoarseLocalizer
+
+NODES_IN_MEMORY = 256
+
+
+class OpenMap:
+    """What a localizer keeps of a map between queries.
+
+    Args:
+        coarse: the map's coarse localizer of this name, or any object with `CoarseLocalizer.rank`; None for the map's default.
+
+    Raises:
+        EmptyMapError: the map has no node.
+        MapError: the map has no such coarse localizer.
+    """
+
+    def __init__(self, topomap: TopoMetricMap, coarse: str | CoarseLocalizer | None = None) -> None:
+        if len(topomap.summaries) == 0:
+            raise EmptyMapError("the map has no nodes")
+        self.topomap = topomap
+        by_name = open_coarse_of(topomap, coarse or topomap.default_coarse) if coarse is None or isinstance(coarse, str) else None
+        self.coarse: CoarseLocalizer = coarse if by_name is None else by_name  # pyright: ignore[reportAttributeAccessIssue]
+        self.feature_config = FeatureConfig(**topomap.config["features"])
+        self.kind = find_kind(self.feature_config.kind)
+        self.node_poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
+        self.lambda_rot, self.d_thresh = (float(topomap.config["nodes"][name]) for name in ("lambda_rot", "d_thresh"))
+        self._local_map = lru_cache(maxsize=NODES_IN_MEMORY)(lambda row: LocalMap.of_node(topomap.nodes[row]))
+
+    @cached_property
+    def focal(self) -> float:
+        """Focal length (pixels) of the finest camera that mapped; each recording is taken to have one camera."""
+        first_rows = {summary.recording: row for row, summary in reversed(list(enumerate(self.topomap.summaries)))}
+        return max(self.topomap.nodes[row].camera.fx for row in first_rows.values())
+
+    @cached_property
+    def walls(self) -> WallIndex | None:
+        """The map's side nodes; None where it has none, or features whose size and orientation say nothing of the wall's slant."""
+        sides = self.topomap.sides
+        return WallIndex(self.topomap, sides) if sides is not None and self.kind.has_scale and self.kind.has_angle else None
+
+    def row_of(self, node_id: int) -> int:
+        return node_id
+
+    def id_of(self, row: int) -> int:
+        return self.topomap.summaries[row].node_id
+
+    def cam_from_world(self, row: int) -> Rigid3:
+        """Of a node's camera."""
+        return self.topomap.summaries[row].world_from_cam.inverse()
+
+    def local_map(self, rows: Sequence[int] | Int[np.ndarray, " n"]) -> LocalMap:
+        """The points of these nodes together."""
+        return LocalMap.pooled([self._local_map(int(row)) for row in rows])
+
+    def distances(self, world_from_cam: Rigid3) -> Float[np.ndarray, " nodes"]:
+        """D_total of Eq. 1 (metres) between a camera and each node, whichever side of the camera is up."""
+        return viewing_distances(world_from_cam, self.node_poses, self.lambda_rot)
+
+    def nearest(self, world_from_cam: Rigid3, num_nodes: int) -> Int[np.ndarray, " n"]:
+        """The rows of the nodes nearest to a camera, the nearest first."""
+        return np.argsort(self.distances(world_from_cam), kind="stable")[:num_nodes]

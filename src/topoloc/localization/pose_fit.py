@@ -1,0 +1,72 @@
+"""Matches of a query image's features with points of the map, and the pose that most of them agree on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from topoloc.features.features import Features, Matches
+from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
+from topoloc.geometry.absolute_pose_focal import estimate_pose_and_focal
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.rough_camera import RoughCamera, usual_camera
+from topoloc.localization.local_map import LocalMap
+from topoloc.localization.seen_points import SeenPoints
+
+_MIN_MATCHES = 4
+
+
+@dataclass(frozen=True, eq=False)
+class PoseFit:
+    """`lens` is what is known of the camera, `camera` the same, or, of a rough one, what comes of it with the focal length found."""
+
+    features: Features
+    lens: Camera | RoughCamera
+    camera: Camera
+    local_map: LocalMap
+    matches: Matches
+    pose: AbsolutePose | None
+
+    @property
+    def num_inliers(self) -> int:
+        return int(self.pose.inliers.sum()) if self.pose else 0
+
+    @property
+    def node_id(self) -> int:
+        """The node that most inliers come from; -1 without any."""
+        if self.num_inliers == 0 or self.pose is None:
+            return -1
+        return int(np.bincount(self.local_map.node_ids[self.matches.train_idx[self.pose.inliers]]).argmax())
+
+    def seen_points(self, scale: float) -> SeenPoints | None:
+        """The inliers in a picture that is `scale` times as wide as that of the features; None without a pose."""
+        if self.pose is None:
+            return None
+        query_idx, train_idx = self.matches.query_idx[self.pose.inliers], self.matches.train_idx[self.pose.inliers]
+        points_world, covariances = self.local_map.points_world[train_idx], self.local_map.covariances[train_idx]
+        return SeenPoints(self.features.points_img[query_idx], points_world, covariances).in_image(scale)
+
+
+def fit_pose(
+    features: Features,
+    lens: Camera | RoughCamera,
+    local_map: LocalMap,
+    matches: Matches,
+    config: AbsolutePoseConfig,
+    start: tuple[Rigid3, Camera] | None = None,
+) -> PoseFit:
+    """Robust PnP on the matches, or the refinement of `start` (cam_from_world and the camera); with the focal length, of a rough camera."""
+    camera = start[1] if start else usual_camera(lens)
+    if len(matches) < _MIN_MATCHES:
+        return PoseFit(features, lens, camera, local_map, matches, None)
+    points_img = features.points_img[matches.query_idx].astype(np.float64)
+    points_world, covariances = local_map.points_world[matches.train_idx], local_map.covariances[matches.train_idx]
+    if isinstance(lens, RoughCamera):
+        found = estimate_pose_and_focal(points_img, points_world, lens, config, point_covariances=covariances, start=start)
+        pose, camera = found or (None, camera)
+    else:
+        near = start[0] if start else None
+        pose = estimate_absolute_pose(points_img, points_world, lens, config, point_covariances=covariances, start=near)
+    return PoseFit(features, lens, camera, local_map, matches, pose)

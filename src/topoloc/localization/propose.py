@@ -1,0 +1,125 @@
+"""First poses for a query image, the cheapest and likeliest first. Who proposes judges nothing: that is `evidence.py`'s and `belief.py`'s.
+
+- **prior**: the nodes nearest to where the camera is expected to be.
+- **retrieval**: the nodes that the coarse localizer names, their points thrown together.
+- **look-alikes**: the pool of the best candidates hides a second place: where its nodes are in the pool, points that are in both fail the
+  ratio test; where they are not, nobody asks. So nodes that look as much like the image as the best one does, but stand far from what
+  was found, are asked on their own.
+- **viewpoints**: in the dark most true matches fail the ratio test, among thousands of descriptors something is always as similar. A camera
+  near a node sees the same things about where the node saw them, about as large and as upright, and among the few key points that fit so
+  the most similar one is right far more often. So each node that ranks high lends its pose as if it were the camera's. Wrong nodes give
+  matches that are displaced anyhow, the right one matches that are displaced alike: only nodes whose displacements agree are followed up.
+
+- **walls**: what is seen of the walls along the way, from the other side (`walls.py`).
+
+Each proposer looks at what is believed so far and proposes nothing where that is settled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from topoloc.features.matching import match_pooled
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.belief import is_same_pose
+from topoloc.localization.guided import largest_shift, match_guided
+from topoloc.localization.pose_fit import PoseFit, fit_pose
+from topoloc.localization.search import Proposal, Search, Source
+from topoloc.localization.walls import propose_walls
+from topoloc.map.nodes import node_distances
+from topoloc.places.coarse import NodeScore
+
+
+def propose(search: Search, prior: Rigid3 | None) -> Iterator[Proposal]:
+    """All first poses worth a look, each made when it is asked for."""
+    if prior is not None:
+        yield _pooled(search, "prior", _near(search, prior))
+        return
+    with search.query.clock.stage("coarse"):
+        num_ranked = max(search.config.num_candidates, search.config.look_alikes.num_ranked)
+        search.ranked = search.map.coarse.rank(search.query.image, search.query.features, num_ranked)
+    yield _pooled(search, "retrieval", search.candidates)
+    yield from _look_alikes(search)
+    yield from _viewpoints(search)
+    yield from propose_walls(search)
+
+
+def _near(search: Search, world_from_cam: Rigid3) -> list[NodeScore]:
+    """As many nodes as the coarse step would name; nearer ones (Eq. 1) score higher."""
+    distances = search.map.distances(world_from_cam)
+    rows = np.argsort(distances, kind="stable")[: search.config.num_candidates]
+    search.ranked = [NodeScore(search.map.id_of(int(row)), -float(distances[row])) for row in rows]
+    return search.ranked
+
+
+def _pooled(search: Search, source: Source, candidates: list[NodeScore]) -> Proposal:
+    """The candidates' points together. The strongest features are nearly always enough; all are tried where they are not."""
+    config, rows = search.config, [search.map.row_of(candidate.node_id) for candidate in candidates]
+    proposal = _matched(search, source, rows, config.num_first_features)
+    if proposal.fit.num_inliers < config.num_clear_inliers and len(search.query.features) > config.num_first_features:
+        proposal = _matched(search, source, rows)
+    return proposal
+
+
+def _matched(search: Search, source: Source, rows: list[int], max_features: int | None = None) -> Proposal:
+    """Matches with the points of these nodes, and robust PnP."""
+    query, local_map = search.query, search.map.local_map(rows)
+    with query.clock.stage("matching"):
+        descriptors = query.features.descriptors[:max_features]
+        matches = match_pooled(descriptors, local_map.descriptors, local_map.points_world, local_map.radii, search.config.matching)
+    if len(matches) < search.config.min_matches:
+        return Proposal(source, PoseFit(query.features, query.lens, query.camera, local_map, matches, None), is_guided=False)
+    with query.clock.stage("pnp"):
+        return Proposal(source, fit_pose(query.features, query.lens, local_map, matches, search.config.pose), is_guided=False)
+
+
+def _look_alikes(search: Search) -> Iterator[Proposal]:
+    """Parts of the map far from what is believed that look like the image about as much as the best node does."""
+    config, best, nodes = search.config.look_alikes, search.best, search.map.node_poses
+    if not search.ranked or config.max_groups == 0:
+        return
+    least = config.min_score_share[0 if search.is_clear else 1] * search.ranked[0].score
+    left = [search.map.row_of(candidate.node_id) for candidate in search.ranked if candidate.score >= least]
+    asked = {search.map.row_of(candidate.node_id) for candidate in search.candidates}
+    reach = config.reach * search.map.d_thresh
+    if best is not None and best.probability >= search.config.evidence.min_probability:
+        far = search.map.distances(best.world_from_cam) > reach
+        left = [row for row in left if far[row]]
+    num_groups = 0
+    while left and num_groups < config.max_groups:
+        leader = Rigid3(nodes.rotations[left[0]], nodes.centres[left[0]])
+        near = node_distances(leader, nodes, search.map.lambda_rot) <= reach
+        group, left = [row for row in left if near[row]], [row for row in left if not near[row]]
+        if set(group) != asked:
+            num_groups += 1
+            yield _matched(search, "look-alikes", group[: search.config.num_candidates])
+
+
+def _viewpoints(search: Search) -> Iterator[Proposal]:
+    """What would be seen from where a node stands, for the nodes whose displacements agree, the most agreeing first."""
+    config, query = search.config.viewpoints, search.query
+    if search.is_clear or config.num_nodes == 0:
+        return
+    found = []
+    with query.clock.stage("matching"):
+        for candidate in search.ranked[: config.num_nodes]:
+            row = search.map.row_of(candidate.node_id)
+            local_map, cam_from_world = search.map.local_map([row]), search.map.cam_from_world(row)
+            matches = match_guided(query.features, local_map, cam_from_world, query.camera, config.matching)
+            num_alike = largest_shift(query.features, local_map, matches, cam_from_world, query.camera, config.shift_px)
+            if num_alike >= config.min_alike + config.chance_share * len(matches):
+                found.append((num_alike, local_map, matches))
+    found.sort(key=lambda one: -one[0])
+    quick = replace(search.config.pose, max_iterations=config.max_iterations)
+    with query.clock.stage("pnp"):
+        fits = [fit_pose(query.features, query.lens, local_map, matches, quick) for _, local_map, matches in found[: config.max_fits]]
+    kept: list[PoseFit] = []
+    for fit in sorted(fits, key=lambda fit: -fit.num_inliers):
+        if fit.pose is not None and not any(is_same_pose(fit, other, search.config.evidence) for other in kept):
+            kept.append(fit)
+            yield Proposal("viewpoints", fit, is_guided=True)
+        if len(kept) == config.max_poses:
+            return

@@ -1,0 +1,88 @@
+"""A query image made ready: of the size at which the map can be asked, with its features when they are first wanted.
+
+Key points have sizes in pixels, and those of a picture with far more pixels a radian than the map's pictures had are mostly smaller
+than any that the map holds: they crowd out the ones that it does. A long lens and a picture of many megapixels are alike in that. Such a
+picture is reduced until its pixels see as much as the map's did; a coarser one stays as it is.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from topoloc.errors import QueryError
+from topoloc.features.extraction import FeatureConfig, extract_normalized, normalize_image
+from topoloc.features.features import Features
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rough_camera import RoughCamera, usual_camera
+from topoloc.localization.stages import StageClock
+from topoloc.places.coarse import Image
+from topoloc.sequences.pictures import grey_image
+
+
+@dataclass(frozen=True, eq=False)
+class Query:
+    """An image with what is known of its camera (`lens`), reduced; the image as it came is `scale` times as wide.
+
+    `deadline` is the time (of `time.perf_counter`) after which no further hypothesis is sought; infinite where there is none.
+    """
+
+    image: Image
+    lens: Camera | RoughCamera
+    scale: float
+    feature_config: FeatureConfig
+    clock: StageClock = field(default_factory=StageClock)
+    deadline: float = float("inf")
+
+    @property
+    def camera(self) -> Camera:
+        """The calibration; of a camera that is only roughly known, the likeliest."""
+        return usual_camera(self.lens)
+
+    @cached_property
+    def grey(self) -> UInt8[np.ndarray, "h w"]:
+        return grey_image(self.image)
+
+    @cached_property
+    def features(self) -> Features:
+        """Patch normalisation, then the local features."""
+        with self.clock.stage("patch_normalization"):
+            normalized = normalize_image(self.grey, self.feature_config)
+        with self.clock.stage("features"):
+            return extract_normalized(normalized, self.feature_config)
+
+    @property
+    def is_late(self) -> bool:
+        return time.perf_counter() > self.deadline
+
+
+def check_size(image: Image, camera: Camera | RoughCamera) -> None:
+    """Raises QueryError where the camera is of another image size."""
+    height, width = image.shape[:2]
+    if (camera.width, camera.height) != (width, height):
+        raise QueryError(f"the image is {width}x{height}, its camera {camera.width}x{camera.height}")
+
+
+def reduced_image(
+    image: Image, camera: Camera | RoughCamera, map_focal: float, max_finer: float, max_side_px: int
+) -> tuple[Image, Camera | RoughCamera]:
+    """The image with its camera, smaller where it has over `max_finer` times the map's pixels a radian, or a longer side.
+
+    Args:
+        map_focal: focal length (pixels) of the map's finest camera: its pixels a radian. A rough camera counts as finer only as
+            far as its whole range is.
+    """
+    height, width = image.shape[:2]
+    focal = camera.min_focal if isinstance(camera, RoughCamera) else camera.fx
+    scale = max_side_px / max(width, height)
+    if focal > max_finer * map_focal:
+        scale = min(scale, map_focal / focal)
+    if scale >= 1.0:
+        return image, camera
+    width, height = max(1, round(width * scale)), max(1, round(height * scale))
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), camera.rescaled(width, height)

@@ -1,0 +1,120 @@
+"""From a first pose to a hypothesis: its points sought once more where they must be seen, the pose estimated again, the evidence counted.
+
+The nodes nearest to the first pose are asked, whose points were measured from nearly the same place; matches that the ratio test had
+to give up among thousands of descriptors are safe within a few pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from topoloc.features.matching import match_pooled
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.belief import Hypothesis
+from topoloc.localization.correlated_errors import inflation
+from topoloc.localization.evidence import Evidence, doubt_of, even_share_of, log_odds_of, spread_of
+from topoloc.localization.guided import count_by_chance, match_guided, visible_pixels
+from topoloc.localization.pose_fit import PoseFit, fit_pose
+from topoloc.localization.search import Proposal, Search
+from topoloc.localization.trace import Tried
+from topoloc.localization.walls import WallProposal, refine_wall, weigh_wall
+
+
+def hypothesis_of(search: Search, proposal: Proposal) -> Hypothesis | None:
+    """The proposal followed up; None where too little was found for any evidence."""
+    if isinstance(proposal, WallProposal):
+        with search.query.clock.stage("walls"):
+            refined = refine_wall(proposal)
+            final = refined[0] if refined is not None else None
+            hypothesis = weigh_wall(proposal, *refined) if refined is not None else None
+    else:
+        final = refine(search, proposal)
+        hypothesis = weigh(search, proposal, final)
+    if search.first is None:
+        search.first = proposal.fit if final is None or final.pose is None else final
+    if search.trace is not None:
+        milliseconds = search.query.clock.times_ms()["total"]
+        search.trace.tried.append(Tried(proposal.source, proposal.fit, final, hypothesis, milliseconds))
+    return hypothesis
+
+
+def refine(search: Search, proposal: Proposal) -> PoseFit:
+    """The pose that follows from what is found around the first one; the first one where nothing is to be found."""
+    config, first = search.config, proposal.fit
+    final = _around(search, first)
+    if first.num_inliers < config.num_clear_inliers:  # it may have been too poor for everything to be found from it at once
+        final = max(final, _around(search, final), key=lambda fit: fit.num_inliers)
+    return final
+
+
+def _around(search: Search, fit: PoseFit) -> PoseFit:
+    config, query = search.config, search.query
+    if config.guided.num_nodes == 0 or fit.pose is None or fit.num_inliers < config.evidence.min_inliers:
+        return fit
+    cam_from_world = fit.pose.cam_from_world
+    with query.clock.stage("matching"):
+        local_map = search.map.local_map(search.map.nearest(cam_from_world.inverse(), config.guided.num_nodes))
+        matches = match_guided(query.features, local_map, cam_from_world, fit.camera, config.guided)
+    with query.clock.stage("pnp"):
+        return fit_pose(query.features, query.lens, local_map, matches, config.pose, (cam_from_world, fit.camera))
+
+
+def weigh(search: Search, proposal: Proposal, final: PoseFit) -> Hypothesis | None:
+    """The hypothesis with its evidence; None where too little was found for any.
+
+    Evidence are matches that no pose guided. The first ones will do where they make the pose clear; where they do not, the nodes around
+    the final pose are asked, which are often nearer than those that the coarse search named.
+    """
+    config, first = search.config.evidence, proposal.fit
+    if first.pose is None or final.pose is None or first.num_inliers < config.min_inliers or final.num_inliers < config.min_found:
+        return None
+    with search.query.clock.stage("evidence"):
+        inflated = inflation(final.num_inliers, search.rho)
+        covariance = inflated * final.pose.covariance
+        evidence = None if proposal.is_guided else _evidence(search, first, final, covariance)
+        if evidence is None or log_odds_of(evidence, search.weights) <= search.weights.evidence.clear_log_odds:
+            evidence = _evidence(search, _unguided(search, final), final, covariance)
+        log_odds = log_odds_of(evidence, search.weights)
+    return Hypothesis(proposal.source, final, evidence, covariance, 1.0 / inflated, log_odds)
+
+
+def _evidence(search: Search, unguided: PoseFit, final: PoseFit, covariance: Float[np.ndarray, "6 6"]) -> Evidence:
+    """`covariance` is that of the left perturbation of cam_from_world."""
+    config, pose, camera = search.config, final.pose, final.camera
+    assert pose is not None
+    # points that share errors differ by them from node to node, so that even true matches agree with a pose less well
+    agreement_px = config.evidence.agreement_px * math.sqrt(1.0 + search.rho)
+    depths = pose.cam_from_world.apply(final.local_map.points_world[final.matches.train_idx[pose.inliers]])[:, 2]
+    found_img = final.features.points_img[final.matches.query_idx[pose.inliers]].astype(np.float64)
+    visible_img = visible_pixels(final.local_map, pose.cam_from_world, camera)
+    return Evidence(
+        num_matches=len(unguided.matches),
+        num_inliers=_num_agreeing(unguided, pose.cam_from_world, camera, agreement_px),
+        num_found=final.num_inliers,
+        num_visible=len(visible_img),
+        num_by_chance=count_by_chance(final.features, final.local_map, pose.cam_from_world, camera, config.guided),
+        spread=spread_of(found_img, camera.width, camera.height),
+        even_share=even_share_of(found_img, visible_img, camera.width, camera.height),
+        doubt=doubt_of(covariance, float(np.median(depths)), config.evidence),
+    )
+
+
+def _unguided(search: Search, final: PoseFit) -> PoseFit:
+    """Matches with the points around the final pose that owe nothing to it."""
+    points = final.local_map
+    matches = match_pooled(final.features.descriptors, points.descriptors, points.points_world, points.radii, search.config.matching)
+    return replace(final, matches=matches, pose=None)
+
+
+def _num_agreeing(unguided: PoseFit, cam_from_world: Rigid3, camera: Camera, agreement_px: float) -> int:
+    """How many of these matches agree with a pose that is not theirs."""
+    points_cam = cam_from_world.apply(unguided.local_map.points_world[unguided.matches.train_idx])
+    with np.errstate(invalid="ignore"):
+        offsets = camera.img_from_cam(points_cam) - unguided.features.points_img[unguided.matches.query_idx]
+        is_near = np.linalg.norm(offsets, axis=1) < agreement_px * max(max(camera.width, camera.height) / 640.0, 0.5)
+    return int(np.count_nonzero(is_near))

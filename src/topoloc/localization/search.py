@@ -1,0 +1,62 @@
+"""What the search for one query image shares: the image, the map, the settings, what is believed so far; and what it is fed with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from topoloc.localization.belief import Belief, Hypothesis
+from topoloc.localization.config import LocalizerConfig
+from topoloc.localization.fitted_weights import FittedWeights
+from topoloc.localization.open_map import OpenMap
+from topoloc.localization.pose_fit import PoseFit
+from topoloc.localization.query import Query
+from topoloc.localization.trace import Trace
+from topoloc.places.coarse import NodeScore
+
+Source = Literal["prior", "retrieval", "look-alikes", "viewpoints", "repetition", "walls"]
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """A first pose (`fit.pose`, None where the matches agree on none), and where it comes from.
+
+    `is_guided`: were the matches sought where a pose expects them? Then they are no evidence for it.
+    """
+
+    source: Source
+    fit: PoseFit
+    is_guided: bool
+
+
+@dataclass(eq=False)
+class Search:
+    """`rho` are the map's correlated errors, `ranked` is what the coarse localizer names, the best first."""
+
+    query: Query
+    map: OpenMap
+    config: LocalizerConfig
+    weights: FittedWeights
+    rho: float
+    trace: Trace | None = None
+    belief: Belief = field(default_factory=Belief)
+    ranked: list[NodeScore] = field(default_factory=list)
+    first: PoseFit | None = None
+    """What was tried first: where nothing is believed, it says why."""
+    is_stopped: bool = False
+    """Time was up before everything was tried."""
+
+    @property
+    def candidates(self) -> list[NodeScore]:
+        return self.ranked[: self.config.num_candidates]
+
+    @property
+    def best(self) -> Hypothesis | None:
+        """The likeliest hypothesis so far, believed or not."""
+        return self.belief.best(self.weights.rivals)
+
+    @property
+    def is_clear(self) -> bool:
+        """Is there so much for one hypothesis that only parts of the map that look nearly the same are asked still?"""
+        best = self.best
+        return best is not None and best.log_odds > self.weights.evidence.clear_log_odds

@@ -1,0 +1,202 @@
+"""First poses from the walls along the way: the last resort, for who comes back along a way that was mapped in one direction only.
+
+The image's views to the left and to the right (`features/side_views.py`) are compared with the map's side nodes that look most like
+them; what their matches suggest (`wall_poses.py`) is followed up in both views together (`wall_matching.py`). Walls repeat
+themselves, doors above all: so it also counts how many of the key points found look more like the
+map's point here than like any that the side nodes show elsewhere. Where the map has nodes
+that look the same way, they would have been recognised, so poses there are not considered.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from topoloc.features.extraction import extract_features
+from topoloc.features.matching import match_pooled
+from topoloc.features.side_views import side_views
+from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.rough_camera import RoughCamera
+from topoloc.localization.belief import Hypothesis
+from topoloc.localization.correlated_errors import inflation
+from topoloc.localization.evidence import Evidence, doubt_of, even_share_of, log_odds_of, spread_of
+from topoloc.localization.guided import visible_pixels
+from topoloc.localization.local_map import LocalMap
+from topoloc.localization.pose_fit import PoseFit
+from topoloc.localization.search import Proposal, Search
+from topoloc.localization.wall_index import WallIndex
+from topoloc.localization.wall_matching import SeenSide, SideMatches, estimate_pose, match_sides, nearest_sides
+from topoloc.localization.wall_poses import agreeing_pose
+
+
+@dataclass(frozen=True, eq=False)
+class WallProposal(Proposal):
+    """A first pose from view `view` and a side node, on which `num_agreeing` of their matches agree."""
+
+    view: int
+    side_row: int
+    num_agreeing: int
+    cam_from_world: Rigid3
+    walls: SeenWalls
+
+
+@dataclass(frozen=True, eq=False)
+class SeenWalls:
+    """Both sides of a query image, and the rows of the side nodes that look most like each."""
+
+    search: Search
+    index: WallIndex
+    seen: list[SeenSide]
+    ranked: list[list[int]]
+
+    @staticmethod
+    def of(search: Search, index: WallIndex) -> SeenWalls:
+        query, seen, ranked = search.query, [], []
+        assert isinstance(query.lens, Camera)
+        for view in side_views(query.lens, index.view_config):
+            picture = view.picture(query.grey)
+            features = view.within(extract_features(picture, query.feature_config))
+            seen.append(SeenSide(view, features, view.in_picture(features, query.lens)))
+            ranked.append([node.node_id for node in index.coarse.rank(picture, features, search.config.walls.num_ranked)])
+        return SeenWalls(search, index, seen, ranked)
+
+    @property
+    def camera(self) -> Camera:
+        return self.search.query.camera
+
+
+def propose_walls(search: Search) -> Iterator[Proposal]:
+    """The first poses that most matches of a view agree with, some for each view."""
+    config, best, index = search.config.walls, search.best, search.map.walls
+    is_settled = best is not None and best.probability >= search.config.evidence.min_probability and best.log_odds > config.clear_log_odds
+    if is_settled or config.num_ranked == 0 or index is None or isinstance(search.query.lens, RoughCamera):
+        return
+    with search.query.clock.stage("walls"):
+        walls = SeenWalls.of(search, index)
+        chosen = [proposal for view in range(len(walls.seen)) for proposal in _of_view(walls, view)]
+    yield from chosen
+
+
+def _of_view(walls: SeenWalls, view: int) -> list[WallProposal]:
+    """The best of one view, apart from each other."""
+    found = [proposal for row in walls.ranked[view] if (proposal := _compared(walls, view, row)) is not None]
+    kept: list[WallProposal] = []
+    for proposal in sorted(found, key=lambda one: -one.num_agreeing):
+        if len(kept) == walls.search.config.walls.num_hypotheses:
+            break
+        if not any(_are_near(walls.search, proposal.cam_from_world, other.cam_from_world) for other in kept):
+            kept.append(proposal)
+    return kept
+
+
+def _compared(walls: SeenWalls, view: int, row: int) -> WallProposal | None:
+    """A view compared with one side node."""
+    config, side = walls.search.config.walls, walls.seen[view]
+    node, local_map = walls.index.local_map(row)
+    points = (local_map.descriptors, local_map.points_world, local_map.radii)
+    matches = match_pooled(side.features.descriptors, *points, config.matching)
+    agreeing = agreeing_pose(side.features, side.view.camera, node, matches)
+    if agreeing is None or agreeing[0] < config.min_agreeing:
+        return None
+    num_agreeing, side_from_world = agreeing
+    fit = PoseFit(side.in_picture, walls.camera, walls.camera, local_map, matches, None)
+    return WallProposal("walls", fit, True, view, row, num_agreeing, side.view.cam_from_side @ side_from_world, walls)
+
+
+def refine_wall(proposal: WallProposal) -> tuple[PoseFit, SideMatches] | None:
+    """What both sides show around the first pose, and the pose that follows; None where too little does, or the map's nodes see it."""
+    walls, config = proposal.walls, proposal.walls.search.config
+    cam_from_world, found, pose = proposal.cam_from_world, None, None
+    for k, (radius_px, max_error_px) in enumerate(config.walls.rounds, start=1):
+        if _is_mapped(walls.search, cam_from_world):
+            return None
+        found = _matched(proposal, cam_from_world, radius_px, with_counts=k == len(config.walls.rounds))
+        pose = _estimate(walls, found, cam_from_world, max_error_px) if found is not None else None
+        if pose is None or np.count_nonzero(pose.inliers) < config.evidence.min_inliers:
+            return None
+        cam_from_world = pose.cam_from_world
+    if found is None or pose is None or _is_mapped(walls.search, cam_from_world):
+        return None
+    return PoseFit(found.features, walls.camera, walls.camera, found.local_map, found.matches, pose), found
+
+
+def weigh_wall(proposal: WallProposal, final: PoseFit, found: SideMatches) -> Hypothesis | None:
+    """The hypothesis with its evidence; None where too little was found for any."""
+    search, pose, camera = proposal.walls.search, final.pose, final.camera
+    if pose is None or final.num_inliers < search.config.walls.min_found:
+        return None
+    inflated = inflation(final.num_inliers, max(search.rho, search.weights.walls.least_shared_errors))
+    covariance = inflated * pose.covariance
+    depths = pose.cam_from_world.apply(found.local_map.points_world[found.matches.train_idx[pose.inliers]])[:, 2]
+    points_img = found.features.points_img[found.matches.query_idx[pose.inliers]].astype(np.float64)
+    visible_img = visible_pixels(found.local_map, pose.cam_from_world, camera)
+    evidence = Evidence(
+        num_matches=len(proposal.fit.matches),
+        num_inliers=proposal.num_agreeing,
+        num_found=final.num_inliers,
+        num_visible=found.num_visible,
+        num_by_chance=found.num_by_chance,
+        spread=spread_of(points_img, camera.width, camera.height),
+        doubt=doubt_of(covariance, float(np.median(depths)), search.config.evidence),
+        even_share=even_share_of(points_img, visible_img, camera.width, camera.height),
+        num_distinct=_num_distinct(proposal.walls, final),
+    )
+    return Hypothesis("walls", final, evidence, covariance, 1.0 / inflated, log_odds_of(evidence, search.weights))
+
+
+def _matched(proposal: WallProposal, cam_from_world: Rigid3, radius_px: float, with_counts: bool) -> SideMatches | None:
+    """The matches of the proposal itself, or, with a radius, those of both sides around the pose."""
+    walls = proposal.walls
+    if radius_px == 0.0:
+        return SideMatches(proposal.fit.features, proposal.fit.local_map, proposal.fit.matches, 0, 0)
+    sides = [(side, local_map) for side in walls.seen if (local_map := _around(walls, side, cam_from_world)) is not None]
+    return match_sides(sides, cam_from_world, replace(walls.search.config.walls.guided, radius_px=radius_px), with_counts)
+
+
+def _around(walls: SeenWalls, side: SeenSide, cam_from_world: Rigid3) -> LocalMap | None:
+    index, num_nodes = walls.index, walls.search.config.walls.num_nodes
+    rows = nearest_sides(side.view, cam_from_world, index.centres, index.axes, num_nodes)
+    return LocalMap.pooled([index.local_map(row)[1] for row in rows]) if rows and len(side.features) else None
+
+
+def _estimate(walls: SeenWalls, found: SideMatches, near: Rigid3, max_error_px: float) -> AbsolutePose | None:
+    """The pose refined, or sought anew where that has more inliers and is near: a wall has a second pose."""
+    sigma_px = walls.search.weights.walls.sigma_px
+    config = AbsolutePoseConfig(max_reprojection_error_px=max_error_px, sigma_px=sigma_px, max_iterations=1000)
+    refined, anew = estimate_pose(found, walls.camera, config, near), estimate_pose(found, walls.camera, config, None)
+    if anew is None or not _are_near(walls.search, anew.cam_from_world, near):
+        return refined
+    return anew if refined is None or np.count_nonzero(anew.inliers) > np.count_nonzero(refined.inliers) else refined
+
+
+def _num_distinct(walls: SeenWalls, final: PoseFit) -> int:
+    """How many inliers look more like the map's point here than like any point that the ranked side nodes show elsewhere."""
+    assert final.pose is not None
+    rows, columns = (index[final.pose.inliers] for index in (final.matches.query_idx, final.matches.train_idx))
+    descriptors, points_world = final.features.descriptors[rows], final.local_map.points_world[columns]
+    here = np.sum(descriptors * final.local_map.descriptors[columns], axis=1)
+    away = 1.5 * walls.search.config.walls.min_distance * walls.search.map.d_thresh
+    centre = points_world.mean(axis=0)
+    for row in sorted({row for of_view in walls.ranked for row in of_view}):
+        _, other = walls.index.local_map(row)
+        is_far = np.linalg.norm(other.points_world - centre, axis=1) > away
+        if is_far.any():
+            here = np.where((descriptors @ other.descriptors[is_far].T).max(axis=1) >= here, np.inf, here)
+    return int(np.count_nonzero(np.isfinite(here)))
+
+
+def _is_mapped(search: Search, cam_from_world: Rigid3) -> bool:
+    """Do nodes of the map look this way from here?"""
+    distances = search.map.distances(cam_from_world.inverse())
+    return bool(distances.min() < search.config.walls.min_distance * search.map.d_thresh)
+
+
+def _are_near(search: Search, a_from_world: Rigid3, b_from_world: Rigid3) -> bool:
+    """Are two first poses, neither of them precise, worth looking into but once?"""
+    apart = a_from_world @ b_from_world.inverse()
+    way = float(np.linalg.norm(a_from_world.inverse().translation - b_from_world.inverse().translation))
+    return way < 1.5 * search.map.d_thresh and np.rad2deg(apart.angle()) < 20.0
