@@ -12,6 +12,7 @@ TopolocError
 ├── WeightsError          weights of a network that are missing, damaged or of another network
 ├── TrainingError         a training that cannot begin or go on: nothing to learn from, a loss that is not finite
 ├── QueryError            the call of a query is wrong (no camera, camera of another image size)
+├── FeatureKindError      features of a kind that there is not, or whose fitted weights are damaged
 └── MissingExtraError     an optional dependency is not installed; names the extra
 """
 
@@ -62,6 +63,10 @@ class TrainingError(TopolocError):
 
 class QueryError(TopolocError):
     """A query that cannot be asked: no camera, or a camera of another image size."""
+
+
+class FeatureKindError(TopolocError):
+    """Features of an unknown kind, or fitted weights that cannot be read; the text names the kinds or the file."""
 
 
 class MissingExtraError(TopolocError):

@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from topoloc.evaluation.metrics import Answer
-from topoloc.features.extraction import FeatureConfig, extract_features
+from topoloc.features.extraction import extract_features
+from topoloc.features.kinds import FeatureConfig, find_kind
 from topoloc.features.matching import MatchingConfig, match_pooled
 from topoloc.geometry.camera import Camera
 from topoloc.localization.guided import GuidedConfig, match_guided
@@ -51,13 +52,14 @@ def match_with_node(answer: Answer, image: Image, camera: Camera, node: TopoNode
     """
     image, scaled, scale = _reduced(image, camera)
     query = extract_features(grey_image(image), features)
-    local_map = LocalMap.of_node(node)
+    local_map, kind = LocalMap.of_node(node), find_kind(features.kind)
     if isinstance(answer.result, Localization):
         cam_from_world = answer.result.world_from_cam.inverse()
-        matches = match_guided(query, local_map, cam_from_world, scaled, GuidedConfig())
+        matches = match_guided(query, local_map, cam_from_world, scaled, GuidedConfig().resolved(kind))
     else:
         cam_from_world = None if answer.world_from_cam is None else answer.world_from_cam.inverse()
-        matches = match_pooled(query.descriptors, local_map.descriptors, local_map.points_world, local_map.radii, MatchingConfig())
+        matching = MatchingConfig(ratio=kind.ratio)
+        matches = match_pooled(query.descriptors, local_map.descriptors, local_map.points_world, local_map.radii, matching)
     points_query = query.points_img[matches.query_idx].astype(np.float64)
     points_node = node.features.points_img[matches.train_idx].astype(np.float64)
     agrees = np.zeros(len(points_query), dtype=bool)

@@ -5,16 +5,12 @@ Maps and the queries put to them must be made with the same `FeatureConfig`: a m
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
-
 import numpy as np
 from jaxtyping import UInt8
 
 from topoloc.features.features import Features
+from topoloc.features.kinds import FeatureConfig, find_kind
 from topoloc.features.patch_normalization import PatchNormalizationConfig, patch_normalize
-from topoloc.features.sift import SiftConfig, extract_sift
-from topoloc.features.surf import SurfConfig, extract_surf
 
 NORMALIZATIONS: dict[str, PatchNormalizationConfig | None] = {
     "none": None,
@@ -24,37 +20,21 @@ NORMALIZATIONS: dict[str, PatchNormalizationConfig | None] = {
 }
 
 
-@dataclass(frozen=True)
-class FeatureConfig:
-    """Which features an image gives. Plain values only: it is stored in the map and built again from them.
-
-    normalization: `none`; `paper`, 17x17 windows and no noise floor; `wide`, 65x65 windows and a floor of 24 grey levels,
-    which keeps what the paper's form gains when the light changes and loses little where it does not.
-    max_features: the strongest are kept. The detector's own threshold is low on purpose: a fixed one is a threshold on
-    contrast, and finds next to nothing in a dark picture.
-    """
-
-    kind: Literal["surf", "sift"] = "surf"
-    normalization: Literal["none", "paper", "wide"] = "wide"
-    max_features: int = 1000
-    hessian_threshold: float = 20.0
-    contrast_threshold: float = 0.01
-
-
 def extract_features(image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int = 2) -> Features:
-    """The features of a grey image, strongest first; the same for any `num_threads`."""
+    """The features of a grey image, strongest first; the same for any `num_threads`.
+
+    Raises:
+        FeatureKindError: there is no such kind.
+    """
     return extract_normalized(normalize_image(image, config, num_threads), config, num_threads)
 
 
 def normalize_image(image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int = 2) -> UInt8[np.ndarray, "h w"]:
     """First step of `extract_features`: the picture that key points are sought in."""
-    normalization = NORMALIZATIONS[config.normalization]
+    normalization = NORMALIZATIONS[config.normalization or find_kind(config.kind).normalization]
     return image if normalization is None else patch_normalize(image, normalization, num_threads)
 
 
 def extract_normalized(normalized: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int = 2) -> Features:
     """Second step of `extract_features`: the features of what `normalize_image` gave."""
-    if config.kind == "sift":
-        return extract_sift(normalized, SiftConfig(max_features=config.max_features, contrast_threshold=config.contrast_threshold))
-    surf = SurfConfig(hessian_threshold=config.hessian_threshold, max_features=config.max_features, num_threads=num_threads)
-    return extract_surf(normalized, surf)
+    return find_kind(config.kind).extract(normalized, config, num_threads)

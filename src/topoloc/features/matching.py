@@ -6,7 +6,7 @@ matching", section III-B). Descriptors must have unit length, so that distance^2
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import cv2
@@ -18,6 +18,7 @@ from topoloc.features.features import Matches
 from topoloc.features.matching_kernels import GROUP, ROWS, TILE, multiply, reject_rivalled
 
 _ROWS_AT_ONCE = 32  # a multiple of ROWS; their products are read again while they are still in the cache
+_LOWES_RATIO = 0.8
 _FLANN_KDTREE = 1
 _FLANN_NEIGHBOURS = 8  # of these the nearest that is no twin is the rival
 _NO_POINTS = np.zeros((0, 3), np.float32)
@@ -26,16 +27,21 @@ _NO_RADII = np.zeros(0, np.float32)
 
 @dataclass(frozen=True)
 class MatchingConfig:
-    """How to match. ratio: a match must be nearer than `ratio` times its nearest rival; 0 accepts every nearest neighbour.
+    """How to match. ratio: a match must be nearer than `ratio` times its nearest rival; 0 accepts every nearest neighbour;
+    None is what suits the kind of features, or 0.8 (Lowe) where that is not known.
 
     mutual: the train feature's nearest query feature must be this one. trees and checks are FLANN's: KD-trees built, leaves visited.
     """
 
     method: Literal["exact", "flann"] = "exact"
-    ratio: float = 0.8
+    ratio: float | None = None
     mutual: bool = True
     trees: int = 5
     checks: int = 50
+
+    def resolved(self, ratio: float) -> MatchingConfig:
+        """With this ratio, unless it has one."""
+        return self if self.ratio is not None else replace(self, ratio=ratio)
 
 
 def match_features(
@@ -75,7 +81,9 @@ def _match(
 ) -> Matches:
     if len(query) == 0 or len(train) == 0:
         return Matches(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros(0, np.float32))
+    config = config.resolved(_LOWES_RATIO)
     if config.method == "exact":
+        assert config.ratio is not None
         train_idx, products = _nearest(query, train, config.ratio, points, radii, num_threads)
     else:
         train_idx, products = _nearest_flann(query, train, points, radii, config)
@@ -133,6 +141,7 @@ def _nearest_flann(
     config: MatchingConfig,
 ) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
     """As `_nearest`, by approximate neighbours."""
+    assert config.ratio is not None
     cv2.setRNGSeed(0)  # the trees split at random; two runs must give the same bytes
     matcher = cv2.FlannBasedMatcher({"algorithm": _FLANN_KDTREE, "trees": config.trees}, {"checks": config.checks})
     found = matcher.knnMatch(np.ascontiguousarray(query), np.ascontiguousarray(train), k=2 if len(points) == 0 else _FLANN_NEIGHBOURS)

@@ -36,7 +36,7 @@ _VARIANCE_OF_ESTIMATE = 0.8265
 
 @dataclass(frozen=True)
 class AbsolutePoseConfig:
-    """`sigma_px` is the standard deviation of a matched key point along x and along y.
+    """`sigma_px` is the standard deviation of a matched key point along x and along y; None: of its kind, or one pixel.
 
     `max_reprojection_error_px` decides what an inlier is. With the poselib method, the uncertainty of a point, projected,
     widens it up to threefold: in proportion to the standard deviation that it adds to `sigma_px`.
@@ -45,12 +45,16 @@ class AbsolutePoseConfig:
 
     method: Literal["poselib", "opencv"] = "poselib"
     max_reprojection_error_px: float = 4.0
-    sigma_px: float = 1.0
+    sigma_px: float | None = None
     max_iterations: int = 3000
     min_iterations: int = 50
     confidence: float = 0.999
     max_refinement_steps: int = 10
     seed: int = 0
+
+    @property
+    def key_point_sigma_px(self) -> float:
+        return 1.0 if self.sigma_px is None else self.sigma_px
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +112,7 @@ def estimate_absolute_pose(
     matches = _Matches(
         points_img=np.ascontiguousarray(points_img[order], dtype=np.float64),
         normalized=normalized[order],
-        covariances=_normalized_covariances(camera, normalized[order], config.sigma_px),
+        covariances=_normalized_covariances(camera, normalized[order], config.key_point_sigma_px),
         points_world=np.ascontiguousarray(points_world[order], dtype=np.float64),
         point_covariances=np.zeros((0, 3, 3))
         if point_covariances is None
@@ -262,7 +266,7 @@ def _select_inliers(
         return errors_px <= limit_px
     # A plain threshold would cut the errors of uncertain points short, and what is left would look too precise.
     squares = squared_errors(*_arguments(cam_from_world, matches))
-    return (squares <= (limit_px / config.sigma_px) ** 2) & (errors_px <= _MAX_WIDENING * limit_px)
+    return (squares <= (limit_px / config.key_point_sigma_px) ** 2) & (errors_px <= _MAX_WIDENING * limit_px)
 
 
 def _reprojection_errors(cam_from_world: Rigid3, matches: _Matches, camera: Camera) -> Float[np.ndarray, " n"]:

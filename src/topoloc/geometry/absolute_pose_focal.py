@@ -114,7 +114,7 @@ def _normal_equations(
     residuals = projected - camera.normalized_from_img(pixels)
     by_point = np.stack([np.column_stack([w, zero, -u * w]), np.column_stack([zero, w, -v * w])], axis=1)
     by_world = by_point @ rotation
-    spread = by_world @ point_covariances @ by_world.transpose(0, 2, 1) + (config.sigma_px / camera.fx) ** 2 * np.eye(2)
+    spread = by_world @ point_covariances @ by_world.transpose(0, 2, 1) + (config.key_point_sigma_px / camera.fx) ** 2 * np.eye(2)
     inverse = np.linalg.inv(spread)
     by_rotation = np.stack([np.column_stack([-u * v, 1.0 + u * u, -v]), np.column_stack([-(1.0 + v * v), u * v, u])], axis=1)
     jacobians = np.concatenate([by_point, by_rotation, projected[:, :, None]], axis=2)

@@ -15,6 +15,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.pose_covariance import covariance_of_inverse
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
+from topoloc.localization.fitted_weights import EvidenceWeights
 from topoloc.localization.guided import GuidedConfig, count_by_chance, visible_pixels
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.result import Localization, NotLocalized
@@ -89,6 +90,7 @@ def judge(
     matching: MatchingConfig,
     guided: GuidedConfig,
     config: VerificationConfig,
+    weights: EvidenceWeights,
     clock: StageClock,
 ) -> Judgement:
     """A pose is an answer only where the evidence for it is strong.
@@ -110,12 +112,12 @@ def judge(
     # points that share errors differ by them from node to node, so that even true matches agree with a pose less well
     agreement_px = config.agreement_px * math.sqrt(1.0 + shared_errors)
     evidence = None if first.is_guided else _evidence(first, final, covariance, agreement_px, guided, config)
-    if evidence is None or log_odds_of(evidence, config) <= config.clear_log_odds:
+    if evidence is None or log_odds_of(evidence, weights) <= weights.clear_log_odds:
         evidence = _evidence(_unguided(final, matching), final, covariance, agreement_px, guided, config)
-    log_odds, probability = log_odds_of(evidence, config), probability_of(evidence, config)
+    log_odds, probability = log_odds_of(evidence, weights), probability_of(evidence, weights)
     if probability < config.min_probability:
         reason, detail = "not_in_map", ""
-        if is_only_imprecise(evidence, config):
+        if is_only_imprecise(evidence, weights, config):
             metres = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
             reason, detail = "too_few_inliers", f"in the map, but where is known to {metres:.2f} m only"
         refusal = NotLocalized(reason, candidates, num_matches, final.num_inliers, clock.times_ms(), detail)

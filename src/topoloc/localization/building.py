@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from topoloc.features.kinds import find_kind
+from topoloc.localization.fitted_weights import weights_of
 from topoloc.localization.localizer import LocalizerConfig
 from topoloc.localization.shared_errors import with_shared_errors
 from topoloc.map import build
@@ -21,7 +23,10 @@ def build_map(
     Raises:
         TrajectoryError: no frame of a recording has a pose.
         EmptyMapError: no picture gave a usable node.
+        FeatureKindError: no features of the kind that `config` names.
         RecordingError, CalibrationError, UnreadableImageError: from reading the recordings.
     """
-    topomap, asked = build.build_map(sequences, config, progress), LocalizerConfig()
-    return with_shared_errors(topomap, asked.guided, asked.pose, asked.shared_errors)
+    config = config or build.BuildConfig()
+    kind = find_kind(config.features.kind)
+    topomap, asked = build.build_map(sequences, config, progress), LocalizerConfig().for_kind(kind)
+    return with_shared_errors(topomap, asked.guided, asked.pose, asked.shared_errors, weights_of(kind.name).shared_errors)

@@ -7,12 +7,14 @@ same place.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
 from topoloc.features.features import Features, Matches
+from topoloc.features.kinds import FeatureKind, GuidedThresholds
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.guided_kernels import match_projections
@@ -21,20 +23,30 @@ from topoloc.localization.local_map import LocalMap
 
 @dataclass(frozen=True)
 class GuidedConfig:
-    """Settings of guided matching."""
+    """Settings of guided matching. A threshold that is None is that of the kind of features (`features/kinds.py`)."""
 
     num_nodes: int = 3
     """Nodes nearest to the first pose (Eq. 1) whose points are sought; 0 keeps the first pose as it is."""
     radius_px: float = 10.0
     """How far from its projection a map point is sought, in an image whose longer side is 640 pixels; grows with that."""
-    max_scale: float = 1.6
+    max_scale: float | None = None
     """Largest ratio of a key point's size to the one expected, or the other way round."""
-    max_turn: float = 0.6
+    max_turn: float | None = None
     """Largest difference of a key point's orientation from the one expected, radians."""
-    min_similarity: float = 0.75
+    min_similarity: float | None = None
     """Least scalar product of the two descriptors."""
-    min_margin: float = 0.03
+    min_margin: float | None = None
     """By how much the best key point must lead the next one within the radius."""
+
+    def resolved(self, kind: FeatureKind, thresholds: GuidedThresholds | None = None) -> GuidedConfig:
+        """With the kind's thresholds (`thresholds`, or those for key points nearby) where none is set.
+
+        Sizes and angles that do not follow the picture are never looked at.
+        """
+        unset = {name: value for name, value in asdict(thresholds or kind.guided).items() if getattr(self, name) is None}
+        unset |= {} if kind.has_scale else {"max_scale": math.inf}
+        unset |= {} if kind.has_angle else {"max_turn": math.inf}
+        return replace(self, **unset)
 
 
 def match_guided(features: Features, local_map: LocalMap, cam_from_world: Rigid3, camera: Camera, config: GuidedConfig) -> Matches:
@@ -61,6 +73,10 @@ def _find(
     features: Features, local_map: LocalMap, expected: Float32[np.ndarray, "n 5"], camera: Camera, config: GuidedConfig
 ) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
     """The most similar key point near where each map point is expected, -1 for none; and how similar it is."""
+    thresholds = (config.max_scale, config.max_turn, config.min_similarity, config.min_margin)
+    numbers = [threshold for threshold in thresholds if threshold is not None]
+    assert len(numbers) == 4, "resolve the configuration first"
+    max_scale, max_turn, min_similarity, min_margin = numbers
     seen = np.column_stack([features.points_img, features.sizes_px, np.cos(features.angles), np.sin(features.angles)])
     return match_projections(
         expected,
@@ -70,10 +86,10 @@ def _find(
         float(camera.width),
         float(camera.height),
         float(config.radius_px * max(max(camera.width, camera.height) / 640.0, 0.5)),
-        np.float32(config.max_scale),
-        np.float32(np.cos(config.max_turn)),
-        np.float32(config.min_similarity),
-        np.float32(config.min_margin),
+        np.float32(max_scale),
+        np.float32(np.cos(max_turn) if max_turn < math.pi else -math.inf),
+        np.float32(min_similarity),
+        np.float32(min_margin),
     )
 
 

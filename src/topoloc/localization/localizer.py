@@ -16,8 +16,9 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from topoloc.errors import EmptyMapError, QueryError
-from topoloc.features.extraction import FeatureConfig, extract_normalized, normalize_image
+from topoloc.features.extraction import extract_normalized, normalize_image
 from topoloc.features.features import Features, Matches
+from topoloc.features.kinds import FeatureConfig, FeatureKind, find_kind
 from topoloc.features.matching import MatchingConfig, match_pooled
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.absolute_pose_focal import estimate_pose_and_focal
@@ -25,6 +26,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera, usual_camera
 from topoloc.localization.attempt import Attempt, Judgement, judge
+from topoloc.localization.fitted_weights import FittedWeights, weights_of
 from topoloc.localization.guided import GuidedConfig, match_guided
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.query_size import reduced_query
@@ -73,6 +75,18 @@ class LocalizerConfig:
     max_side_px: int = 1600
     """Larger images are reduced to this width or height first: nothing is gained from more, but time and memory."""
 
+    def for_kind(self, kind: FeatureKind) -> LocalizerConfig:
+        """With the thresholds of this kind of features where none are set."""
+        sides, standpoints = self.sides, self.standpoints
+        return replace(
+            self,
+            matching=self.matching.resolved(kind.ratio),
+            guided=self.guided.resolved(kind),
+            pose=self.pose if self.pose.sigma_px is not None else replace(self.pose, sigma_px=kind.sigma_px),
+            standpoints=replace(standpoints, matching=standpoints.matching.resolved(kind, kind.distant)),
+            sides=replace(sides, matching=sides.matching.resolved(kind.wall_ratio), guided=sides.guided.resolved(kind)),
+        )
+
 
 class Localizer:
     """Holds an open map, its coarse localizer and the nodes used lately.
@@ -80,19 +94,29 @@ class Localizer:
     Args:
         coarse: names the candidate nodes instead of one of the map's own coarse localizers: any object with `CoarseLocalizer.rank`
             (`topoloc/places/coarse.py`), such as retrieval of another kind or a prior from elsewhere. `config.coarse` is then left aside.
+        weights: what the evidence counts, instead of what ships for the map's kind of features.
 
     Raises:
+        FeatureKindError: the map's features are of a kind that there is not.
         EmptyMapError: the map has no node.
         MapError: the map has no such coarse localizer.
     """
 
-    def __init__(self, topomap: TopoMetricMap, config: LocalizerConfig | None = None, coarse: CoarseLocalizer | None = None) -> None:
-        self.config = config or LocalizerConfig()
+    def __init__(
+        self,
+        topomap: TopoMetricMap,
+        config: LocalizerConfig | None = None,
+        coarse: CoarseLocalizer | None = None,
+        weights: FittedWeights | None = None,
+    ) -> None:
+        self._feature_config = FeatureConfig(**topomap.config["features"])
+        self._kind = find_kind(self._feature_config.kind)
+        self.config = (config or LocalizerConfig()).for_kind(self._kind)
+        self.weights = weights or weights_of(self._kind.name)
         self.topomap = topomap
         if len(topomap.summaries) == 0:
             raise EmptyMapError("the map has no nodes")
         self._coarse = open_coarse_of(topomap, self.config.coarse or topomap.default_coarse) if coarse is None else coarse
-        self._feature_config = FeatureConfig(**topomap.config["features"])
         self._node_poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
         self._lambda_rot = float(topomap.config["nodes"]["lambda_rot"])
         self._d_thresh = float(topomap.config["nodes"]["d_thresh"])
@@ -142,6 +166,7 @@ class Localizer:
         result = judgement.result
         if not isinstance(result, Localization):
             return result, None
+        result = replace(result, calibrated=self.weights.is_calibrated)
         if result.focal_length_px is not None:
             result = replace(result, focal_length_px=result.focal_length_px * scale)
         return result, judgement.final.seen_points(scale)
@@ -149,13 +174,14 @@ class Localizer:
     @cached_property
     def shared_errors(self) -> float:
         """rho of the map: the share of a match's variance that its points have in common (see `shared_errors.py`)."""
-        return shared_errors_of(self.topomap, self.config.guided, self.config.pose, self.config.shared_errors)
+        return shared_errors_of(self.topomap, self.config.guided, self.config.pose, self.config.shared_errors, self.weights.shared_errors)
 
     @cached_property
     def _sides(self) -> SideLocalizer | None:
-        if self.topomap.sides is None or self.config.sides.num_ranked == 0:
-            return None
-        return SideLocalizer(self.topomap, self.topomap.sides, self._node_poses, self.config.verification, self.config.sides)
+        sides, config = self.topomap.sides, self.config
+        if sides is None or config.sides.num_ranked == 0 or not (self._kind.has_scale and self._kind.has_angle):
+            return None  # a wall's first poses follow from how large and how turned its key points are
+        return SideLocalizer(self.topomap, sides, self._node_poses, config.verification, config.sides, self.weights.walls)
 
     @cached_property
     def _map_focal(self) -> float:
@@ -243,8 +269,8 @@ class Localizer:
         if first.num_inliers < self.config.num_clear_inliers:  # it may have been too poor to be found from all at once
             final = max(final, self._localize_around(final, clock), key=lambda attempt: attempt.num_inliers)
         with clock.stage("verification"):
-            c = self.config
-            return judge(first, final, candidates, shared_errors, c.min_matches, c.matching, c.guided, c.verification, clock)
+            c, weights = self.config, self.weights.evidence
+            return judge(first, final, candidates, shared_errors, c.min_matches, c.matching, c.guided, c.verification, weights, clock)
 
     def _against_rivals(
         self,
@@ -259,7 +285,7 @@ class Localizer:
         result, config = judgement.result, self.config.rivals
         found = result.world_from_cam if isinstance(result, Localization) else None
         asked = [candidate.node_id for candidate in result.candidates]
-        is_clear = judgement.log_odds > self.config.verification.clear_log_odds
+        is_clear = judgement.log_odds > self.weights.evidence.clear_log_odds
         groups = rival_groups(
             ranked, asked, found, is_clear, self._node_poses, self._lambda_rot, self._d_thresh, self.config.num_candidates, config
         )
@@ -270,7 +296,9 @@ class Localizer:
         if not is_clear and config.max_groups > 0:
             attempts = self._from_nodes(ranked, features, lens, clock)
             judgements += [self._judge(first, result.candidates, shared_errors, clock) for first in attempts]
-        return decide(judgements, self._lambda_rot, self._d_thresh, config, clock) if len(judgements) > 1 else judgement
+        if len(judgements) == 1:
+            return judgement
+        return decide(judgements, self._lambda_rot, self._d_thresh, config, self.weights.rivals, clock)
 
     def _against_sides(
         self, judgement: Judgement, image: Image, lens: Camera | RoughCamera, shared_errors: float, clock: StageClock

@@ -7,7 +7,7 @@ pose found, are asked once more on their own, and so are the poses that comparis
 Two poses exclude each other, and their odds against nothing at all say little of which of them it is: a place that repeats itself
 has most of its things twice. What tells them apart is the part of the picture where the two differ, in which the wrong pose finds
 nothing (the even share found), and that the wrong pose, which has only some of the picture to stand on, is less precise (the doubt).
-The weights of both were chosen by hand on pairs of a right and a wrong pose of one picture (`benchmarks/rival_weights.py`). With odds o
+The weights of both stand in `fitted_weights.py`. With odds o
 of the best pose against "neither" and odds of e^d against each other one, by which it leads that, it is right with the probability
 1 / (1 + 1/o + sum of e^-d).
 """
@@ -21,6 +21,7 @@ import numpy as np
 
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.attempt import Judgement
+from topoloc.localization.fitted_weights import RivalWeights
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.stages import StageClock
 from topoloc.localization.viewing import viewing_distances
@@ -42,10 +43,6 @@ class RivalsConfig:
     """Two poses within so many D_thresh are one."""
     max_groups: int = 3
     """Parts of the map that are asked on their own, at most; 0 asks none, and compares no picture with what nodes saw."""
-    odds_weight: float = 0.3
-    even_share_weight: float = 6.0
-    doubt_weight: float = -3.0
-    """How much the odds, the even share found and the doubt count between two poses, in logarithms."""
     min_lead: float = 2.0
     """By how much the best pose must lead the next one, in logarithms of odds."""
 
@@ -84,16 +81,18 @@ def rival_groups(
     return groups
 
 
-def decide(judgements: list[Judgement], lambda_rot: float, d_thresh: float, config: RivalsConfig, clock: StageClock) -> Judgement:
+def decide(
+    judgements: list[Judgement], lambda_rot: float, d_thresh: float, config: RivalsConfig, weights: RivalWeights, clock: StageClock
+) -> Judgement:
     """The best of them, as probable as the others leave it, or "ambiguous"; the first where none has a pose that is believed."""
-    best = max(judgements, key=lambda judgement: (isinstance(judgement.result, Localization), _strength(judgement, config)))
+    best = max(judgements, key=lambda judgement: (isinstance(judgement.result, Localization), _strength(judgement, weights)))
     if not isinstance(best.result, Localization):
         return judgements[0]
     result = replace(best.result, times_ms=clock.times_ms())
     rivals = [j for j in judgements if j is not best and j.evidence and not _agree(best, j, lambda_rot, d_thresh, config)]
     if not rivals:
         return replace(best, result=result)
-    leads = [_strength(best, config) - _strength(rival, config) for rival in rivals]
+    leads = [_strength(best, weights) - _strength(rival, weights) for rival in rivals]
     if min(leads) < config.min_lead:
         detail = f"as much like node {rivals[int(np.argmin(leads))].final.node_id} as like node {result.node_id}"
         refusal = NotLocalized("ambiguous", result.candidates, result.num_matches, result.num_inliers, result.times_ms, detail)
@@ -102,13 +101,13 @@ def decide(judgements: list[Judgement], lambda_rot: float, d_thresh: float, conf
     return replace(best, result=replace(result, probability=1.0 / (1.0 + others)))
 
 
-def _strength(judgement: Judgement, config: RivalsConfig) -> float:
+def _strength(judgement: Judgement, weights: RivalWeights) -> float:
     """What is compared between two poses; minus infinity where there is none."""
     evidence = judgement.evidence
     if evidence is None:
         return float("-inf")
-    odds, even = config.odds_weight * judgement.log_odds, config.even_share_weight * math.log(evidence.even_share + 0.002)
-    return odds + even + config.doubt_weight * math.log(max(evidence.doubt, 0.01))
+    odds, even = weights.odds * judgement.log_odds, weights.even_share * math.log(evidence.even_share + 0.002)
+    return odds + even + weights.doubt * math.log(max(evidence.doubt, 0.01))
 
 
 def _agree(a: Judgement, b: Judgement, lambda_rot: float, d_thresh: float, config: RivalsConfig) -> bool:

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
+from topoloc.localization.fitted_weights import SharedErrorWeights
 from topoloc.localization.guided import GuidedConfig, match_guided
 from topoloc.localization.local_map import LocalMap
 from topoloc.map.nodes import NodePoses, node_distances
@@ -42,13 +43,9 @@ class SharedErrorsConfig:
     """The nearest of the others, whose points do."""
     min_inliers: int = 20
     min_nodes: int = 5
-    """With fewer nodes compared, rho is taken to be `unknown`."""
+    """With fewer nodes compared, rho is taken to be unknown."""
     percentile: float = 75.0
     """Of the nodes' rho; above the median, since some parts of a map are worse than others."""
-    factor: float = 2.0
-    """What neighbours share cannot be seen by comparing them: recordings with truth showed about as much again."""
-    least: float = 0.005
-    unknown: float = 0.1
 
 
 def inflation(num_inliers: int, rho: float) -> float:
@@ -56,25 +53,31 @@ def inflation(num_inliers: int, rho: float) -> float:
     return 1.0 + num_inliers * rho
 
 
-def shared_errors_of(topomap: TopoMetricMap, guided: GuidedConfig, pose: AbsolutePoseConfig, config: SharedErrorsConfig) -> float:
+def shared_errors_of(
+    topomap: TopoMetricMap, guided: GuidedConfig, pose: AbsolutePoseConfig, config: SharedErrorsConfig, weights: SharedErrorWeights
+) -> float:
     """rho as the map tells it, where it was measured of these nodes and with these settings; else measured now.
 
     Args:
         guided, pose: as queries are matched and localized.
     """
     known = topomap.shared_errors
-    if known is not None and known.digest == _digest(topomap, guided, pose, config):
+    if known is not None and known.digest == _digest(topomap, guided, pose, config, weights):
         return known.rho
-    return measure_shared_errors(topomap, guided, pose, config)
+    return measure_shared_errors(topomap, guided, pose, config, weights)
 
 
-def with_shared_errors(topomap: TopoMetricMap, guided: GuidedConfig, pose: AbsolutePoseConfig, config: SharedErrorsConfig) -> TopoMetricMap:
+def with_shared_errors(
+    topomap: TopoMetricMap, guided: GuidedConfig, pose: AbsolutePoseConfig, config: SharedErrorsConfig, weights: SharedErrorWeights
+) -> TopoMetricMap:
     """The map, rho measured, so that who opens its file need not."""
-    rho = measure_shared_errors(topomap, guided, pose, config)
-    return replace(topomap, shared_errors=SharedErrors(rho, _digest(topomap, guided, pose, config)))
+    rho = measure_shared_errors(topomap, guided, pose, config, weights)
+    return replace(topomap, shared_errors=SharedErrors(rho, _digest(topomap, guided, pose, config, weights)))
 
 
-def measure_shared_errors(topomap: TopoMetricMap, guided: GuidedConfig, pose: AbsolutePoseConfig, config: SharedErrorsConfig) -> float:
+def measure_shared_errors(
+    topomap: TopoMetricMap, guided: GuidedConfig, pose: AbsolutePoseConfig, config: SharedErrorsConfig, weights: SharedErrorWeights
+) -> float:
     """rho of the map: see above."""
     poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
     lambda_rot, d_thresh = (float(topomap.config["nodes"][name]) for name in ("lambda_rot", "d_thresh"))
@@ -90,13 +93,20 @@ def measure_shared_errors(topomap: TopoMetricMap, guided: GuidedConfig, pose: Ab
             if rho is not None:
                 rhos.append(rho)
         if len(rhos) >= config.min_nodes:
-            return max(config.factor * float(np.percentile(rhos, config.percentile)), config.least)
-    return config.unknown
+            return max(weights.factor * float(np.percentile(rhos, config.percentile)), weights.least)
+    return weights.unknown
 
 
-def _digest(topomap: TopoMetricMap, guided: GuidedConfig, pose: AbsolutePoseConfig, config: SharedErrorsConfig) -> str:
+def _digest(
+    topomap: TopoMetricMap, guided: GuidedConfig, pose: AbsolutePoseConfig, config: SharedErrorsConfig, weights: SharedErrorWeights
+) -> str:
     """A short name for all that rho follows from: the settings, and the nodes by their poses and numbers of points."""
-    settings = {"guided": asdict(guided), "pose": asdict(pose), "config": asdict(config), "nodes": topomap.config["nodes"]}
+    settings = {
+        "guided": asdict(guided),
+        "pose": asdict(pose),
+        "config": asdict(config) | asdict(weights),
+        "nodes": topomap.config["nodes"],
+    }
     digest = hashlib.sha256(json.dumps([_METHOD, settings], sort_keys=True).encode())
     for summary in topomap.summaries:
         digest.update(summary.world_from_cam.matrix().astype("<f8").tobytes() + summary.num_points.to_bytes(4, "little"))

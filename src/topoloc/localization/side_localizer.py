@@ -10,7 +10,7 @@ that look the same way, they would have been recognised, so poses there are not 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -24,6 +24,7 @@ from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.attempt import Attempt, Judgement, answer_of
+from topoloc.localization.fitted_weights import WallWeights
 from topoloc.localization.guided import GuidedConfig, visible_pixels
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.shared_errors import inflation
@@ -53,14 +54,12 @@ class SidesConfig:
     """Side nodes whose points are sought in each view around a pose."""
     min_distance: float = 5.0
     """Poses within so many D_thresh (Eq. 1) of a node would have been found by that node."""
-    matching: MatchingConfig = field(default_factory=lambda: MatchingConfig(ratio=0.9))
+    matching: MatchingConfig = field(default_factory=MatchingConfig)
     rounds: tuple[tuple[float, float], ...] = ((0.0, 12.0), (0.0, 6.0), (30.0, 6.0), (25.0, 3.0), (25.0, 3.0))
     """Matches and pose in turn: search radius and largest error, pixels. Radius 0 are the unguided matches: guided ones draw a pose that
     is not yet right towards itself."""
-    sigma_px: float = 2.0
-    """Standard deviation of a key point found at such a slant."""
-    least_shared_errors: float = 0.2
-    """rho (`shared_errors.py`) is at least this: what is wrong with a wall seen at a slant is wrong with all points on it."""
+    guided: GuidedConfig = field(default_factory=GuidedConfig)
+    """How a view's key points are matched around a pose; `rounds` give the radius."""
     min_found: int = 20
     verdict: SideVerdictConfig = field(default_factory=SideVerdictConfig)
 
@@ -70,15 +69,22 @@ class SideLocalizer:
 
     Args:
         node_poses: of the map's ordinary nodes; `lambda_rot` and `d_thresh` (metres) are those of its Eq. 1.
+        config: resolved for the map's kind of features, of which `weights` are.
 
     Raises:
         MapError: what ranks the side nodes is missing or not of them.
     """
 
     def __init__(
-        self, topomap: TopoMetricMap, sides: SideNodes, node_poses: NodePoses, verification: VerificationConfig, config: SidesConfig
+        self,
+        topomap: TopoMetricMap,
+        sides: SideNodes,
+        node_poses: NodePoses,
+        verification: VerificationConfig,
+        config: SidesConfig,
+        weights: WallWeights,
     ) -> None:
-        self.config, self._verification, self._sides, self._node_poses = config, verification, sides, node_poses
+        self.config, self._verification, self._sides, self._node_poses, self._weights = config, verification, sides, node_poses, weights
         self._coarse, self._centres = _ranking_of(sides)
         self._axes = np.array([summary.world_from_cam.rotation[:, 2] for summary in sides.summaries])
         self._feature_config = FeatureConfig(**topomap.config["features"])
@@ -171,9 +177,9 @@ class SideLocalizer:
         clock: StageClock,
     ) -> Judgement:
         attempt = Attempt(found.features, camera, camera, found.local_map, found.matches, pose)
-        inflated = inflation(attempt.num_inliers, max(shared_errors, self.config.least_shared_errors))
+        inflated = inflation(attempt.num_inliers, max(shared_errors, self._weights.least_shared_errors))
         evidence = self._evidence(hypothesis, attempt, found, inflated * pose.covariance)
-        log_odds = side_log_odds(evidence, self._num_distinct(attempt, ranked), self.config.verdict)
+        log_odds = side_log_odds(evidence, self._num_distinct(attempt, ranked), self._weights)
         probability = 1.0 / (1.0 + math.exp(-log_odds))
         answer = answer_of(attempt, inflated * pose.covariance, 1.0 / inflated, probability, candidates, evidence, clock)
         return Judgement(answer, attempt, evidence, log_odds)
@@ -185,11 +191,11 @@ class SideLocalizer:
         if radius_px == 0.0:
             return SideMatches(seen[hypothesis.view].in_picture, self._local_map(hypothesis.side_id)[1], hypothesis.matches, 0, 0)
         sides = [(side, local_map) for side in seen if (local_map := self._around(side, cam_from_world)) is not None]
-        return match_sides(sides, cam_from_world, GuidedConfig(radius_px=radius_px), with_counts)
+        return match_sides(sides, cam_from_world, replace(self.config.guided, radius_px=radius_px), with_counts)
 
     def _estimate(self, found: SideMatches, camera: Camera, near: Rigid3, max_error_px: float) -> AbsolutePose | None:
         """The pose refined, or sought anew where that has more inliers and is near: a wall has a second pose."""
-        config = AbsolutePoseConfig(max_reprojection_error_px=max_error_px, sigma_px=self.config.sigma_px, max_iterations=1000)
+        config = AbsolutePoseConfig(max_reprojection_error_px=max_error_px, sigma_px=self._weights.sigma_px, max_iterations=1000)
         refined, anew = estimate_pose(found, camera, config, near), estimate_pose(found, camera, config, None)
         if anew is None or not self._agree(anew.cam_from_world, near):
             return refined

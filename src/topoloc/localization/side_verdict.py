@@ -1,8 +1,7 @@
 """Is a pose that the walls let expect believed, beside what the map's nodes say?
 
 Much of what speaks for a pose is the same as in `verification.py`, with weights of its own: a wall repeats itself more than a room
-does, and less of it is recognised at a slant. The weights are set by hand, on a rendered corridor and a rendered street that were mapped
-in one direction and walked in the other, and on queries from elsewhere, of which none came near (docs/journal.md, "The other way round").
+does, and less of it is recognised at a slant (`fitted_weights.py`; docs/journal.md, "The other way round").
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ import math
 from dataclasses import dataclass, replace
 
 from topoloc.localization.attempt import Judgement
+from topoloc.localization.fitted_weights import WallWeights
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.stages import StageClock
 from topoloc.localization.verification import Evidence
@@ -18,16 +18,8 @@ from topoloc.localization.verification import Evidence
 
 @dataclass(frozen=True)
 class SideVerdictConfig:
-    """The weights of the evidence, and what is asked of an answer; all in logarithms of odds."""
+    """What is asked of an answer; all in logarithms of odds."""
 
-    found_weight: float = 0.89
-    chance_weight: float = 1.47
-    inliers_weight: float = 0.54
-    inlier_share_weight: float = 2.16
-    spread_weight: float = 0.6
-    doubt_weight: float = -0.5
-    distinct_weight: float = 0.8
-    bias: float = 2.96
     min_lead: float = 2.0
     """By how much the best of the walls' poses must lead the next one, and that of the nodes, be that believed or not; and by how much
     a believed one of the nodes must lead it, not to be called in question."""
@@ -37,21 +29,21 @@ class SideVerdictConfig:
     """Of the right place and a precise pose together: less probable poses are not reported."""
 
 
-def side_log_odds(e: Evidence, num_distinct: int, config: SideVerdictConfig) -> float:
+def side_log_odds(e: Evidence, num_distinct: int, weights: WallWeights) -> float:
     """Logarithm of the odds that a pose is right.
 
     Args:
         num_distinct: inliers that look more like the map's point here than like any elsewhere.
     """
     return (
-        config.found_weight * math.log((e.num_found + 1) / (e.num_visible + 20))
-        + config.chance_weight * math.log((e.num_found + 1) / (e.num_by_chance + 5))
-        + config.inliers_weight * math.log(e.num_inliers + 1)
-        + config.inlier_share_weight * math.log((e.num_inliers + 1) / (e.num_matches + 10))
-        + config.spread_weight * math.log(e.spread + 0.02)
-        + config.doubt_weight * math.log(max(e.doubt, 0.01))
-        + config.distinct_weight * math.log(num_distinct + 1)
-        + config.bias
+        weights.found * math.log((e.num_found + 1) / (e.num_visible + 20))
+        + weights.chance * math.log((e.num_found + 1) / (e.num_by_chance + 5))
+        + weights.inliers * math.log(e.num_inliers + 1)
+        + weights.inlier_share * math.log((e.num_inliers + 1) / (e.num_matches + 10))
+        + weights.spread * math.log(e.spread + 0.02)
+        + weights.doubt * math.log(max(e.doubt, 0.01))
+        + weights.distinct * math.log(num_distinct + 1)
+        + weights.bias
     )
 
 

@@ -27,9 +27,7 @@ class StandpointsConfig:
     """Of the poses found, those with the most inliers are looked into."""
     max_iterations: int = 500
     """Of RANSAC, for each of them."""
-    matching: GuidedConfig = field(
-        default_factory=lambda: GuidedConfig(radius_px=64.0, max_scale=1.5, max_turn=0.35, min_similarity=0.8, min_margin=0.02)
-    )
+    matching: GuidedConfig = field(default_factory=lambda: GuidedConfig(radius_px=64.0))
 
 
 def strongest_and_distinct(attempts: list[Attempt], lambda_rot: float, max_distance: float, max_poses: int) -> list[Attempt]:

@@ -7,9 +7,8 @@ away, where chance alone finds some. So these two ratios count, beside the numbe
 that agree with it all the same, and how much of the picture the points found cover. What a pose from the right place may lack is
 precision: its own covariance, beside what is tolerated, says so.
 
-The weights are those of a logistic regression on 8,152 poses, 1,244 of them right: rooms, streets and corridors asked about
-themselves, in good light and bad, from the other side, about each other, about noise, lettering and repeated patterns
-(`benchmarks/acceptance.py` repeats it). That of the doubt is set by hand: wrong places in a corridor of many doors come with precise
+The weights are those of a logistic regression on poses tried, right and wrong ones; each kind of features has its own
+(`fitted_weights.py`). That of the doubt is set by hand: wrong places in a corridor of many doors come with precise
 poses, and a free weight would follow them to zero.
 """
 
@@ -20,6 +19,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
+
+from topoloc.localization.fitted_weights import EvidenceWeights
 
 COLUMNS, ROWS = 8, 6
 """The cells of a picture whose number with an inlier in it measures the inliers' spread."""
@@ -48,7 +49,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class VerificationConfig:
-    """What a right pose is, the weights of the logistic regression, and what is asked of an answer."""
+    """What a right pose is, and what is asked of an answer."""
 
     max_translation: float = 0.25
     """A right pose is no further off than this (metres), nor than `depth_share` of the distance of what is seen, if that is less."""
@@ -62,24 +63,6 @@ class VerificationConfig:
     """Map points found where the pose says they must be, at least."""
     min_probability: float = 0.5
     """Poses less probable than this are not reported."""
-    clear_log_odds: float = 4.5
-    """A pose with more for it (logarithm of its odds) is clear: only parts of the map that look nearly the same are asked then.
-    The clearest of 6,908 wrong poses had 3.9."""
-    even_share_weight: float = 2.13
-    chance_weight: float = 0.73
-    inliers_weight: float = 0.12
-    inlier_share_weight: float = 2.29
-    spread_weight: float = 0.8
-    doubt_weight: float = -0.5
-    bias: float = 7.64
-    """Above the 7.34 of the fit, whose wrong poses are mostly twins in a corridor that repeats itself; those are left to `rivals.py`.
-    Of 3,799 poses of pictures from elsewhere the most probable is then right with the probability 0.35."""
-
-    @property
-    def weights(self) -> tuple[float, ...]:
-        """In the order of `score_features`."""
-        evidence = (self.even_share_weight, self.chance_weight, self.inliers_weight, self.inlier_share_weight)
-        return (*evidence, self.spread_weight, self.doubt_weight)
 
 
 def tolerated_translation(median_depth: float, config: VerificationConfig) -> float:
@@ -130,16 +113,16 @@ def score_features(evidence: Evidence) -> tuple[float, ...]:
     )
 
 
-def log_odds_of(evidence: Evidence, config: VerificationConfig) -> float:
+def log_odds_of(evidence: Evidence, weights: EvidenceWeights) -> float:
     """Logarithm of the odds that the pose is right."""
-    return sum(weight * x for weight, x in zip(config.weights, score_features(evidence), strict=True)) + config.bias
+    return sum(weight * x for weight, x in zip(weights.in_order, score_features(evidence), strict=True)) + weights.bias
 
 
-def probability_of(evidence: Evidence, config: VerificationConfig) -> float:
+def probability_of(evidence: Evidence, weights: EvidenceWeights) -> float:
     """The probability, in [0, 1], that the pose is right."""
-    return 1.0 / (1.0 + math.exp(-log_odds_of(evidence, config)))
+    return 1.0 / (1.0 + math.exp(-log_odds_of(evidence, weights)))
 
 
-def is_only_imprecise(evidence: Evidence, config: VerificationConfig) -> bool:
+def is_only_imprecise(evidence: Evidence, weights: EvidenceWeights, config: VerificationConfig) -> bool:
     """Would the same evidence do if the pose it gives were more precise?"""
-    return probability_of(replace(evidence, doubt=min(evidence.doubt, 0.3)), config) >= config.min_probability
+    return probability_of(replace(evidence, doubt=min(evidence.doubt, 0.3)), weights) >= config.min_probability

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, Int
 
-from topoloc.features.extraction import FeatureConfig, extract_features
+from topoloc.features.extraction import extract_features
+from topoloc.features.kinds import FeatureConfig, find_kind
 from topoloc.features.matching import MatchingConfig, match_features
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.rigid import Rigid3
@@ -50,8 +51,8 @@ def place_view(view: FrameView, config: PlaceMatchingConfig) -> PlaceView:
 
 def match_places(source: PlaceView, target: PlaceView, stereo: StereoCamera, config: PlaceMatchingConfig) -> PlaceMatch | None:
     """Where `source` was taken, seen from `target` (whose camera is `stereo`), or None where they do not agree on it."""
-    rows = np.flatnonzero(source.points.valid)
-    matches = match_features(target.features.descriptors, source.features.descriptors[rows], config.matching)
+    rows, matching = np.flatnonzero(source.points.valid), config.matching.resolved(find_kind(config.features.kind).ratio)
+    matches = match_features(target.features.descriptors, source.features.descriptors[rows], matching)
     if len(matches) < config.min_inliers:
         return None
     source_rows, target_rows = rows[matches.train_idx], matches.query_idx.astype(np.int64)

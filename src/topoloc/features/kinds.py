@@ -1,0 +1,116 @@
+"""The kinds of local features that a map may be made of, in one table: all that differs between them stands here.
+
+A kind is added by one entry in `KINDS`: how a picture gives its features, and the thresholds with which they are matched. What makes
+its answers honest is fitted and kept beside the code that uses it (`localization/fitted_weights.py`); until then its answers say that
+their probability is not calibrated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import UInt8
+
+from topoloc.errors import FeatureKindError
+from topoloc.features.features import Features
+from topoloc.features.sift import SiftConfig, extract_sift
+from topoloc.features.surf import DESCRIPTOR_LENGTH, SurfConfig, extract_surf
+
+Normalization = Literal["none", "paper", "wide"]
+
+
+@dataclass(frozen=True)
+class FeatureConfig:
+    """Which features an image gives. Plain values only: it is stored in the map and built again from them.
+
+    kind: a name in `KINDS`.
+    normalization: `none`; `paper`, 17x17 windows and no noise floor; `wide`, 65x65 windows and a floor of 24 grey levels,
+    which keeps what the paper's form gains when the light changes and loses little where it does not. None: what suits the kind.
+    max_features: the strongest are kept. The detector's own threshold is low on purpose: a fixed one is a threshold on
+    contrast, and finds next to nothing in a dark picture.
+    """
+
+    kind: str = "surf"
+    normalization: Normalization | None = None
+    max_features: int = 1000
+    hessian_threshold: float = 20.0
+    contrast_threshold: float = 0.01
+
+
+@dataclass(frozen=True)
+class GuidedThresholds:
+    """Which key point near the place where a map point must be seen is that point.
+
+    min_similarity: least scalar product of the two descriptors; min_margin: by how much the best key point must lead the next one.
+    max_scale: largest ratio of a key point's size to the one expected, or the other way round; max_turn: largest difference of its
+    orientation from the one expected, radians.
+    """
+
+    min_similarity: float
+    min_margin: float
+    max_scale: float = float("inf")
+    max_turn: float = float("inf")
+
+
+@dataclass(frozen=True)
+class FeatureKind:
+    """A kind of local feature.
+
+    extract: gives the features of a grey uint8 picture, strongest first, with these settings on so many threads. Descriptors must have
+    unit length: they are compared by their scalar product.
+    normalization: what is done to the picture first, unless the settings say otherwise.
+    descriptor_scale: a map file keeps a descriptor's numbers times this as signed bytes; what exceeds 127 is clipped.
+    has_scale, has_angle: do `Features.sizes_px` and `angles` follow the picture? Where they do not, all are the same, and matching
+    does not look at them.
+    sigma_px: standard deviation (pixels) of a matched key point along x and along y.
+    ratio: a match must be nearer than this times its nearest rival; wall_ratio, of walls seen from the side, which repeat themselves.
+    guided: thresholds for key points near their projection; distant: far from it, where the pose is only that of a node nearby.
+    """
+
+    name: str
+    extract: Callable[[UInt8[np.ndarray, "h w"], FeatureConfig, int], Features]
+    descriptor_size: int
+    guided: GuidedThresholds
+    distant: GuidedThresholds
+    normalization: Normalization = "wide"
+    descriptor_scale: float = 200.0
+    has_scale: bool = True
+    has_angle: bool = True
+    sigma_px: float = 1.0
+    ratio: float = 0.8
+    wall_ratio: float = 0.9
+
+
+def _extract_surf(image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int) -> Features:
+    settings = SurfConfig(hessian_threshold=config.hessian_threshold, max_features=config.max_features, num_threads=num_threads)
+    return extract_surf(image, settings)
+
+
+def _extract_sift(image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int) -> Features:
+    return extract_sift(image, SiftConfig(max_features=config.max_features, contrast_threshold=config.contrast_threshold))
+
+
+SURF = FeatureKind(
+    "surf",
+    _extract_surf,
+    DESCRIPTOR_LENGTH,
+    guided=GuidedThresholds(min_similarity=0.75, min_margin=0.03, max_scale=1.6, max_turn=0.6),
+    distant=GuidedThresholds(min_similarity=0.8, min_margin=0.02, max_scale=1.5, max_turn=0.35),
+)
+SIFT = FeatureKind("sift", _extract_sift, 128, guided=SURF.guided, distant=SURF.distant)
+
+KINDS: dict[str, FeatureKind] = {kind.name: kind for kind in (SURF, SIFT)}
+
+
+def find_kind(name: str) -> FeatureKind:
+    """The kind of this name.
+
+    Raises:
+        FeatureKindError: there is none.
+    """
+    if name not in KINDS:
+        raise FeatureKindError(f"no features of kind {name!r}; there are {', '.join(KINDS)}")
+    return KINDS[name]
