@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 
 from topoloc.features.features import Features
+from topoloc.features.kinds import SURF
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.guided import GuidedConfig, count_by_chance, match_guided, visible_pixels
 from topoloc.localization.local_map import LocalMap
 from topoloc.map.topomap import NodeSummary, TopoNode
+
+GUIDED = GuidedConfig().resolved(SURF)
 
 CAMERA = Camera.pinhole(640, 480, 500.0, 500.0, 320.0, 240.0)
 NUM_POINTS = 200
@@ -53,7 +56,7 @@ POSES = [
 def test_every_point_in_view_is_matched_with_itself(cam_from_world: Rigid3):
     node = _node(np.random.default_rng(0))
     local_map = LocalMap.of_node(node)
-    matches = match_guided(_seen(node, cam_from_world), local_map, cam_from_world, CAMERA, GuidedConfig())
+    matches = match_guided(_seen(node, cam_from_world), local_map, cam_from_world, CAMERA, GUIDED)
     num_visible = len(visible_pixels(local_map, cam_from_world, CAMERA))
     assert num_visible > 100
     assert len(matches) > 0.95 * num_visible
@@ -63,14 +66,14 @@ def test_every_point_in_view_is_matched_with_itself(cam_from_world: Rigid3):
 @pytest.mark.parametrize("wrong", [{"shift_px": 25.0}, {"turn": 1.2}, {"scale": 2.0}])
 def test_what_is_elsewhere_or_turned_or_of_another_size_is_no_match(wrong: dict[str, float]):
     node = _node(np.random.default_rng(1))
-    matches = match_guided(_seen(node, POSES[0], **wrong), LocalMap.of_node(node), POSES[0], CAMERA, GuidedConfig())
+    matches = match_guided(_seen(node, POSES[0], **wrong), LocalMap.of_node(node), POSES[0], CAMERA, GUIDED)
     assert len(matches) < 0.03 * NUM_POINTS
 
 
 def test_a_key_point_is_matched_once_though_two_nodes_hold_it():
     node = _node(np.random.default_rng(2))
     twice = LocalMap.pooled([LocalMap.of_node(node), LocalMap.of_node(node)])
-    matches = match_guided(_seen(node, POSES[0]), twice, POSES[0], CAMERA, GuidedConfig())
+    matches = match_guided(_seen(node, POSES[0]), twice, POSES[0], CAMERA, GUIDED)
     assert len(set(matches.query_idx.tolist())) == len(matches) > 100
 
 
@@ -83,15 +86,27 @@ def test_nothing_is_visible_behind_the_camera():
 def test_chance_finds_next_to_nothing_among_descriptors_that_differ():
     node = _node(np.random.default_rng(4))
     features = _seen(node, POSES[0])
-    assert len(match_guided(features, LocalMap.of_node(node), POSES[0], CAMERA, GuidedConfig())) > 100
-    assert count_by_chance(features, LocalMap.of_node(node), POSES[0], CAMERA, GuidedConfig()) < 5
+    assert len(match_guided(features, LocalMap.of_node(node), POSES[0], CAMERA, GUIDED)) > 100
+    assert count_by_chance(features, LocalMap.of_node(node), POSES[0], CAMERA, GUIDED) < 5
 
 
 def test_chance_finds_as_much_as_the_pose_where_all_descriptors_are_alike():
     node = _node(np.random.default_rng(5))
     same = np.tile(node.features.descriptors[:1], (NUM_POINTS, 1))
     alike = replace(node, features=replace(node.features, descriptors=same, angles=np.zeros_like(node.features.angles)))
-    config = GuidedConfig(min_margin=0.0, max_scale=4.0, radius_px=40.0)
+    config = GuidedConfig(min_margin=0.0, max_scale=4.0, radius_px=40.0).resolved(SURF)
     found = len(match_guided(_seen(alike, POSES[0]), LocalMap.of_node(alike), POSES[0], CAMERA, config))
     by_chance = count_by_chance(_seen(alike, POSES[0]), LocalMap.of_node(alike), POSES[0], CAMERA, config)
     assert by_chance > 0.5 * found > 10
+
+
+def test_a_kind_without_scale_and_angle_is_matched_however_large_and_turned():
+    node = _node(np.random.default_rng(6))
+    plain = GuidedConfig(max_scale=1.1).resolved(replace(SURF, has_scale=False, has_angle=False))
+    cam_from_world = POSES[1] @ POSES[0]
+    seen = _seen(node, cam_from_world)
+    constant = replace(seen, sizes_px=np.full_like(seen.sizes_px, 24.0), angles=np.zeros_like(seen.angles))
+    matches = match_guided(constant, LocalMap.of_node(node), cam_from_world, CAMERA, plain)
+    assert len(matches) > 100
+    assert np.array_equal(matches.query_idx, matches.train_idx)
+    assert len(match_guided(constant, LocalMap.of_node(node), cam_from_world, CAMERA, GUIDED)) < 0.3 * len(matches)

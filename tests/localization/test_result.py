@@ -67,3 +67,8 @@ def test_the_cameras_own_covariance_is_that_of_a_perturbation_on_its_side():
     result = Localization(POSE, np.cov(left.T), 0.98, 17, CANDIDATES, 212, 158)
     deviations = np.sqrt(np.diag(result.camera_covariance))
     np.testing.assert_allclose(deviations, np.diag(roots), rtol=0.03)
+
+
+def test_a_probability_that_is_not_calibrated_says_so():
+    result = Localization(POSE, np.eye(6), 0.9, 0, [], 1, 1, calibrated=False)
+    assert result.to_json("a.png")["calibrated"] is False

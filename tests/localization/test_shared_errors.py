@@ -15,11 +15,12 @@ from built_room import built_room
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization import shared_errors
+from topoloc.localization.fitted_weights import weights_of
 from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.map.topomap import TopoMetricMap
 
-CONFIG = SharedErrorsConfig(min_nodes=3)
+CONFIG, WEIGHTS = SharedErrorsConfig(min_nodes=3), weights_of("surf").shared_errors
 
 
 def _disturbed(topomap: TopoMetricMap, metres: float, radians: float) -> TopoMetricMap:
@@ -40,7 +41,7 @@ def test_nodes_out_of_place_share_errors_and_nodes_in_place_do_not(tiny_recordin
     topomap = built_room(tiny_recording)
     exact = _rho(topomap)
     assert exact < 0.03
-    assert _rho(_disturbed(topomap, 0.02, 0.005)) > 10.0 * max(exact, CONFIG.least)
+    assert _rho(_disturbed(topomap, 0.02, 0.005)) > 10.0 * max(exact, WEIGHTS.least)
 
 
 @pytest.fixture
@@ -76,7 +77,7 @@ def test_a_map_knows_what_was_measured_when_it_was_built(saved: Path, measurings
 @pytest.mark.parametrize(
     "config",
     [
-        LocalizerConfig(shared_errors=SharedErrorsConfig(factor=4.0)),
+        LocalizerConfig(shared_errors=SharedErrorsConfig(percentile=50.0)),
         LocalizerConfig(guided=GuidedConfig(radius_px=7.0)),
         LocalizerConfig(pose=AbsolutePoseConfig(max_reprojection_error_px=5.0)),
     ],
@@ -106,7 +107,7 @@ def test_of_other_nodes_it_is_measured_anew(saved: Path, measurings: list[TopoMe
 def test_a_map_of_one_node_is_taken_to_be_of_middling_quality(tiny_recording: Path):
     topomap = built_room(tiny_recording)
     single = replace(topomap, nodes=topomap.nodes[:1], summaries=topomap.summaries[:1], edges=[])
-    assert _rho(single) == CONFIG.unknown
+    assert _rho(single) == WEIGHTS.unknown
 
 
 def test_without_shared_errors_the_covariance_stays_as_it_is():

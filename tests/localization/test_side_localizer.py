@@ -9,19 +9,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from topoloc.localization.attempt import Judgement
-from topoloc.localization.side_localizer import SideLocalizer, SidesConfig
-from topoloc.localization.verification import VerificationConfig
 
 from built_corridor import WIDE, back, built_corridor, corridor, seen_ahead, seen_on_the_way_back
 from tiny_world import path_pose, render, room
 from topoloc.errors import MapError
+from topoloc.features.kinds import SURF
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.attempt import Judgement
+from topoloc.localization.fitted_weights import weights_of
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.side_localizer import SideLocalizer, SidesConfig
 from topoloc.localization.stages import StageClock
+from topoloc.localization.verification import VerificationConfig
 from topoloc.map.nodes import NodePoses
 from topoloc.map.topomap import SideNodes, TopoMetricMap
 
@@ -156,8 +158,9 @@ def test_walls_that_stand_in_two_places_are_no_answer():
 def _by_the_walls(topomap: TopoMetricMap, picture: np.ndarray, config: SidesConfig | None = None) -> list[Judgement]:
     """What the walls let expect, whatever the nodes say."""
     assert topomap.sides is not None
+    resolved = LocalizerConfig(sides=config or SidesConfig()).for_kind(SURF)
     node_poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
-    walls = SideLocalizer(topomap, topomap.sides, node_poses, VerificationConfig(), config or SidesConfig())
+    walls = SideLocalizer(topomap, topomap.sides, node_poses, VerificationConfig(), resolved.sides, weights_of("surf").walls)
     return walls.localize(picture, WIDE, [], 0.1, StageClock())
 
 

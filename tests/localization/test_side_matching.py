@@ -9,8 +9,9 @@ import pytest
 from topoloc.localization.side_matching import SeenSide, estimate_pose, match_sides, nearest_sides, of_picture
 
 from built_corridor import WIDE, back, built_corridor, seen_on_the_way_back
-from topoloc.features.extraction import FeatureConfig, extract_features
+from topoloc.features.extraction import extract_features
 from topoloc.features.features import Features
+from topoloc.features.kinds import SURF, FeatureConfig
 from topoloc.features.side_views import SideViewConfig, side_views
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.geometry.alignment import rotation_error, translation_error
@@ -20,7 +21,7 @@ from topoloc.localization.local_map import LocalMap
 from topoloc.map.topomap import SideNodes
 
 PICTURE, TRUTH = seen_on_the_way_back()[2]
-GUIDED = GuidedConfig(radius_px=25.0)
+GUIDED = GuidedConfig(radius_px=25.0).resolved(SURF)
 
 
 def _sides() -> SideNodes:

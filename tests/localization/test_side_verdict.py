@@ -9,20 +9,21 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from topoloc.localization.attempt import Attempt, Judgement
-from topoloc.localization.side_verdict import SideVerdictConfig, decide_with_sides, side_log_odds
-from topoloc.localization.verification import Evidence
 
 from built_corridor import WIDE
 from topoloc.features.features import Features, Matches
 from topoloc.geometry.absolute_pose import AbsolutePose
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.attempt import Attempt, Judgement
+from topoloc.localization.fitted_weights import weights_of
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.side_verdict import SideVerdictConfig, decide_with_sides, side_log_odds
 from topoloc.localization.stages import StageClock
+from topoloc.localization.verification import Evidence
 from topoloc.places.coarse import NodeScore
 
-CONFIG = SideVerdictConfig()
+CONFIG, WEIGHTS = SideVerdictConfig(), weights_of("surf").walls
 EVIDENCE = Evidence(num_matches=150, num_inliers=40, num_found=60, num_visible=200, num_by_chance=12, spread=0.5, doubt=0.3, even_share=0.2)
 CANDIDATES = [NodeScore(3, 0.5)]
 
@@ -155,9 +156,9 @@ MORE = {
 
 @pytest.mark.parametrize(("evidence", "num_distinct"), MORE.values(), ids=MORE.keys())
 def test_more_evidence_means_better_odds(evidence: Evidence, num_distinct: int):
-    assert side_log_odds(evidence, num_distinct, CONFIG) > side_log_odds(EVIDENCE, 30, CONFIG) + 0.1
+    assert side_log_odds(evidence, num_distinct, WEIGHTS) > side_log_odds(EVIDENCE, 30, WEIGHTS) + 0.1
 
 
 def test_no_evidence_at_all_is_odds_all_the_same():
     nothing = Evidence(num_matches=0, num_inliers=0, num_found=0, num_visible=0, num_by_chance=0, spread=0.0, doubt=50.0, even_share=0.0)
-    assert side_log_odds(nothing, 0, CONFIG) < -5.0
+    assert side_log_odds(nothing, 0, WEIGHTS) < -5.0

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
+from topoloc.localization.fitted_weights import weights_of
 from topoloc.localization.verification import (
     Evidence,
     VerificationConfig,
@@ -19,7 +21,7 @@ from topoloc.localization.verification import (
     tolerated_translation,
 )
 
-CONFIG = VerificationConfig()
+CONFIG, WEIGHTS = VerificationConfig(), weights_of("surf").evidence
 STRONG = Evidence(
     num_matches=150, num_inliers=90, num_found=300, num_visible=1700, num_by_chance=20, spread=0.8, doubt=0.1, even_share=0.15
 )
@@ -44,7 +46,7 @@ evidences = st.builds(
 
 @given(evidences)
 def test_what_speaks_for_a_pose_never_makes_it_less_probable(evidence: Evidence):
-    probability = probability_of(evidence, CONFIG)
+    probability = probability_of(evidence, WEIGHTS)
     assert 0.0 <= probability <= 1.0
     for better in (
         replace(evidence, num_found=evidence.num_found + 5),
@@ -52,21 +54,21 @@ def test_what_speaks_for_a_pose_never_makes_it_less_probable(evidence: Evidence)
         replace(evidence, even_share=min(evidence.even_share + 0.01, 1.0)),
         replace(evidence, num_inliers=evidence.num_inliers + 1),
     ):
-        assert probability_of(better, CONFIG) >= probability
+        assert probability_of(better, WEIGHTS) >= probability
     for worse in (
         replace(evidence, num_by_chance=evidence.num_by_chance + 5),
         replace(evidence, num_matches=evidence.num_matches + 5),
         replace(evidence, doubt=evidence.doubt * 2.0),
     ):
-        assert probability_of(worse, CONFIG) <= probability
+        assert probability_of(worse, WEIGHTS) <= probability
 
 
 def test_strong_evidence_is_believed():
-    assert probability_of(STRONG, CONFIG) > 0.97
+    assert probability_of(STRONG, WEIGHTS) > 0.97
 
 
 def test_many_found_of_very_many_that_should_be_is_still_improbable():
-    assert probability_of(MANY_OF_VERY_MANY, CONFIG) < 0.3
+    assert probability_of(MANY_OF_VERY_MANY, WEIGHTS) < 0.3
 
 
 @pytest.mark.parametrize(
@@ -79,14 +81,14 @@ def test_many_found_of_very_many_that_should_be_is_still_improbable():
     ],
 )
 def test_no_single_part_of_the_evidence_carries_a_pose(weaker: dict[str, float]):
-    assert probability_of(replace(STRONG, **weaker), CONFIG) < 0.7
+    assert probability_of(replace(STRONG, **weaker), WEIGHTS) < 0.7
 
 
 def test_a_pose_that_is_only_imprecise_is_told_from_one_that_has_nothing_to_stand_on():
     small = replace(STRONG, num_inliers=24, num_matches=40, num_found=110, num_by_chance=12, spread=0.2, doubt=30.0, even_share=0.08)
-    assert probability_of(small, CONFIG) < CONFIG.min_probability
-    assert is_only_imprecise(small, CONFIG)
-    assert not is_only_imprecise(MANY_OF_VERY_MANY, CONFIG)
+    assert probability_of(small, WEIGHTS) < CONFIG.min_probability
+    assert is_only_imprecise(small, WEIGHTS, CONFIG)
+    assert not is_only_imprecise(MANY_OF_VERY_MANY, WEIGHTS, CONFIG)
 
 
 def test_indoors_less_is_tolerated():

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
 from topoloc.cli.info import describe_map
 from topoloc.cli.output import UsageError, check_outputs, progress_bar, write_json
 from topoloc.errors import RecordingError
+from topoloc.features.kinds import KINDS
 from topoloc.localization.building import build_map
 from topoloc.map.build import BuildConfig, Progress
 from topoloc.map.coarse_training import train_coarse
@@ -49,7 +50,7 @@ class Command:
     """The network that a learned coarse localizer stands on."""
     weights: Annotated[str | None, tyro.conf.arg(metavar="FILE|scratch", help_behavior_hint="(default: the published)")] = None
     """The network's weights: a PyTorch file of torchvision's or NetVLAD's layout, or `scratch` for random ones."""
-    features: Annotated[Literal["surf", "sift"] | None, tyro.conf.arg(metavar="surf|sift", help_behavior_hint="(default: surf)")] = None
+    features: Annotated[str | None, tyro.conf.arg(metavar="surf|sift", help_behavior_hint="(default: surf)")] = None
     """Local features of the map, and of every query to it."""
     json: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
     """Write what `topoloc info` says of the new map to this file (- for standard output)."""
@@ -57,12 +58,15 @@ class Command:
 
     def run(self) -> int:
         recordings, target = self._split_paths()
+        config = self._config()
+        if config.features.kind not in KINDS:
+            raise UsageError(f"no features {config.features.kind}; there are {', '.join(KINDS)}")
         check_outputs([str(target), self.json], inputs=[path for path in self.trajectory if path not in ("truth", "slam")])
         sequences, poses_from = self._open(recordings)
         with progress_bar() as progress:
             if poses_from == "slam":
                 sequences = _with_slam(sequences, progress)
-            topomap = build_map(sequences, self._config(), progress)
+            topomap = build_map(sequences, config, progress)
             if self.coarse != "surf-vlad":
                 model = train_coarse(topomap, self.coarse, self.backbone, self.weights, progress=progress)
                 topomap = replace(topomap, coarse_models={**topomap.coarse_models, model.name: model}, default_coarse=model.name)

@@ -24,7 +24,7 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class EvidenceWeights:
-    """Of the evidence for one pose (`verification.py`), in logarithms of odds.
+    """Of the evidence for one pose (`evidence.py`), in logarithms of odds.
 
     A pose with more than `clear_log_odds` for it is clear: only parts of the map that look nearly the same are asked then.
     """
@@ -46,7 +46,7 @@ class EvidenceWeights:
 
 @dataclass(frozen=True)
 class RivalWeights:
-    """How much the odds, the even share found and the doubt count between two poses of one picture (`rivals.py`), in logarithms."""
+    """How much the odds, the even share found and the doubt count between two poses of one picture (`belief.py`), in logarithms."""
 
     odds: float
     even_share: float
@@ -55,9 +55,9 @@ class RivalWeights:
 
 @dataclass(frozen=True)
 class WallWeights:
-    """Of the evidence for a pose that the walls let expect (`side_verdict.py`), in logarithms of odds.
+    """Of the evidence for a pose that the walls let expect (`walls.py`), in logarithms of odds.
 
-    sigma_px: standard deviation of a key point found at such a slant; least_shared_errors: rho (`shared_errors.py`) is at least this,
+    sigma_px: standard deviation of a key point found at such a slant; least_shared_errors: rho (`correlated_errors.py`) is at least this,
     for what is wrong with a wall seen at a slant is wrong with all points on it.
     """
 
@@ -75,7 +75,7 @@ class WallWeights:
 
 @dataclass(frozen=True)
 class SharedErrorWeights:
-    """What rho (`shared_errors.py`) is taken to be, from what comparing neighbouring nodes gives.
+    """What rho (`correlated_errors.py`) is taken to be, from what comparing neighbouring nodes gives.
 
     factor: what neighbours share cannot be seen by comparing them. unknown: where too few nodes can be compared.
     """
@@ -152,9 +152,10 @@ def weights_from_json(read: Any) -> FittedWeights:
     for name in _SOURCE[:-1]:
         if not isinstance(read[name], str):
             raise ValueError(f"{name} is not a text")
-    error = _number(read["calibration_error"], "calibration_error")
-    groups = {name: _group(group, read["weights"][name], name) for name, group in _GROUPS.items()}
-    return FittedWeights(*(read[name] for name in _SOURCE[:-1]), error, **groups)
+    values: dict[str, Any] = {name: read[name] for name in _SOURCE}
+    values["calibration_error"] = _number(read["calibration_error"], "calibration_error")
+    values |= {name: _group(group, read["weights"][name], name) for name, group in _GROUPS.items()}
+    return FittedWeights(**values)
 
 
 def _group(group: type[_T], read: Any, name: str) -> _T:

@@ -26,7 +26,8 @@ class Localization:
     is the map's, and a picture taken close by shares it.
 
     `probability` is that of the pose being within 0.25 m and 2 degrees, or within 5 % of the distance of what is seen where that is
-    less than 0.25 m; weighed from `evidence`. `node_id` is the node that most inliers come from; `times_ms` the milliseconds of each
+    less than 0.25 m; weighed from `evidence`, with weights that were fitted to this kind of features: `calibrated` is False where none are,
+    and those of another kind stand in. `node_id` is the node that most inliers come from; `times_ms` the milliseconds of each
     stage; `focal_length_px` the focal length found with the pose, None where the camera was calibrated.
     """
 
@@ -61,6 +62,7 @@ class Localization:
             "world_from_cam": _pose_json(self.world_from_cam),
             "covariance": self.covariance.tolist(),
             "probability": self.probability,
+            **({} if self.calibrated else {"calibrated": False}),
             "node": self.node_id,
             **_evidence_json(self),
             **({} if self.focal_length_px is None else {"focal_length_px": self.focal_length_px}),

@@ -1,0 +1,72 @@
+"""Fitted weights are data: read strictly, and a kind without any says so."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from topoloc.errors import FeatureKindError
+from topoloc.features.kinds import KINDS
+from topoloc.localization.fitted_weights import WEIGHTS_FOLDER, read_weights, weights_of
+
+
+@pytest.mark.parametrize("path", sorted(WEIGHTS_FOLDER.iterdir()), ids=lambda path: path.name)
+def test_every_file_that_ships_is_of_a_kind_and_says_where_it_comes_from(path: Path):
+    weights = weights_of(path.stem)
+    assert weights.kind == path.stem
+    assert weights.kind in KINDS
+    assert weights.calibration_error is not None
+    assert 0.0 < weights.calibration_error < 0.1
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d", weights.date)
+    assert weights.corpus
+    assert weights.command
+
+
+def test_what_is_written_is_read_again(tmp_path: Path):
+    path = tmp_path / "surf.json"
+    path.write_text(json.dumps(weights_of("surf").to_json()))
+    assert read_weights(path) == weights_of("surf")
+
+
+def test_a_kind_without_a_file_takes_those_of_surf_and_is_not_calibrated():
+    stand_in = weights_of("no such kind")
+    assert not stand_in.is_calibrated
+    assert stand_in.evidence == weights_of("surf").evidence
+
+
+def _changed(change: Callable[[dict[str, Any]], Any]) -> str:
+    read = weights_of("surf").to_json()
+    change(read)
+    return json.dumps(read)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "Expecting value"),
+        ("[" * 100_000, "recursion"),
+        ("[]", "the file is no table"),
+        (_changed(lambda read: read.pop("date")), "the file lacks date"),
+        (_changed(lambda read: read.update(note="x")), "the file has an unknown note"),
+        (_changed(lambda read: read.update(corpus=3)), "corpus is not a text"),
+        (_changed(lambda read: read["weights"].pop("walls")), "weights lacks walls"),
+        (_changed(lambda read: read["weights"].update(rivals=[])), "rivals is no table"),
+        (_changed(lambda read: read["weights"]["evidence"].pop("bias")), "evidence lacks bias"),
+        (_changed(lambda read: read["weights"]["evidence"].update(bais=1.0)), "evidence has an unknown bais"),
+        (_changed(lambda read: read["weights"]["evidence"].update(bias="7.6")), "evidence.bias is not a finite number"),
+        (_changed(lambda read: read["weights"]["evidence"].update(bias=float("nan"))), "evidence.bias is not a finite number"),
+        (_changed(lambda read: read["weights"]["shared_errors"].update(factor=True)), "shared_errors.factor is not a finite number"),
+    ],
+)
+def test_a_damaged_file_is_told_in_one_line(text: str, said: str, tmp_path: Path):
+    path = tmp_path / "surf.json"
+    path.write_text(text)
+    with pytest.raises(FeatureKindError, match=re.escape(said)) as raised:
+        read_weights(path)
+    assert str(path) in str(raised.value)
+    assert "\n" not in str(raised.value)
