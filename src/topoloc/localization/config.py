@@ -34,9 +34,9 @@ class ViewpointsConfig:
     """Nodes of the best coarse rank that are compared, one by one; 0 compares none."""
     shift_px: float = 12.0
     """Matches whose displacements differ by less than this agree, in an image whose longer side is 640 pixels; grows with that."""
-    min_alike: int = 10
+    min_alike: int = 8
     """A node is followed up where so many matches agree ..."""
-    chance_share: float = 0.05
+    chance_share: float = 0.09
     """... and this share of all its matches more."""
     max_fits: int = 6
     """Nodes whose matches are asked for a pose, those that agree most."""
@@ -87,6 +87,8 @@ class LocalizerConfig:
     num_first_features: int = 500
     """The image's strongest features are matched first; the rest only where these give fewer inliers than the next number."""
     num_clear_inliers: int = 40
+    num_chance_inliers: int = 7
+    """Fewer agree on a pose anywhere: where the first matches have no more, and no viewpoint stands out, look-alikes are not asked."""
     min_matches: int = 8
     """With fewer first matches no pose is sought."""
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)

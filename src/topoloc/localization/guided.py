@@ -51,7 +51,14 @@ class GuidedConfig:
 
 def match_guided(features: Features, local_map: LocalMap, cam_from_world: Rigid3, camera: Camera, config: GuidedConfig) -> Matches:
     """Matches of key points with map points that `cam_from_world` lets expect nearby: one map point a key point, the most similar."""
-    found, similarities = _find(features, local_map, _expected_key_points(local_map, cam_from_world, camera), camera, config)
+    return match_expected(features, local_map, expected_key_points(local_map, cam_from_world, camera), camera, config)
+
+
+def match_expected(
+    features: Features, local_map: LocalMap, expected: Float32[np.ndarray, "n 5"], camera: Camera, config: GuidedConfig
+) -> Matches:
+    """As `match_guided`, where each map point is expected as `expected_key_points` says."""
+    found, similarities = _find(features, local_map, expected, camera, config)
     train_idx = np.flatnonzero(found >= 0)
     train_idx = train_idx[np.argsort(-similarities[train_idx], kind="stable")]
     query_idx, first = np.unique(found[train_idx], return_index=True)
@@ -62,7 +69,7 @@ def match_guided(features: Features, local_map: LocalMap, cam_from_world: Rigid3
 
 def count_by_chance(features: Features, local_map: LocalMap, cam_from_world: Rigid3, camera: Camera, config: GuidedConfig) -> int:
     """How many matches `match_guided` would find were the pose wrong: all map points are sought a third of the picture away."""
-    expected = _expected_key_points(local_map, cam_from_world, camera)
+    expected = expected_key_points(local_map, cam_from_world, camera)
     size = np.array([camera.width, camera.height], np.float32)
     expected[:, :2] = np.mod(expected[:, :2] + size / 3.0, size)
     found, _ = _find(features, local_map, expected, camera, config)
@@ -107,7 +114,7 @@ def _pixels_in_view(points_cam: Float[np.ndarray, "n 3"], camera: Camera) -> Flo
     return np.where(inside[:, None], pixels, np.nan)
 
 
-def _expected_key_points(local_map: LocalMap, cam_from_world: Rigid3, camera: Camera) -> Float32[np.ndarray, "n 5"]:
+def expected_key_points(local_map: LocalMap, cam_from_world: Rigid3, camera: Camera) -> Float32[np.ndarray, "n 5"]:
     """Pixel, size and orientation (cosine, sine) at which each map point must be seen; NaN where it is out of view.
 
     The surface is taken to face the node's camera; `max_scale` and `max_turn` leave room for its slant.
@@ -123,14 +130,11 @@ def _expected_key_points(local_map: LocalMap, cam_from_world: Rigid3, camera: Ca
     return np.where(inside[:, None], expected, np.nan).astype(np.float32)
 
 
-def largest_shift(
-    features: Features, local_map: LocalMap, matches: Matches, cam_from_world: Rigid3, camera: Camera, within_px: float
-) -> int:
-    """How many of these matches are displaced alike from where `cam_from_world` lets expect them: the most that lie within `within_px` of
+def largest_shift(features: Features, matches: Matches, expected: Float32[np.ndarray, "n 5"], camera: Camera, within_px: float) -> int:
+    """How many of these matches are displaced alike from where they were expected: the most that lie within `within_px` of
     the displacement of one of them, in an image whose longer side is 640 pixels; grows with that."""
     if len(matches) == 0:
         return 0
-    expected = _pixels_in_view(cam_from_world.apply(local_map.points_world[matches.train_idx]), camera)
-    shifts = (features.points_img[matches.query_idx] - expected).astype(np.float32)
+    shifts = features.points_img[matches.query_idx] - expected[matches.train_idx, :2]
     apart = np.square(shifts[:, None] - shifts[None]).sum(axis=2)
     return int(np.count_nonzero(apart < (within_px * max(max(camera.width, camera.height) / 640.0, 0.5)) ** 2, axis=1).max())

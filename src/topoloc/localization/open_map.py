@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from functools import cached_property, lru_cache
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float32, Int
 
 from topoloc.errors import EmptyMapError
 from topoloc.features.kinds import FeatureConfig, find_kind
+from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.guided import expected_key_points
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.viewing import viewing_distances
 from topoloc.localization.wall_index import WallIndex
@@ -42,6 +44,7 @@ class OpenMap:
         self.kind = find_kind(self.feature_config.kind)
         self.node_poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
         self.lambda_rot, self.d_thresh = (float(topomap.config["nodes"][name]) for name in ("lambda_rot", "d_thresh"))
+        self.expected_at_node = lru_cache(maxsize=NODES_IN_MEMORY)(self._expected_at_node)
         self._local_map = lru_cache(maxsize=NODES_IN_MEMORY)(lambda row: LocalMap.of_node(topomap.nodes[row]))
 
     @cached_property
@@ -69,6 +72,10 @@ class OpenMap:
     def local_map(self, rows: Sequence[int] | Int[np.ndarray, " n"]) -> LocalMap:
         """The points of these nodes together."""
         return LocalMap.pooled([self._local_map(int(row)) for row in rows])
+
+    def _expected_at_node(self, row: int, camera: Camera) -> Float32[np.ndarray, "n 5"]:
+        """What `expected_key_points` says of a node's points for a camera that stands where the node does."""
+        return expected_key_points(self._local_map(row), self.cam_from_world(row), camera)
 
     def distances(self, world_from_cam: Rigid3) -> Float[np.ndarray, " nodes"]:
         """D_total of Eq. 1 (metres) between a camera and each node, whichever side of the camera is up."""

@@ -25,7 +25,7 @@ import numpy as np
 from topoloc.features.matching import match_pooled
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.belief import is_same_pose
-from topoloc.localization.guided import largest_shift, match_guided
+from topoloc.localization.guided import largest_shift, match_expected
 from topoloc.localization.pose_fit import PoseFit, fit_pose
 from topoloc.localization.search import Proposal, Search, Source
 from topoloc.localization.walls import propose_walls
@@ -38,12 +38,16 @@ def propose(search: Search, prior: Rigid3 | None) -> Iterator[Proposal]:
     if prior is not None:
         yield _pooled(search, "prior", _near(search, prior))
         return
+    features = search.query.features
     with search.query.clock.stage("coarse"):
         num_ranked = max(search.config.num_candidates, search.config.look_alikes.num_ranked)
-        search.ranked = search.map.coarse.rank(search.query.image, search.query.features, num_ranked)
-    yield _pooled(search, "retrieval", search.candidates)
-    yield from _look_alikes(search)
-    yield from _viewpoints(search)
+        search.ranked = search.map.coarse.rank(search.query.image, features, num_ranked)
+    retrieved = _pooled(search, "retrieval", search.candidates)
+    yield retrieved
+    viewpoints = [] if search.is_clear else list(_viewpoints(search))
+    yield from viewpoints
+    if search.is_clear or viewpoints or retrieved.fit.num_inliers >= search.config.num_chance_inliers:
+        yield from _look_alikes(search)
     yield from propose_walls(search)
 
 
@@ -56,10 +60,11 @@ def _near(search: Search, world_from_cam: Rigid3) -> list[NodeScore]:
 
 
 def _pooled(search: Search, source: Source, candidates: list[NodeScore]) -> Proposal:
-    """The candidates' points together. The strongest features are nearly always enough; all are tried where they are not."""
+    """The candidates' points together. The strongest features are nearly always enough, or give nothing at all; else all are tried."""
     config, rows = search.config, [search.map.row_of(candidate.node_id) for candidate in candidates]
     proposal = _matched(search, source, rows, config.num_first_features)
-    if proposal.fit.num_inliers < config.num_clear_inliers and len(search.query.features) > config.num_first_features:
+    is_open = config.num_chance_inliers <= proposal.fit.num_inliers < config.num_clear_inliers
+    if is_open and len(search.query.features) > config.num_first_features:
         proposal = _matched(search, source, rows)
     return proposal
 
@@ -101,15 +106,13 @@ def _look_alikes(search: Search) -> Iterator[Proposal]:
 def _viewpoints(search: Search) -> Iterator[Proposal]:
     """What would be seen from where a node stands, for the nodes whose displacements agree, the most agreeing first."""
     config, query = search.config.viewpoints, search.query
-    if search.is_clear or config.num_nodes == 0:
-        return
     found = []
     with query.clock.stage("matching"):
         for candidate in search.ranked[: config.num_nodes]:
             row = search.map.row_of(candidate.node_id)
-            local_map, cam_from_world = search.map.local_map([row]), search.map.cam_from_world(row)
-            matches = match_guided(query.features, local_map, cam_from_world, query.camera, config.matching)
-            num_alike = largest_shift(query.features, local_map, matches, cam_from_world, query.camera, config.shift_px)
+            local_map, expected = search.map.local_map([row]), search.map.expected_at_node(row, query.camera)
+            matches = match_expected(query.features, local_map, expected, query.camera, config.matching)
+            num_alike = largest_shift(query.features, matches, expected, query.camera, config.shift_px)
             if num_alike >= config.min_alike + config.chance_share * len(matches):
                 found.append((num_alike, local_map, matches))
     found.sort(key=lambda one: -one[0])

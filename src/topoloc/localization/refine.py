@@ -24,6 +24,8 @@ from topoloc.localization.search import Proposal, Search
 from topoloc.localization.trace import Tried
 from topoloc.localization.walls import WallProposal, refine_wall, weigh_wall
 
+_HOPELESS = -3.0  # odds, in logarithms, that nothing can mend
+
 
 def hypothesis_of(search: Search, proposal: Proposal) -> Hypothesis | None:
     """The proposal followed up; None where too little was found for any evidence."""
@@ -78,7 +80,11 @@ def weigh(search: Search, proposal: Proposal, final: PoseFit) -> Hypothesis | No
         covariance = inflated * final.pose.covariance
         evidence = None if proposal.is_guided else _evidence(search, first, final, covariance)
         if evidence is None or log_odds_of(evidence, search.weights) <= search.weights.evidence.clear_log_odds:
-            evidence = _evidence(search, _unguided(search, final), final, covariance)
+            guessed = evidence or _evidence(search, final, final, covariance)
+            at_best = replace(guessed, num_matches=final.num_inliers, num_inliers=final.num_inliers)
+            if log_odds_of(at_best, search.weights) < _HOPELESS:  # whatever the unguided matches say
+                return None
+            evidence = _with_unguided(search, guessed, _unguided(search, final), final)
         log_odds = log_odds_of(evidence, search.weights)
     return Hypothesis(proposal.source, final, evidence, covariance, 1.0 / inflated, log_odds)
 
@@ -87,14 +93,12 @@ def _evidence(search: Search, unguided: PoseFit, final: PoseFit, covariance: Flo
     """`covariance` is that of the left perturbation of cam_from_world."""
     config, pose, camera = search.config, final.pose, final.camera
     assert pose is not None
-    # points that share errors differ by them from node to node, so that even true matches agree with a pose less well
-    agreement_px = config.evidence.agreement_px * math.sqrt(1.0 + search.rho)
     depths = pose.cam_from_world.apply(final.local_map.points_world[final.matches.train_idx[pose.inliers]])[:, 2]
     found_img = final.features.points_img[final.matches.query_idx[pose.inliers]].astype(np.float64)
     visible_img = visible_pixels(final.local_map, pose.cam_from_world, camera)
-    return Evidence(
-        num_matches=len(unguided.matches),
-        num_inliers=_num_agreeing(unguided, pose.cam_from_world, camera, agreement_px),
+    counted = Evidence(
+        num_matches=0,
+        num_inliers=0,
         num_found=final.num_inliers,
         num_visible=len(visible_img),
         num_by_chance=count_by_chance(final.features, final.local_map, pose.cam_from_world, camera, config.guided),
@@ -102,6 +106,16 @@ def _evidence(search: Search, unguided: PoseFit, final: PoseFit, covariance: Flo
         even_share=even_share_of(found_img, visible_img, camera.width, camera.height),
         doubt=doubt_of(covariance, float(np.median(depths)), config.evidence),
     )
+    return _with_unguided(search, counted, unguided, final)
+
+
+def _with_unguided(search: Search, evidence: Evidence, unguided: PoseFit, final: PoseFit) -> Evidence:
+    """The evidence with these matches as those that no pose guided."""
+    assert final.pose is not None
+    # points that share errors differ by them from node to node, so that even true matches agree with a pose less well
+    agreement_px = search.config.evidence.agreement_px * math.sqrt(1.0 + search.rho)
+    num_agreeing = _num_agreeing(unguided, final.pose.cam_from_world, final.camera, agreement_px)
+    return replace(evidence, num_matches=len(unguided.matches), num_inliers=num_agreeing)
 
 
 def _unguided(search: Search, final: PoseFit) -> PoseFit:
