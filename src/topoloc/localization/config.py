@@ -53,9 +53,11 @@ class WallsConfig:
 
     num_ranked: int = 32
     """Side nodes that are compared with each view; 0 asks none."""
-    min_agreeing: int = 5
-    """Matches of a view with a side node that must agree on one pose, for that to be looked into."""
-    num_hypotheses: int = 8
+    num_first: int = 8
+    """So many are compared first; the others only where one of these is recognised."""
+    min_agreeing: int = 8
+    """Matches of a view with a side node that must agree on one pose, for it to be recognised: from elsewhere there are 5 to 7."""
+    num_hypotheses: int = 6
     """First poses of each view that are looked into."""
     num_nodes: int = 4
     """Side nodes whose points are sought in each view around a pose."""
@@ -84,7 +86,7 @@ class LocalizerConfig:
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     guided: GuidedConfig = field(default_factory=GuidedConfig)
     pose: AbsolutePoseConfig = field(default_factory=lambda: AbsolutePoseConfig(max_reprojection_error_px=8.0, max_iterations=1000))
-    num_first_features: int = 500
+    num_first_features: int = 320
     """The image's strongest features are matched first; the rest only where these give fewer inliers than the next number."""
     num_clear_inliers: int = 40
     num_chance_inliers: int = 7

@@ -77,18 +77,27 @@ def propose_walls(search: Search) -> Iterator[Proposal]:
         return
     with search.query.clock.stage("walls"):
         walls = SeenWalls.of(search, index)
-        chosen = [proposal for view in range(len(walls.seen)) for proposal in _of_view(walls, view)]
+        found = _compared_with(walls, slice(0, config.num_first))
+        if found:
+            found += _compared_with(walls, slice(config.num_first, None))
+        chosen = [proposal for view in range(len(walls.seen)) for proposal in _best([one for one in found if one.view == view])]
     yield from chosen
 
 
-def _of_view(walls: SeenWalls, view: int) -> list[WallProposal]:
-    """The best of one view, apart from each other."""
-    found = [proposal for row in walls.ranked[view] if (proposal := _compared(walls, view, row)) is not None]
+def _compared_with(walls: SeenWalls, ranks: slice) -> list[WallProposal]:
+    """What each view has in common with the side nodes of these ranks."""
+    pairs = [(view, row) for view, rows in enumerate(walls.ranked) for row in rows[ranks]]
+    return [proposal for view, row in pairs if (proposal := _compared(walls, view, row)) is not None]
+
+
+def _best(found: list[WallProposal]) -> list[WallProposal]:
+    """Those on which most matches agree, apart from each other."""
     kept: list[WallProposal] = []
     for proposal in sorted(found, key=lambda one: -one.num_agreeing):
-        if len(kept) == walls.search.config.walls.num_hypotheses:
+        search = proposal.walls.search
+        if len(kept) == search.config.walls.num_hypotheses:
             break
-        if not any(_are_near(walls.search, proposal.cam_from_world, other.cam_from_world) for other in kept):
+        if not any(_are_near(search, proposal.cam_from_world, other.cam_from_world) for other in kept):
             kept.append(proposal)
     return kept
 
@@ -166,7 +175,7 @@ def _around(walls: SeenWalls, side: SeenSide, cam_from_world: Rigid3) -> LocalMa
 def _estimate(walls: SeenWalls, found: SideMatches, near: Rigid3, max_error_px: float) -> AbsolutePose | None:
     """The pose refined, or sought anew where that has more inliers and is near: a wall has a second pose."""
     sigma_px = walls.search.weights.walls.sigma_px
-    config = AbsolutePoseConfig(max_reprojection_error_px=max_error_px, sigma_px=sigma_px, max_iterations=1000)
+    config = AbsolutePoseConfig(max_reprojection_error_px=max_error_px, sigma_px=sigma_px, max_iterations=400)
     refined, anew = estimate_pose(found, walls.camera, config, near), estimate_pose(found, walls.camera, config, None)
     if anew is None or not _are_near(walls.search, anew.cam_from_world, near):
         return refined
