@@ -75,11 +75,11 @@ def _refusal(search: Search, ranked: list[Hypothesis]) -> NotLocalized:
     if is_only_imprecise(best.evidence, search.weights, search.config.evidence):
         metres = float(np.sqrt(np.linalg.eigvalsh(best.covariance[:3, :3])[-1]))
         return _refused(search, "too_few_inliers", best, f"in the map, but where is known to {metres:.2f} m only")
-    return _refused(search, "not_in_map", best, _late(search))
+    return _refused(search, "not_in_map", best, "")
 
 
 def _refused(search: Search, reason: Reason, best: Hypothesis, detail: str, alternatives: tuple[Alternative, ...] = ()) -> NotLocalized:
-    times_ms = search.query.clock.times_ms()
+    times_ms, detail = search.query.clock.times_ms(), "; ".join(text for text in (detail, _late(search)) if text)
     return NotLocalized(reason, search.candidates, len(best.fit.matches), best.fit.num_inliers, times_ms, detail, alternatives)
 
 

@@ -99,32 +99,37 @@ def _columns(fit: PoseFit) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """The hypotheses so far, of each pose the one with the most for it."""
+    """The hypotheses so far, of each pose the one with the most for it.
+
+    `weighed` are all that came, for "the same pose" does not carry over: of a row of three the middle one may say the same as both ends,
+    which differ. So which are left out is decided anew with each, from the strongest down, and the order in which they came counts nothing.
+    """
 
     hypotheses: tuple[Hypothesis, ...] = ()
+    weighed: tuple[Hypothesis, ...] = ()
 
     def given(self, hypothesis: Hypothesis, config: EvidenceConfig, weights: RivalWeights) -> Belief:
         """With one more hypothesis."""
-        same = [other for other in self.hypotheses if _say_the_same(hypothesis, other, config)]
-        if any(_rank(other, hypothesis, weights) >= _rank(hypothesis, other, weights) for other in same):
-            return self
-        return Belief((*(other for other in self.hypotheses if other not in same), hypothesis))
+        weighed, kept = (*self.weighed, hypothesis), list[Hypothesis]()
+        for one in _ranked(weighed, weights):
+            if not any(_say_the_same(one, other, config) for other in kept):
+                kept.append(one)
+        return Belief(tuple(kept), weighed)
 
     def ranked(self, weights: RivalWeights) -> list[Hypothesis]:
         """The hypotheses, the one that leads all others first."""
-
-        def least_lead(one: Hypothesis) -> float:
-            return min((lead(one, other, weights) for other in self.hypotheses if other is not one), default=math.inf)
-
-        return sorted(self.hypotheses, key=lambda one: (one.probability >= 0.5, least_lead(one)), reverse=True)
+        return _ranked(self.hypotheses, weights)
 
     def best(self, weights: RivalWeights) -> Hypothesis | None:
         """The likeliest hypothesis, believed or not."""
         return self.ranked(weights)[0] if self.hypotheses else None
 
 
-def _rank(one: Hypothesis, other: Hypothesis, weights: RivalWeights) -> tuple[bool, float]:
-    return one.probability >= 0.5, lead(one, other, weights)
+def _ranked(hypotheses: tuple[Hypothesis, ...], weights: RivalWeights) -> list[Hypothesis]:
+    def least_lead(one: Hypothesis) -> float:
+        return min((lead(one, other, weights) for other in hypotheses if other is not one), default=math.inf)
+
+    return sorted(hypotheses, key=lambda one: (one.probability >= 0.5, least_lead(one)), reverse=True)
 
 
 def _say_the_same(a: Hypothesis, b: Hypothesis, config: EvidenceConfig) -> bool:

@@ -70,7 +70,7 @@ def check_size(image: Image, camera: Camera | RoughCamera) -> None:
 
 def reduced_image(
     image: Image, camera: Camera | RoughCamera, map_focal: float, max_finer: float, max_side_px: int
-) -> tuple[Image, Camera | RoughCamera]:
+) -> tuple[np.ndarray, Camera | RoughCamera]:
     """The image with its camera, smaller where it has over `max_finer` times the map's pixels a radian, or a longer side.
 
     Args:
