@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -13,6 +13,7 @@ import tyro
 
 from topoloc.cli.output import UsageError, check_outputs, interruptible, progress_bar, write_text
 from topoloc.cli.query_answers import QueryAnswer, answer_line, exit_status, stream_summary, trajectory_of
+from topoloc.cli.settings_file import read_settings, with_option
 from topoloc.errors import CalibrationError, QueryError, TopolocError, UnreadableImageError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
@@ -72,24 +73,27 @@ class Command:
     """A stream's poses by external odometry, TUM format, in any world of its own: used to predict where the next picture was taken."""
     max_jump: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="")] = None
     """The paper's rule for streams, not the motion model: a pose further than this from the one before is refused, which is copied."""
-    tracker: Annotated[TrackerConfig, tyro.conf.arg(name="config.tracker")] = field(default_factory=TrackerConfig)
-    config: LocalizerConfig = field(default_factory=LocalizerConfig)
+    config: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    """All other settings: a TOML file, as `topoloc config localize` prints it."""
 
     def run(self) -> int:
         if not self.inputs:
             raise UsageError("localize takes a map and at least one image, folder or recording")
         self._check_usage()
-        check_outputs([self.json, self.tum], inputs=[self.map, *self.inputs, *([self.odometry] if self.odometry else [])])
+        check_outputs([self.json, self.tum], inputs=[path for path in (self.map, *self.inputs, self.odometry, self.config) if path])
+        settings = read_settings(self.config)
+        config = with_option(settings.of(LocalizerConfig), "coarse", self.coarse, "--coarse")
+        tracking = self._tracking(settings.of(TrackerConfig))
         topomap = TopoMetricMap.load(self.map)
         camera = None if self.camera is None else _camera_of_size(self.camera, topomap)
         queries = [self._open(path) for path in self.inputs]
-        localizer = Localizer(topomap, replace(self.config, coarse=self.coarse or self.config.coarse))
+        localizer = Localizer(topomap, config)
         answers: list[QueryAnswer] = []
         total = sum(len(query.sequence) for query in queries)
         start = time.perf_counter()
         try:
             with interruptible(), progress_bar() as progress:
-                for answer in self._answers(localizer, queries, camera):
+                for answer in _answers(localizer, tracking, queries, camera):
                     answers.append(answer)
                     as_json = self.json == "-"
                     print(json.dumps(answer.to_json()) if as_json else answer_line(answer), flush=True)
@@ -110,8 +114,6 @@ class Command:
             raise UsageError("--stream and --single cannot both be meant")
         if self.odometry is not None and len(self.inputs) > 1:
             raise UsageError("--odometry is that of one stream: give one input with it")
-        if self.max_jump is not None and not self.max_jump > 0:
-            raise UsageError(f"--max-jump is a length in metres, not {self.max_jump:g}")
 
     def _open(self, path: str) -> _Query:
         """Recordings and videos are streams; pictures, and folders of them, are single unless they are said not to be."""
@@ -125,19 +127,9 @@ class Command:
             odometry = frame_poses(read_trajectory(Path(self.odometry)), sequence.t_ns, Path(self.odometry))
         return _Query(path, sequence, is_stream, odometry or [None] * len(sequence))
 
-    def _answers(self, localizer: Localizer, queries: list[_Query], camera_of_size: CameraOfSize | None) -> Iterator[QueryAnswer]:
-        for query in queries:
-            tracker = self._tracker(localizer) if query.is_stream else None
-            for i, frame_name in enumerate(query.sequence.names):
-                name = frame_name if len(queries) == 1 else query.path if len(query.sequence) == 1 else f"{query.path}/{frame_name}"
-                try:
-                    yield _answer(name, query, i, localizer, tracker, camera_of_size)
-                except (QueryError, CalibrationError) as error:
-                    raise type(error)(f"{name}: {error}") from error
-
-    def _tracker(self, localizer: Localizer) -> Tracker:
-        config = self.tracker
-        return Tracker(localizer, config if self.max_jump is None else replace(config, mode="paper", max_jump=self.max_jump))
+    def _tracking(self, config: TrackerConfig) -> TrackerConfig:
+        config = with_option(config, "max_jump", self.max_jump, "--max-jump")
+        return config if self.max_jump is None else replace(config, mode="paper")
 
     def _write_files(self, answers: list[QueryAnswer]) -> list[str]:
         """The paths written."""
@@ -149,6 +141,19 @@ class Command:
             write_tum(Path(self.tum), trajectory_of(answers, self.smoothed))
             files.append(self.tum)
         return files
+
+
+def _answers(
+    localizer: Localizer, tracking: TrackerConfig, queries: list[_Query], camera_of_size: CameraOfSize | None
+) -> Iterator[QueryAnswer]:
+    for query in queries:
+        tracker = Tracker(localizer, tracking) if query.is_stream else None
+        for i, frame_name in enumerate(query.sequence.names):
+            name = frame_name if len(queries) == 1 else query.path if len(query.sequence) == 1 else f"{query.path}/{frame_name}"
+            try:
+                yield _answer(name, query, i, localizer, tracker, camera_of_size)
+            except (QueryError, CalibrationError) as error:
+                raise type(error)(f"{name}: {error}") from error
 
 
 def _answer(
