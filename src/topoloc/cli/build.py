@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from topoloc.cli.info import describe_map
+from topoloc.cli.options import File, Format
 from topoloc.cli.output import UsageError, check_outputs, progress_bar, write_json
 from topoloc.cli.settings_file import read_settings, with_option
 from topoloc.errors import RecordingError
@@ -36,26 +37,26 @@ class Command:
         tyro.conf.UseAppendAction[tuple[str, ...]],
         tyro.conf.arg(metavar="truth|slam|FILE", help_behavior_hint="(default: truth where there is one, else slam)"),
     ] = ()
-    """Where poses come from: `truth` (the recording's own), `slam`, or a TUM or KITTI trajectory file; for all, or once for each."""
-    format: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: recognised)")] = None
+    """Where poses come from: `truth` (the recording's own), `slam`, or a TUM or KITTI file; given once for all, or once for each."""
+    format: Format = None
     """The recordings' format: kitti, euroc, tum, seven_scenes or folder."""
-    d_thresh: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="(default: from the scene's median depth)")] = None
-    """D_thresh of Eq. 1, metres between nodes."""
+    d_thresh: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="(default: by what is seen)")] = None
+    """Metres between nodes (D_thresh of the paper's Eq. 1)."""
     lambda_rot: Annotated[
-        float | None, tyro.conf.arg(name="lambda", metavar="M/RAD", help_behavior_hint="(default: from an angle that alone makes a node)")
+        float | None, tyro.conf.arg(name="lambda", metavar="M/RAD", help_behavior_hint="(default: 2 degrees make a node)")
     ] = None
-    """lambda of Eq. 1, metres a radian."""
+    """How much turning counts beside metres (lambda of Eq. 1)."""
     coarse: CoarseName = "surf-vlad"
-    """The coarse localizer that answers; another than surf-vlad is trained once the map is built, as `topoloc train` does."""
+    """The coarse localizer that answers; all but surf-vlad are trained once the map is built, as by `topoloc train`."""
     backbone: BackboneName = "squeezenet1_1"
     """The network that a learned coarse localizer stands on."""
     weights: Annotated[str | None, tyro.conf.arg(metavar="FILE|scratch", help_behavior_hint="(default: the published)")] = None
-    """The network's weights: a PyTorch file of torchvision's or NetVLAD's layout, or `scratch` for random ones."""
+    """Weights of that network: a PyTorch file of torchvision's or NetVLAD's layout, or `scratch` for random ones."""
     features: Annotated[Literal["surf", "sift"] | None, tyro.conf.arg(metavar="surf|sift", help_behavior_hint="(default: surf)")] = None
     """Local features of the map, and of every query to it."""
-    json: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    json: File = None
     """Write what `topoloc info` says of the new map to this file (- for standard output)."""
-    config: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    config: File = None
     """All other settings: a TOML file, as `topoloc config build` prints it."""
 
     def run(self) -> int:

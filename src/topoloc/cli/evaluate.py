@@ -12,6 +12,7 @@ import numpy as np
 import tyro
 
 from topoloc.cli.info import describe_map
+from topoloc.cli.options import File, Format
 from topoloc.cli.output import UsageError, check_outputs, print_facts, progress_bar, report_writer, write_json
 from topoloc.cli.recordings_table import print_recordings
 from topoloc.cli.settings_file import read_settings, with_option
@@ -37,17 +38,17 @@ class Command:
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="SEQ", help_behavior_hint="(may be given several times)")
     ] = ()
     """A recording of another place: every pose given for one of its images counts as a false accept."""
-    map_from_truth: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    map_from_truth: File = None
     """A JSON file with the 4x4 matrix (metres) that takes the world of the recordings' truth into the map's, where they differ."""
     coarse: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")] = None
-    """Which of the map's coarse localizers is asked; `topoloc info` names them."""
-    format: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: recognised)")] = None
+    """Coarse localizer that is asked; `topoloc info` names those of the map."""
+    format: Format = None
     """The recordings' format: kitti, euroc, tum, seven_scenes or folder."""
-    json: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    json: File = None
     """Write the evaluation as JSON to this file (- for standard output)."""
-    report: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
-    """Write a page with the table, the top-down map, the error curves and the worst queries to this file (report.html)."""
-    config: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    report: File = None
+    """Write a page with the table, the map from above, the error curves and the worst queries to this file (report.html)."""
+    config: File = None
     """All other settings: a TOML file, as `topoloc config evaluate` prints it."""
 
     def run(self) -> int:

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
+from topoloc.cli.options import File, Format
 from topoloc.cli.output import check_outputs, print_facts, progress_bar, write_json
 from topoloc.cli.settings_file import read_settings
 from topoloc.geometry.rigid import Rigid3
@@ -29,11 +30,11 @@ class Command:
     """A stereo or RGB-D recording. PATH@0::2 takes every second frame of PATH."""
     out: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="OUT.tum")]
     """The trajectory to write: t tx ty tz qx qy qz qw, world_from_cam; the world is the camera of the first frame."""
-    format: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: recognised)")] = None
+    format: Format = None
     """The recording's format: kitti, euroc, tum, seven_scenes or folder."""
-    json: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    json: File = None
     """Write what is printed to this file, too (- for standard output)."""
-    config: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    config: File = None
     """All other settings: a TOML file, as `topoloc config slam` prints it."""
 
     def run(self) -> int:

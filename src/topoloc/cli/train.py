@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from topoloc.cli.options import File, Flag
 from topoloc.cli.output import UsageError, check_outputs, progress_bar, write_json
 from topoloc.cli.settings_file import read_settings
 from topoloc.map.coarse_storage import list_coarse, store_coarse
@@ -31,15 +32,15 @@ class Command:
     """The network it stands on."""
     weights: Annotated[str | None, tyro.conf.arg(metavar="FILE|scratch", help_behavior_hint="(default: the published)")] = None
     """The network's weights: a PyTorch file of torchvision's or NetVLAD's layout, or `scratch` for random ones."""
-    default: bool = False
+    default: Flag = False
     """From now on it answers where --coarse is not given."""
     out: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: MAP itself)")] = None
     """Write the map with the new coarse localizer to this file and leave MAP as it is."""
-    checkpoint: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    checkpoint: File = None
     """cnn-fc: write the state of the training to this file after each epoch, and go on from it if it is there already."""
-    json: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    json: File = None
     """Write what was trained to this file (- for standard output)."""
-    config: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    config: File = None
     """All other settings: a TOML file, as `topoloc config train` prints it."""
 
     def run(self) -> int:
