@@ -5,7 +5,7 @@ Whatever its bounds, no number may be NaN or infinite, and none so large that it
 
 from __future__ import annotations
 
-import sys
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
@@ -120,7 +120,7 @@ def complaint(value: Any, kind: Any) -> str | None:
     if not _is_a(value, plain):
         return f"{in_words(plain)} is expected, not {_shown(value)}"
     for number in _numbers(value):
-        if not abs(number) <= sys.float_info.max:
+        if not _is_finite(number):
             return f"must be a finite number, not {_shown(number)}"
         for bound in bounds_of(kind):
             if not bound.holds(number):
@@ -168,10 +168,17 @@ def _are(values: tuple[Any, ...], items: tuple[Any, ...]) -> bool:
     return len(values) == len(items) and all(map(_is_a, values, items))
 
 
+def _is_finite(number: float | int) -> bool:
+    try:
+        return math.isfinite(number)
+    except OverflowError:  # a whole number of more than 308 digits
+        return False
+
+
 def _numbers(value: Any) -> Iterator[Any]:
-    """The numbers in a value, of Python or of numpy."""
+    """The numbers in a value; those of numpy as Python's."""
     if isinstance(value, tuple):
         for item in value:
             yield from _numbers(item)
     elif isinstance(value, Real) and not isinstance(value, bool):
-        yield value
+        yield int(value) if isinstance(value, Integral) else float(value)

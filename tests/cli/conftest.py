@@ -54,3 +54,15 @@ def complaint(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[...
         return printed.err
 
     return run
+
+
+@pytest.fixture
+def file_of(tmp_path: Path) -> Callable[[str | bytes], str]:
+    """Writes a TOML file and returns its path."""
+
+    def write(content: str | bytes) -> str:
+        path = tmp_path / "my.toml"
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
+        return str(path)
+
+    return write

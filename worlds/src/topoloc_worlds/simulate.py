@@ -32,7 +32,7 @@ _WOBBLE_AND_SHAKE: dict[Sway, tuple[float, float]] = {"none": (0.0, 0.0), "natur
 class RouteOptions:
     """Where the camera goes, along the world's closed line."""
 
-    laps: float = 1.0
+    laps: Annotated[float, tyro.conf.arg(metavar="N")] = 1.0
     """Times round; 0.25 is a quarter."""
     num_frames: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Stop after N frames."""
