@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from topoloc.localization.attempt import Attempt, Judgement
+from topoloc.localization.side_verdict import SideVerdictConfig, decide_with_sides, side_log_odds
+from topoloc.localization.verification import Evidence
 
 from built_corridor import WIDE
 from topoloc.features.features import Features, Matches
 from topoloc.geometry.absolute_pose import AbsolutePose
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.attempt import Attempt, Judgement
 from topoloc.localization.fitted_weights import weights_of
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.localization.side_verdict import SideVerdictConfig, decide_with_sides, side_log_odds
 from topoloc.localization.stages import StageClock
-from topoloc.localization.verification import Evidence
 from topoloc.places.coarse import NodeScore
 
 CONFIG, WEIGHTS = SideVerdictConfig(), weights_of("surf").walls

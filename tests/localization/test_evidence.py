@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from topoloc.localization.fitted_weights import weights_of
 from topoloc.localization.verification import (
     Evidence,
     VerificationConfig,
@@ -20,6 +18,8 @@ from topoloc.localization.verification import (
     spread_of,
     tolerated_translation,
 )
+
+from topoloc.localization.fitted_weights import weights_of
 
 CONFIG, WEIGHTS = VerificationConfig(), weights_of("surf").evidence
 STRONG = Evidence(

@@ -9,6 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from topoloc.localization.attempt import Judgement
+from topoloc.localization.side_localizer import SideLocalizer, SidesConfig
+from topoloc.localization.verification import VerificationConfig
 
 from built_corridor import WIDE, back, built_corridor, corridor, seen_ahead, seen_on_the_way_back
 from tiny_world import path_pose, render, room
@@ -17,13 +20,10 @@ from topoloc.features.kinds import SURF
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.attempt import Judgement
 from topoloc.localization.fitted_weights import weights_of
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.localization.side_localizer import SideLocalizer, SidesConfig
 from topoloc.localization.stages import StageClock
-from topoloc.localization.verification import VerificationConfig
 from topoloc.map.nodes import NodePoses
 from topoloc.map.topomap import SideNodes, TopoMetricMap
 

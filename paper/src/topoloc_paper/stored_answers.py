@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from topoloc.localization.verification import Evidence
+from topoloc.localization.evidence import Evidence
 
 from topoloc.evaluation.metrics import Answer
 from topoloc.geometry.rigid import Rigid3

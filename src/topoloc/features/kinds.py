@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import UInt8
 
+from topoloc.bounds import AtLeast, Between
 from topoloc.errors import FeatureKindError
 from topoloc.features.features import Features
 from topoloc.features.sift import SiftConfig, extract_sift
@@ -24,20 +25,20 @@ Normalization = Literal["none", "paper", "wide"]
 
 @dataclass(frozen=True)
 class FeatureConfig:
-    """Which features an image gives. Plain values only: it is stored in the map and built again from them.
-
-    kind: a name in `KINDS`.
-    normalization: `none`; `paper`, 17x17 windows and no noise floor; `wide`, 65x65 windows and a floor of 24 grey levels,
-    which keeps what the paper's form gains when the light changes and loses little where it does not. None: what suits the kind.
-    max_features: the strongest are kept. The detector's own threshold is low on purpose: a fixed one is a threshold on
-    contrast, and finds next to nothing in a dark picture.
-    """
+    """Which features an image gives. Plain values only: it is stored in the map and built again from them."""
 
     kind: str = "surf"
+    """Local features of the map, and of every query to it: a name in `KINDS`."""
     normalization: Normalization | None = None
-    max_features: int = 1000
-    hessian_threshold: float = 20.0
-    contrast_threshold: float = 0.01
+    """`none`. `paper`: 17x17 windows and no noise floor. `wide`: 65x65 windows and a floor of 24 grey levels, which keeps what the paper's
+    form gains when the light changes and loses little where it does not. Unset: what suits the kind."""
+    max_features: Annotated[int, Between(1, 100_000)] = 1000
+    """The strongest are kept."""
+    hessian_threshold: Annotated[float, AtLeast(0)] = 20.0
+    """Of SURF, for images of 0..255. Low on purpose: a fixed one is a threshold on contrast, and finds next to nothing in a dark
+    picture."""
+    contrast_threshold: Annotated[float, AtLeast(0)] = 0.01
+    """The same of SIFT, as OpenCV's."""
 
 
 @dataclass(frozen=True)

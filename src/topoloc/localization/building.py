@@ -1,4 +1,4 @@
-"""A map that is ready to be asked: as `mapping/build.py` constructs it, and with what only localizing can tell of it."""
+"""A map that is ready to be asked: as `map/build.py` constructs it, and with what only localizing can tell of it."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ def build_map(
     """Build a topo-metric map from one or several recordings of one place whose poses share one world.
 
     Raises:
+        ConfigError: a value of `config` is out of its bounds.
         TrajectoryError: no frame of a recording has a pose.
         EmptyMapError: no picture gave a usable node.
         FeatureKindError: no features of the kind that `config` names.

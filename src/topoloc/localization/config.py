@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
+from topoloc.bounds import Above, AtLeast, Between
 from topoloc.features.kinds import FeatureKind
 from topoloc.features.matching import MatchingConfig
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
@@ -16,13 +18,13 @@ from topoloc.localization.guided import GuidedConfig
 class LookAlikesConfig:
     """When another part of the map that looks like the image is asked on its own."""
 
-    num_ranked: int = 48
+    num_ranked: Annotated[int, Between(1, 100_000)] = 48
     """Nodes that the coarse localizer ranks, the candidates among them; look-alikes come from these."""
-    min_score_share: tuple[float, float] = (0.85, 0.4)
+    min_score_share: Annotated[tuple[float, float], Between(0, 1)] = (0.85, 0.4)
     """A look-alike's score is at least this share of the best one's: where the pose is clear, and where it is not."""
-    reach: float = 5.0
+    reach: Annotated[float, AtLeast(0)] = 5.0
     """Nodes within so many D_thresh of a pose (Eq. 1) belong to it; look-alikes are farther away."""
-    max_groups: int = 3
+    max_groups: Annotated[int, Between(0, 1000)] = 3
     """Parts of the map that are asked on their own, at most; 0 asks none."""
 
 
@@ -30,46 +32,48 @@ class LookAlikesConfig:
 class ViewpointsConfig:
     """Where an image that is not clear is compared with what nodes saw."""
 
-    num_nodes: int = 24
+    num_nodes: Annotated[int, Between(0, 10_000)] = 24
     """Nodes of the best coarse rank that are compared, one by one; 0 compares none."""
-    shift_px: float = 12.0
+    shift_px: Annotated[float, Above(0)] = 12.0
     """Matches whose displacements differ by less than this agree, in an image whose longer side is 640 pixels; grows with that."""
-    min_alike: int = 8
+    min_alike: Annotated[int, AtLeast(0)] = 8
     """A node is followed up where so many matches agree ..."""
-    chance_share: float = 0.09
+    chance_share: Annotated[float, Between(0, 1)] = 0.09
     """... and this share of all its matches more."""
-    max_fits: int = 6
+    max_fits: Annotated[int, Between(1, 1000)] = 6
     """Nodes whose matches are asked for a pose, those that agree most."""
-    max_poses: int = 4
+    max_poses: Annotated[int, Between(1, 1000)] = 4
     """Of the poses found, those with the most inliers are looked into."""
-    max_iterations: int = 500
+    max_iterations: Annotated[int, Between(1, 1_000_000)] = 500
     """Of RANSAC, for each of them."""
     matching: GuidedConfig = field(default_factory=lambda: GuidedConfig(radius_px=64.0))
+    """How widely points are sought around where the node saw them."""
 
 
 @dataclass(frozen=True)
 class WallsConfig:
     """How the walls along the way are asked."""
 
-    num_ranked: int = 32
+    num_ranked: Annotated[int, Between(0, 10_000)] = 32
     """Side nodes that are compared with each view; 0 asks none."""
-    num_first: int = 8
+    num_first: Annotated[int, Between(1, 10_000)] = 8
     """So many are compared first; the others only where one of these is recognised."""
-    min_agreeing: int = 8
+    min_agreeing: Annotated[int, AtLeast(3)] = 8
     """Matches of a view with a side node that must agree on one pose, for it to be recognised: from elsewhere there are 5 to 7."""
-    num_hypotheses: int = 6
+    num_hypotheses: Annotated[int, Between(1, 1000)] = 6
     """First poses of each view that are looked into."""
-    num_nodes: int = 4
+    num_nodes: Annotated[int, Between(1, 1000)] = 4
     """Side nodes whose points are sought in each view around a pose."""
-    min_distance: float = 5.0
+    min_distance: Annotated[float, AtLeast(0)] = 5.0
     """Poses within so many D_thresh (Eq. 1) of a node would have been found by that node."""
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     guided: GuidedConfig = field(default_factory=GuidedConfig)
-    rounds: tuple[tuple[float, float], ...] = ((0.0, 12.0), (0.0, 6.0), (30.0, 6.0), (25.0, 3.0), (25.0, 3.0))
+    rounds: Annotated[tuple[tuple[float, float], ...], AtLeast(0)] = ((0.0, 12.0), (0.0, 6.0), (30.0, 6.0), (25.0, 3.0), (25.0, 3.0))
     """Matches and pose in turn: search radius and largest error, pixels. Radius 0 are the unguided matches: guided ones draw a pose that
     is not yet right towards itself."""
-    min_found: int = 20
-    clear_log_odds: float = 2.5
+    min_found: Annotated[int, AtLeast(4)] = 20
+    """Map points found where the pose says they must be, at least."""
+    clear_log_odds: Annotated[float, Between(-100, 100)] = 2.5
     """Where there is more for a pose of the nodes, the walls are not asked."""
 
 
@@ -79,29 +83,29 @@ class LocalizerConfig:
 
     coarse: str | None = None
     """Which of the map's coarse localizers is asked (None: the map's default)."""
-    max_ms: float | None = None
+    max_ms: Annotated[float | None, AtLeast(0)] = None
     """After so many milliseconds no further hypothesis is sought (None: all are)."""
-    num_candidates: int = 4
+    num_candidates: Annotated[int, Between(1, 10_000)] = 4
     """Nodes whose points are pooled; 1 is the paper's single node."""
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     guided: GuidedConfig = field(default_factory=GuidedConfig)
     pose: AbsolutePoseConfig = field(default_factory=lambda: AbsolutePoseConfig(max_reprojection_error_px=8.0, max_iterations=1000))
-    num_first_features: int = 320
+    num_first_features: Annotated[int, AtLeast(1)] = 320
     """The image's strongest features are matched first; the rest only where these give fewer inliers than the next number."""
-    num_clear_inliers: int = 40
-    num_chance_inliers: int = 7
+    num_clear_inliers: Annotated[int, AtLeast(0)] = 40
+    num_chance_inliers: Annotated[int, AtLeast(0)] = 7
     """Fewer agree on a pose anywhere: where the first matches have no more, and no viewpoint stands out, look-alikes are not asked."""
-    min_matches: int = 8
+    min_matches: Annotated[int, AtLeast(4)] = 8
     """With fewer first matches no pose is sought."""
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
     look_alikes: LookAlikesConfig = field(default_factory=LookAlikesConfig)
     viewpoints: ViewpointsConfig = field(default_factory=ViewpointsConfig)
     walls: WallsConfig = field(default_factory=WallsConfig)
     correlated_errors: CorrelatedErrorsConfig = field(default_factory=CorrelatedErrorsConfig)
-    max_finer: float = 1.15
+    max_finer: Annotated[float, AtLeast(1)] = 1.15
     """An image of more than so many times the pixels a radian (focal length in pixels) of the map's finest camera is reduced to that
     camera's first: at larger sizes its key points find none alike in the map."""
-    max_side_px: int = 1600
+    max_side_px: Annotated[int, Between(64, 100_000)] = 1600
     """Larger images are reduced to this width or height first: nothing is gained from more, but time and memory."""
 
     def for_kind(self, kind: FeatureKind) -> LocalizerConfig:

@@ -18,10 +18,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from topoloc.bounds import Above, AtLeast, Between
 from topoloc.localization.fitted_weights import FittedWeights, WallWeights
 
 COLUMNS, ROWS = 8, 6
@@ -55,17 +57,19 @@ class Evidence:
 class EvidenceConfig:
     """What a right pose is, and what is asked of an answer."""
 
-    max_translation: float = 0.25
+    max_translation: Annotated[float, Above(0)] = 0.25
     """A right pose is no further off than this (metres), nor than `depth_share` of the distance of what is seen, if that is less."""
-    depth_share: float = 0.05
-    max_rotation_deg: float = 2.0
-    agreement_px: float = 4.0
+    depth_share: Annotated[float, Above(0)] = 0.05
+    """See `max_translation`."""
+    max_rotation_deg: Annotated[float, Between(0.001, 180)] = 2.0
+    """A right pose is turned by no more than this."""
+    agreement_px: Annotated[float, Above(0)] = 4.0
     """Unguided matches within this of the final pose agree with it, in an image whose longer side is 640 pixels; grows with that."""
-    min_inliers: int = 5
+    min_inliers: Annotated[int, AtLeast(4)] = 5
     """With fewer, a first pose is not even tried out."""
-    min_found: int = 12
+    min_found: Annotated[int, AtLeast(4)] = 12
     """Map points found where the pose says they must be, at least."""
-    min_probability: float = 0.5
+    min_probability: Annotated[float, Between(0, 1)] = 0.5
     """Poses less probable than this are not reported."""
 
 

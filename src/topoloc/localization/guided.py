@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
+from topoloc.bounds import AtLeast, Between
 from topoloc.features.features import Features, Matches
 from topoloc.features.kinds import FeatureKind, GuidedThresholds
 from topoloc.geometry.camera import Camera
@@ -25,17 +27,17 @@ from topoloc.localization.local_map import LocalMap
 class GuidedConfig:
     """Settings of guided matching. A threshold that is None is that of the kind of features (`features/kinds.py`)."""
 
-    num_nodes: int = 3
+    num_nodes: Annotated[int, Between(0, 1000)] = 3
     """Nodes nearest to the first pose (Eq. 1) whose points are sought; 0 keeps the first pose as it is."""
-    radius_px: float = 10.0
+    radius_px: Annotated[float, Between(0, 1000)] = 10.0
     """How far from its projection a map point is sought, in an image whose longer side is 640 pixels; grows with that."""
-    max_scale: float | None = None
-    """Largest ratio of a key point's size to the one expected, or the other way round."""
-    max_turn: float | None = None
-    """Largest difference of a key point's orientation from the one expected, radians."""
-    min_similarity: float | None = None
-    """Least scalar product of the two descriptors."""
-    min_margin: float | None = None
+    max_scale: Annotated[float | None, AtLeast(1)] = None
+    """Largest ratio of a key point's size to the one expected, or the other way round. Unset: what suits the kind of features."""
+    max_turn: Annotated[float | None, AtLeast(0)] = None
+    """Largest difference of a key point's orientation from the one expected, radians. Unset: what suits the kind of features."""
+    min_similarity: Annotated[float | None, Between(-1, 1)] = None
+    """Least scalar product of the two descriptors. Unset: what suits the kind of features."""
+    min_margin: Annotated[float | None, Between(0, 2)] = None
     """By how much the best key point must lead the next one within the radius."""
 
     def resolved(self, kind: FeatureKind, thresholds: GuidedThresholds | None = None) -> GuidedConfig:

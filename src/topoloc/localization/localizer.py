@@ -14,6 +14,7 @@ from __future__ import annotations
 import time
 from functools import cached_property
 
+from topoloc.bounds import check_bounds
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
@@ -44,6 +45,7 @@ class Localizer:
         weights: what the evidence counts, instead of what ships for the map's kind of features.
 
     Raises:
+        ConfigError: a setting is out of bounds.
         FeatureKindError: the map's features are of a kind that there is not.
         EmptyMapError: the map has no node.
         MapError: the map has no such coarse localizer.
@@ -57,6 +59,7 @@ class Localizer:
         weights: FittedWeights | None = None,
     ) -> None:
         config = config or LocalizerConfig()
+        check_bounds(config)
         self.topomap = topomap
         self.map = OpenMap(topomap, coarse or config.coarse)
         self.config = config.for_kind(self.map.kind)
