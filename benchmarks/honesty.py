@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from topoloc.localization.verification import VerificationConfig, tolerated_translation
 
-from real_recordings import PLACES, Place, darkened, drawn_pictures, read_rigid
+from real_recordings import PLACES, Place
 from topoloc.demo.recordings import SHIPPED
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
@@ -30,6 +30,8 @@ from topoloc.map.build import BuildConfig, build_map
 from topoloc.map.nodes import NodeConfig
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.open import open_sequence
+from topoloc_paper.fit.corpus import read_rigid
+from topoloc_paper.fit.pictures import darkened, drawn_pictures
 
 BEYOND = Place("kitchen, beyond the map", "seven_scenes/kitchen@0:120", "seven_scenes/kitchen@120::2", 0.5)
 CHI_SQUARE_6_AT_95 = 12.592

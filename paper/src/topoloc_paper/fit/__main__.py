@@ -1,0 +1,138 @@
+"""Fit the weights of a kind of features, and try them on places that they were not fitted to.
+
+    python -m topoloc_paper.fit --kind KIND [--shared ../shared] [--rendered FOLDER] [--step N] [--families NAME ...]
+                                [--save POSES | --load POSES ...] [--out FILE]
+
+Each place of `corpus.py` is mapped with features of this kind, and asked about its own pictures (in good light and bad), about those of
+other places and about drawn pictures; every pose that was tried is kept, not only the one answered. A pose is right within 0.25 m (5 % of
+the distance, where that is less) and 2 degrees, wrong beyond 0.5 m or 10 degrees; what lies between is left out. The walls to both sides
+are not asked: their weights are taken over. --step N asks every N-th of the pictures, --families only of the maps of these places; --save
+keeps the poses, after each place, and --load fits to poses that were kept. FILE is what ships as `localization/weights/KIND.json`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+
+from topoloc.errors import TopolocError
+from topoloc.features.kinds import find_kind
+from topoloc.localization.fitted_weights import FittedWeights, weights_of
+from topoloc_paper.fit.corpus import FAMILIES, PLACES, family_of, open_recordings
+from topoloc_paper.fit.evidence import Judged, calibration_error, decided, fit_evidence, fit_shared_errors, judged, try_on_other_families
+from topoloc_paper.fit.rivals import MIN_HARD_PAIRS, fit_rivals, num_mistaken, pairs_of
+from topoloc_paper.fit.tried_poses import TriedPose, ask_place, load_poses, save_poses
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m topoloc_paper.fit", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--kind", required=True)
+    parser.add_argument("--shared", type=Path, default=Path(os.environ.get("TOPOLOC_SHARED", "../shared")))
+    parser.add_argument("--rendered", type=Path)
+    parser.add_argument("--step", type=int, default=1)
+    parser.add_argument("--families", nargs="+", choices=sorted(set(FAMILIES.values()) - {"drawn"}))
+    parser.add_argument("--save", type=Path)
+    parser.add_argument("--load", type=Path, nargs="+")
+    parser.add_argument("--out", type=Path)
+    asked = parser.parse_args()
+    try:
+        find_kind(asked.kind)
+    except TopolocError as error:
+        raise SystemExit(f"error: {error}") from error
+    if asked.load:
+        poses = [pose for path in asked.load for pose in load_poses(path)]
+    else:
+        poses = ask_places(asked.kind, asked.shared.resolve() / "data", asked.rendered, asked.step, asked.save, asked.families)
+    if len({pose.is_right for pose in decided(poses)}) < 2:
+        raise SystemExit("error: right and wrong poses are needed, and there are not both")
+    weights = fit(asked.kind, poses, asked.step)
+    if asked.out:
+        asked.out.write_text(json.dumps(weights.to_json(), indent=2) + "\n")
+
+
+def ask_places(kind: str, data: Path, rendered: Path | None, step: int, kept: Path | None, families: list[str] | None) -> list[TriedPose]:
+    """Every pose that the places of the corpus (of these families) lead to; written to `kept` after each place."""
+    recordings = open_recordings(data, rendered)
+    poses: list[TriedPose] = []
+    for place in (place for place in PLACES if families is None or family_of(place.mapping) in families):
+        here = ask_place(place, recordings, data, kind, step)
+        poses += here
+        print(f"{place.mapping}: {len(here)} poses of {len({pose.picture for pose in here})} pictures", flush=True)
+        if kept:
+            save_poses(poses, kept)
+    return poses
+
+
+def fit(kind: str, poses: list[TriedPose], step: int) -> FittedWeights:
+    """Fitted weights of this kind, with a report of how they do beside those in use."""
+    before = weights_of(kind)
+    evidence = fit_evidence(poses, before.evidence.doubt)
+    held_out = try_on_other_families(poses, before.evidence.doubt)
+    log_odds, is_right = (np.concatenate([getattr(part, name) for part in held_out]) for name in ("log_odds", "is_right"))
+    rivals, num_hard = fit_rivals(poses, evidence, before.rivals)
+    fitted = FittedWeights(
+        kind,
+        corpus_of(poses, num_hard),
+        datetime.date.today().isoformat(),
+        f"python -m topoloc_paper.fit --kind {kind} --rendered FOLDER --step {step} --out FILE",
+        round(calibration_error(log_odds, is_right), 4),
+        evidence,
+        rivals,
+        before.walls,
+        fit_shared_errors(poses, before.shared_errors),
+    )
+    report(poses, before, fitted, held_out)
+    return fitted
+
+
+def corpus_of(poses: list[TriedPose], num_hard: int) -> str:
+    """One sentence on what was fitted to."""
+    num_right, told = sum(pose.is_right for pose in poses), decided(poses)
+    places = ", ".join(dict.fromkeys(pose.mapping for pose in poses))
+    elsewhere = sum(pose.error_m is None for pose in poses)
+    rivals = f"fitted to {num_hard} hard pairs" if num_hard >= MIN_HARD_PAIRS else f"taken over, {num_hard} hard pairs being too few"
+    return (
+        f"{len(told)} poses tried, {num_right} of them right, {elsewhere} of pictures from elsewhere, of maps of {places}; "
+        f"rivals {rivals}; taken over: the weight of the doubt, walls, shared_errors but for the factor. "
+        "Calibration error: of poses that would be answered, each family of places judged by a fit without it"
+    )
+
+
+def report(poses: list[TriedPose], before: FittedWeights, fitted: FittedWeights, held_out: list[Judged]) -> None:
+    told = decided(poses)
+    num_right = sum(pose.is_right for pose in told)
+    print(f"{len(told)} poses, {num_right} of them right; {len(poses) - len(told)} more are neither right nor wrong")
+    for name, weights in (("in use", before), ("fitted", fitted)):
+        all_poses = judged("all", told, weights.evidence)
+        elsewhere = judged("elsewhere", [pose for pose in told if pose.error_m is None], weights.evidence)
+        clearest, most = (max(part.log_odds[~part.is_right], default=-99.0) for part in (all_poses, elsewhere))
+        print(f"{name}: {weights.evidence}")
+        print(f"  {verdict(all_poses)}; log odds of the clearest wrong pose {clearest:.1f},")
+        print(f"  probability of the most probable of {len(elsewhere.is_right)} from elsewhere {1 / (1 + np.exp(-most)):.2f}")
+    for part in held_out:
+        in_use = judged(part.family, [pose for pose in told if family_of(pose.mapping) == part.family], before.evidence)
+        print(f"{part.family}, fitted without it: {verdict(part)}\n  in use: {verdict(in_use)}")
+    differences, is_hard = pairs_of(poses, fitted.evidence)
+    was, now = (num_mistaken(differences[is_hard], rivals) for rivals in (before.rivals, fitted.rivals))
+    print(f"rivals: {fitted.rivals}, {now} of {np.sum(is_hard)} hard pairs mistaken ({was})")
+    print(f"shared errors: factor {fitted.shared_errors.factor} ({before.shared_errors.factor})")
+    print(f"calibration error, every family judged by a fit without it: {fitted.calibration_error}")
+
+
+def verdict(part: Judged) -> str:
+    wrong, lost = np.sum((part.log_odds > 0) & ~part.is_right), np.sum((part.log_odds <= 0) & part.is_right)
+    error = calibration_error(part.log_odds, part.is_right)
+    return (
+        f"accepts {wrong} of {np.sum(~part.is_right)} wrong, loses {lost} of {np.sum(part.is_right)} right, calibration error {error:.3f}"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,161 @@
+"""Every pose that a picture led to, not only the one answered, with what spoke for it and whether it is right."""
+
+from __future__ import annotations
+
+import json
+import math
+import tempfile
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from topoloc.features.kinds import FeatureConfig
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.attempt import Attempt, Judgement, judge
+from topoloc.localization.building import build_map
+from topoloc.localization.localizer import Localizer
+from topoloc.localization.stages import StageClock
+from topoloc.localization.verification import Evidence, VerificationConfig, tolerated_translation
+from topoloc.map.build import BuildConfig
+from topoloc.map.side_nodes import SideNodesConfig
+from topoloc.map.topomap import TopoMetricMap
+from topoloc.places.coarse import NodeScore
+from topoloc.sequences.frame import StereoSequence
+from topoloc_paper.fit.corpus import GAMMAS, AskedPlace, read_rigid
+from topoloc_paper.fit.pictures import darkened, drawn_pictures
+
+ASKED = VerificationConfig()
+_NUM_DRAWN = 25
+
+
+@dataclass(frozen=True)
+class TriedPose:
+    """A pose that a picture led to, and what spoke for it.
+
+    `error_m`, `error_deg`: None for a picture from elsewhere. `depth`: median distance (metres) of the points that it stands on.
+    `first_evidence`: that of the matches that it came from; None where these were guided. `square`: its squared error in standard
+    deviations of a covariance that takes all matches for independent; `rho` is what the map says of errors that they share.
+    """
+
+    mapping: str
+    queries: str
+    index: int
+    light: str
+    error_m: float | None
+    error_deg: float | None
+    depth: float
+    evidence: Evidence
+    first_evidence: Evidence | None
+    square: float | None
+    rho: float
+
+    @property
+    def is_right(self) -> bool:
+        if self.error_m is None or self.error_deg is None:
+            return False
+        return self.error_m < tolerated_translation(self.depth, ASKED) and self.error_deg < ASKED.max_rotation_deg
+
+    @property
+    def is_wrong(self) -> bool:
+        return self.error_m is None or self.error_deg is None or self.error_m >= 0.5 or self.error_deg >= 10.0
+
+    @property
+    def picture(self) -> tuple[str, str, int, str]:
+        return (self.mapping, self.queries, self.index, self.light)
+
+
+class ListeningLocalizer(Localizer):
+    """Keeps every pose that was judged: of the candidates, of other parts of the map, of what single nodes saw."""
+
+    def __init__(self, topomap: TopoMetricMap) -> None:
+        super().__init__(topomap)
+        self.tried: list[tuple[Judgement, Evidence | None]] = []
+
+    def _judge(self, first: Attempt, candidates: list[NodeScore], shared_errors: float, clock: StageClock) -> Judgement:
+        judgement = super()._judge(first, candidates, shared_errors, clock)
+        if judgement.final.pose is not None and judgement.evidence is not None:
+            c, of_first = self.config, None
+            if not first.is_guided:
+                always = replace(self.weights.evidence, clear_log_odds=-math.inf)
+                again = judge(
+                    first, judgement.final, candidates, shared_errors, c.min_matches, c.matching, c.guided, c.verification, always, clock
+                )
+                of_first = again.evidence
+            self.tried.append((judgement, of_first))
+        return judgement
+
+
+def ask_place(place: AskedPlace, recordings: dict[str, StereoSequence], data: Path, kind: str, step: int) -> list[TriedPose]:
+    """Every pose that the place's map, of features of this kind, leads to; none where its recording is missing.
+
+    Args:
+        step: only every so manieth of the place's pictures is asked.
+    """
+    if place.mapping not in recordings:
+        return []
+    poses: list[TriedPose] = []
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "place.topo"
+        config = BuildConfig(features=FeatureConfig(kind=kind), sides=SideNodesConfig(spacing=0.0))
+        build_map(recordings[place.mapping], config).save(path)
+        localizer = ListeningLocalizer(TopoMetricMap.load(path))
+        world_from_truth = read_rigid(data / place.map_from_truth) if place.map_from_truth else Rigid3.identity()
+        for name, index, frame in _frames(place.own, recordings, step):
+            truth = world_from_truth @ frame.world_from_cam
+            for light, gamma in GAMMAS.items():
+                if gamma is None or place.is_darkened:
+                    image = frame.image if gamma is None else darkened(frame.image, gamma, index)
+                    poses += _tried(localizer, image, frame.camera, truth, (place.mapping, name, index, light))
+        for name, index, frame in _frames(place.others, recordings, step):
+            poses += _tried(localizer, frame.image, frame.camera, None, (place.mapping, name, index, "as it is"))
+        camera = Camera.pinhole(640, 480, 525.0, 525.0, 319.5, 239.5)
+        for index, image in enumerate(drawn_pictures(_NUM_DRAWN)[::step] if place.others else []):
+            poses += _tried(localizer, image, camera, None, (place.mapping, "drawn", index, "as it is"))
+    return poses
+
+
+def save_poses(poses: list[TriedPose], path: Path) -> None:
+    path.write_text(json.dumps([asdict(pose) for pose in poses]))
+
+
+def load_poses(path: Path) -> list[TriedPose]:
+    """What `save_poses` wrote."""
+
+    def evidence(saved: dict[str, Any] | None) -> Evidence | None:
+        return None if saved is None else Evidence(**saved)
+
+    read = json.loads(path.read_text())
+    return [TriedPose(**row | {key: evidence(row[key]) for key in ("evidence", "first_evidence")}) for row in read]
+
+
+def _frames(asked: dict[str, int], recordings: dict[str, StereoSequence], step: int) -> Iterator[tuple[str, int, Any]]:
+    for name, every in asked.items():
+        if name in recordings:
+            for index in range(0, len(recordings[name]), every * step):
+                yield name, index, recordings[name][index]
+
+
+def _tried(
+    localizer: ListeningLocalizer, image: np.ndarray, camera: Camera, world_from_cam: Rigid3 | None, picture: tuple[str, str, int, str]
+) -> Iterator[TriedPose]:
+    """`world_from_cam` is the truth, in the map's world; None for a picture from elsewhere."""
+    localizer.tried.clear()
+    localizer.localize(image, camera)
+    rho = localizer.shared_errors
+    for judgement, first_evidence in localizer.tried:
+        final = judgement.final
+        assert final.pose is not None
+        assert judgement.evidence is not None
+        cam_from_world, error_m, error_deg, square = final.pose.cam_from_world, None, None, None
+        if world_from_cam is not None:
+            error = cam_from_world @ world_from_cam
+            error_m, error_deg = float(np.linalg.norm(error.translation)), math.degrees(error.angle())
+            xi = error.log()
+            square = float(xi @ np.linalg.solve(final.pose.covariance, xi))
+        points_world = final.local_map.points_world[final.matches.train_idx[final.pose.inliers]]
+        depth = float(np.median(cam_from_world.apply(points_world)[:, 2]))
+        yield TriedPose(*picture, error_m, error_deg, depth, judgement.evidence, first_evidence, square, rho)

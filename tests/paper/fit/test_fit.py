@@ -1,0 +1,138 @@
+"""Weights are found again from poses drawn with known ones; what is right, wrong or lies between; the command's file is one that ships."""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from topoloc.localization.fitted_weights import EvidenceWeights, RivalWeights, SharedErrorWeights, read_weights
+from topoloc.localization.verification import Evidence, log_odds_of
+from topoloc_paper.fit import __main__ as command
+from topoloc_paper.fit.evidence import Judged, calibration_error, decided, fit_evidence, fit_shared_errors, judged, try_on_other_families
+from topoloc_paper.fit.rivals import MIN_HARD_PAIRS, fit_rivals, num_mistaken, pairs_of
+from topoloc_paper.fit.tried_poses import TriedPose, load_poses, save_poses
+
+TRUE = EvidenceWeights(even_share=2.0, chance=1.0, inliers=0.3, inlier_share=1.5, spread=0.5, doubt=-0.5, bias=7.0, clear_log_odds=4.5)
+RIGHT, WRONG, BETWEEN = (0.01, 0.2), (3.0, 5.0), (0.3, 5.0)
+MAPS = ("corridor_map", "demo/map_lap1", "seven_scenes/kitchen@0-59/100")
+
+
+def _pose(error: tuple[float, float] | None, evidence: Evidence, index: int = 0, mapping: str = MAPS[0]) -> TriedPose:
+    metres, degrees = error or (None, None)
+    return TriedPose(mapping, mapping, index, "as it is", metres, degrees, 8.0, evidence, None, 6.0 if error else None, 0.02)
+
+
+def _evidence(rng: np.random.Generator) -> Evidence:
+    visible = int(rng.integers(200, 1500))
+    found = int(visible * rng.beta(1.0, 4.0)) + 12
+    matches = int(rng.integers(10, 200))
+    inliers = int(matches * rng.beta(1.0, 2.0))
+    spread, doubt, even = rng.uniform(0.05, 0.9), rng.lognormal(-1.0, 1.0), float(rng.beta(1.0, 8.0))
+    return Evidence(matches, inliers, found, visible, int(rng.integers(0, 60)), float(spread), float(doubt), even)
+
+
+def _drawn(num: int, seed: int = 0) -> list[TriedPose]:
+    """Poses that are right with the probability that `TRUE` gives them; the wrong ones are of the place itself."""
+    rng, poses = np.random.default_rng(seed), []
+    for k in range(num):
+        evidence = _evidence(rng)
+        is_right = rng.random() < 1.0 / (1.0 + math.exp(-log_odds_of(evidence, TRUE)))
+        poses.append(_pose(RIGHT if is_right else WRONG, evidence, k, MAPS[k % 3]))
+    return poses
+
+
+def test_poses_between_right_and_wrong_are_left_out():
+    evidence = _evidence(np.random.default_rng(0))
+    poses = [_pose(error, evidence) for error in (RIGHT, WRONG, BETWEEN, None)]
+    assert [pose.is_right for pose in poses] == [True, False, False, False]
+    assert decided(poses) == [poses[0], poses[1], poses[3]]
+
+
+def test_weights_that_poses_were_drawn_with_are_found_again():
+    poses = _drawn(6000)
+    fitted = fit_evidence(poses, doubt=-0.5)
+    there, here = (judged("all", _drawn(2000, seed=1), weights) for weights in (TRUE, fitted))
+    assert np.corrcoef(there.log_odds, here.log_odds)[0, 1] > 0.99
+    assert calibration_error(here.log_odds, here.is_right) < 0.06
+    assert fitted.doubt == -0.5
+    clearest = max(odds for odds, pose in zip(judged("", poses, fitted).log_odds, poses, strict=True) if pose.is_wrong)
+    assert fitted.clear_log_odds > clearest
+
+
+def test_a_picture_from_elsewhere_lowers_the_bias_until_it_is_not_believed():
+    poses = _drawn(1500)
+    strongest = max((pose.evidence for pose in poses), key=lambda evidence: log_odds_of(evidence, TRUE))
+    fitted = fit_evidence([*poses, _pose(None, strongest)], doubt=-0.5)
+    assert 1.0 / (1.0 + math.exp(-log_odds_of(strongest, fitted))) == pytest.approx(0.35, abs=1e-6)
+    assert fitted.bias < fit_evidence(poses, doubt=-0.5).bias - 1.0
+
+
+def test_every_family_is_judged_by_a_fit_without_it():
+    poses = _drawn(3000)
+    # in one family the evidence says the opposite: only a fit that has seen it could know
+    turned = [replace(pose, error_m=3.0 if pose.is_right else 0.01) if pose.mapping == MAPS[0] else pose for pose in poses]
+    held_out = {part.family: part for part in try_on_other_families(turned, doubt=-0.5)}
+    assert set(held_out) == {"corridor", "lab", "kitchen"}
+    assert calibration_error(held_out["corridor"].log_odds, held_out["corridor"].is_right) > 0.3
+    assert sum(len(part.is_right) for part in held_out.values()) == len(decided(turned))
+
+
+def test_calibration_error_is_the_mean_gap_of_what_would_be_answered():
+    log_odds = np.array([math.log(9.0)] * 10 + [-3.0] * 50)  # ten answers of 0.9, of which six are right
+    part = Judged("any", log_odds, np.array([True] * 6 + [False] * 4 + [True] * 50))
+    assert calibration_error(part.log_odds, part.is_right) == pytest.approx(0.3)
+
+
+def test_the_factor_of_shared_errors_puts_95_percent_inside():
+    rng, before = np.random.default_rng(0), SharedErrorWeights(2.0, 0.005, 0.1)
+    evidence = _evidence(rng)
+    true_factor, rho = 3.0, 0.01
+    inflation = 1.0 + evidence.num_found * true_factor * rho
+    poses = [replace(_pose(RIGHT, evidence), square=float(inflation * rng.chisquare(6)), rho=2.0 * rho) for _ in range(4000)]
+    assert fit_shared_errors(poses, before).factor == pytest.approx(true_factor, rel=0.15)
+    assert fit_shared_errors([_pose(WRONG, evidence)], before) == before
+
+
+def test_pairs_are_of_one_picture_and_too_few_of_them_change_nothing():
+    strong, weak = Evidence(150, 90, 300, 900, 20, 0.8, 0.1, 0.3), Evidence(150, 60, 250, 900, 20, 0.7, 0.3, 0.05)
+    before = RivalWeights(0.3, 6.0, -3.0)
+    poses = [pose for k in range(MIN_HARD_PAIRS) for pose in (_pose(RIGHT, strong, k), _pose(WRONG, weak, k))]
+    differences, is_hard = pairs_of(poses, TRUE)
+    assert len(differences) == MIN_HARD_PAIRS
+    assert is_hard.all()
+    assert num_mistaken(differences, before) == 0
+    assert fit_rivals(poses[2:], TRUE, before) == (before, MIN_HARD_PAIRS - 1)
+    fitted, num_hard = fit_rivals(poses, TRUE, before)
+    assert num_hard == MIN_HARD_PAIRS
+    assert fitted != before
+    assert min(fitted.odds, fitted.even_share, -fitted.doubt) >= 0.0
+    assert len(pairs_of([replace(pose, error_m=None) for pose in poses], TRUE)[0]) == 0
+
+
+def test_the_command_writes_a_file_that_ships(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    kept, out = (tmp_path / "a.json", tmp_path / "b.json"), tmp_path / "sift.json"
+    poses = _drawn(900)
+    save_poses(poses[:450], kept[0])
+    save_poses(poses[450:], kept[1])
+    assert load_poses(kept[0]) == poses[:450]
+    monkeypatch.setattr(sys, "argv", ["fit", "--kind", "sift", "--load", *map(str, kept), "--out", str(out)])
+    command.main()
+    weights = read_weights(out)
+    assert weights.kind == "sift"
+    assert weights.is_calibrated
+    assert weights.evidence == fit_evidence(poses, weights.evidence.doubt)
+    assert "900 poses tried" in weights.corpus
+    assert "corridor, fitted without it" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("kind", "said"), [("orb", "no features of kind 'orb'"), ("sift", "right and wrong poses are needed")])
+def test_what_cannot_be_fitted_is_told_in_one_line(kind: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    save_poses([pose for pose in _drawn(50) if pose.is_wrong], tmp_path / "poses.json")
+    monkeypatch.setattr(sys, "argv", ["fit", "--kind", kind, "--load", str(tmp_path / "poses.json")])
+    with pytest.raises(SystemExit, match=said):
+        command.main()
