@@ -9,6 +9,7 @@ that look the same way, they would have been recognised, so poses there are not 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -71,9 +72,9 @@ class SeenWalls:
 
 def propose_walls(search: Search) -> Iterator[Proposal]:
     """The first poses that most matches of a view agree with, some for each view."""
-    config, best, index = search.config.walls, search.best, search.map.walls
+    config, best = search.config.walls, search.best
     is_settled = best is not None and best.probability >= search.config.evidence.min_probability and best.log_odds > config.clear_log_odds
-    if is_settled or config.num_ranked == 0 or index is None or isinstance(search.query.lens, RoughCamera):
+    if is_settled or config.num_ranked == 0 or isinstance(search.query.lens, RoughCamera) or (index := search.map.walls) is None:
         return
     with search.query.clock.stage("walls"):
         walls = SeenWalls.of(search, index)
@@ -208,4 +209,4 @@ def _are_near(search: Search, a_from_world: Rigid3, b_from_world: Rigid3) -> boo
     """Are two first poses, neither of them precise, worth looking into but once?"""
     apart = a_from_world @ b_from_world.inverse()
     way = float(np.linalg.norm(a_from_world.inverse().translation - b_from_world.inverse().translation))
-    return way < 1.5 * search.map.d_thresh and np.rad2deg(apart.angle()) < 20.0
+    return way < 1.5 * search.map.d_thresh and math.degrees(apart.angle()) < 20.0
