@@ -15,13 +15,17 @@ def build_map(
     sequences: StereoSequence | Sequence[StereoSequence],
     config: build.BuildConfig | None = None,
     progress: build.Progress | None = None,
+    poses_from: Sequence[str] | None = None,
 ) -> TopoMetricMap:
     """Build a topo-metric map from one or several recordings of one place whose poses share one world.
+
+    Args:
+        poses_from: where the poses of each recording come from (`truth`, `slam`, a file), for the map to remember.
 
     Raises:
         TrajectoryError: no frame of a recording has a pose.
         EmptyMapError: no picture gave a usable node.
         RecordingError, CalibrationError, UnreadableImageError: from reading the recordings.
     """
-    topomap, asked = build.build_map(sequences, config, progress), LocalizerConfig()
+    topomap, asked = build.build_map(sequences, config, progress, poses_from), LocalizerConfig()
     return with_shared_errors(topomap, asked.guided, asked.pose, asked.shared_errors)

@@ -11,12 +11,12 @@ well. Where nothing is clear, the walls along the way are asked from the other s
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 
 from topoloc.errors import EmptyMapError, QueryError
-from topoloc.features.extraction import FeatureConfig, extract_normalized, normalize_image
+from topoloc.features.extraction import extract_normalized, normalize_image
 from topoloc.features.features import Features, Matches
 from topoloc.features.matching import MatchingConfig, match_pooled
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
@@ -38,12 +38,11 @@ from topoloc.localization.stages import StageClock
 from topoloc.localization.standpoints import StandpointsConfig, strongest_and_distinct
 from topoloc.localization.verification import VerificationConfig
 from topoloc.localization.viewing import viewing_distances
+from topoloc.map.memory import RememberedNodes
 from topoloc.map.nodes import NodePoses
 from topoloc.map.topomap import TopoMetricMap, open_coarse_of
 from topoloc.places.coarse import CoarseLocalizer, Image, NodeScore
 from topoloc.sequences.pictures import grey_image
-
-NODES_IN_MEMORY = 256
 
 
 @dataclass(frozen=True)
@@ -92,11 +91,10 @@ class Localizer:
         if len(topomap.summaries) == 0:
             raise EmptyMapError("the map has no nodes")
         self._coarse = open_coarse_of(topomap, self.config.coarse or topomap.default_coarse) if coarse is None else coarse
-        self._feature_config = FeatureConfig(**topomap.config["features"])
+        self._feature_config = topomap.config.features
         self._node_poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
-        self._lambda_rot = float(topomap.config["nodes"]["lambda_rot"])
-        self._d_thresh = float(topomap.config["nodes"]["d_thresh"])
-        self._local_map = lru_cache(maxsize=NODES_IN_MEMORY)(lambda node_id: LocalMap.of_node(topomap.nodes[node_id]))
+        self._lambda_rot, self._d_thresh = topomap.config.lambda_rot, topomap.config.d_thresh
+        self._local_map = RememberedNodes(lambda row: LocalMap.of_node(topomap.nodes[row]))
 
     def localize(self, image: Image, camera: Camera | RoughCamera | None) -> Localization | NotLocalized:
         """Where was this image (grey or RGB, uint8) taken, by a camera of this calibration?
@@ -139,7 +137,7 @@ class Localizer:
             judgement = self._judge(first, candidates, shared_errors, clock)
             judgement = self._against_rivals(judgement, ranked, features, lens, shared_errors, clock)
             judgement = self._against_sides(judgement, image, lens, shared_errors, clock)
-        result = judgement.result
+        result = replace(judgement.result, candidates=self._with_ids(judgement.result.candidates))
         if not isinstance(result, Localization):
             return result, None
         if result.focal_length_px is not None:
@@ -160,8 +158,13 @@ class Localizer:
     @cached_property
     def _map_focal(self) -> float:
         """Focal length (pixels) of the finest camera that mapped; each recording is taken to have one camera."""
-        first_nodes = {summary.recording: summary.node_id for summary in reversed(self.topomap.summaries)}
-        return max(self.topomap.nodes[node_id].camera.fx for node_id in first_nodes.values())
+        summaries = self.topomap.summaries
+        first_nodes = {summaries[row].session_id: row for row in reversed(range(len(summaries)))}
+        return max(self.topomap.nodes[row].camera.fx for row in first_nodes.values())
+
+    def _with_ids(self, candidates: list[NodeScore]) -> list[NodeScore]:
+        """Candidates as they are reported: until then a candidate's `node_id` is the row of its node."""
+        return [NodeScore(self.topomap.summaries[candidate.node_id].node_id, candidate.score) for candidate in candidates]
 
     def _extract(self, image: Image, clock: StageClock) -> Features:
         """Patch normalisation, then the local features."""

@@ -77,7 +77,7 @@ def with_shared_errors(topomap: TopoMetricMap, guided: GuidedConfig, pose: Absol
 def measure_shared_errors(topomap: TopoMetricMap, guided: GuidedConfig, pose: AbsolutePoseConfig, config: SharedErrorsConfig) -> float:
     """rho of the map: see above."""
     poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
-    lambda_rot, d_thresh = (float(topomap.config["nodes"][name]) for name in ("lambda_rot", "d_thresh"))
+    lambda_rot, d_thresh = topomap.config.lambda_rot, topomap.config.d_thresh
     node_ids = np.unique(np.linspace(0, len(topomap.summaries) - 1, config.num_nodes).round().astype(int))
     for min_distance in config.min_distances:
         rhos = []
@@ -96,7 +96,7 @@ def measure_shared_errors(topomap: TopoMetricMap, guided: GuidedConfig, pose: Ab
 
 def _digest(topomap: TopoMetricMap, guided: GuidedConfig, pose: AbsolutePoseConfig, config: SharedErrorsConfig) -> str:
     """A short name for all that rho follows from: the settings, and the nodes by their poses and numbers of points."""
-    settings = {"guided": asdict(guided), "pose": asdict(pose), "config": asdict(config), "nodes": topomap.config["nodes"]}
+    settings = {"guided": asdict(guided), "pose": asdict(pose), "config": asdict(config), "nodes": asdict(topomap.config.nodes)}
     digest = hashlib.sha256(json.dumps([_METHOD, settings], sort_keys=True).encode())
     for summary in topomap.summaries:
         digest.update(summary.world_from_cam.matrix().astype("<f8").tobytes() + summary.num_points.to_bytes(4, "little"))

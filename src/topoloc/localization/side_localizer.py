@@ -11,15 +11,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from topoloc.errors import MapError
-from topoloc.features.extraction import FeatureConfig, extract_features
+from topoloc.features.extraction import extract_features
 from topoloc.features.matching import MatchingConfig, match_pooled
-from topoloc.features.side_views import SideViewConfig, side_views
+from topoloc.features.side_views import side_views
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
@@ -33,12 +32,11 @@ from topoloc.localization.side_verdict import SideVerdictConfig, side_log_odds
 from topoloc.localization.stages import StageClock
 from topoloc.localization.verification import Evidence, VerificationConfig, doubt_of, even_share_of, spread_of
 from topoloc.localization.viewing import viewing_distances
+from topoloc.map.memory import RememberedNodes
 from topoloc.map.nodes import NodePoses
-from topoloc.map.topomap import SideNodes, TopoMetricMap, TopoNode
+from topoloc.map.topomap import SideNodes, TopoMetricMap, TopoNode, in_rows
 from topoloc.places.coarse import NodeScore
 from topoloc.places.vlad import SurfVlad
-
-_NODES_IN_MEMORY = 512
 
 
 @dataclass(frozen=True)
@@ -81,12 +79,9 @@ class SideLocalizer:
         self.config, self._verification, self._sides, self._node_poses = config, verification, sides, node_poses
         self._coarse, self._centres = _ranking_of(sides)
         self._axes = np.array([summary.world_from_cam.rotation[:, 2] for summary in sides.summaries])
-        self._feature_config = FeatureConfig(**topomap.config["features"])
-        self._view_config = SideViewConfig(**topomap.config["sides"]["views"])
-        self._lambda_rot, self._d_thresh = (float(topomap.config["nodes"][name]) for name in ("lambda_rot", "d_thresh"))
-        ids = {(summary.recording, summary.name): summary.node_id for summary in topomap.summaries}
-        self._node_ids = [ids.get((summary.recording, summary.name), 0) for summary in sides.summaries]
-        self._local_map = lru_cache(maxsize=_NODES_IN_MEMORY)(self._read)
+        self._feature_config, self._view_config = topomap.config.features, topomap.config.sides.views
+        self._lambda_rot, self._d_thresh = topomap.config.lambda_rot, topomap.config.d_thresh
+        self._local_map = RememberedNodes(lambda row: _read(sides, row))
 
     def localize(
         self, grey: UInt8[np.ndarray, "h w"], camera: Camera, candidates: list[NodeScore], shared_errors: float, clock: StageClock
@@ -241,14 +236,16 @@ class SideLocalizer:
         way = float(np.linalg.norm(a_from_world.inverse().translation - b_from_world.inverse().translation))
         return way < 1.5 * self._d_thresh and apart.angle() < math.radians(20.0)
 
-    def _read(self, side_id: int) -> tuple[TopoNode, LocalMap]:
-        node = self._sides.nodes[side_id]
-        return node, of_picture(LocalMap.of_node(node), self._node_ids[side_id])
+
+def _read(sides: SideNodes, row: int) -> tuple[TopoNode, LocalMap]:
+    node = sides.nodes[row]
+    assert node.summary.of_node is not None, "a side node is one of a node"
+    return node, of_picture(LocalMap.of_node(node), node.summary.of_node)
 
 
 def _ranking_of(sides: SideNodes) -> tuple[SurfVlad, Float[np.ndarray, "nodes 3"]]:
     """What names the side nodes that look most like a view, and the middles (metres, world) of what they show."""
-    models = list(sides.coarse_models.values())
+    models = [in_rows(model, [summary.node_id for summary in sides.summaries]) for model in sides.coarse_models.values()]
     centres = models[0].arrays.get("centres") if len(models) == 1 else None
     if centres is None or centres.shape != (len(sides.summaries), 3):
         raise MapError("the map's side nodes come without what ranks them; build it again")
