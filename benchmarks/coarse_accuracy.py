@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from topoloc.evaluation.experiments import neighbours_of
-from topoloc.features.extraction import FeatureConfig, extract_features
+from topoloc.features.extraction import extract_features
 from topoloc.map.coarse_training import CoarseTrainingConfig, train_coarse
 from topoloc.map.nodes import NodePoses, node_distances
 from topoloc.map.topomap import TopoMetricMap
@@ -75,8 +75,8 @@ def trained(topomap: TopoMetricMap, method: str, weights: str | None) -> CoarseL
 def judge(topomap: TopoMetricMap, localizer: CoarseLocalizer, sequence: StereoSequence) -> dict[str, Any]:
     """Top-1 and neighbour accuracy, and D_total from the query to the node named (the median, in D_thresh)."""
     nodes = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
-    lambda_rot, d_thresh = (float(topomap.config["nodes"][key]) for key in ("lambda_rot", "d_thresh"))
-    features_config = FeatureConfig(**topomap.config["features"])
+    lambda_rot, d_thresh = topomap.config.lambda_rot, topomap.config.d_thresh
+    features_config = topomap.config.features
     hits, near, away = [], [], []
     for i, world_from_cam in enumerate(sequence.poses):
         assert world_from_cam is not None, "queries need their truth"

@@ -27,7 +27,7 @@ def main(map_file: Path | None, out: Path) -> None:
     covariances = np.concatenate([local_map.covariances for local_map in local_maps])
     sigmas_cm = 100.0 * np.sqrt(np.trace(covariances, axis1=1, axis2=2))
     print(f"{len(topomap.nodes)} nodes, {len(points)} points, {len(topomap.edges)} edges, {topomap.length_m:.1f} m")
-    print(f"D_thresh {topomap.config['nodes']['d_thresh']:.2f} m, lambda {topomap.config['nodes']['lambda_rot']:.2f} m/rad")
+    print(f"D_thresh {topomap.config.d_thresh:.2f} m, lambda {topomap.config.lambda_rot:.2f} m/rad")
     print("standard deviation of a point: " + ", ".join(f"{q} %: {np.percentile(sigmas_cm, q):.2f} cm" for q in (10, 50, 90)))
 
     fig, ax = plt.subplots(figsize=(9, 7), layout="constrained")

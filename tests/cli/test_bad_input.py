@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from topoloc.cli import main
-from topoloc.map.storage import SCHEMA_VERSION
+from topoloc.map.schema import SCHEMA_VERSION
 
 Complaint = Callable[..., str]
 

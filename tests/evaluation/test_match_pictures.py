@@ -11,7 +11,6 @@ from built_room import built_room, unseen_views
 from tiny_world import CAMERA
 from topoloc.evaluation.match_pictures import MAX_LINES, NodeMatches, decoded, draw_pair, jpeg_of, match_with_node
 from topoloc.evaluation.metrics import Answer
-from topoloc.features.extraction import FeatureConfig
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
@@ -36,7 +35,7 @@ def test_matches_of_a_localized_query_are_those_that_its_pose_explains(topomap: 
     picture, truth = unseen_views()[2]
     result = Localizer(topomap).localize(picture, CAMERA)
     assert isinstance(result, Localization)
-    config = FeatureConfig(**topomap.config["features"])
+    config = topomap.config.features
     matches = match_with_node(Answer("q", result, truth), picture, CAMERA, topomap.nodes[result.node_id], config)
     assert len(matches.agrees) > 60
     assert matches.agrees.all()
@@ -46,7 +45,7 @@ def test_matches_of_a_localized_query_are_those_that_its_pose_explains(topomap: 
 def test_without_a_pose_the_truth_tells_right_from_wrong(topomap: TopoMetricMap):
     picture, truth = unseen_views()[2]
     node = topomap.nodes[2]
-    config = FeatureConfig(**topomap.config["features"])
+    config = topomap.config.features
     known = match_with_node(Answer("q", NotLocalized("not_in_map"), truth), picture, CAMERA, node, config)
     off = _seen_in_node(topomap, 2, known, truth)
     assert known.agrees.any()
@@ -58,7 +57,7 @@ def test_without_a_pose_the_truth_tells_right_from_wrong(topomap: TopoMetricMap)
 
 def test_a_picture_without_features_has_no_matches(topomap: TopoMetricMap):
     black = np.zeros((240, 320), np.uint8)
-    config = FeatureConfig(**topomap.config["features"])
+    config = topomap.config.features
     matches = match_with_node(Answer("q", NotLocalized("too_few_matches"), None), black, CAMERA, topomap.nodes[0], config)
     assert len(matches.agrees) == 0
 

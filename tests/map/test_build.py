@@ -36,13 +36,13 @@ def depth_errors(node: TopoNode) -> np.ndarray:
 
 
 def test_nodes_follow_eq_1_and_every_image_belongs_to_the_nearest(tiny_map: TopoMetricMap):
-    config = tiny_map.config["nodes"]
+    config = tiny_map.config
     poses = NodePoses.of([summary.world_from_cam for summary in tiny_map.summaries])
     assert 2 <= len(tiny_map.nodes) <= len(tiny_map.place_images) == tiny_world.NUM_FRAMES // 2
     for image in tiny_map.place_images:
-        distances = node_distances(image.world_from_cam, poses, config["lambda_rot"])
+        distances = node_distances(image.world_from_cam, poses, config.lambda_rot)
         assert image.node_id == distances.argmin()
-        assert distances.min() <= config["d_thresh"]
+        assert distances.min() <= config.d_thresh
     assert [node.summary.node_id for node in tiny_map.nodes] == list(range(len(tiny_map.nodes)))
 
 

@@ -190,8 +190,8 @@ def share_of_near_candidates(map_part: str, query_part: str, config: BuildConfig
         assert pose is not None
         features = extract_features(grey_image(frame.image), FeatureConfig())
         candidates = [score.node_id for score in coarse.rank(frame.image, features, 5)]
-        distances = node_distances(pose, nodes, topomap.config["nodes"]["lambda_rot"])
-        near.append(distances[candidates].min() <= 2 * topomap.config["nodes"]["d_thresh"])
+        distances = node_distances(pose, nodes, topomap.config.lambda_rot)
+        near.append(distances[candidates].min() <= 2 * topomap.config.d_thresh)
     return float(np.mean(near))
 
 

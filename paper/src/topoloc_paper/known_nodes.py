@@ -17,7 +17,7 @@ class KnownNodes:
 
     def __init__(self, topomap: TopoMetricMap, world_from_cams: list[Rigid3]) -> None:
         self._nodes = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
-        self._lambda_rot = float(topomap.config["nodes"]["lambda_rot"])
+        self._lambda_rot = topomap.config.lambda_rot
         self._truths = iter(world_from_cams)
 
     def rank(self, image: Any, features: Any, num_candidates: int) -> list[NodeScore]:

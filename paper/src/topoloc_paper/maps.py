@@ -77,7 +77,7 @@ def built(bench: Bench, dataset: Dataset, kind: MapKind) -> Done:
         topomap.save(path)
         facts = {"num_nodes": len(topomap.summaries), "num_images": len(topomap.place_images), "length_m": topomap.length_m}
         place_bytes = sum(len(image.jpeg) for image in topomap.place_images)
-        nodes = topomap.config["nodes"]
+        nodes = asdict(topomap.config.nodes)
         facts["images_digest"] = images_digest(topomap)
         return facts | {"bytes": path.stat().st_size, "place_bytes": place_bytes, "nodes": nodes}
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 
-from topoloc.features.extraction import FeatureConfig, extract_features
+from topoloc.features.extraction import extract_features
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.coarse import open_coarse
 from topoloc.sequences.frame import Image, StereoFrame
@@ -21,7 +21,7 @@ class Retrieval:
     """The coarse localizer of a map, `surf-vlad`."""
 
     def __init__(self, topomap: TopoMetricMap) -> None:
-        self._features = FeatureConfig(**topomap.config["features"])
+        self._features = topomap.config.features
         self._world_from_nodes = [summary.world_from_cam for summary in topomap.summaries]
         model = topomap.coarse_models["surf-vlad"]
         self._coarse = open_coarse(model)

@@ -7,10 +7,10 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from topoloc.localization.evidence import Evidence
 
 from topoloc.evaluation.metrics import Answer
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.evidence import Evidence
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.places.coarse import NodeScore
 from topoloc.sequences.frame import StereoSequence

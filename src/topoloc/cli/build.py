@@ -70,9 +70,9 @@ class Command:
             raise UsageError(f"no features {config.features.kind}; there are {', '.join(KINDS)}")
         sequences, poses_from = self._open(recordings)
         with progress_bar() as progress:
-            if poses_from == "slam":
+            if poses_from[0] == "slam":
                 sequences = _with_slam(sequences, settings.of(SlamConfig), progress)
-            topomap = build_map(sequences, config, progress)
+            topomap = build_map(sequences, config, progress, poses_from)
             if self.coarse != "surf-vlad":
                 model = train_coarse(topomap, self.coarse, self.backbone, self.weights, settings.of(CoarseTrainingConfig), progress)
                 topomap = replace(topomap, coarse_models={**topomap.coarse_models, model.name: model}, default_coarse=model.name)
@@ -80,7 +80,7 @@ class Command:
         info = describe_map(topomap, target)
         if self.json != "-":
             size = f"{info['num_nodes']} nodes, {info['num_points']} points, {info['bytes'] / 1e6:.2f} MB"
-            print(f"{target}: {size}, {info['length_m']:.1f} m mapped, poses from {poses_from}")
+            print(f"{target}: {size}, {info['length_m']:.1f} m mapped, poses from {' and '.join(sorted(set(poses_from)))}")
         write_json(self.json, info)
         return 0
 
@@ -101,8 +101,8 @@ class Command:
         config = with_option(config, "nodes.lambda_rot", self.lambda_rot, "--lambda")
         return with_option(config, "features.kind", self.features, "--features")
 
-    def _open(self, recordings: list[str]) -> tuple[list[StereoSequence], str]:
-        """The recordings with their poses, and where these come from; with `slam` they are still to be found."""
+    def _open(self, recordings: list[str]) -> tuple[list[StereoSequence], list[str]]:
+        """The recordings with their poses, and where those of each come from; with `slam` they are still to be found."""
         sequences = [open_sequence(path, self.format) for path in recordings]
         trajectories = self.trajectory or ("truth" if all(any(sequence.poses) for sequence in sequences) else "slam",)
         if len(trajectories) == 1:
@@ -112,10 +112,10 @@ class Command:
         if "slam" in trajectories:
             if set(trajectories) != {"slam"}:
                 raise UsageError("--trajectory slam goes for all recordings or for none: its world is no other's")
-            return sequences, "slam"
+            return sequences, list(trajectories)
         pairs = zip(sequences, trajectories, strict=True)
         posed = [sequence if trajectory == "truth" else with_trajectory(sequence, Path(trajectory)) for sequence, trajectory in pairs]
-        return posed, " and ".join(sorted(set(trajectories)))
+        return posed, list(trajectories)
 
 
 def _with_slam(sequences: list[StereoSequence], config: SlamConfig, progress: Progress) -> list[StereoSequence]:

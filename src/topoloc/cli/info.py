@@ -59,7 +59,7 @@ def describe_map(topomap: Any, path: Path) -> dict[str, Any]:
         "coarse": sorted(topomap.coarse_models),
         "default_coarse": topomap.default_coarse,
         "coarse_models": list_coarse(path),
-        "config": dict(topomap.config),
+        "config": topomap.config.to_json(),
     }
 
 

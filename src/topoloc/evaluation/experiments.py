@@ -38,7 +38,7 @@ def answer_queries(
         CalibrationError: it holds no camera.
     """
     nodes = NodePoses.of([summary.world_from_cam for summary in localizer.topomap.summaries])
-    lambda_rot = float(localizer.topomap.config["nodes"]["lambda_rot"])
+    lambda_rot = localizer.topomap.config.lambda_rot
     frames = [i for i, pose in enumerate(sequence.poses) if pose is not None]
     if not frames:
         raise TrajectoryError(f"{sequence.name}: no frame has a known pose to judge against")
@@ -49,7 +49,8 @@ def answer_queries(
         assert frame.world_from_cam is not None
         world_from_cam = (map_from_truth or Rigid3.identity()) @ frame.world_from_cam
         distances = node_distances(world_from_cam, nodes, lambda_rot)
-        nearest, near = int(np.argmin(distances)), neighbours_of(localizer.topomap, distances)
+        nearest = localizer.topomap.summaries[int(np.argmin(distances))].node_id
+        near = neighbours_of(localizer.topomap, distances)
         result = _localize(localizer, frame)
         answers.append(Answer(frame.name, result, world_from_cam, nearest, label, _image_reader(sequence, i), frame.camera, near))
         if progress:
@@ -80,12 +81,12 @@ def answer_elsewhere(
 
 
 def neighbours_of(topomap: TopoMetricMap, distances: Float[np.ndarray, " nodes"]) -> frozenset[int]:
-    """The nodes next to the nearest one along the route, and those within 1.5 D_thresh, given D_total to each node (metres, Eq. 1)."""
-    nearest = int(np.argmin(distances))
+    """Ids of the nodes next to the nearest one along the route, and within 1.5 D_thresh, given D_total to each (metres, Eq. 1)."""
+    nearest = topomap.summaries[int(np.argmin(distances))].node_id
     along = {edge.target_id for edge in topomap.edges if edge.source_id == nearest}
     along |= {edge.source_id for edge in topomap.edges if edge.target_id == nearest}
-    d_thresh = float(topomap.config["nodes"]["d_thresh"])
-    return frozenset(along | {int(node) for node in np.flatnonzero(distances <= NEIGHBOUR_SHARE * d_thresh)})
+    rows = np.flatnonzero(distances <= NEIGHBOUR_SHARE * topomap.config.d_thresh)
+    return frozenset(along | {topomap.summaries[int(row)].node_id for row in rows})
 
 
 def _localize(localizer: Localizer, frame: StereoFrame) -> Localization | NotLocalized:

@@ -82,7 +82,7 @@ def _draw_nodes(axes: Axes, topomap: TopoMetricMap, axes_idx: list[int], span: f
     centres = np.array([p.translation[axes_idx] for p in poses])
     looks = centres + 0.022 * span * np.array([p.rotation[axes_idx, 2] for p in poses])
     many = len(poses) > MAX_MARKS
-    edges = [(centres[edge.source_id], centres[edge.target_id]) for edge in topomap.edges]
+    edges = [(centres[topomap.row_of(edge.source_id)], centres[topomap.row_of(edge.target_id)]) for edge in topomap.edges]
     axes.add_collection(LineCollection(edges, colors=NODE, linewidths=0.7, alpha=0.6, rasterized=many))
     axes.add_collection(LineCollection(list(np.stack([centres, looks], axis=1)), colors=NODE, linewidths=1.0, rasterized=many))
     axes.plot(*centres.T, "o", color=NODE, markersize=5, rasterized=many)

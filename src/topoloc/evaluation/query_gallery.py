@@ -12,7 +12,6 @@ from topoloc.errors import UnreadableImageError
 from topoloc.evaluation.match_pictures import NodeMatches, decoded, draw_pair, jpeg_of, match_with_node
 from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION, Answer, by_recording
 from topoloc.evaluation.units import length_text
-from topoloc.features.extraction import FeatureConfig
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.map.topomap import TopoMetricMap, TopoNode
 from topoloc.sequences.frame import Image
@@ -58,7 +57,7 @@ def _badness(answer: Answer) -> tuple[int, float]:
 def _article(answer: Answer, topomap: TopoMetricMap) -> str:
     result = answer.result
     node_id = _node_to_show(answer)
-    node = None if node_id is None else topomap.nodes[node_id]
+    node = None if node_id is None else topomap.nodes[topomap.row_of(node_id)]
     evidence = f"{result.num_inliers} inliers of {result.num_matches} matches"
     if isinstance(result, Localization):
         sigma = float(np.sqrt(max(np.trace(result.camera_covariance[:3, :3]), 0.0)))
@@ -108,7 +107,7 @@ def _matches(answer: Answer, image: Image, node: TopoNode, topomap: TopoMetricMa
     """Matches to draw; None where the node has no points or the camera is not known."""
     if answer.camera is None or node.summary.num_points == 0:
         return None
-    return match_with_node(answer, image, answer.camera, node, FeatureConfig(**topomap.config["features"]))
+    return match_with_node(answer, image, answer.camera, node, topomap.config.features)
 
 
 def _query_image(answer: Answer) -> Image | None:

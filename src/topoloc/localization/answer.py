@@ -39,7 +39,7 @@ def _localization(search: Search, best: Hypothesis, probability: float) -> Local
         covariance=covariance_of_inverse(best.fit.pose.cam_from_world, best.covariance),
         probability=probability,
         node_id=best.fit.node_id,
-        candidates=search.candidates,
+        candidates=search.named,
         num_matches=len(best.fit.matches),
         num_inliers=best.fit.num_inliers,
         times_ms=search.query.clock.times_ms(),
@@ -70,7 +70,7 @@ def _refusal(search: Search, ranked: list[Hypothesis]) -> NotLocalized:
         first = search.first
         num_matches, num_inliers = (len(first.matches), first.num_inliers) if first is not None else (0, 0)
         reason: Reason = "too_few_matches" if num_matches < search.config.min_matches else "too_few_inliers"
-        return NotLocalized(reason, search.candidates, num_matches, num_inliers, search.query.clock.times_ms(), _late(search))
+        return NotLocalized(reason, search.named, num_matches, num_inliers, search.query.clock.times_ms(), _late(search))
     best = ranked[0]
     if is_only_imprecise(best.evidence, search.weights, search.config.evidence):
         metres = float(np.sqrt(np.linalg.eigvalsh(best.covariance[:3, :3])[-1]))
@@ -80,7 +80,7 @@ def _refusal(search: Search, ranked: list[Hypothesis]) -> NotLocalized:
 
 def _refused(search: Search, reason: Reason, best: Hypothesis, detail: str, alternatives: tuple[Alternative, ...] = ()) -> NotLocalized:
     times_ms, detail = search.query.clock.times_ms(), "; ".join(text for text in (detail, _late(search)) if text)
-    return NotLocalized(reason, search.candidates, len(best.fit.matches), best.fit.num_inliers, times_ms, detail, alternatives)
+    return NotLocalized(reason, search.named, len(best.fit.matches), best.fit.num_inliers, times_ms, detail, alternatives)
 
 
 def _late(search: Search) -> str:

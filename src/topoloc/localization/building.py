@@ -17,8 +17,12 @@ def build_map(
     sequences: StereoSequence | Sequence[StereoSequence],
     config: build.BuildConfig | None = None,
     progress: build.Progress | None = None,
+    poses_from: Sequence[str] | None = None,
 ) -> TopoMetricMap:
     """Build a topo-metric map from one or several recordings of one place whose poses share one world.
+
+    Args:
+        poses_from: where the poses of each recording come from (`truth`, `slam`, a file), for the map to remember.
 
     Raises:
         ConfigError: a value of `config` is out of its bounds.
@@ -29,5 +33,5 @@ def build_map(
     """
     config = config or build.BuildConfig()
     kind = find_kind(config.features.kind)
-    topomap, asked = build.build_map(sequences, config, progress), LocalizerConfig().for_kind(kind)
+    topomap, asked = build.build_map(sequences, config, progress, poses_from), LocalizerConfig().for_kind(kind)
     return with_correlated_errors(topomap, asked.guided, asked.pose, asked.correlated_errors, weights_of(kind.name).shared_errors)

@@ -83,7 +83,7 @@ def measure_correlated_errors(
 ) -> float:
     """rho of the map: see above."""
     poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
-    lambda_rot, d_thresh = (float(topomap.config["nodes"][name]) for name in ("lambda_rot", "d_thresh"))
+    lambda_rot, d_thresh = topomap.config.lambda_rot, topomap.config.d_thresh
     node_ids = np.unique(np.linspace(0, len(topomap.summaries) - 1, config.num_nodes).round().astype(int))
     for min_distance in config.min_distances:
         rhos = []
@@ -108,7 +108,7 @@ def _digest(
         "guided": asdict(guided),
         "pose": asdict(pose),
         "config": asdict(config) | asdict(weights),
-        "nodes": topomap.config["nodes"],
+        "nodes": asdict(topomap.config.nodes),
     }
     digest = hashlib.sha256(json.dumps([_METHOD, settings], sort_keys=True).encode())
     for summary in topomap.summaries:

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from topoloc.errors import EmptyMapError
-from topoloc.features.kinds import FeatureConfig, find_kind
+from topoloc.features.kinds import find_kind
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.guided import expected_key_points
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.viewing import viewing_distances
 from topoloc.localization.wall_index import WallIndex
+from topoloc.map.memory import RememberedNodes
 from topoloc.map.nodes import NodePoses
 from topoloc.map.topomap import TopoMetricMap, open_coarse_of
-from topoloc.places.coarse import CoarseLocalizer
-
-NODES_IN_MEMORY = 256
+from topoloc.places.coarse import CoarseLocalizer, NodeScore
 
 
 class OpenMap:
@@ -40,17 +39,18 @@ class OpenMap:
         self.topomap = topomap
         by_name = open_coarse_of(topomap, coarse or topomap.default_coarse) if coarse is None or isinstance(coarse, str) else None
         self.coarse: CoarseLocalizer = coarse if by_name is None else by_name  # pyright: ignore[reportAttributeAccessIssue]
-        self.feature_config = FeatureConfig(**topomap.config["features"])
+        self.feature_config = topomap.config.features
         self.kind = find_kind(self.feature_config.kind)
         self.node_poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
-        self.lambda_rot, self.d_thresh = (float(topomap.config["nodes"][name]) for name in ("lambda_rot", "d_thresh"))
-        self.expected_at_node = lru_cache(maxsize=NODES_IN_MEMORY)(self._expected_at_node)
-        self._local_map = lru_cache(maxsize=NODES_IN_MEMORY)(lambda row: LocalMap.of_node(topomap.nodes[row]))
+        self.lambda_rot, self.d_thresh = topomap.config.lambda_rot, topomap.config.d_thresh
+        self._local_map = RememberedNodes(lambda row: LocalMap.of_node(topomap.nodes[row]))
+        self._expected: tuple[Camera, RememberedNodes[Float32[np.ndarray, "n 5"]]] | None = None
 
     @cached_property
     def focal(self) -> float:
         """Focal length (pixels) of the finest camera that mapped; each recording is taken to have one camera."""
-        first_rows = {summary.recording: row for row, summary in reversed(list(enumerate(self.topomap.summaries)))}
+        summaries = self.topomap.summaries
+        first_rows = {summaries[row].session_id: row for row in reversed(range(len(summaries)))}
         return max(self.topomap.nodes[row].camera.fx for row in first_rows.values())
 
     @cached_property
@@ -59,11 +59,9 @@ class OpenMap:
         sides = self.topomap.sides
         return WallIndex(self.topomap, sides) if sides is not None and self.kind.has_scale and self.kind.has_angle else None
 
-    def row_of(self, node_id: int) -> int:
-        return node_id
-
-    def id_of(self, row: int) -> int:
-        return self.topomap.summaries[row].node_id
+    def with_ids(self, candidates: list[NodeScore]) -> list[NodeScore]:
+        """Candidates as they are reported: until then a candidate's `node_id` is the row of its node."""
+        return [NodeScore(self.topomap.summaries[candidate.node_id].node_id, candidate.score) for candidate in candidates]
 
     def cam_from_world(self, row: int) -> Rigid3:
         """Of a node's camera."""
@@ -73,9 +71,13 @@ class OpenMap:
         """The points of these nodes together."""
         return LocalMap.pooled([self._local_map(int(row)) for row in rows])
 
-    def _expected_at_node(self, row: int, camera: Camera) -> Float32[np.ndarray, "n 5"]:
+    def expected_at_node(self, row: int, camera: Camera) -> Float32[np.ndarray, "n 5"]:
         """What `expected_key_points` says of a node's points for a camera that stands where the node does."""
-        return expected_key_points(self._local_map(row), self.cam_from_world(row), camera)
+        kept = self._expected
+        if kept is None or kept[0] != camera:  # queries mostly come from one camera
+            read = RememberedNodes(lambda row: expected_key_points(self._local_map(row), self.cam_from_world(row), camera))
+            self._expected = kept = (camera, read)
+        return kept[1](row)
 
     def distances(self, world_from_cam: Rigid3) -> Float[np.ndarray, " nodes"]:
         """D_total of Eq. 1 (metres) between a camera and each node, whichever side of the camera is up."""

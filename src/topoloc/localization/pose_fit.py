@@ -38,7 +38,8 @@ class PoseFit:
         """The node that most inliers come from; -1 without any."""
         if self.num_inliers == 0 or self.pose is None:
             return -1
-        return int(np.bincount(self.local_map.node_ids[self.matches.train_idx[self.pose.inliers]]).argmax())
+        node_ids, counts = np.unique(self.local_map.node_ids[self.matches.train_idx[self.pose.inliers]], return_counts=True)
+        return int(node_ids[counts.argmax()])
 
     def seen_points(self, scale: float) -> SeenPoints | None:
         """The inliers in a picture that is `scale` times as wide as that of the features; None without a pose."""

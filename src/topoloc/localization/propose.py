@@ -55,13 +55,13 @@ def _near(search: Search, world_from_cam: Rigid3) -> list[NodeScore]:
     """As many nodes as the coarse step would name; nearer ones (Eq. 1) score higher."""
     distances = search.map.distances(world_from_cam)
     rows = np.argsort(distances, kind="stable")[: search.config.num_candidates]
-    search.ranked = [NodeScore(search.map.id_of(int(row)), -float(distances[row])) for row in rows]
+    search.ranked = [NodeScore(int(row), -float(distances[row])) for row in rows]
     return search.ranked
 
 
 def _pooled(search: Search, source: Source, candidates: list[NodeScore]) -> Proposal:
     """The candidates' points together. The strongest features are nearly always enough, or give nothing at all; else all are tried."""
-    config, rows = search.config, [search.map.row_of(candidate.node_id) for candidate in candidates]
+    config, rows = search.config, [candidate.node_id for candidate in candidates]
     proposal = _matched(search, source, rows, config.num_first_features)
     is_open = config.num_chance_inliers <= proposal.fit.num_inliers < config.num_clear_inliers
     if is_open and len(search.query.features) > config.num_first_features:
@@ -87,8 +87,8 @@ def _look_alikes(search: Search) -> Iterator[Proposal]:
     if not search.ranked or config.max_groups == 0:
         return
     least = config.min_score_share[0 if search.is_clear else 1] * search.ranked[0].score
-    left = [search.map.row_of(candidate.node_id) for candidate in search.ranked if candidate.score >= least]
-    asked = {search.map.row_of(candidate.node_id) for candidate in search.candidates}
+    left = [candidate.node_id for candidate in search.ranked if candidate.score >= least]
+    asked = {candidate.node_id for candidate in search.candidates}
     reach = config.reach * search.map.d_thresh
     if best is not None and best.probability >= search.config.evidence.min_probability:
         far = search.map.distances(best.world_from_cam) > reach
@@ -109,7 +109,7 @@ def _viewpoints(search: Search) -> Iterator[Proposal]:
     found = []
     with query.clock.stage("matching"):
         for candidate in search.ranked[: config.num_nodes]:
-            row = search.map.row_of(candidate.node_id)
+            row = candidate.node_id
             local_map, expected = search.map.local_map([row]), search.map.expected_at_node(row, query.camera)
             matches = match_expected(query.features, local_map, expected, query.camera, config.matching)
             num_alike = largest_shift(query.features, matches, expected, query.camera, config.shift_px)

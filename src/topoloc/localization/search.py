@@ -31,7 +31,7 @@ class Proposal:
 
 @dataclass(eq=False)
 class Search:
-    """`rho` are the map's correlated errors, `ranked` is what the coarse localizer names, the best first."""
+    """`rho` are the map's correlated errors, `ranked` is what the coarse localizer names, the best first, by rows."""
 
     query: Query
     map: OpenMap
@@ -48,7 +48,13 @@ class Search:
 
     @property
     def candidates(self) -> list[NodeScore]:
+        """The nodes that were asked together, by their rows."""
         return self.ranked[: self.config.num_candidates]
+
+    @property
+    def named(self) -> list[NodeScore]:
+        """The same by their ids, as they are reported."""
+        return self.map.with_ids(self.candidates)
 
     @property
     def best(self) -> Hypothesis | None:

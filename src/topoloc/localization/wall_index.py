@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 from jaxtyping import Float
 
 from topoloc.errors import MapError
-from topoloc.features.side_views import SideViewConfig
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.wall_matching import of_picture
-from topoloc.map.topomap import SideNodes, TopoMetricMap, TopoNode
+from topoloc.map.memory import RememberedNodes
+from topoloc.map.topomap import SideNodes, TopoMetricMap, TopoNode, in_rows
 from topoloc.places.vlad import SurfVlad
-
-_NODES_IN_MEMORY = 512
 
 
 class WallIndex:
@@ -27,20 +23,19 @@ class WallIndex:
     def __init__(self, topomap: TopoMetricMap, sides: SideNodes) -> None:
         self.coarse, self.centres = _ranking_of(sides)
         self.axes = np.array([summary.world_from_cam.rotation[:, 2] for summary in sides.summaries])
-        self.view_config = SideViewConfig(**topomap.config["sides"]["views"])
-        self._sides = sides
-        ids = {(summary.recording, summary.name): summary.node_id for summary in topomap.summaries}
-        self._node_ids = [ids.get((summary.recording, summary.name), 0) for summary in sides.summaries]
-        self.local_map = lru_cache(maxsize=_NODES_IN_MEMORY)(self._read)
+        self.view_config = topomap.config.sides.views
+        self.local_map = RememberedNodes(lambda row: _read(sides, row))
 
-    def _read(self, row: int) -> tuple[TopoNode, LocalMap]:
-        node = self._sides.nodes[row]
-        return node, of_picture(LocalMap.of_node(node), self._node_ids[row])
+
+def _read(sides: SideNodes, row: int) -> tuple[TopoNode, LocalMap]:
+    node = sides.nodes[row]
+    assert node.summary.of_node is not None, "a side node is one of a node"
+    return node, of_picture(LocalMap.of_node(node), node.summary.of_node)
 
 
 def _ranking_of(sides: SideNodes) -> tuple[SurfVlad, Float[np.ndarray, "nodes 3"]]:
     """What names the side nodes that look most like a view, and the middles (metres, world) of what they show."""
-    models = list(sides.coarse_models.values())
+    models = [in_rows(model, [summary.node_id for summary in sides.summaries]) for model in sides.coarse_models.values()]
     centres = models[0].arrays.get("centres") if len(models) == 1 else None
     if centres is None or centres.shape != (len(sides.summaries), 3):
         raise MapError("the map's side nodes come without what ranks them; build it again")

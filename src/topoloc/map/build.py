@@ -7,51 +7,37 @@ with their 3-D positions. All mapping images, labelled with their node, teach th
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Annotated
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
-from topoloc.bounds import Between, check_bounds
+from topoloc.bounds import check_bounds
 from topoloc.errors import EmptyMapError, TrajectoryError
-from topoloc.features.extraction import FeatureConfig, extract_features
+from topoloc.features.extraction import extract_features
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.map.landmarks import LandmarkConfig, Observations, observe_points, refine_points
+from topoloc.map.config import MapConfig
+from topoloc.map.entries import Edge, NodeSummary, PlaceImage, TopoNode
+from topoloc.map.landmarks import Observations, observe_points, refine_points, session_sums
 from topoloc.map.nodes import NodeConfig, NodePoses, node_distances, place_nodes
-from topoloc.map.side_nodes import SideNodesConfig, describe_sides, gather_sides, nodes_with_sides
-from topoloc.map.topomap import Edge, NodeSummary, PlaceImage, TopoMetricMap, TopoNode
+from topoloc.map.schema import SCHEMA_VERSION
+from topoloc.map.sessions import Edit, Light, Session, light_of, mean_light, path_of, today
+from topoloc.map.side_nodes import describe_sides, gather_sides, nodes_with_sides
+from topoloc.map.topomap import TopoMetricMap
 from topoloc.map.views import MappingView, mapping_view
-from topoloc.places.vlad import SurfVlad, VladConfig, learn_words, placed, vlad
+from topoloc.places.vlad import SurfVlad, learn_words, placed, vlad
 from topoloc.sequences.frame import Image, StereoSequence
-from topoloc.slam.metric_points import MetricPointsConfig, keypoint_sigmas, locate_points
+from topoloc.slam.metric_points import keypoint_sigmas, locate_points
 
 Progress = Callable[[str, int, int], None]
 """Called with a stage's name, steps done and steps in all."""
 
 
-@dataclass(frozen=True)
-class BuildConfig:
-    """All that decides what a map looks like; stored in the map."""
-
-    nodes: NodeConfig = field(default_factory=NodeConfig)
-    features: FeatureConfig = field(default_factory=FeatureConfig)
-    points: MetricPointsConfig = field(default_factory=MetricPointsConfig)
-    landmarks: LandmarkConfig = field(default_factory=LandmarkConfig)
-    vlad: VladConfig = field(default_factory=VladConfig)
-    sides: SideNodesConfig = field(default_factory=SideNodesConfig)
-    max_node_points: Annotated[int, Between(1, 100_000)] = 800
-    """Features that a node keeps, the strongest ones."""
-    min_node_points: Annotated[int, Between(1, 100_000)] = 20
-    """A picture with fewer located features becomes no node."""
-    template_side_px: Annotated[int, Between(16, 4096)] = 240
-    """Shorter side of the template picture that a node keeps, at most."""
-    place_side_px: Annotated[int, Between(16, 4096)] = 160
-    """Shorter side of the other mapping images, at most: what the coarse localizers of section III-B are trained with."""
+BuildConfig = MapConfig
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +45,7 @@ class _MappingFrame:
     """A frame with a pose, not yet read."""
 
     sequence: StereoSequence
+    session_id: int
     index: int
     name: str
     t_ns: int
@@ -76,6 +63,7 @@ class _MappingImage:
     world_from_cam: Rigid3
     features: Features
     place_jpeg: bytes
+    light: Light
 
 
 @dataclass(eq=False)
@@ -97,9 +85,15 @@ class _NodeDraft:
 
 
 def build_map(
-    sequences: StereoSequence | Sequence[StereoSequence], config: BuildConfig | None = None, progress: Progress | None = None
+    sequences: StereoSequence | Sequence[StereoSequence],
+    config: BuildConfig | None = None,
+    progress: Progress | None = None,
+    poses_from: Sequence[str] | None = None,
 ) -> TopoMetricMap:
     """Build a topo-metric map from one or several recordings of one place whose poses share one world.
+
+    Args:
+        poses_from: where the poses of each recording come from (`truth`, `slam`, a file), for the map to remember.
 
     Raises:
         ConfigError: a value of `config` is out of its bounds.
@@ -112,26 +106,46 @@ def build_map(
     progress = progress or (lambda stage, done, total: None)
     if isinstance(sequences, StereoSequence):
         sequences = [sequences]
-    frames = [frame for sequence in sequences for frame in _posed_frames(sequence)]
+    frames = [frame for session_id, sequence in enumerate(sequences) for frame in _posed_frames(sequence, session_id)]
     node_config = _resolve_node_config(frames, config)
     drafts = _draft_nodes(frames, node_config, config, progress)
-    place_images, coarse = _visit_all_images(frames, drafts, node_config, config, progress)
+    place_images, lights, coarse = _visit_all_images(frames, drafts, node_config, config, progress)
     nodes = [_finish_node(node_id, draft, config) for node_id, draft in enumerate(drafts)]
+    sides = [replace(side, summary=replace(side.summary, of_node=node_id)) for node_id, draft in enumerate(drafts) for side in draft.sides]
+    poses_from = poses_from or ["given"] * len(sequences)
     return TopoMetricMap(
         summaries=[node.summary for node in nodes],
         nodes=nodes,
         edges=_edges_along(frames, [image.node_id for image in place_images]),
         place_images=place_images,
         coarse_models={SurfVlad.name: coarse.to_model()},
-        config=asdict(config) | {"nodes": asdict(node_config)},
+        config=replace(config, nodes=node_config),
         length_m=_trajectory_length(frames),
-        sides=gather_sides([side for draft in drafts for side in draft.sides], config.sides),
+        sides=gather_sides(sides, config.sides),
+        sessions=[_session(k, sequence, frames, lights, poses_from[k], drafts) for k, sequence in enumerate(sequences)],
+        edits=[Edit(1, "build", today(), SCHEMA_VERSION)],
     )
 
 
-def _posed_frames(sequence: StereoSequence) -> list[_MappingFrame]:
+def _session(
+    session_id: int,
+    sequence: StereoSequence,
+    frames: list[_MappingFrame],
+    lights: list[Light],
+    poses_from: str,
+    drafts: list[_NodeDraft],
+) -> Session:
+    """What the map remembers of a recording; `lights` are those of the frames."""
+    of_session = [k for k, frame in enumerate(frames) if frame.session_id == session_id]
+    t_ns = [frames[k].t_ns for k in of_session]
+    camera = next((draft.image.camera for draft in drafts if draft.frame.session_id == session_id), None)
+    light = mean_light([lights[k] for k in of_session])
+    return Session(session_id, sequence.name, path_of(sequence), poses_from, min(t_ns), max(t_ns), camera, light)
+
+
+def _posed_frames(sequence: StereoSequence, session_id: int) -> list[_MappingFrame]:
     described = enumerate(zip(sequence.names, sequence.t_ns, sequence.poses, strict=True))
-    frames = [_MappingFrame(sequence, i, name, t_ns, pose) for i, (name, t_ns, pose) in described if pose is not None]
+    frames = [_MappingFrame(sequence, session_id, i, name, t_ns, pose) for i, (name, t_ns, pose) in described if pose is not None]
     if not frames:
         raise TrajectoryError(f"{sequence.name}: no frame has a pose; give a trajectory (TUM or KITTI rows) of this recording")
     return frames
@@ -174,50 +188,53 @@ def _draft_node(frame: _MappingFrame, with_sides: bool, config: BuildConfig) -> 
     located = locate_points(image.features, view, config.points)
     rows = np.flatnonzero(located.valid)
     template_jpeg = _encode_jpeg(view.picture, config.template_side_px, quality=75)
-    summary = NodeSummary(-1, frame.sequence.name, frame.name, frame.t_ns, image.world_from_cam, len(rows))
+    summary = NodeSummary(-1, frame.sequence.name, frame.name, frame.t_ns, image.world_from_cam, len(rows), frame.session_id)
     sides = describe_sides(summary, view, config.features, config.points, config.sides) if with_sides else []
     return _NodeDraft(frame, image, template_jpeg, rows, located.points_cam[rows], located.covariances[rows], [], sides)
 
 
 def _mapping_image(view: MappingView, config: BuildConfig) -> _MappingImage:
     jpeg = _encode_jpeg(view.picture, config.place_side_px, quality=60)
-    return _MappingImage(view.camera, view.world_from_cam, extract_features(view.grey, config.features), jpeg)
+    return _MappingImage(view.camera, view.world_from_cam, extract_features(view.grey, config.features), jpeg, light_of(view.picture))
 
 
 def _visit_all_images(
     frames: list[_MappingFrame], drafts: list[_NodeDraft], node_config: NodeConfig, config: BuildConfig, progress: Progress
-) -> tuple[list[PlaceImage], SurfVlad]:
+) -> tuple[list[PlaceImage], list[Light], SurfVlad]:
     """Label every mapping image with its nearest node, let it observe the points of the nodes around, and teach the
-    coarse localizer with it."""
+    coarse localizer with it; its light is measured on the way."""
     assert node_config.lambda_rot is not None
     words = learn_words(np.concatenate([_placed(draft.features, draft.image, config) for draft in drafts]), config.vlad)
     node_poses = NodePoses.of([draft.image.world_from_cam for draft in drafts])
     drafted = {draft.frame: draft.image for draft in drafts}  # read already
     images: list[PlaceImage] = []
-    vlads = []
+    vlads, lights = [], []
     for done, frame in enumerate(frames):
         image = drafted.get(frame) or _mapping_image(frame.view(with_depth=False), config)
         nearest = np.argsort(node_distances(image.world_from_cam, node_poses, node_config.lambda_rot), kind="stable")
         for node_id in nearest[: config.landmarks.nodes_per_image]:
             if drafts[node_id].frame is not frame:
-                _observe(drafts[node_id], image, config)
+                _observe(drafts[node_id], image, frame.session_id, config)
         vlads.append(vlad(_placed(image.features, image, config), words))
-        images.append(PlaceImage(frame.sequence.name, frame.name, int(nearest[0]), image.world_from_cam, image.place_jpeg))
+        node_id, number = int(nearest[0]), done + 1
+        images.append(
+            PlaceImage(frame.sequence.name, frame.name, node_id, image.world_from_cam, image.place_jpeg, frame.session_id, number)
+        )
+        lights.append(image.light)
         progress("images", done + 1, len(frames))
     node_ids = np.array([image.node_id for image in images])
-    return images, SurfVlad.fit(words, np.stack(vlads), node_ids, config.vlad)
+    return images, lights, SurfVlad.fit(words, np.stack(vlads), node_ids, config.vlad)
 
 
 def _placed(features: Features, image: _MappingImage, config: BuildConfig) -> np.ndarray:
     return placed(features, image.camera.width, image.camera.height, config.vlad)
 
 
-def _observe(draft: _NodeDraft, image: _MappingImage, config: BuildConfig) -> None:
+def _observe(draft: _NodeDraft, image: _MappingImage, session_id: int, config: BuildConfig) -> None:
     cam_from_node = image.world_from_cam.inverse() @ draft.image.world_from_cam
     sigmas_px = keypoint_sigmas(image.features, config.points)
-    seen = observe_points(
-        draft.features, draft.points_cam, draft.covariances, image.features, sigmas_px, image.camera, cam_from_node, config.landmarks
-    )
+    known = (draft.features, draft.points_cam, draft.covariances)
+    seen = observe_points(*known, image.features, sigmas_px, image.camera, cam_from_node, config.landmarks, session_id)
     draft.observations.append(seen)
 
 
@@ -228,13 +245,15 @@ def _finish_node(node_id: int, draft: _NodeDraft, config: BuildConfig) -> TopoNo
     rows = np.sort(rows[np.argsort(-np.minimum(refined.num_observations[rows], 2), kind="stable")][: config.max_node_points])
     sqrt_covs = np.linalg.cholesky(refined.covariances[rows])[:, *np.tril_indices(3)]
     frame, image = draft.frame, draft.image
+    sums = session_sums(refined.points_cam, draft.points_cam, draft.covariances, draft.observations, rows, frame.session_id)
     return TopoNode(
-        NodeSummary(node_id, frame.sequence.name, frame.name, frame.t_ns, image.world_from_cam, len(rows)),
+        NodeSummary(node_id, frame.sequence.name, frame.name, frame.t_ns, image.world_from_cam, len(rows), frame.session_id),
         image.camera,
         draft.features.select(rows),
         refined.points_cam[rows].astype(np.float32),
         sqrt_covs.astype(np.float32),
         draft.template_jpeg,
+        sums,
     )
 
 

@@ -1,17 +1,18 @@
-"""The coarse localizers in a map file: listed without reading them, added or replaced without touching the rest."""
+"""The coarse localizers in a map file: listed without reading them, added or replaced."""
 
 from __future__ import annotations
 
-import json
-import shutil
-import sqlite3
-from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from topoloc.errors import MapError
-from topoloc.map.storage import check_header, insert_model, replaced_file
+from topoloc.map.file import MapFile
+from topoloc.map.schema import SCHEMA_VERSION
+from topoloc.map.sessions import Edit, today
+from topoloc.map.topomap import TopoMetricMap
+from topoloc.map.validation import Damage
 from topoloc.places.coarse import CoarseModel
+from topoloc.places.stored_settings import json_of
 
 
 def store_coarse(path: Path, target: Path, model: CoarseModel, make_default: bool) -> None:
@@ -23,30 +24,27 @@ def store_coarse(path: Path, target: Path, model: CoarseModel, make_default: boo
     Raises:
         MapError: `path` is no map, or `target` cannot be written.
     """
-    check_header(path)
-    if target.is_dir():
-        raise MapError(f"cannot write map {target}: it is a folder")
-    with replaced_file(target) as temporary:
-        shutil.copyfile(path, temporary)
-        with closing(sqlite3.connect(temporary)) as database:
-            insert_model(database, model)
-            if make_default:
-                database.execute("INSERT OR REPLACE INTO map VALUES ('default_coarse', ?)", (json.dumps(model.name),))
-            database.commit()
-            database.execute("VACUUM")  # else the bytes of what was replaced stay in the file
+    with TopoMetricMap.load(path) as topomap:
+        models = {name: topomap.coarse_models[name] for name in topomap.coarse_models} | {model.name: model}
+        number = max([topomap.next_ids.edit, *(edit.edit_id + 1 for edit in topomap.edits)])
+        edits = [*topomap.edits, Edit(number, f"train {model.name}", today(), SCHEMA_VERSION)]
+        default = model.name if make_default else topomap.default_coarse
+        replace(topomap, coarse_models=models, edits=edits, default_coarse=default).save(target)
 
 
 def list_coarse(path: Path) -> list[dict[str, Any]]:
     """Name, bytes, backbone and weights of each coarse localizer of a map file. Raises MapError."""
-    check_header(path)
-    query = "SELECT name, settings, length(arrays) FROM coarse_models ORDER BY name"
+    file = MapFile(path)
     try:
-        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)) as database:
-            return [_facts(name, json.loads(settings), num_bytes) for name, settings, num_bytes in database.execute(query)]
-    except (sqlite3.Error, ValueError, AttributeError) as error:
-        raise MapError(f"map {path} is damaged: {' '.join(str(error).split())}") from error
+        with file.reading() as database:
+            query = "SELECT name, settings, length(arrays) FROM coarse_models ORDER BY name LIMIT 1000"
+            return [_facts(name, json_of(settings), num_bytes) for name, settings, num_bytes in database.execute(query)]
+    finally:
+        file.close()
 
 
-def _facts(name: str, settings: dict[str, Any], num_bytes: int) -> dict[str, Any]:
+def _facts(name: str, settings: Any, num_bytes: int) -> dict[str, Any]:
+    if not isinstance(settings, dict):
+        raise Damage(f"the settings of coarse localizer {name} are none")
     facts = {"name": name, "bytes": num_bytes}
     return facts | {key: settings[key] for key in ("backbone", "weights", "trained") if key in settings}

@@ -10,7 +10,7 @@ import numpy as np
 from topoloc.bounds import check_bounds
 from topoloc.errors import EmptyMapError, TrainingError
 from topoloc.map.nodes import NodePoses, node_distances
-from topoloc.map.topomap import TopoMetricMap
+from topoloc.map.topomap import TopoMetricMap, in_ids
 from topoloc.places.classifier_config import BackboneName, CnnFcConfig, CnnNnConfig, VladNnConfig
 from topoloc.places.coarse import CoarseModel, module_of
 from topoloc.places.training_set import Progress, TrainingSet
@@ -57,7 +57,8 @@ def train_coarse(
     of_name = {"cnn-fc": config.cnn_fc, "cnn-nn": config.cnn_nn, "vlad-nn": config.vlad_nn}[name]
     found = find_weights(backbone, weights)
     arguments = (training_set_of(topomap), backbone, found, of_name, progress or (lambda stage, done, total: None))
-    return module.train(*arguments, checkpoint) if name == "cnn-fc" else module.train(*arguments)
+    model = module.train(*arguments, checkpoint) if name == "cnn-fc" else module.train(*arguments)
+    return in_ids(model, [summary.node_id for summary in topomap.summaries])
 
 
 def training_set_of(topomap: TopoMetricMap) -> TrainingSet:
@@ -66,11 +67,11 @@ def training_set_of(topomap: TopoMetricMap) -> TrainingSet:
     if not images or len(topomap.summaries) == 0:
         raise EmptyMapError("the map holds no mapping images to learn from")
     nodes = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
-    lambda_rot, d_thresh = (float(topomap.config["nodes"][key]) for key in ("lambda_rot", "d_thresh"))
+    lambda_rot, d_thresh = topomap.config.lambda_rot, topomap.config.d_thresh
     return TrainingSet(
         jpegs=[image.jpeg for image in images],
         world_from_cams=[image.world_from_cam for image in images],
-        node_ids=np.array([image.node_id for image in images], np.int64),
+        node_ids=np.array([topomap.row_of(image.node_id) for image in images], np.int64),
         node_distances=np.stack([node_distances(image.world_from_cam, nodes, lambda_rot) for image in images]),
         d_thresh=d_thresh,
         lambda_rot=lambda_rot,

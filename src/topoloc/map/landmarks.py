@@ -2,7 +2,8 @@
 
 One stereo pair or depth image measures a point once, over a short baseline. The mapping images near the node see it from
 elsewhere, at poses that are known; triangulating from all of them, with the first measurement as the prior, shrinks the
-long axis of its uncertainty, and shows up points that are not where they seemed (mismatched, or moving).
+long axis of its uncertainty, and shows up points that are not where they seemed (mismatched, or moving). What each session
+contributed to that is kept as sums (`sums.py`).
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from topoloc.features.features import Features
 from topoloc.features.matching import MatchingConfig, match_features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.map.sums import LandmarkSums
 
 _CAUCHY_SCALE = 2.385  # of a residual in standard deviations
 
@@ -43,13 +45,16 @@ class LandmarkConfig:
 class Observations:
     """One mapping image's view of a node's points: point `rows[k]` is seen at `normalized[k]` (plane z = 1).
 
-    `sigmas` are standard deviations on that plane, `cam_from_node` the transform into the image's camera.
+    `sigmas` are standard deviations on that plane, `cam_from_node` the transform into the image's camera. `in_view` are the points that
+    lie in the image's view, seen or not; the image is one of the session `session_id`.
     """
 
     rows: Int[np.ndarray, " m"]
     normalized: Float[np.ndarray, "m 2"]
     sigmas: Float[np.ndarray, " m"]
     cam_from_node: Rigid3
+    in_view: Int[np.ndarray, " v"] = field(default_factory=lambda: np.zeros(0, np.int64))
+    session_id: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +76,7 @@ def observe_points(
     camera: Camera,
     cam_from_node: Rigid3,
     config: LandmarkConfig,
+    session_id: int = 0,
 ) -> Observations:
     """Find a node's points among the features of another mapping image: by descriptor, then by where they must be."""
     matches = match_features(node_features.descriptors, features.descriptors, config.matching)
@@ -81,7 +87,8 @@ def observe_points(
     expected = jacobians @ covariances[rows] @ jacobians.transpose(0, 2, 1) + sigmas[:, None, None] ** 2 * np.eye(2)
     squares = np.einsum("mi,mij,mj->m", residuals, np.linalg.inv(expected), residuals)
     seen = in_front & (squares < config.gate**2)
-    return Observations(rows[seen], normalized[seen], sigmas[seen], cam_from_node)
+    in_view = _in_view(points_cam, camera, cam_from_node)
+    return Observations(rows[seen], normalized[seen], sigmas[seen], cam_from_node, in_view, session_id)
 
 
 def refine_points(
@@ -105,6 +112,42 @@ def refine_points(
     rms = np.sqrt(squares / np.maximum(2 * num_observations, 1))
     agrees = (rms < config.max_disagreement) & np.isfinite(points).all(axis=1) & (points[:, 2] > 0)
     return RefinedPoints(points, np.linalg.inv(information), num_observations, agrees)
+
+
+def session_sums(
+    refined: Float[np.ndarray, "n 3"],
+    points_cam: Float[np.ndarray, "n 3"],
+    covariances: Float[np.ndarray, "n 3 3"],
+    observations: list[Observations],
+    kept: Int[np.ndarray, " k"],
+    own_session: int,
+) -> list[LandmarkSums]:
+    """What each session contributed to the `refined` positions of the points `kept`, whose rows are counted anew.
+
+    Args:
+        points_cam, covariances: the first measurement, which belongs to the session `own_session`; its image saw every point.
+    """
+    prior, sums = np.linalg.inv(covariances), []
+    for session_id in sorted({own_session, *(seen.session_id for seen in observations)}):
+        is_own, of_session = session_id == own_session, [seen for seen in observations if seen.session_id == session_id]
+        information, pulls, _ = _normal_equations(refined, points_cam, prior if is_own else np.zeros_like(prior), of_session)
+        expected, num_seen = (np.full(len(refined), int(is_own)) for _ in range(2))
+        for seen in of_session:
+            expected[np.union1d(seen.in_view, seen.rows)] += 1
+            num_seen[seen.rows] += 1
+        rows = np.flatnonzero(expected[kept] > 0)
+        known = kept[rows]
+        if len(rows):
+            sums.append(LandmarkSums.of(session_id, rows, information[known], pulls[known], expected[known], num_seen[known]))
+    return sums
+
+
+def _in_view(points_node: Float[np.ndarray, "n 3"], camera: Camera, cam_from_node: Rigid3) -> Int[np.ndarray, " v"]:
+    """The points that lie in the camera's picture, whatever may stand before them."""
+    with np.errstate(invalid="ignore"):
+        pixels = camera.img_from_cam(cam_from_node.apply(points_node))
+        inside = (pixels >= -0.5).all(axis=1) & (pixels[:, 0] < camera.width - 0.5) & (pixels[:, 1] < camera.height - 0.5)
+    return np.flatnonzero(inside)
 
 
 def _normal_equations(

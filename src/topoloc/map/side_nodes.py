@@ -18,8 +18,8 @@ from topoloc.bounds import AtLeast, Between
 from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.side_views import SideView, SideViewConfig, side_views
 from topoloc.geometry.rigid import Rigid3
+from topoloc.map.entries import NodeSummary, SideNodes, TopoNode
 from topoloc.map.nodes import NodeConfig, place_nodes
-from topoloc.map.topomap import NodeSummary, SideNodes, TopoNode
 from topoloc.map.views import MappingView
 from topoloc.places.vlad import SurfVlad, VladConfig, learn_words, placed, vlad
 from topoloc.slam.metric_points import MetricPointsConfig, locate_points
@@ -69,7 +69,7 @@ def describe_sides(
 
 
 def gather_sides(described: list[TopoNode], config: SideNodesConfig) -> SideNodes | None:
-    """All side nodes of a map, numbered, with what ranks them by looks; None without any."""
+    """All side nodes of a map, numbered, with what ranks them by looks; None without any. Each knows the node that it is of."""
     if not described:
         return None
     nodes = [replace(node, summary=replace(node.summary, node_id=k)) for k, node in enumerate(described)]

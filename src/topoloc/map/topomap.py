@@ -1,110 +1,67 @@
 """The topo-metric map of the paper (section III-A): nodes with features and their 3-D positions, edges, place images.
 
-Data only: `build.py` makes it, `storage.py` writes and `stored_map.py` reads it, `localization` asks it.
+Data only: `build.py` makes it, `writing.py` writes and `reading.py` reads it, `localization` asks it.
+
+Everything in a map has an id that never changes and is never used again. Whoever computes works on rows, which the open map derives: row
+i is `summaries[i]` and `nodes[i]`, and `row_of` leads there from an id.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, no_type_check
 
 import numpy as np
-from jaxtyping import Float32
 
 from topoloc.errors import MapError
-from topoloc.features.features import Features
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.rigid import Rigid3
+from topoloc.map.config import MapConfig
+from topoloc.map.entries import Edge, NodeSummary, PlaceImage, SharedErrors, SideNodes, TopoNode
+from topoloc.map.file import MapFile
+from topoloc.map.sessions import Edit, Session
 from topoloc.places.coarse import CoarseLocalizer, CoarseModel, open_coarse
 
-
-@dataclass(frozen=True, eq=False)
-class NodeSummary:
-    """What is known of a node without reading its points: where it stands and where it comes from."""
-
-    node_id: int
-    recording: str
-    name: str
-    t_ns: int
-    world_from_cam: Rigid3
-    num_points: int
-
-
-@dataclass(frozen=True, eq=False)
-class TopoNode:
-    """One topological node: "a single template node image, its global SE(3) pose and a point cloud
-    comprising of 2D SURF features and their 3D positions".
-
-    `features.points_img` are pixels of `camera` (of a stereo pair: the rectified left one); row k of `points_cam` (metres,
-    the node's camera frame) is the position of feature k, with covariance ``L @ L.T`` for the lower triangular L in row k
-    of `point_sqrt_covs` (xx, yx, yy, zx, zy, zz; metres). `template_jpeg` is the node's picture, encoded, possibly smaller than `camera`.
-    """
-
-    summary: NodeSummary
-    camera: Camera
-    features: Features
-    points_cam: Float32[np.ndarray, "n 3"]
-    point_sqrt_covs: Float32[np.ndarray, "n 6"]
-    template_jpeg: bytes
-
-
-@dataclass(frozen=True, eq=False)
-class PlaceImage:
-    """A mapping image labelled with the node it belongs to (nearest by Eq. 1): what the coarse localizers learn from.
-
-    The picture is small and encoded (`jpeg`).
-    """
-
-    recording: str
-    name: str
-    node_id: int
-    world_from_cam: Rigid3
-    jpeg: bytes
-
-
-@dataclass(frozen=True, eq=False)
-class SideNodes:
-    """Nodes seen once more by cameras turned to the left and to the right (`side_nodes.py`).
-
-    `summaries[i]` and `nodes[i]` describe side node i: recording, name and time are those of the node whose picture it comes
-    from, the pose is that of the side camera, and there is no template. The one model of `coarse_models` ranks side nodes by
-    looks; its array `centres` (n, 3) holds the world points (metres) in the middle of what each of them shows.
-    """
-
-    summaries: Sequence[NodeSummary]
-    nodes: Sequence[TopoNode]
-    coarse_models: Mapping[str, CoarseModel]
+__all__ = [
+    "Edge",
+    "Edit",
+    "NodeSummary",
+    "PlaceImage",
+    "Session",
+    "SharedErrors",
+    "SideNodes",
+    "TopoMetricMap",
+    "TopoNode",
+    "open_coarse_of",
+]
 
 
 @dataclass(frozen=True)
-class Edge:
-    """The robot went from node `source_id` to node `target_id`."""
+class NextIds:
+    """The ids that new entries of a map get: more than any that was ever used in it."""
 
-    source_id: int
-    target_id: int
-
-
-@dataclass(frozen=True)
-class SharedErrors:
-    """rho, the share of a match's variance that the map's points have in common, as `localization/shared_errors.py` measured it.
-
-    `digest` stands for the nodes and the settings that it was measured of and with: of others it says nothing.
-    """
-
-    rho: float
-    digest: str
+    session: int = 0
+    node: int = 0
+    place_image: int = 1
+    side_node: int = 0
+    edit: int = 1
 
 
+@no_type_check  # at run time: it would read from the file to look at entries' types
 @dataclass(frozen=True, eq=False)
 class TopoMetricMap:
     """The map. In a map that was loaded, every sequence and mapping reads the file only when an entry is asked for.
 
-    `summaries[i]` describes `nodes[i]`, and ``nodes[i].summary.node_id == i``. `config` is the effective configuration it
+    `summaries[i]` describes `nodes[i]`; their ids are in increasing order. `config` is the effective configuration it
     was built with, `length_m` the metres of trajectory that were mapped. `default_coarse` names the coarse localizer that answers
     where the user names none. `shared_errors` is None where nobody has measured them,
-    `sides` where no mapping picture is wide enough to show the walls along the way.
+    `sides` where no mapping picture is wide enough to show the walls along the way. `edits` begins with the build.
+    `other_kinds` are the same nodes with points of further kinds of features, by the kind's name.
+
+    A map that was loaded holds its file open; ``with TopoMetricMap.load(path) as topomap`` or `close` let go of it. It is pickled as
+    its path, and several threads may read it.
     """
 
     summaries: Sequence[NodeSummary]
@@ -112,29 +69,104 @@ class TopoMetricMap:
     edges: Sequence[Edge]
     place_images: Sequence[PlaceImage]
     coarse_models: Mapping[str, CoarseModel]
-    config: Mapping[str, Any] = field(default_factory=dict)
+    config: MapConfig = field(default_factory=MapConfig)
     length_m: float = 0.0
     default_coarse: str = "surf-vlad"
     shared_errors: SharedErrors | None = None
     sides: SideNodes | None = None
+    sessions: Sequence[Session] = ()
+    edits: Sequence[Edit] = ()
+    next_ids: NextIds = NextIds()
+    other_kinds: Mapping[str, Sequence[TopoNode]] = field(default_factory=dict)
+
+    def row_of(self, node_id: int) -> int:
+        """The row of a node. Raises KeyError where the map has no node of this id."""
+        return self._rows[node_id]
+
+    @property
+    def kind(self) -> str:
+        """The kind of features that the nodes' points are described with, and queries must be."""
+        return self.config.features.kind
+
+    @cached_property
+    def _rows(self) -> dict[int, int]:
+        return {summary.node_id: row for row, summary in enumerate(self.summaries)}
 
     def save(self, path: str | Path) -> None:
         """Write the map file at once or not at all. Raises MapError."""
-        from topoloc.map.storage import save_map
+        from topoloc.map.writing import save_map
 
         save_map(self, Path(path))
 
     @staticmethod
     def load(path: str | Path) -> TopoMetricMap:
         """Open a map file; nodes are read when asked for. Raises MapError, MapVersionError."""
-        from topoloc.map.stored_map import open_map
+        from topoloc.map.reading import open_map
 
         return open_map(Path(path))
 
+    def close(self) -> None:
+        """Let go of the file, where the map was loaded; what is asked of it afterwards is a MapError."""
+        if self._file is not None:
+            self._file.close()
+
+    def __enter__(self) -> TopoMetricMap:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    @property
+    def _file(self) -> MapFile | None:
+        """Where the map comes from as it is; a changed one (`dataclasses.replace`) is no longer that of the file."""
+        return self.__dict__.get("_opened")
+
+    def __reduce__(self) -> Any:
+        if self._file is None:
+            return super().__reduce__()
+        return _load_same, (str(self._file.path.absolute()), self._file.digest)
+
+
+def _load_same(path: str, digest: str) -> TopoMetricMap:
+    """The map that was pickled. Raises MapError where another one is in its place by now."""
+    from topoloc.map.reading import open_map
+
+    return open_map(Path(path), digest)
+
 
 def open_coarse_of(topomap: TopoMetricMap, name: str) -> CoarseLocalizer:
-    """A map's coarse localizer. Raises MapError where the map has none of this name."""
+    """A map's coarse localizer, which names nodes by their rows. Raises MapError where the map has none of this name, or it is damaged."""
     if name not in topomap.coarse_models:
         available = ", ".join(topomap.coarse_models) or "none"
         raise MapError(f"the map has no coarse localizer {name!r} (it has: {available})")
-    return open_coarse(topomap.coarse_models[name])
+    return open_coarse(in_rows(topomap.coarse_models[name], [summary.node_id for summary in topomap.summaries]))
+
+
+def in_rows(model: CoarseModel, ids: Sequence[int]) -> CoarseModel:
+    """A stored model, which names nodes by their `ids`, as one that names them by their rows; what it knows of others is left out."""
+    known = model.arrays.get("node_ids", _outputs_of(model))
+    if known is None or known.ndim != 1 or known.dtype.kind not in "iu":
+        return model  # it says itself what is wrong with it
+    if list(ids) == list(range(len(ids))) and (len(known) == 0 or 0 <= known.min() <= known.max() < len(ids)):
+        return model
+    rows = {node_id: row for row, node_id in enumerate(ids)}
+    of_known = np.array([rows.get(int(node_id), -1) for node_id in known], np.int64)
+    if "vectors" not in model.arrays:  # one output a node
+        return replace(model, arrays={**model.arrays, "node_ids": of_known})
+    kept = of_known >= 0
+    per_vector = {name: model.arrays[name][kept] for name in ("vectors", "centres") if len(model.arrays.get(name, ())) == len(kept)}
+    return replace(model, arrays={**model.arrays, **per_vector, "node_ids": of_known[kept]})
+
+
+def in_ids(model: CoarseModel, ids: Sequence[int]) -> CoarseModel:
+    """The inverse of `in_rows`: a model that was made of the map's rows, as the map keeps it."""
+    if list(ids) == list(range(len(ids))):
+        return model
+    rows = model.arrays.get("node_ids", np.arange(len(ids)))
+    return replace(model, arrays={**model.arrays, "node_ids": np.asarray(ids, np.int64)[rows]})
+
+
+def _outputs_of(model: CoarseModel) -> np.ndarray | None:
+    """Of a model with an output for each node there was when it was made, in the order of their ids."""
+    num_nodes = model.settings.get("num_nodes")
+    return np.arange(num_nodes) if isinstance(num_nodes, int) and 0 <= num_nodes <= 1_000_000 else None

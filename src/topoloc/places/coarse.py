@@ -26,7 +26,10 @@ Image = UInt8[np.ndarray, "h w"] | UInt8[np.ndarray, "h w 3"]
 
 @dataclass(frozen=True)
 class NodeScore:
-    """A candidate node; a higher score is a better one, comparable within one localizer only."""
+    """A candidate node; a higher score is a better one, comparable within one localizer only.
+
+    `node_id` is the node's id in what is reported, and its row in the open map while a query is answered (`CoarseLocalizer.rank`).
+    """
 
     node_id: int
     score: float
@@ -46,7 +49,8 @@ class CoarseLocalizer(Protocol):
     """Names the nodes that an image may belong to."""
 
     def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
-        """Up to `num_candidates` distinct nodes, best first. `features` are those of `image` that the fine step uses too."""
+        """Up to `num_candidates` distinct nodes by their rows in the map, best first. `features` are those of `image` that the fine
+        step uses too."""
         ...
 
 

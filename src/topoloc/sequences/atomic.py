@@ -1,11 +1,25 @@
-"""Files written at once or not at all: a reader sees the old file or the new one, and a failure leaves nothing behind."""
+"""Files written at once or not at all: a reader sees the old file or the new one, and a failure leaves nothing behind.
+
+What is written goes to a file beside the target, of a name that nobody else has, and is renamed over it when it is whole and on the disk.
+Its writer holds a lock on it (`flock`), which ends with the process however that ends: a temporary file whose lock can be had belongs to
+nobody, and the next writer of the same target removes it. Several writers, also of other containers, do not meet; the last one wins whole.
+"""
 
 from __future__ import annotations
 
 import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from hashlib import blake2b
 from pathlib import Path
 
 from topoloc.errors import TopolocError
+
+try:
+    import fcntl
+except ImportError:  # Windows: leftovers stay there
+    fcntl = None
 
 
 def write_text(path: Path, text: str) -> None:
@@ -14,12 +28,102 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write beside the file first, then rename over it. Raises TopolocError where the file cannot be written."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    """Write the whole file. Raises TopolocError where it cannot be written."""
     try:
-        part.write_bytes(data)
-        os.replace(part, path)
+        with replaced_file(path) as temporary:
+            temporary.write_bytes(data)
     except OSError as error:
         raise TopolocError(f"cannot write {path}: {error.strerror}") from error
+
+
+@contextmanager
+def replaced_file(path: Path) -> Iterator[Path]:
+    """An empty file beside `path` to write to; it is renamed over `path` when all went well, and removed when not.
+
+    Raises:
+        OSError: the folder or the file cannot be written.
+    """
+    remove_leftovers(path)
+    temporary, lock = _own_file(path)
+    try:
+        yield temporary
+        _sync(temporary)
+        os.replace(temporary, path)
+        _sync(path.parent)
     finally:
-        part.unlink(missing_ok=True)
+        with suppress(OSError):  # renamed already, or the folder is gone: the error that led here says more
+            temporary.unlink()
+        os.close(lock)
+
+
+def remove_leftovers(path: Path) -> None:
+    """Remove what writers of `path` left beside it that were killed; what a living process writes stays."""
+    prefix = _prefix(path)
+    try:
+        names = [entry.name for entry in os.scandir(path.parent) if entry.name.startswith(prefix)]
+    except OSError:  # no such folder: whoever writes there will say so
+        return
+    parts = {name for name in names if name.endswith(".part")}
+    for name in parts:
+        _remove_unowned(path.parent / name)
+    for name in names:  # of SQLite, beside a temporary file that is gone
+        owner = name.removesuffix("-journal")
+        if owner != name and owner.endswith(".part") and not (path.parent / owner).exists():
+            with suppress(OSError):
+                (path.parent / name).unlink()
+
+
+def _prefix(path: Path) -> str:
+    """What the names of all temporary files of `path` begin with; short enough for any file system."""
+    name = path.name if len(os.fsencode(path.name)) <= 200 else blake2b(os.fsencode(path.name), digest_size=16).hexdigest()
+    return f".{name}."
+
+
+def _own_file(path: Path) -> tuple[Path, int]:
+    """A new empty file beside `path`, and its descriptor, which holds its lock."""
+    while True:
+        temporary = path.with_name(f"{_prefix(path)}{secrets.token_hex(8)}.part")
+        descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+        # between these two lines another writer may have taken it for a leftover
+        if _lock(descriptor) is not False and os.fstat(descriptor).st_nlink > 0:
+            return temporary, descriptor
+        os.close(descriptor)
+        with suppress(OSError):
+            temporary.unlink()
+
+
+def _remove_unowned(temporary: Path) -> None:
+    try:
+        descriptor = os.open(temporary, os.O_RDWR)
+    except OSError:  # removed by another writer, or not ours to remove
+        return
+    try:
+        if _lock(descriptor):
+            with suppress(OSError):
+                temporary.unlink()
+    finally:
+        os.close(descriptor)
+
+
+def _lock(descriptor: int) -> bool | None:
+    """Take the lock of an open file; False where another has it, None where there are no locks."""
+    if fcntl is None:
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        return None
+    return True
+
+
+def _sync(path: Path) -> None:
+    """Hold until a file, or the names in a folder, are on the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError:  # file systems that cannot; the rename is atomic there, too
+        pass
+    finally:
+        os.close(descriptor)

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from topoloc.localization.verification import Evidence, log_odds_of
 
 from topoloc.localization.fitted_weights import EvidenceWeights, RivalWeights, SharedErrorWeights, read_weights
-from topoloc.localization.verification import Evidence, log_odds_of
 from topoloc_paper.fit import __main__ as command
 from topoloc_paper.fit.evidence import Judged, calibration_error, decided, fit_evidence, fit_shared_errors, judged, try_on_other_families
 from topoloc_paper.fit.rivals import MIN_HARD_PAIRS, fit_rivals, num_mistaken, pairs_of

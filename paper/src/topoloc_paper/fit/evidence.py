@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import minimize
+from topoloc.localization.verification import log_odds_of, score_features
 
 from topoloc.localization.fitted_weights import EvidenceWeights, SharedErrorWeights
-from topoloc.localization.verification import log_odds_of, score_features
 from topoloc_paper.fit.corpus import family_of
 from topoloc_paper.fit.tried_poses import TriedPose
 

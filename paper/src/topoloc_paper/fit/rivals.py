@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import minimize
+from topoloc.localization.verification import log_odds_of, score_features
 
 from topoloc.localization.fitted_weights import EvidenceWeights, RivalWeights
-from topoloc.localization.verification import log_odds_of, score_features
 from topoloc_paper.fit.tried_poses import TriedPose
 
 MIN_HARD_PAIRS = 80

@@ -11,15 +11,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from topoloc.localization.attempt import Attempt, Judgement, judge
+from topoloc.localization.verification import Evidence, VerificationConfig, tolerated_translation
 
 from topoloc.features.kinds import FeatureConfig
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.attempt import Attempt, Judgement, judge
 from topoloc.localization.building import build_map
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.stages import StageClock
-from topoloc.localization.verification import Evidence, VerificationConfig, tolerated_translation
 from topoloc.map.build import BuildConfig
 from topoloc.map.side_nodes import SideNodesConfig
 from topoloc.map.topomap import TopoMetricMap

@@ -1,0 +1,334 @@
+"""A map from its file: its nodes, images and coarse localizers are read one by one, when they are asked for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from topoloc.errors import MapError
+from topoloc.features.features import Features
+from topoloc.geometry.camera import Camera
+from topoloc.map.config import MapConfig, config_from_text, descriptor_size_of, resolved_config
+from topoloc.map.entries import Edge, NodeSummary, PlaceImage, SharedErrors, SideNodes, TopoNode
+from topoloc.map.file import MapFile
+from topoloc.map.schema import SIDE
+from topoloc.map.sessions import Edit, Light, Session
+from topoloc.map.sums import LandmarkSums
+from topoloc.map.topomap import NextIds, TopoMetricMap
+from topoloc.map.validation import MAX_POINTS, Damage, array_from, arrays_from, camera_from, count_within, pose_from, unpacked
+from topoloc.places.coarse import CoarseModel
+from topoloc.places.stored_settings import json_of, settings_from, value_from
+
+T = TypeVar("T")
+MAX_ID = 2**53
+
+
+def open_map(path: Path, digest: str | None = None) -> TopoMetricMap:
+    """Open a map file without reading its nodes.
+
+    Args:
+        digest: of the map that is expected; another one is an error.
+
+    Raises:
+        MapError: missing, no topoloc map, truncated, damaged, or not the one expected.
+        MapVersionError: written with another schema.
+    """
+    file = MapFile(path)
+    try:
+        if digest is not None and file.digest != digest:
+            raise MapError(f"map {path} is not the one that was pickled: it was replaced since")
+        with file.reading():
+            topomap = _map_of(file)
+    except BaseException:
+        file.close()
+        raise
+    topomap.__dict__["_opened"] = file  # no field: a changed copy is not that of the file
+    return topomap
+
+
+def _map_of(file: MapFile) -> TopoMetricMap:
+    facts = file.facts
+    missing = [key for key in ("config", "length_m") if key not in facts]
+    if missing:
+        raise Damage(f"key {missing[0]!r} of table map is missing")
+    config = config_from_text(facts["config"]) if file.version > 1 else _config_of_schema_1(facts["config"])
+    kinds = _kinds_of(facts, config)
+    sides = None
+    if file.count(f"{SIDE}nodes") > 0:
+        sides = SideNodes(_StoredSummaries(file, SIDE), StoredNodes(file, config.features.kind, SIDE), _StoredModels(file, SIDE))
+    return TopoMetricMap(
+        summaries=_StoredSummaries(file),
+        nodes=StoredNodes(file, config.features.kind),
+        edges=[Edge(row["source_id"], row["target_id"]) for row in file.rows("edges")],
+        place_images=_StoredImages(file),
+        coarse_models=_StoredModels(file),
+        config=config,
+        length_m=value_from(float, json_of(facts["length_m"]), "length_m"),
+        default_coarse=value_from(str, json_of(facts.get("default_coarse", '"surf-vlad"')), "default_coarse"),
+        shared_errors=_shared_errors_of(facts.get("shared_errors")),
+        sides=sides,
+        sessions=list(_sessions_of(file).values()),
+        edits=[Edit(*row.values()) for row in file.rows("edits")],
+        next_ids=settings_from(NextIds, json_of(facts.get("next_ids", "{}")), "next_ids"),
+        other_kinds={kind: StoredNodes(file, kind, is_default=False) for kind in kinds if kind != config.features.kind},
+    )
+
+
+def _config_of_schema_1(text: str) -> MapConfig:
+    return resolved_config(json_of(text))
+
+
+def _kinds_of(facts: Mapping[str, str], config: MapConfig) -> list[str]:
+    """The kinds of features that the map holds, the one that answers first."""
+    kinds = json_of(facts["kinds"]) if "kinds" in facts else [config.features.kind]
+    if not isinstance(kinds, list) or not all(isinstance(kind, str) for kind in kinds) or len(kinds) > 8 or len(set(kinds)) < len(kinds):
+        raise Damage("kinds: a list of names is expected")
+    if kinds[:1] != [config.features.kind]:
+        raise Damage(f"kinds: {kinds} do not begin with that of the configuration")
+    for kind in kinds:
+        descriptor_size_of(kind)
+    return kinds
+
+
+def _shared_errors_of(text: str | None) -> SharedErrors | None:
+    if text is None:
+        return None
+    found = settings_from(SharedErrors, json_of(text), "shared_errors")
+    if not 0.0 <= found.rho < math.inf:
+        raise Damage("shared errors that are no share")
+    return found
+
+
+def _sessions_of(file: MapFile) -> dict[int, Session]:
+    def read() -> dict[int, Session]:
+        return {row["session_id"]: _session(row) for row in file.rows("sessions")}
+
+    return file.kept("sessions", read)
+
+
+def _session(row: Mapping[str, Any]) -> Session:
+    facts = json_of(row["json"])
+    if not isinstance(facts, dict):
+        raise Damage("a session that says nothing of itself")
+    camera, light = facts.pop("camera", None), facts.pop("light", None)
+    known = settings_from(Session, facts | {"session_id": row["session_id"], "name": row["name"]}, "session")
+    return Session(
+        known.session_id,
+        known.name,
+        known.recording,
+        known.poses_from,
+        known.start_ns,
+        known.end_ns,
+        None if camera is None else Camera.from_json(camera),
+        None if light is None else settings_from(Light, light, "session.light"),
+    )
+
+
+class _Stored(Sequence[T]):
+    """Rows of the map, numbered from 0, each read when asked for."""
+
+    def __init__(self, file: MapFile, prefix: str = "") -> None:
+        self._file, self._prefix = file, prefix
+
+    def _read(self, row: int) -> T:
+        raise NotImplementedError
+
+    def __getitem__(self, index):  # type: ignore[override]
+        if isinstance(index, slice):
+            return [self._read(i) for i in range(*index.indices(len(self)))]
+        position = index + len(self) if index < 0 else index
+        if not 0 <= position < len(self):
+            raise IndexError(index)
+        return self._read(int(position))
+
+
+class _StoredSummaries(_Stored[NodeSummary]):
+    """The summaries of all nodes, read together at the first question: a few dozen bytes a node."""
+
+    def __len__(self) -> int:
+        return len(_summaries(self._file, self._prefix))
+
+    def _read(self, row: int) -> NodeSummary:
+        return _summaries(self._file, self._prefix)[row]
+
+
+def _summaries(file: MapFile, prefix: str) -> list[NodeSummary]:
+    def read() -> list[NodeSummary]:
+        with file.reading():
+            rows = file.rows(f"{prefix}nodes")
+            of_id = {summary.node_id: summary for summary in _summaries(file, "")} if prefix else {}
+            return [_summary(row, file, of_id if prefix else None) for row in rows]
+
+    return file.kept(f"{prefix}summaries", read)
+
+
+def _summary(row: Mapping[str, Any], file: MapFile, nodes: Mapping[int, NodeSummary] | None) -> NodeSummary:
+    """A node's, or, with `nodes`, a side node's, which is of the session of its node."""
+    node_id = count_within(row["node_id"], 0, MAX_ID, "a node's id")
+    num_points = count_within(row["num_points"], 0, MAX_POINTS, f"the number of points of node {node_id}")
+    if nodes is not None and row["of_node"] not in nodes:
+        raise Damage(f"side node {node_id} is of node {row['of_node']}, which is missing")
+    session_id = row["session_id"] if nodes is None else nodes[row["of_node"]].session_id
+    if session_id not in _sessions_of(file):
+        raise Damage(f"session {session_id} is missing")
+    recording, pose = _sessions_of(file)[session_id].name, pose_from(row["world_from_cam"])
+    return NodeSummary(node_id, recording, row["name"], row["t_ns"], pose, num_points, session_id, row.get("of_node"))
+
+
+class StoredNodes(_Stored[TopoNode]):
+    """Nodes with their points of one kind."""
+
+    def __init__(self, file: MapFile, kind: str, prefix: str = "", is_default: bool = True) -> None:
+        super().__init__(file, prefix)
+        self._kind, self._is_default = kind, is_default
+
+    def __len__(self) -> int:
+        return self._file.count(f"{self._prefix}nodes")
+
+    def _read(self, row: int) -> TopoNode:
+        node = read_node(self._file, row, self._kind, self._prefix)
+        if self._is_default and node.summary.num_points != len(node.features):
+            raise MapError(f"map {self._file.path} is damaged: node {node.summary.node_id} has {len(node.features)} points")
+        return node
+
+
+def read_node(file: MapFile, row: int, kind: str, prefix: str = "") -> TopoNode:
+    """The node of a row with its points of a kind; with the prefix `SIDE` a side node, which has no template. Raises MapError."""
+    with file.reading():
+        summary = _summaries(file, prefix)[row]
+        node_id, what = summary.node_id, f"{prefix}node {summary.node_id}"
+        points = _found(file.row(f"{prefix}node_points", node_id=node_id, kind=kind), f"the points of {what}")
+        template = b"" if prefix else _found(file.row("node_templates", node_id=node_id), f"the template of {what}")["jpeg"]
+        n, size = count_within(points["num_points"], 0, MAX_POINTS, f"the points of {what}"), descriptor_size_of(kind)
+        if points["descriptor_size"] != size:
+            raise Damage(f"the points of {what} are not described as {kind} is")
+        stored = array_from(points["descriptors"], "i1", (n, size), what)
+        sizes, angles, responses = np.ascontiguousarray(array_from(points["shapes"], "<f4", (n, 3), what).T)
+        points_img = array_from(points["points_img"], "<f4", (n, 2), what)
+        return TopoNode(
+            summary,
+            _camera_of(file, prefix, node_id),
+            Features(points_img, sizes, angles, responses, unit_descriptors(stored)),
+            array_from(points["points_cam"], "<f4", (n, 3), what),
+            array_from(points["sqrt_covs"], "<f2", (n, 6), what).astype(np.float32),
+            template,
+            () if prefix else _StoredSums(file, node_id, kind, n),
+            stored,
+        )
+
+
+def unit_descriptors(stored: np.ndarray) -> np.ndarray:
+    """Descriptors (n, d) of length 1 from the file's signed bytes."""
+    descriptors = stored.astype(np.float32)
+    descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-6)
+    return descriptors
+
+
+def _camera_of(file: MapFile, prefix: str, node_id: int) -> Camera:
+    def read_ids() -> dict[int, int]:
+        return {row["node_id"]: row["camera_id"] for row in file.rows(f"{prefix}nodes", ("node_id", "camera_id"))}
+
+    camera_id = file.kept(f"{prefix}camera_ids", read_ids)[node_id]
+
+    def read() -> Camera:
+        return camera_from(_found(file.row("cameras", camera_id=camera_id), f"camera {camera_id}")["json"])
+
+    return file.kept(f"camera {camera_id}", read)
+
+
+class _StoredSums(Sequence[LandmarkSums]):
+    """What each session knows of a node's points; no answer needs it, so it is read when asked for."""
+
+    def __init__(self, file: MapFile, node_id: int, kind: str, num_points: int) -> None:
+        self._file, self._node_id, self._kind, self._num_points = file, node_id, kind, num_points
+
+    def _sessions(self) -> list[int]:
+        with self._file.reading() as database:
+            query = "SELECT session_id FROM landmark_sums WHERE node_id = ? AND kind = ? ORDER BY session_id LIMIT 100000"
+            return [value_from(int, row[0], "landmark_sums.session_id") for row in database.execute(query, (self._node_id, self._kind))]
+
+    def __len__(self) -> int:
+        return len(self._sessions())
+
+    def __getitem__(self, index):  # type: ignore[override]
+        with self._file.reading():
+            session_ids = self._sessions()[index]
+            return [self._of(k) for k in session_ids] if isinstance(index, slice) else self._of(session_ids)
+
+    def _of(self, session_id: int) -> LandmarkSums:
+        what = f"the sums of node {self._node_id}"
+        row = _found(self._file.row("landmark_sums", node_id=self._node_id, kind=self._kind, session_id=session_id), what)
+        return sums_from(session_id, row["sums"], count_within(row["num_rows"], 0, self._num_points, what), self._num_points)
+
+
+def sums_from(session_id: int, data: bytes, num_rows: int, num_points: int) -> LandmarkSums:
+    """Sums as `writing.sums_bytes` packed them."""
+    what = f"sums of session {session_id}"
+    planes = array_from(unpacked(data, 24 * num_rows, what), "u1", (2, 12 * num_rows), what)
+    words = np.ascontiguousarray(planes.T).tobytes()
+    m, parts, start = num_rows, [], 0
+    for dtype, width in (("<u2", 1), ("<f2", 6), ("<i2", 3), ("<u2", 1), ("<u2", 1)):
+        parts.append(array_from(words[start : start + 2 * m * width], dtype, (m, width) if width > 1 else (m,), what))
+        start += 2 * m * width
+    rows = parts[0].astype(np.int64)
+    if m and (int(rows[-1]) >= num_points or (np.diff(rows) <= 0).any()):
+        raise Damage(f"{what}: of points that are not there")
+    return LandmarkSums(session_id, rows, *parts[1:])
+
+
+class _StoredImages(_Stored[PlaceImage]):
+    def _ids(self) -> list[int]:
+        def read() -> list[int]:
+            return [row["image_id"] for row in self._file.rows("place_images", ("image_id",))]
+
+        return self._file.kept("image_ids", read)
+
+    def __len__(self) -> int:
+        return self._file.count("place_images")
+
+    def _read(self, row: int) -> PlaceImage:
+        with self._file.reading():
+            image_id = self._ids()[row]
+            found = _found(self._file.row("place_images", image_id=image_id), f"place image {image_id}")
+            session_id, sessions = found["session_id"], _sessions_of(self._file)
+            if session_id not in sessions:
+                raise Damage(f"session {session_id} is missing")
+            pose = pose_from(found["world_from_cam"])
+            return PlaceImage(sessions[session_id].name, found["name"], found["node_id"], pose, found["jpeg"], session_id, image_id)
+
+
+class _StoredModels(Mapping[str, CoarseModel]):
+    def __init__(self, file: MapFile, prefix: str = "") -> None:
+        self._file, self._table = file, f"{prefix}coarse_models"
+
+    def _names(self) -> list[str]:
+        def read() -> list[str]:
+            return [row["name"] for row in self._file.rows(self._table, ("name",))]
+
+        return self._file.kept(self._table, read)
+
+    def __len__(self) -> int:
+        return len(self._names())
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names())
+
+    def __getitem__(self, name: str) -> CoarseModel:
+        if name not in self._names():
+            raise KeyError(name)
+        with self._file.reading():
+            row = _found(self._file.row(self._table, name=name), f"coarse localizer {name}")
+            settings = json_of(row["settings"])
+            if not isinstance(settings, dict):
+                raise Damage(f"the settings of coarse localizer {name} are none")
+            return CoarseModel(name, settings, arrays_from(row["arrays"], f"coarse localizer {name}"))
+
+
+def _found(row: dict[str, Any] | None, what: str) -> dict[str, Any]:
+    if row is None:
+        raise Damage(f"{what} is missing")
+    return row

@@ -1,0 +1,116 @@
+"""The tables of a map file (docs/map-format.md), and what makes one row of them checkable."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from hashlib import blake2b
+
+APPLICATION_ID = 0x544F504F  # "TOPO", in the database's header
+SCHEMA_VERSION = 2
+DESCRIPTOR_SCALE = 200.0  # components of unit descriptors stay below 127 / 200 = 0.63 but for rare spikes, which are clipped
+SIDE = "side_"
+
+Columns = dict[str, str]
+_CHECKSUM = "checksum BLOB NOT NULL"
+_POINTS: Columns = {
+    "kind": "TEXT NOT NULL",
+    "num_points": "INTEGER NOT NULL",
+    "descriptor_size": "INTEGER NOT NULL",
+    "points_img": "BLOB NOT NULL",
+    "shapes": "BLOB NOT NULL",
+    "descriptors": "BLOB NOT NULL",
+    "points_cam": "BLOB NOT NULL",
+    "sqrt_covs": "BLOB NOT NULL",
+}
+_MODEL: Columns = {"name": "TEXT PRIMARY KEY", "settings": "TEXT NOT NULL", "arrays": "BLOB NOT NULL"}
+_NODE: Columns = {
+    "name": "TEXT NOT NULL",
+    "t_ns": "INTEGER NOT NULL",
+    "camera_id": "INTEGER NOT NULL REFERENCES cameras",
+    "world_from_cam": "BLOB NOT NULL",
+    "num_points": "INTEGER NOT NULL",
+}
+
+# table -> column -> how SQL declares it. Each row also has the column `checksum`.
+TABLES: dict[str, Columns] = {
+    "map": {"key": "TEXT PRIMARY KEY", "value": "TEXT NOT NULL"},
+    "edits": {"edit_id": "INTEGER PRIMARY KEY", "name": "TEXT NOT NULL", "date": "TEXT NOT NULL", "schema": "INTEGER NOT NULL"},
+    "sessions": {"session_id": "INTEGER PRIMARY KEY", "name": "TEXT NOT NULL", "json": "TEXT NOT NULL"},
+    "cameras": {"camera_id": "INTEGER PRIMARY KEY", "json": "TEXT NOT NULL UNIQUE"},
+    "nodes": {"node_id": "INTEGER PRIMARY KEY", "session_id": "INTEGER NOT NULL REFERENCES sessions", **_NODE},
+    "node_points": {"node_id": "INTEGER NOT NULL REFERENCES nodes", **_POINTS},
+    "landmark_sums": {
+        "node_id": "INTEGER NOT NULL REFERENCES nodes",
+        "kind": "TEXT NOT NULL",
+        "session_id": "INTEGER NOT NULL REFERENCES sessions",
+        "num_rows": "INTEGER NOT NULL",
+        "sums": "BLOB NOT NULL",
+    },
+    "node_templates": {"node_id": "INTEGER PRIMARY KEY REFERENCES nodes", "jpeg": "BLOB NOT NULL"},
+    "edges": {"source_id": "INTEGER NOT NULL REFERENCES nodes", "target_id": "INTEGER NOT NULL REFERENCES nodes"},
+    "place_images": {
+        "image_id": "INTEGER PRIMARY KEY",
+        "session_id": "INTEGER NOT NULL REFERENCES sessions",
+        "name": "TEXT NOT NULL",
+        "node_id": "INTEGER NOT NULL REFERENCES nodes",
+        "world_from_cam": "BLOB NOT NULL",
+        "jpeg": "BLOB NOT NULL",
+    },
+    "coarse_models": dict(_MODEL),
+    "side_nodes": {"node_id": "INTEGER PRIMARY KEY", "of_node": "INTEGER NOT NULL REFERENCES nodes", **_NODE},
+    "side_node_points": {"node_id": "INTEGER NOT NULL REFERENCES side_nodes", **_POINTS},
+    "side_coarse_models": dict(_MODEL),
+}
+_CONSTRAINTS = {
+    "node_points": "PRIMARY KEY (node_id, kind)",
+    "side_node_points": "PRIMARY KEY (node_id, kind)",
+    "landmark_sums": "PRIMARY KEY (node_id, kind, session_id)",
+    "edges": "PRIMARY KEY (source_id, target_id)",
+}
+# In whose order rows are written, read and digested.
+ORDER = {table: next(iter(columns)) for table, columns in TABLES.items()} | {
+    "node_points": "node_id, kind",
+    "side_node_points": "node_id, kind",
+    "landmark_sums": "node_id, kind, session_id",
+    "edges": "source_id, target_id",
+}
+
+# What schema 1 had; a file may lack the tables of side nodes.
+SCHEMA_1 = {
+    "map": "CREATE TABLE map (key TEXT PRIMARY KEY, value TEXT NOT NULL)",
+    "cameras": "CREATE TABLE cameras (camera_id INTEGER PRIMARY KEY, json TEXT NOT NULL UNIQUE)",
+    "node_templates": "CREATE TABLE node_templates (node_id INTEGER PRIMARY KEY REFERENCES nodes, jpeg BLOB NOT NULL)",
+    "edges": "CREATE TABLE edges (source_id INTEGER NOT NULL REFERENCES nodes, target_id INTEGER NOT NULL REFERENCES nodes)",
+    "place_images": """CREATE TABLE place_images (image_id INTEGER PRIMARY KEY, recording TEXT NOT NULL, name TEXT NOT NULL,
+    node_id INTEGER NOT NULL REFERENCES nodes, world_from_cam BLOB NOT NULL, jpeg BLOB NOT NULL)""",
+}
+for _prefix in ("", SIDE):
+    SCHEMA_1[f"{_prefix}nodes"] = (
+        f"CREATE TABLE {_prefix}nodes (node_id INTEGER PRIMARY KEY, recording TEXT NOT NULL, name TEXT NOT NULL, t_ns INTEGER NOT NULL,\n"
+        "    camera_id INTEGER NOT NULL REFERENCES cameras, world_from_cam BLOB NOT NULL, num_points INTEGER NOT NULL)"
+    )
+    SCHEMA_1[f"{_prefix}node_points"] = (
+        f"CREATE TABLE {_prefix}node_points (node_id INTEGER PRIMARY KEY REFERENCES {_prefix}nodes, descriptor_size INTEGER NOT NULL,\n"
+        "    points_img BLOB NOT NULL, shapes BLOB NOT NULL, descriptors BLOB NOT NULL, points_cam BLOB NOT NULL, sqrt_covs BLOB NOT NULL)"
+    )
+    SCHEMA_1[f"{_prefix}coarse_models"] = (
+        f"CREATE TABLE {_prefix}coarse_models (name TEXT PRIMARY KEY, settings TEXT NOT NULL, arrays BLOB NOT NULL)"
+    )
+
+
+def creation_of(table: str) -> str:
+    """The statement that makes a table, to the letter: a file with other tables than these is not read."""
+    declared = [f"{name} {declaration}" for name, declaration in TABLES[table].items()]
+    constraint = [_CONSTRAINTS[table]] if table in _CONSTRAINTS else []
+    return f"CREATE TABLE {table} ({', '.join([*declared, _CHECKSUM, *constraint])})"
+
+
+def checksum_of(table: str, row: Sequence[int | str | bytes]) -> bytes:
+    """8 bytes (BLAKE2b) that change with the table's name and every bit of its row, columns in the order of `TABLES`."""
+    digest = blake2b(table.encode(), digest_size=8)
+    for value in row:
+        data = value if isinstance(value, bytes) else str(value).encode("utf-8", "surrogatepass")
+        digest.update(struct.pack("<cQ", type(value).__name__[:1].encode(), len(data)))
+        digest.update(data)
+    return digest.digest()

@@ -1,0 +1,116 @@
+"""What a map file says, held against what can be: shapes, types, bounds. What is not is a `Damage`, before any kernel sees it."""
+
+from __future__ import annotations
+
+import io
+import math
+import zipfile
+import zlib
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from topoloc.errors import CalibrationError
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.places.stored_settings import json_of
+
+MAX_POINTS = 100_000
+MAX_SIDE_PX = 32_768
+_FAR = 1e7  # metres and pixels; nothing that was measured is farther
+
+
+class Damage(Exception):
+    """Something in a map file that no map can hold; the text says what."""
+
+
+def array_from(data: bytes, dtype: str, shape: tuple[int, ...], what: str, bound: float = _FAR) -> np.ndarray:
+    """An array of exactly this shape; finite and within ± `bound`, where it is of floating point."""
+    if len(data) != math.prod(shape) * np.dtype(dtype).itemsize:
+        raise Damage(f"{what}: {len(data)} bytes are not {' x '.join(map(str, shape))} {dtype}")
+    array = np.frombuffer(data, dtype).reshape(shape)
+    if array.dtype.kind == "f" and array.size and not (float(np.abs(array).max()) <= bound):  # NaN compares as false
+        raise Damage(f"{what}: a number that is not finite or beyond {bound:g}")
+    return array
+
+
+def pose_from(data: bytes) -> Rigid3:
+    """A rigid transform: 3x4 float64, the left 3x3 a rotation."""
+    matrix = array_from(data, "<f8", (3, 4), "a pose")
+    rotation = matrix[:, :3]
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6 or np.linalg.det(rotation) < 0.0:
+        raise Damage("a pose whose rotation is none")
+    return Rigid3(rotation.copy(), matrix[:, 3].copy())
+
+
+def camera_from(text: str) -> Camera:
+    """A camera of a size that pictures have. Raises SettingsError, CalibrationError, Damage."""
+    camera = Camera.from_json(json_of(text))
+    if max(camera.width, camera.height) > MAX_SIDE_PX or max(map(abs, camera.params)) > _FAR or min(camera.fx, camera.fy) < 1.0:
+        raise CalibrationError(f"a camera of {camera.width}x{camera.height} pixels, f = {camera.fx:g}, is none")
+    return camera
+
+
+def count_within(value: int, least: int, most: int, what: str) -> int:
+    if not least <= value <= most:
+        raise Damage(f"{what}: {value} is not within {least} and {most}")
+    return value
+
+
+def counts_from(text: str | None, tables: Iterable[str]) -> dict[str, int]:
+    """Rows of each table, from the JSON that a map keeps."""
+    counts = json_of(text) if text is not None else None
+    if not isinstance(counts, dict) or set(counts) != set(tables) - {"map"} or not all(type(n) is int and n >= 0 for n in counts.values()):
+        raise Damage("the numbers of rows are missing")
+    return counts
+
+
+def unpacked(data: bytes, num_bytes: int, what: str) -> bytes:
+    """What zlib packed, which must be of this length."""
+    unpacker = zlib.decompressobj()
+    try:
+        found = unpacker.decompress(data, num_bytes + 1)
+    except zlib.error as error:
+        raise Damage(f"{what}: {error}") from error
+    if len(found) != num_bytes or not unpacker.eof:
+        raise Damage(f"{what}: not {num_bytes} bytes")
+    return found
+
+
+def arrays_from(data: bytes, what: str) -> dict[str, np.ndarray]:
+    """The arrays of a NumPy `.npz` as we write it: stored, not compressed, so that they are no larger than their bytes; no objects."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            members = archive.infolist()
+            if len(members) > 2000 or sum(member.file_size for member in members) > len(data):
+                raise Damage(f"{what}: larger than it can be")
+            if any(member.compress_type != zipfile.ZIP_STORED or member.flag_bits & 1 for member in members):
+                raise Damage(f"{what}: of a compression that no map has")
+            return {member.filename.removesuffix(".npy"): _array_of(archive.read(member), what) for member in members}
+    except (zipfile.BadZipFile, EOFError, OSError, ValueError, NotImplementedError, LookupError, OverflowError) as error:
+        raise Damage(f"{what}: {' '.join(str(error).split())[:100]}") from error
+
+
+def _array_of(data: bytes, what: str) -> np.ndarray:
+    """One `.npy`, whose header must agree with its length before anything is made of it."""
+    stream = io.BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    read_header: Any = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
+    if read_header is None:
+        raise Damage(f"{what}: an array of an unknown version")
+    try:
+        shape, is_fortran, dtype = read_header(stream, max_header_size=2000)
+    except (SyntaxError, TypeError, RecursionError, MemoryError) as error:  # of Python's own parser, on what is no header
+        raise Damage(f"{what}: an array without a header") from error
+    left = len(data) - stream.tell()
+    if (
+        dtype.kind not in "fiub"
+        or dtype.itemsize > 8
+        or len(shape) > 6
+        or math.prod(shape) * dtype.itemsize != left
+        or min(shape, default=0) < 0
+    ):
+        raise Damage(f"{what}: an array of {left} bytes that says {dtype} {shape}")
+    flat = np.frombuffer(data, dtype, offset=stream.tell())
+    return flat.reshape(shape[::-1]).T.copy("F") if is_fortran else flat.reshape(shape).copy()

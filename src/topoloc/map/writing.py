@@ -1,0 +1,205 @@
+"""The map file written: one SQLite database (see docs/map-format.md), at once or not at all; `reading.py` opens it.
+
+A node costs about 120 bytes a point and a small JPEG: descriptors are kept as signed bytes, covariances as half floats
+of their square root, pixels and positions as single floats, the sessions' sums packed.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import sqlite3
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Int8
+
+from topoloc.errors import MapError
+from topoloc.geometry.rigid import Rigid3
+from topoloc.map.config import config_to_text
+from topoloc.map.entries import TopoNode
+from topoloc.map.reading import unit_descriptors
+from topoloc.map.schema import APPLICATION_ID, DESCRIPTOR_SCALE, ORDER, SCHEMA_VERSION, SIDE, TABLES, checksum_of, creation_of
+from topoloc.map.sessions import Session, sessions_named
+from topoloc.map.sums import LandmarkSums
+from topoloc.map.topomap import NextIds, TopoMetricMap
+from topoloc.places.coarse import CoarseModel
+from topoloc.sequences.atomic import replaced_file
+
+
+def save_map(topomap: TopoMetricMap, path: Path) -> None:
+    """Write the map to `path`: beside it first, then renamed over it, so that a reader sees the old map or the new one.
+
+    Raises:
+        MapError: the folder does not exist or cannot be written, or the disk is full; nothing is left behind.
+    """
+    if os.path.isdir(path):  # Path.is_dir raises for names that are too long
+        raise MapError(f"cannot write map {path}: it is a folder")
+    with _failing_as_map_error(path), replaced_file(path) as temporary:
+        database = sqlite3.connect(temporary, isolation_level=None)
+        try:
+            _Writer(database).write(topomap)
+        finally:
+            database.close()
+
+
+@contextmanager
+def _failing_as_map_error(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (sqlite3.OperationalError, OSError, ValueError) as error:
+        if isinstance(error, ValueError) and "null" not in str(error):  # of a file's name; any other is a bug
+            raise
+        raise MapError(f"cannot write map {path}: {error}") from error
+
+
+class _Writer:
+    """Rows put in, with their checksums, counted; what all of them are goes into the table `map` at the end."""
+
+    def __init__(self, database: sqlite3.Connection) -> None:
+        self._database = database
+        self._checksums: dict[str, list[tuple[tuple[Any, ...], bytes]]] = {table: [] for table in TABLES}
+        self._camera_ids: dict[str, int] = {}
+
+    def write(self, topomap: TopoMetricMap) -> None:
+        # the file is nobody's until it is renamed: no journal is needed to undo what is half done
+        for pragma in ("page_size = 4096", "journal_mode = OFF", "synchronous = OFF", f"application_id = {APPLICATION_ID}"):
+            self._database.execute(f"PRAGMA {pragma}")
+        self._database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+        self._database.execute("BEGIN")
+        for table in TABLES:
+            self._database.execute(creation_of(table))
+        sessions = topomap.sessions or sessions_named([entry.recording for entry in (*topomap.summaries, *topomap.place_images)])
+        ids = {session.name: session.session_id for session in sessions} if not topomap.sessions else {}
+        for session in sessions:
+            self._insert("sessions", session.session_id, session.name, _session_text(session))
+        for edit in topomap.edits:
+            self._insert("edits", edit.edit_id, edit.name, edit.date, edit.schema)
+        self._write_nodes(topomap, ids)
+        for edge in sorted(topomap.edges, key=lambda edge: (edge.source_id, edge.target_id)):
+            self._insert("edges", edge.source_id, edge.target_id)
+        next_image = self._write_images(topomap, ids)
+        for model in sorted(topomap.coarse_models.values(), key=lambda model: model.name):
+            self._insert_model(model)
+        if topomap.sides is not None:
+            for node in topomap.sides.nodes:
+                self._insert_node(node, topomap.kind, {}, SIDE)
+            for model in topomap.sides.coarse_models.values():
+                self._insert_model(model, SIDE)
+        self._write_facts(topomap, sessions, next_image)
+        self._database.execute("COMMIT")
+
+    def _write_nodes(self, topomap: TopoMetricMap, session_ids: Mapping[str, int]) -> None:
+        for row, node in enumerate(topomap.nodes):
+            self._insert_node(node, topomap.kind, session_ids)
+            self._insert("node_templates", node.summary.node_id, node.template_jpeg)
+            for kind, nodes in sorted(topomap.other_kinds.items()):
+                self._insert_points(nodes[row], kind)
+
+    def _write_images(self, topomap: TopoMetricMap, session_ids: Mapping[str, int]) -> int:
+        """Images without an id get the next ones; returns the one after them."""
+        next_id = max(topomap.next_ids.place_image, 1)
+        for image in topomap.place_images:
+            image_id = next_id if image.image_id is None else image.image_id
+            session_id = session_ids.get(image.recording, image.session_id)
+            self._insert("place_images", image_id, session_id, image.name, image.node_id, _pose_bytes(image.world_from_cam), image.jpeg)
+            next_id = max(next_id, image_id + 1)
+        return next_id
+
+    def _write_facts(self, topomap: TopoMetricMap, sessions: Sequence[Session], next_image: int) -> None:
+        used = NextIds(
+            session=max((session.session_id + 1 for session in sessions), default=0),
+            node=max((summary.node_id + 1 for summary in topomap.summaries), default=0),
+            place_image=next_image,
+            side_node=max((summary.node_id + 1 for summary in topomap.sides.summaries), default=0) if topomap.sides else 0,
+            edit=max((edit.edit_id + 1 for edit in topomap.edits), default=1),
+        )
+        facts = {
+            "config": config_to_text(topomap.config),
+            "kinds": json.dumps([topomap.kind, *sorted(topomap.other_kinds)]),
+            "length_m": json.dumps(topomap.length_m),
+            "default_coarse": json.dumps(topomap.default_coarse),
+            "next_ids": json.dumps({name: max(value, getattr(used, name)) for name, value in asdict(topomap.next_ids).items()}),
+            "counts": json.dumps({table: len(rows) for table, rows in self._checksums.items() if table != "map"}),
+        }
+        if topomap.shared_errors is not None:
+            facts["shared_errors"] = json.dumps(asdict(topomap.shared_errors))
+        for key, value in sorted(facts.items()):
+            self._insert("map", key, value)
+        self._insert("map", "digest", digest_of({table: [c for _, c in sorted(rows)] for table, rows in self._checksums.items()}))
+
+    def _insert_node(self, node: TopoNode, kind: str, session_ids: Mapping[str, int], prefix: str = "") -> None:
+        camera_json = json.dumps(node.camera.to_json(), sort_keys=True)
+        if camera_json not in self._camera_ids:
+            self._camera_ids[camera_json] = len(self._camera_ids) + 1
+            self._insert("cameras", self._camera_ids[camera_json], camera_json)
+        s = node.summary
+        owner = s.of_node if prefix else session_ids.get(s.recording, s.session_id)
+        row = (s.node_id, owner, s.name, s.t_ns, self._camera_ids[camera_json], _pose_bytes(s.world_from_cam), len(node.features))
+        self._insert(f"{prefix}nodes", *row)
+        self._insert_points(node, kind, prefix)
+
+    def _insert_points(self, node: TopoNode, kind: str, prefix: str = "") -> None:
+        f, node_id = node.features, node.summary.node_id
+        shapes = np.stack([f.sizes_px, f.angles, f.responses], axis=1).astype("<f4")
+        blobs = (f.points_img.astype("<f4"), shapes, _quantised(node), node.points_cam.astype("<f4"), node.point_sqrt_covs.astype("<f2"))
+        self._insert(f"{prefix}node_points", node_id, kind, len(f), f.descriptors.shape[1], *(blob.tobytes() for blob in blobs))
+        if not prefix:
+            for sums in node.sums:
+                self._insert("landmark_sums", node_id, kind, sums.session_id, len(sums.rows), sums_bytes(sums))
+
+    def _insert_model(self, model: CoarseModel, prefix: str = "") -> None:
+        self._insert(f"{prefix}coarse_models", model.name, json.dumps(model.settings, sort_keys=True), _arrays_bytes(model.arrays))
+
+    def _insert(self, table: str, *row: Any) -> None:
+        checksum = checksum_of(table, row)
+        self._database.execute(f"INSERT INTO {table} VALUES ({', '.join('?' * (len(row) + 1))})", (*row, checksum))
+        names = list(TABLES[table])
+        self._checksums[table].append((tuple(row[names.index(name)] for name in ORDER[table].split(", ")), checksum))
+
+
+def digest_of(checksums: Mapping[str, Sequence[bytes]]) -> str:
+    """One digest of a whole map: of the checksums of all its rows, table by table in their order, but for that of the digest itself."""
+    digest = blake2b(digest_size=16)
+    for table in TABLES:
+        digest.update(f"{table} {len(checksums[table])}\n".encode() + b"".join(checksums[table]))
+    return digest.hexdigest()
+
+
+def sums_bytes(sums: LandmarkSums) -> bytes:
+    """Rows, roots, pulls and counts as 16-bit words, all low bytes before all high ones, packed by zlib."""
+    parts = ((sums.rows, "<u2"), (sums.roots, "<f2"), (sums.pulls, "<i2"), (sums.expected, "<u2"), (sums.seen, "<u2"))
+    words = np.frombuffer(b"".join(part.astype(dtype).tobytes() for part, dtype in parts), np.uint8)
+    return zlib.compress(np.ascontiguousarray(words.reshape(-1, 2).T).tobytes(), 6)
+
+
+def _quantised(node: TopoNode) -> Int8[np.ndarray, "n d"]:
+    """The descriptors as signed bytes; of a node that was read from a file, those that it was read from."""
+    descriptors, stored = node.features.descriptors, node.stored_descriptors
+    if stored is not None and stored.shape == descriptors.shape and np.array_equal(unit_descriptors(stored), descriptors):
+        return stored
+    return np.clip(np.rint(descriptors * DESCRIPTOR_SCALE), -127, 127).astype(np.int8)
+
+
+def _session_text(session: Session) -> str:
+    facts = {name: value for name, value in asdict(session).items() if name not in ("session_id", "name") and value is not None}
+    if session.camera is not None:
+        facts["camera"] = session.camera.to_json()
+    return json.dumps(facts, sort_keys=True)
+
+
+def _pose_bytes(world_from_cam: Rigid3) -> bytes:
+    return world_from_cam.matrix()[:3].astype("<f8").tobytes()
+
+
+def _arrays_bytes(arrays: Mapping[str, np.ndarray]) -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, **dict(arrays))  # pyright: ignore[reportArgumentType]
+    return buffer.getvalue()
