@@ -1,11 +1,11 @@
-"""Fit the weights of `localization/verification.py` anew, and try them on places that they were not fitted on.
+"""Fit the weights of `localization/evidence.py` anew, and try them on places that they were not fitted on.
 
     python benchmarks/acceptance.py [--shared ../shared] [--rendered FOLDER] [--step N] [--save FILE] [--load FILE]
 
 Each place is asked about its own pictures (in good light and bad), about those of other places and about drawn pictures; every pose
 that was tried and weighed is kept, not only the one answered. It is right within 0.25 m (5 % of the distance, where that is less) and
-2 degrees, wrong beyond 0.5 m or 10 degrees; what lies between is left out. The walls to both sides (`side_localizer.py`) are not asked:
-their poses have weights of their own. Nor is the weight of the doubt fitted, see `verification.py`.
+2 degrees, wrong beyond 0.5 m or 10 degrees; what lies between is left out. The walls to both sides (`walls.py`) are not asked:
+their poses have weights of their own. Nor is the weight of the doubt fitted, see `evidence.py`.
 
 FOLDER holds recordings of `topoloc simulate` (docs/benchmarks.md says how each was made); what is missing is left out, with a line.
 With --step N only every N-th of the pictures is asked, with the same maps. --save keeps the poses for `rival_weights.py`; --load fits
@@ -26,23 +26,22 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
-from topoloc.localization.attempt import Attempt, Judgement, judge
-from topoloc.localization.verification import Evidence, VerificationConfig, log_odds_of, score_features, tolerated_translation
 
 from real_recordings import darkened, drawn_pictures, read_rigid
 from topoloc.errors import RecordingError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.evidence import Evidence, EvidenceConfig, log_odds_of, score_features, tolerated_translation
+from topoloc.localization.fitted_weights import weights_of
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.stages import StageClock
+from topoloc.localization.trace import Trace
 from topoloc.map.build import BuildConfig, build_map
 from topoloc.map.side_nodes import SideNodesConfig
 from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.coarse import NodeScore
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import open_sequence
 
-IN_USE = VerificationConfig()
+IN_USE, TOLERATED = weights_of("surf"), EvidenceConfig()
 COLUMNS = ("even share", "chance", "inliers", "inlier share", "spread", "bias")
 KITCHEN, ZED = "seven_scenes/kitchen@60-99/100", "zed_lab/session2@0:99"
 STREET_1, STREET_2 = "kitti/sequences/street1@1::2", "kitti/sequences/street2@1::2"
@@ -93,7 +92,7 @@ class TriedPose:
     """A pose that a picture led to, and what spoke for it.
 
     `error_m`, `error_deg`: None for a picture from elsewhere. `depth`: median distance (metres) of the points that it stands on.
-    `first_evidence`: that of the matches that it came from; None where these were guided.
+    `first_evidence`: the same with the matches that it came from and their own inliers; None where these were guided.
     """
 
     mapping: str
@@ -110,7 +109,7 @@ class TriedPose:
     def is_right(self) -> bool:
         if self.error_m is None or self.error_deg is None:
             return False
-        return self.error_m < tolerated_translation(self.depth, IN_USE) and self.error_deg < IN_USE.max_rotation_deg
+        return self.error_m < tolerated_translation(self.depth, TOLERATED) and self.error_deg < TOLERATED.max_rotation_deg
 
     @property
     def is_wrong(self) -> bool:
@@ -119,25 +118,6 @@ class TriedPose:
     @property
     def picture(self) -> tuple[str, str, int, str]:
         return (self.mapping, self.queries, self.index, self.light)
-
-
-class ListeningLocalizer(Localizer):
-    """Keeps every pose that was judged: of the candidates, of other parts of the map, of what single nodes saw."""
-
-    def __init__(self, topomap: TopoMetricMap) -> None:
-        super().__init__(topomap)
-        self.tried: list[tuple[Judgement, Evidence | None]] = []
-
-    def _judge(self, first: Attempt, candidates: list[NodeScore], shared_errors: float, clock: StageClock) -> Judgement:
-        judgement = super()._judge(first, candidates, shared_errors, clock)
-        if judgement.final.pose is not None and judgement.evidence is not None:
-            c, of_first = self.config, None
-            if not first.is_guided:
-                always = replace(c.verification, clear_log_odds=-math.inf)
-                again = judge(first, judgement.final, candidates, shared_errors, c.min_matches, c.matching, c.guided, always, clock)
-                of_first = again.evidence
-            self.tried.append((judgement, of_first))
-        return judgement
 
 
 def main() -> None:
@@ -180,7 +160,7 @@ def ask_place(place: AskedPlace, recordings: dict[str, StereoSequence], data: Pa
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "place.topo"
         build_map(recordings[place.mapping], BuildConfig(sides=SideNodesConfig(spacing=0.0))).save(path)
-        localizer = ListeningLocalizer(TopoMetricMap.load(path))
+        localizer = Localizer(TopoMetricMap.load(path))
         world_from_truth = read_rigid(data / place.map_from_truth) if place.map_from_truth else Rigid3.identity()
         for name, index, frame in _frames(place.own, recordings, step):
             assert frame.world_from_cam is not None
@@ -206,22 +186,26 @@ def _frames(asked: dict[str, int], recordings: dict[str, StereoSequence], step: 
 
 
 def _tried(
-    localizer: ListeningLocalizer, image: np.ndarray, camera: Camera, world_from_cam: Rigid3 | None, picture: tuple[str, str, int, str]
+    localizer: Localizer, image: np.ndarray, camera: Camera, world_from_cam: Rigid3 | None, picture: tuple[str, str, int, str]
 ) -> Iterator[TriedPose]:
     """`world_from_cam` is the truth, in the map's world; None for a picture from elsewhere."""
-    localizer.tried.clear()
-    localizer.localize(image, camera)
-    for judgement, first_evidence in localizer.tried:
-        final = judgement.final
+    trace = Trace()
+    localizer.localize(image, camera, trace=trace)
+    for tried in trace.tried:
+        if tried.hypothesis is None:
+            continue
+        final, evidence = tried.hypothesis.fit, tried.hypothesis.evidence
         assert final.pose is not None
-        assert judgement.evidence is not None
+        first_evidence = None
+        if tried.source != "viewpoints":
+            first_evidence = replace(evidence, num_matches=len(tried.first.matches), num_inliers=tried.first.num_inliers)
         cam_from_world, error_m, error_deg = final.pose.cam_from_world, None, None
         if world_from_cam is not None:
             error = cam_from_world @ world_from_cam
             error_m, error_deg = float(np.linalg.norm(error.translation)), math.degrees(error.angle())
         points_world = final.local_map.points_world[final.matches.train_idx[final.pose.inliers]]
         depth = float(np.median(cam_from_world.apply(points_world)[:, 2]))
-        yield TriedPose(*picture, error_m, error_deg, depth, judgement.evidence, first_evidence)
+        yield TriedPose(*picture, error_m, error_deg, depth, evidence, first_evidence)
 
 
 def load_poses(path: Path) -> list[TriedPose]:
@@ -239,7 +223,7 @@ def report(poses: list[TriedPose]) -> None:
         raise SystemExit("right and wrong poses are needed, and there are not both")
     x, y = np.array([score_features(pose.evidence) for pose in poses]), np.array([pose.is_right for pose in poses])
     print(f"{len(y)} poses, {y.sum()} of them right; {num_between} more are neither right nor wrong")
-    in_use = np.array([*np.delete(IN_USE.weights, -1), IN_USE.bias])
+    in_use = np.array([*IN_USE.evidence.in_order[:-1], IN_USE.evidence.bias])
     print(f"{'':20}" + "".join(f"{name:>14}" for name in COLUMNS))
     for name, weights in (("fitted", fit(x, y)), ("its std. deviation", deviation(x, y, poses)), ("in use", in_use)):
         print(f"{name:20}" + "".join(f"{weight:14.2f}" for weight in weights))
@@ -256,7 +240,7 @@ def report(poses: list[TriedPose]) -> None:
         print(f"the most probable of {len(elsewhere)} poses of pictures from elsewhere: {1 / (1 + math.exp(-max(elsewhere))):.2f}")
     first = [log_odds_of(pose.first_evidence, IN_USE) for pose in poses if pose.is_wrong and pose.first_evidence]
     clearest = f"{max(odds_in_use[~y]):.1f}" + (f", by its first matches {max(first):.1f}" if first else "")
-    print(f"log odds of the clearest wrong pose: {clearest}; clear is what has more than {IN_USE.clear_log_odds}")
+    print(f"log odds of the clearest wrong pose: {clearest}; clear is what has more than {IN_USE.evidence.clear_log_odds}")
 
 
 def family_key(name: str) -> str:
@@ -265,7 +249,7 @@ def family_key(name: str) -> str:
 
 def log_odds(x: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """`weights` are those of all but the doubt (last in `x`), whose weight is given, and the bias."""
-    return x[:, :-1] @ weights[:-1] + weights[-1] + IN_USE.doubt_weight * x[:, -1]
+    return x[:, :-1] @ weights[:-1] + weights[-1] + IN_USE.evidence.doubt * x[:, -1]
 
 
 def fit(x: np.ndarray, y: np.ndarray, counts: np.ndarray | None = None) -> np.ndarray:

@@ -1,11 +1,11 @@
-"""Fit the weights of `localization/rivals.py` anew: which of two poses of one picture, far from each other, is the right one?
+"""Fit the weights of `localization/belief.py` anew: which of two poses of one picture, far from each other, is the right one?
 
     python benchmarks/acceptance.py --rendered FOLDER --save POSES
     python benchmarks/rival_weights.py POSES
 
 Of each picture's poses within 0.5 m and 10 degrees the strongest is paired with every wrong pose that could be taken for it. A pair is
 hard where the wrong pose comes near to being believed on its own. Weights are compared by how many pairs they get wrong, and how many
-stay, either way, within the lead that an answer needs (`min_lead`), so that "ambiguous" is said. The slope is what the leads over hard
+stay, either way, within the lead that an answer needs (`MIN_LEAD`), so that "ambiguous" is said. The slope is what the leads over hard
 pairs must be multiplied by to be logarithms of odds. The fit is to hard pairs; they are few, and those in use were chosen by hand.
 """
 
@@ -16,12 +16,14 @@ from pathlib import Path
 
 import numpy as np
 from scipy.optimize import minimize
-from topoloc.localization.rivals import RivalsConfig
-from topoloc.localization.verification import VerificationConfig, log_odds_of, score_features
 
 from acceptance import TriedPose, load_poses
+from topoloc.localization.belief import MIN_LEAD
+from topoloc.localization.evidence import log_odds_of, score_features
+from topoloc.localization.fitted_weights import weights_of
 
-IN_USE, VERIFICATION = RivalsConfig(), VerificationConfig()
+WEIGHTS = weights_of("surf")
+IN_USE = WEIGHTS.rivals
 COULD_BE_TAKEN = -1.5
 """Logarithm of the odds of a wrong pose that makes a pair; one that is less than `NEAR` behind the right one makes a pair, too."""
 NEAR = 2.0
@@ -36,11 +38,11 @@ def main() -> None:
     print(f"{len(differences)} pairs, {is_hard.sum()} of them hard")
     if not is_hard.any():
         raise SystemExit("there is no hard pair to fit to")
-    in_use = np.array([IN_USE.odds_weight, IN_USE.even_share_weight, IN_USE.doubt_weight])
+    in_use = np.array([IN_USE.odds, IN_USE.even_share, IN_USE.doubt])
     odds, even, doubt = np.diag(in_use)
     candidates = {"fitted": fit(differences[is_hard]), "in use": in_use, "without the doubt": odds + even, "without the odds": even + doubt}
     candidates |= {"without the even share": odds + doubt, "the odds alone": np.array([1.0, 0.0, 0.0])}
-    beyond = f"> {IN_USE.min_lead:g}"
+    beyond = f"> {MIN_LEAD:g}"
     heading = f"hard: wrong / by {beyond}, right by {beyond}"
     print(f"{'':24}{'odds':>6}{'even':>6}{'doubt':>7}{'slope':>7}   {heading:40}all")
     for name, weights in candidates.items():
@@ -75,7 +77,7 @@ def pairs_of(poses: list[TriedPose]) -> tuple[np.ndarray, np.ndarray, np.ndarray
 def terms(pose: TriedPose) -> np.ndarray:
     """What is weighed between two poses, in the order of the weights."""
     features = score_features(pose.evidence)
-    return np.array([log_odds_of(pose.evidence, VERIFICATION), features[0], features[-1]])
+    return np.array([log_odds_of(pose.evidence, WEIGHTS), features[0], features[-1]])
 
 
 def fit(differences: np.ndarray) -> np.ndarray:
@@ -99,7 +101,7 @@ def slope(lead: np.ndarray) -> float:
 
 
 def outcome(lead: np.ndarray) -> str:
-    wrong, badly, clearly = np.sum(lead < 0), np.sum(lead < -IN_USE.min_lead), np.sum(lead > IN_USE.min_lead)
+    wrong, badly, clearly = np.sum(lead < 0), np.sum(lead < -MIN_LEAD), np.sum(lead > MIN_LEAD)
     return f"{wrong} / {badly}, {clearly} of {len(lead)}"
 
 
