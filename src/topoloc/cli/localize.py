@@ -58,6 +58,8 @@ class Command:
     """The recordings' format: kitti, euroc, tum, seven_scenes, video or folder."""
     coarse: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")] = None
     """Which of the map's coarse localizers is asked; `topoloc info` names them."""
+    max_ms: Annotated[float | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: no limit)")] = None
+    """After so many milliseconds no further hypothesis is sought for an image; the first one is always tried."""
     json: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
     """Write one JSON line a query to this file (- for standard output)."""
     tum: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
@@ -83,7 +85,8 @@ class Command:
         topomap = TopoMetricMap.load(self.map)
         camera = None if self.camera is None else _camera_of_size(self.camera, topomap)
         queries = [self._open(path) for path in self.inputs]
-        localizer = Localizer(topomap, replace(self.config, coarse=self.coarse or self.config.coarse))
+        max_ms = self.config.max_ms if self.max_ms is None else self.max_ms
+        localizer = Localizer(topomap, replace(self.config, coarse=self.coarse or self.config.coarse, max_ms=max_ms))
         answers: list[QueryAnswer] = []
         total = sum(len(query.sequence) for query in queries)
         start = time.perf_counter()
@@ -112,6 +115,8 @@ class Command:
             raise UsageError("--odometry is that of one stream: give one input with it")
         if self.max_jump is not None and not self.max_jump > 0:
             raise UsageError(f"--max-jump is a length in metres, not {self.max_jump:g}")
+        if self.max_ms is not None and not self.max_ms >= 0:
+            raise UsageError(f"--max-ms is a time in milliseconds, not {self.max_ms:g}")
 
     def _open(self, path: str) -> _Query:
         """Recordings and videos are streams; pictures, and folders of them, are single unless they are said not to be."""
