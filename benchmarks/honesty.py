@@ -17,13 +17,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from topoloc.localization.verification import VerificationConfig, tolerated_translation
 
 from real_recordings import PLACES, Place
 from topoloc.demo.recordings import SHIPPED
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
+from topoloc.localization.evidence import EvidenceConfig, tolerated_translation
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.map.build import BuildConfig, build_map
@@ -63,7 +63,7 @@ class Asked:
         metres, degrees = float(np.linalg.norm(error.translation)), float(np.rad2deg(error.angle()))
         xi = (truth @ result.world_from_cam.inverse()).log()
         self.metres.append(metres)
-        self.is_right.append(metres < tolerated_translation(depth, VerificationConfig()) and degrees < 2.0)
+        self.is_right.append(metres < tolerated_translation(depth, EvidenceConfig()) and degrees < 2.0)
         self.is_far_off.append(metres > 0.5 or degrees > 10.0)
         if not self.is_far_off[-1]:
             self.squares.append(float(xi @ np.linalg.solve(result.covariance, xi)))

@@ -14,11 +14,10 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass
 
-from topoloc.localization.verification import VerificationConfig
-
 from topoloc.evaluation.experiments import answer_queries
 from topoloc.evaluation.metrics import summarize
 from topoloc.features.extraction import FeatureConfig
+from topoloc.localization.evidence import EvidenceConfig
 from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.map.build import BuildConfig, build_map
@@ -26,7 +25,7 @@ from topoloc.sequences.open import open_sequence
 
 BOUNDS = ("0.05m_5deg", "0.25m_2deg")
 UNGUIDED = GuidedConfig(num_nodes=0)
-ANY_POSE = VerificationConfig(min_inliers=12, min_found=12, min_probability=0.0)
+ANY_POSE = EvidenceConfig(min_inliers=12, min_found=12, min_probability=0.0)
 
 
 @dataclass(frozen=True)
@@ -42,12 +41,12 @@ METHODS = (
     Method(
         "plain SIFT, five nodes",
         FeatureConfig(kind="sift", normalization="none", contrast_threshold=0.04),
-        LocalizerConfig(num_candidates=5, guided=UNGUIDED, verification=ANY_POSE, num_first_features=1_000_000),
+        LocalizerConfig(num_candidates=5, guided=UNGUIDED, evidence=ANY_POSE, num_first_features=1_000_000),
     ),
     Method(
         "the paper's scheme",
         FeatureConfig(kind="surf", normalization="paper"),
-        LocalizerConfig(num_candidates=1, guided=UNGUIDED, verification=ANY_POSE, num_first_features=1_000_000),
+        LocalizerConfig(num_candidates=1, guided=UNGUIDED, evidence=ANY_POSE, num_first_features=1_000_000),
     ),
     Method("defaults", FeatureConfig(), LocalizerConfig()),
 )

@@ -23,7 +23,7 @@ def main(map_file: Path | None, recordings: list[str]) -> None:
     else:
         topomap = topoloc.TopoMetricMap.load(map_file)
     localizer = topoloc.Localizer(topomap)
-    print(f"a pose is reported from a probability of {localizer.config.verification.min_probability} on")
+    print(f"a pose is reported from a probability of {localizer.config.evidence.min_probability} on")
     for path in recordings:
         pictures = topoloc.open_sequence(path)
         results = [localizer.localize(pictures[i].image, pictures[i].camera) for i in range(len(pictures))]

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from topoloc.geometry.rigid import Rigid3
     from topoloc.localization.building import build_map
     from topoloc.localization.localizer import Localizer, LocalizerConfig
-    from topoloc.localization.result import Localization, NotLocalized
+    from topoloc.localization.result import Alternative, Localization, NotLocalized
+    from topoloc.localization.trace import Trace
     from topoloc.map.build import BuildConfig
     from topoloc.map.topomap import TopoMetricMap
     from topoloc.sequences.open import open_sequence
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     __version__: str
 
 __all__ = [
+    "Alternative",
     "BuildConfig",
     "Camera",
     "Localization",
@@ -34,6 +36,7 @@ __all__ = [
     "StreamedPose",
     "TopoMetricMap",
     "TopolocError",
+    "Trace",
     "Tracker",
     "TrackerConfig",
     "__version__",
@@ -42,6 +45,7 @@ __all__ = [
 ]
 
 _MODULES = {
+    "Alternative": "topoloc.localization.result",
     "BuildConfig": "topoloc.map.build",
     "Camera": "topoloc.geometry.camera",
     "Localization": "topoloc.localization.result",
@@ -52,6 +56,7 @@ _MODULES = {
     "StreamedPose": "topoloc.tracking.stream_result",
     "TopoMetricMap": "topoloc.map.topomap",
     "TopolocError": "topoloc.errors",
+    "Trace": "topoloc.localization.trace",
     "Tracker": "topoloc.tracking.tracker",
     "TrackerConfig": "topoloc.tracking.tracker",
     "build_map": "topoloc.localization.building",

@@ -210,6 +210,28 @@ def test_a_picture_of_nothing_known_is_not_localized(
     assert printed.err == ""
 
 
+def test_a_query_may_be_given_a_time(room_map: Path, queries: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    given: list[float | None] = []
+    opened = Localizer.__init__
+
+    def told(self: Localizer, *arguments: Any, **settings: Any) -> None:
+        opened(self, *arguments, **settings)
+        given.append(self.config.max_ms)
+
+    monkeypatch.setattr(Localizer, "__init__", told)
+    for options in ([], ["--max-ms", "0"], ["--config.max-ms", "50"], ["--config.max-ms", "50", "--max-ms", "80"]):
+        assert main(["localize", str(room_map), str(queries), "--json", str(tmp_path / "a.json"), *options]) == 0
+        assert all(line["localized"] for line in _lines(tmp_path / "a.json"))  # the first hypothesis of each is clear
+    assert given == [None, 0.0, 50.0, 80.0]
+
+
+def test_a_query_without_a_pose_says_where_time_was_up(room_map: Path, elsewhere: Path, tmp_path: Path):
+    assert main(["localize", str(room_map), str(elsewhere), "--max-ms", "0", "--json", str(tmp_path / "a.json")]) == 0
+    for line in _lines(tmp_path / "a.json"):
+        assert not line["localized"]
+        assert "time was up" in line["detail"]
+
+
 def test_fifty_megapixels_need_little_memory_and_no_matplotlib(room_map: Path, tmp_path: Path):
     pytest.importorskip("resource")
     picture = cv2.resize(unseen_views()[3][0], (8160, 6120), interpolation=cv2.INTER_NEAREST)

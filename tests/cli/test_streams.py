@@ -127,5 +127,6 @@ def test_streams_that_cannot_be_are_one_line(room_map: Path, stream: Path, tmp_p
 def test_options_that_contradict_are_wrong_usage(room_map: Path, stream: Path, queries: Path, complaint: Callable[..., str]):
     assert "--single" in complaint("localize", room_map, stream, "--single", "--stream", status=2)
     assert "--max-jump" in complaint("localize", room_map, stream, "--max-jump", "-1", status=2)
+    assert "--max-ms" in complaint("localize", room_map, stream, "--max-ms", "-1", status=2)
     assert "--odometry" in complaint("localize", room_map, stream, queries, "--odometry", "a.tum", status=2)
     assert "--stream" in complaint("localize", room_map, queries, "--odometry", "a.tum", status=2)

@@ -1,7 +1,8 @@
-"""What is answered where the nodes and the walls both have something to say."""
+"""What is believed of several hypotheses of one image, and what is answered: one posterior, whatever came first."""
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 
@@ -9,156 +10,248 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from topoloc.localization.attempt import Attempt, Judgement
-from topoloc.localization.side_verdict import SideVerdictConfig, decide_with_sides, side_log_odds
-from topoloc.localization.verification import Evidence
+from made_hypotheses import CANDIDATES, WEIGHTS, believed, made_features, made_fit, made_hypothesis
 
-from built_corridor import WIDE
-from topoloc.features.features import Features, Matches
-from topoloc.geometry.absolute_pose import AbsolutePose
-from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.fitted_weights import weights_of
-from topoloc.localization.local_map import LocalMap
+from topoloc.localization.answer import answer
+from topoloc.localization.belief import MIN_LEAD, Belief, Hypothesis, is_same_pose, lead
+from topoloc.localization.config import LocalizerConfig
+from topoloc.localization.evidence import Evidence, EvidenceConfig
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.localization.stages import StageClock
-from topoloc.places.coarse import NodeScore
 
-CONFIG, WEIGHTS = SideVerdictConfig(), weights_of("surf").walls
-EVIDENCE = Evidence(num_matches=150, num_inliers=40, num_found=60, num_visible=200, num_by_chance=12, spread=0.5, doubt=0.3, even_share=0.2)
-CANDIDATES = [NodeScore(3, 0.5)]
+CONFIG = EvidenceConfig()
+POINTS = np.random.default_rng(0).uniform(-1.0, 1.0, (20, 3))
 
 
-def _attempt(at: float) -> Attempt:
-    empty, one, rows = np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int32)
-    local_map = LocalMap(np.zeros((0, 64), np.float32), empty, np.zeros((0, 3, 3)), one, np.zeros(0, int), one, empty)
-    pose = AbsolutePose(Rigid3(np.eye(3), np.array([at, 0.0, 0.0])), np.zeros(0, bool), np.eye(6), one)
-    return Attempt(Features.empty(64), WIDE, WIDE, local_map, Matches(rows, rows, np.zeros(0, np.float32)), pose)
+def _answered(*hypotheses: Hypothesis) -> Localization | NotLocalized:
+    return answer(believed(list(hypotheses)))[0]
 
 
-def _localized(log_odds: float, at: float = 0.0, doubt: float = 0.3) -> Judgement:
-    """A pose `at` metres along x."""
-    attempt, evidence = _attempt(at), replace(EVIDENCE, doubt=doubt)
-    assert attempt.pose is not None
-    answer = Localization(attempt.pose.cam_from_world.inverse(), np.eye(6), 0.9, 1, CANDIDATES, 150, 60, evidence=evidence)
-    return Judgement(answer, attempt, evidence, log_odds)
+def _along(result: Localization | NotLocalized) -> float:
+    """The metres along x of the pose that is answered."""
+    assert isinstance(result, Localization)
+    return float(result.world_from_cam.translation[0])
 
 
-def _not_localized(log_odds: float = -math.inf) -> Judgement:
-    return Judgement(NotLocalized("not_in_map", CANDIDATES, 90, 9), _attempt(0.0), EVIDENCE, log_odds)
+# of the same pose, the one with the most for it
 
 
-def _decide(judgement: Judgement, sides: list[Judgement]) -> Judgement:
-    return decide_with_sides(judgement, sides, CONFIG, StageClock())
+def test_a_hypothesis_of_the_same_pose_replaces_the_weaker_one_and_not_the_stronger():
+    weak, strong, elsewhere = made_hypothesis(1.0), made_hypothesis(3.0, x=0.1), made_hypothesis(0.5, x=9.0)
+    search = believed([weak, elsewhere, strong, made_hypothesis(2.0, x=0.05)])
+    assert {id(one) for one in search.belief.hypotheses} == {id(strong), id(elsewhere)}
+    assert search.best is strong
 
 
-def _is_answer_of(decided: Judgement, judgement: Judgement) -> bool:
-    if decided.final is not judgement.final:
-        return False
-    one, other = decided.result, judgement.result
-    if isinstance(one, Localization) and isinstance(other, Localization):
-        return one.world_from_cam is other.world_from_cam
-    return isinstance(one, NotLocalized) and isinstance(other, NotLocalized) and one.reason == other.reason
+def test_poses_within_twice_what_is_tolerated_are_one():
+    here = made_fit(0.0)
+    assert is_same_pose(here, made_fit(0.4), CONFIG)
+    assert not is_same_pose(here, made_fit(0.6), CONFIG)
 
 
-@pytest.mark.parametrize("judgement", [_localized(0.7), _not_localized(-3.0)], ids=["localized", "not localized"])
-def test_where_the_walls_say_nothing_the_nodes_do(judgement: Judgement):
-    decided = _decide(judgement, [])
-    assert _is_answer_of(decided, judgement)
-    assert decided.log_odds == judgement.log_odds
-    assert "total" in decided.result.times_ms  # with the time that it took to ask the walls
+@pytest.mark.parametrize(("moved", "expected"), [(0.0, True), (0.04, True), (5.0, False)], ids=["same", "in doubt", "elsewhere"])
+def test_poses_that_are_not_near_are_one_where_the_same_features_show_the_same_points(moved: float, expected: bool):
+    """One of them is not precise yet; of two places that look alike, the same features show other points."""
+    features = made_features(len(POINTS))
+    one = made_fit(0.0, POINTS, features)
+    assert is_same_pose(one, made_fit(1.0, POINTS + np.array([moved, 0.0, 0.0]), features), CONFIG) is expected
+    assert not is_same_pose(one, made_fit(1.0, POINTS, made_features(len(POINTS))), CONFIG)  # of other features nothing follows
 
 
-@pytest.mark.parametrize("log_odds", [-math.inf, -2.0])
-def test_walls_lead_where_nodes_know_nothing(log_odds: float):
-    sides = [_localized(1.5, at=-9.0), _localized(-2.0, at=4.0)]
-    decided = _decide(_not_localized(log_odds), sides)
-    assert _is_answer_of(decided, sides[0])
-    assert isinstance(decided.result, Localization)
-    assert CONFIG.min_probability <= decided.result.probability <= 1.0 / (1.0 + math.exp(-1.5))
-    assert "total" in decided.result.times_ms
+def test_poses_so_uncertain_that_both_may_be_right_are_one():
+    here, there = made_hypothesis(3.0), made_hypothesis(3.0, x=1.5)
+    assert len(believed([here, there]).belief.hypotheses) == 2
+    unsure = replace(there, covariance=np.diag([0.5, 1e-8, 1e-8, 1e-8, 1e-8, 1e-8]))
+    assert len(believed([here, unsure]).belief.hypotheses) == 1
 
 
-def test_walls_lead_a_pose_of_the_nodes_that_has_much_less_for_it():
-    sides = [_localized(3.0, at=-9.0)]
-    assert _is_answer_of(_decide(_localized(3.0 - CONFIG.min_lead - 0.1), sides), sides[0])
+# one posterior
+
+hypotheses_of_nodes = st.builds(
+    made_hypothesis, st.floats(-8.0, 12.0), st.integers(0, 5).map(lambda k: 10.0 * k), st.floats(0.0, 1.0), st.floats(0.01, 50.0)
+)
+hypotheses_of_walls = st.builds(
+    made_hypothesis,
+    st.floats(-8.0, 12.0),
+    st.integers(6, 9).map(lambda k: 10.0 * k),
+    st.floats(0.0, 1.0),
+    st.floats(0.01, 50.0),
+    st.just(True),
+)
+some_hypotheses = st.lists(hypotheses_of_nodes | hypotheses_of_walls, max_size=6)
 
 
-def test_nodes_lead_walls_that_have_much_less_for_them():
-    judgement = _localized(1.0)
-    decided = _decide(judgement, [_localized(1.0 - CONFIG.min_lead - 0.1, at=-9.0)])
-    assert _is_answer_of(decided, judgement)
-    assert isinstance(decided.result, Localization)
-    assert decided.result.probability == 0.9  # what the nodes said, untouched
+@given(some_hypotheses)
+def test_the_probabilities_of_all_that_excludes_each_other_are_at_most_one(hypotheses: list[Hypothesis]):
+    result = _answered(*hypotheses)
+    if isinstance(result, Localization):
+        assert CONFIG.min_probability <= result.probability <= 1.0
+        return
+    probabilities = [one.probability for one in result.alternatives]
+    assert probabilities == sorted(probabilities, reverse=True)
+    assert all(0.0 < probability <= 1.0 for probability in probabilities)
+    assert sum(probabilities) <= 1.0 + 1e-12
+    assert (result.reason == "ambiguous") == (len(probabilities) > 1)
 
 
-@pytest.mark.parametrize("lead", [-0.9, 0.0, 0.9])
-def test_a_pose_of_the_nodes_that_the_walls_contradict_is_ambiguous(lead: float):
-    decided = _decide(_localized(2.0), [_localized(2.0 + lead * CONFIG.min_lead, at=-9.0)])
-    assert isinstance(decided.result, NotLocalized)
-    assert decided.result.reason == "ambiguous"
-    assert decided.result.candidates == CANDIDATES
-    assert "walls" in decided.result.detail
+@given(some_hypotheses)
+def test_an_answer_leads_all_others(hypotheses: list[Hypothesis]):
+    search = believed(hypotheses)
+    result, _ = answer(search)
+    if isinstance(result, Localization):
+        assert search.best is not None
+        assert result.world_from_cam == search.best.world_from_cam or np.array_equal(
+            result.world_from_cam.matrix(), search.best.world_from_cam.matrix()
+        )
+        others = [one for one in search.belief.hypotheses if one is not search.best]
+        assert all(lead(search.best, other, WEIGHTS.rivals) >= MIN_LEAD for other in others)
 
 
-@pytest.mark.parametrize("judgement", [_not_localized(), _localized(2.0)], ids=["not localized", "localized"])
-def test_two_walls_that_look_alike_are_no_answer(judgement: Judgement):
-    decided = _decide(judgement, [_localized(3.0, at=-9.0), _localized(3.0 - 0.9 * CONFIG.min_lead, at=4.0)])
-    assert isinstance(decided.result, NotLocalized)
-    assert decided.result.reason == ("ambiguous" if isinstance(judgement.result, Localization) else "not_in_map")
+@given(some_hypotheses.filter(lambda those: len({one.log_odds for one in those}) == len(those)), st.randoms(use_true_random=False))
+def test_the_answer_does_not_depend_on_the_order_in_which_hypotheses_arrive(hypotheses: list[Hypothesis], random):
+    other_order = list(hypotheses)
+    random.shuffle(other_order)
+    one, other = _answered(*hypotheses), _answered(*other_order)
+    facts, others = (result.to_json("") | {"times_ms": {}} for result in (one, other))
+    assert facts.keys() == others.keys()
+    for key in ("localized", "reason", "detail", "world_from_cam", "node"):
+        assert facts.get(key) == others.get(key)
+    assert facts.get("probability", 0.0) == pytest.approx(others.get("probability", 0.0))
+    mine, theirs = ([(x["world_from_cam"], pytest.approx(x["probability"])) for x in f.get("alternatives", [])] for f in (facts, others))
+    assert mine == theirs
 
 
-def test_an_unbelieved_pose_of_the_nodes_counts_as_a_rival():
-    """It was not believed, but the walls do not lead it by enough either."""
-    assert isinstance(_decide(_not_localized(0.9), [_localized(1.5, at=-9.0)]).result, NotLocalized)
+@pytest.mark.parametrize("order", [(0, 1, 2), (1, 2, 0), (2, 1, 0), (0, 2, 1)], ids=str)
+def test_poses_that_lead_from_one_to_the_next_are_told_apart_in_the_same_way_in_any_order(order: tuple[int, ...]):
+    """The middle one says the same as both ends, which say different things."""
+    chain = [made_hypothesis(3.0, x=0.0), made_hypothesis(2.0, x=0.4), made_hypothesis(1.0, x=0.8)]
+    belief = believed([chain[k] for k in order]).belief
+    assert [one.log_odds for one in belief.ranked(WEIGHTS.rivals)] == [3.0, 1.0]
+
+
+def test_alone_a_hypothesis_is_as_probable_as_its_odds_against_nowhere():
+    result = _answered(made_hypothesis(2.0, x=3.0))
+    assert isinstance(result, Localization)
+    assert result.probability == pytest.approx(1.0 / (1.0 + math.exp(-2.0)))
+    assert _along(result) == pytest.approx(3.0)
+    assert result.candidates == CANDIDATES
+
+
+def test_another_hypothesis_far_behind_takes_a_little_of_the_probability():
+    best, other = made_hypothesis(4.0), made_hypothesis(-1.0, x=9.0, even_share=0.06)
+    alone, beside = _answered(best), _answered(other, best)
+    assert isinstance(alone, Localization)
+    assert isinstance(beside, Localization)
+    behind = lead(best, other, WEIGHTS.rivals)
+    assert behind > MIN_LEAD
+    assert beside.probability == pytest.approx(1.0 / (1.0 + math.exp(-4.0) + math.exp(-behind)))
+    assert beside.probability < alone.probability
+
+
+# two places that look alike
+
+
+def test_two_places_that_look_alike_are_ambiguous_and_both_are_named():
+    one, other = made_hypothesis(4.0, fit=made_fit(0.0, POINTS, node_id=3)), made_hypothesis(3.8, fit=made_fit(9.0, POINTS, node_id=8))
+    result = _answered(one, other)
+    assert isinstance(result, NotLocalized)
+    assert result.reason == "ambiguous"
+    assert [alternative.node_id for alternative in result.alternatives] == [3, 8]
+    assert [alternative.world_from_cam.translation[0] for alternative in result.alternatives] == [0.0, 9.0]
+    assert sum(alternative.probability for alternative in result.alternatives) > 0.95
+    assert result.detail == "as much like node 8 as like node 3"
+    line = json.loads(json.dumps(result.to_json("a.png"), allow_nan=False))
+    assert "world_from_cam" not in line
+    assert [named["node"] for named in line["alternatives"]] == [3, 8]
+    assert line["alternatives"][1]["world_from_cam"] == {"translation": [9.0, 0.0, 0.0], "quat_wxyz": [1.0, 0.0, 0.0, 0.0]}
+    assert line["alternatives"][0]["probability"] == result.alternatives[0].probability
+
+
+def test_what_is_found_evenly_tells_two_poses_apart_that_have_the_same_odds():
+    full, half = made_hypothesis(4.0, even_share=0.2, doubt=0.1), made_hypothesis(4.0, x=9.0, even_share=0.02, doubt=0.5)
+    assert _along(_answered(half, full)) == pytest.approx(0.0)
+
+
+# the walls along the way
+
+
+@pytest.mark.parametrize("of_nodes", [[], [made_hypothesis(-3.0)]], ids=["nothing", "hardly anything"])
+def test_walls_are_believed_where_nodes_know_nothing(of_nodes: list[Hypothesis]):
+    walls = [made_hypothesis(1.5, x=-9.0, walls=True), made_hypothesis(-2.0, x=4.0, walls=True)]
+    result = _answered(*of_nodes, *walls)
+    assert isinstance(result, Localization)
+    assert _along(result) == pytest.approx(-9.0)
+    assert CONFIG.min_probability <= result.probability <= 1.0 / (1.0 + math.exp(-1.5))
+
+
+def test_of_walls_and_nodes_the_one_with_much_more_for_it_is_believed():
+    behind = 3.0 - MIN_LEAD - 0.1
+    assert _along(_answered(made_hypothesis(behind), made_hypothesis(3.0, x=-9.0, walls=True))) == pytest.approx(-9.0)
+    assert _along(_answered(made_hypothesis(3.0), made_hypothesis(behind, x=-9.0, walls=True))) == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize("ahead", [-0.9, 0.0, 0.9])
+def test_a_pose_of_the_nodes_that_the_walls_contradict_is_ambiguous(ahead: float):
+    result = _answered(made_hypothesis(2.0), made_hypothesis(2.0 + ahead * MIN_LEAD, x=-9.0, walls=True))
+    assert isinstance(result, NotLocalized)
+    assert result.reason == "ambiguous"
+    assert {alternative.world_from_cam.translation[0] for alternative in result.alternatives} == {0.0, -9.0}
+
+
+@pytest.mark.parametrize("of_nodes", [[], [made_hypothesis(2.0)]], ids=["without nodes", "with nodes"])
+def test_two_walls_that_look_alike_are_no_answer(of_nodes: list[Hypothesis]):
+    walls = [made_hypothesis(3.0, x=-9.0, walls=True), made_hypothesis(3.0 - 0.9 * MIN_LEAD, x=4.0, walls=True)]
+    result = _answered(*of_nodes, *walls)
+    assert isinstance(result, NotLocalized)
+    assert result.reason == "ambiguous"
+
+
+def test_walls_that_do_not_lead_a_hypothesis_of_the_nodes_are_no_answer_though_that_is_not_believed_itself():
+    unlikely = made_hypothesis(-0.1)
+    assert unlikely.probability < CONFIG.min_probability
+    assert isinstance(_answered(unlikely, made_hypothesis(1.5, x=-9.0, walls=True)), NotLocalized)
 
 
 def test_a_place_beyond_doubt_but_imprecise_is_not_answered():
-    precise, imprecise = (_decide(_not_localized(), [_localized(8.0, at=-9.0, doubt=doubt)]).result for doubt in (0.3, 3.0))
+    evidence = Evidence(150, 40, 60, 200, 12, spread=0.5, doubt=0.3, even_share=0.2, num_distinct=30)
+    of_wall = replace(made_hypothesis(8.0, x=-9.0, walls=True), evidence=evidence)
+    precise, imprecise = (_answered(replace(of_wall, evidence=replace(evidence, doubt=doubt))) for doubt in (0.3, 3.0))
     assert isinstance(precise, Localization)
     assert precise.probability > 0.99
     assert isinstance(imprecise, NotLocalized)
+    assert imprecise.reason == "too_few_inliers"
+    assert imprecise.detail.startswith("in the map, but where is known to")
 
 
-def test_walls_that_are_not_probable_are_not_answered():
-    assert isinstance(_decide(_not_localized(), [_localized(-0.5, at=-9.0)]).result, NotLocalized)
+# nothing to believe
 
 
-@given(
-    of_nodes=st.floats(-6.0, 6.0),
-    believed=st.booleans(),
-    of_walls=st.lists(st.floats(-6.0, 8.0), max_size=4),
-    doubt=st.floats(0.05, 4.0),
-)
-def test_whatever_is_said_an_answer_leads_all_others(of_nodes: float, believed: bool, of_walls: list[float], doubt: float):
-    sides = [_localized(x, at=-9.0 - k, doubt=doubt) for k, x in enumerate(sorted(of_walls, reverse=True))]
-    judgement = _localized(of_nodes) if believed else _not_localized(of_nodes)
-    decided = _decide(judgement, sides)
-    if isinstance(decided.result, Localization):
-        assert _is_answer_of(decided, judgement) or _is_answer_of(decided, sides[0])
-        others = [other.log_odds for other in (judgement, *sides) if not _is_answer_of(decided, other)]
-        assert decided.log_odds - max(others, default=-math.inf) >= CONFIG.min_lead
-        assert decided.result.probability >= CONFIG.min_probability
-    elif believed:
-        assert decided.result.reason == "ambiguous"
+def test_hypotheses_that_are_not_probable_are_no_answer():
+    result = _answered(made_hypothesis(-2.0, x=4.0), made_hypothesis(-0.5, x=-9.0, walls=True))
+    assert isinstance(result, NotLocalized)
+    assert result.reason == "not_in_map"
+    assert result.alternatives == ()
 
 
-MORE = {
-    "found": (replace(EVIDENCE, num_found=90), 30),
-    "less must be in view": (replace(EVIDENCE, num_visible=120), 30),
-    "less by chance": (replace(EVIDENCE, num_by_chance=3), 30),
-    "inliers": (replace(EVIDENCE, num_inliers=60), 30),
-    "fewer matches that agree with nothing": (replace(EVIDENCE, num_matches=80), 30),
-    "spread": (replace(EVIDENCE, spread=0.8), 30),
-    "precise": (replace(EVIDENCE, doubt=0.1), 30),
-    "distinct": (EVIDENCE, 50),
-}
+def test_without_a_hypothesis_there_is_none_to_name():
+    result = _answered()
+    assert isinstance(result, NotLocalized)
+    assert (result.reason, result.candidates, result.alternatives) == ("too_few_matches", CANDIDATES, ())
+    assert Belief().best(WEIGHTS.rivals) is None
 
 
-@pytest.mark.parametrize(("evidence", "num_distinct"), MORE.values(), ids=MORE.keys())
-def test_more_evidence_means_better_odds(evidence: Evidence, num_distinct: int):
-    assert side_log_odds(evidence, num_distinct, WEIGHTS) > side_log_odds(EVIDENCE, 30, WEIGHTS) + 0.1
+def test_a_search_that_was_cut_short_says_so():
+    imprecise = replace(made_hypothesis(-1.0), evidence=Evidence(150, 90, 300, 1700, 20, spread=0.8, doubt=40.0, even_share=0.15))
+    alike = [made_hypothesis(4.0), made_hypothesis(4.0, x=9.0)]
+    for hypotheses in ([], [made_hypothesis(-2.0)], [imprecise], alike):
+        search = believed(hypotheses)
+        search.is_stopped = True
+        result, _ = answer(search)
+        assert isinstance(result, NotLocalized)
+        assert "time was up" in result.detail
 
 
-def test_no_evidence_at_all_is_odds_all_the_same():
-    nothing = Evidence(num_matches=0, num_inliers=0, num_found=0, num_visible=0, num_by_chance=0, spread=0.0, doubt=50.0, even_share=0.0)
-    assert side_log_odds(nothing, 0, WEIGHTS) < -5.0
+def test_what_is_asked_of_an_answer_can_be_set():
+    strict = LocalizerConfig(evidence=EvidenceConfig(min_probability=0.95))
+    for log_odds, is_answer in ((2.0, False), (4.0, True)):
+        result, _ = answer(believed([made_hypothesis(log_odds)], strict))
+        assert isinstance(result, Localization) is is_answer

@@ -8,19 +8,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from topoloc.localization.shared_errors import SharedErrorsConfig, inflation
 
 import topoloc
 from built_room import built_room
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization import shared_errors
+from topoloc.localization import correlated_errors
+from topoloc.localization.correlated_errors import CorrelatedErrorsConfig, inflation
 from topoloc.localization.fitted_weights import weights_of
 from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.map.topomap import TopoMetricMap
 
-CONFIG, WEIGHTS = SharedErrorsConfig(min_nodes=3), weights_of("surf").shared_errors
+CONFIG, WEIGHTS = CorrelatedErrorsConfig(min_nodes=3), weights_of("surf").shared_errors
 
 
 def _disturbed(topomap: TopoMetricMap, metres: float, radians: float) -> TopoMetricMap:
@@ -34,10 +34,10 @@ def _disturbed(topomap: TopoMetricMap, metres: float, radians: float) -> TopoMet
 
 
 def _rho(topomap: TopoMetricMap) -> float:
-    return Localizer(topomap, LocalizerConfig(shared_errors=CONFIG)).shared_errors
+    return Localizer(topomap, LocalizerConfig(correlated_errors=CONFIG)).correlated_errors
 
 
-def test_nodes_out_of_place_share_errors_and_nodes_in_place_do_not(tiny_recording: Path):
+def test_nodes_out_of_place_have_correlated_errors_and_nodes_in_place_do_not(tiny_recording: Path):
     topomap = built_room(tiny_recording)
     exact = _rho(topomap)
     assert exact < 0.03
@@ -48,13 +48,13 @@ def test_nodes_out_of_place_share_errors_and_nodes_in_place_do_not(tiny_recordin
 def measurings(monkeypatch: pytest.MonkeyPatch) -> list[TopoMetricMap]:
     """The maps that were measured since."""
     measured: list[TopoMetricMap] = []
-    measure = shared_errors.measure_shared_errors
+    measure = correlated_errors.measure_correlated_errors
 
     def told(topomap: TopoMetricMap, *settings: Any) -> float:
         measured.append(topomap)
         return measure(topomap, *settings)
 
-    monkeypatch.setattr(shared_errors, "measure_shared_errors", told)
+    monkeypatch.setattr(correlated_errors, "measure_correlated_errors", told)
     return measured
 
 
@@ -67,40 +67,40 @@ def saved(tiny_recording: Path, tmp_path: Path) -> Path:
 
 def test_a_map_knows_what_was_measured_when_it_was_built(saved: Path, measurings: list[TopoMetricMap]):
     loaded = TopoMetricMap.load(saved)
-    known = Localizer(loaded).shared_errors
+    known = Localizer(loaded).correlated_errors
     assert not measurings
     unknown = replace(loaded, shared_errors=None)
-    assert Localizer(unknown).shared_errors == pytest.approx(known, rel=0.3)  # the file's points are rounded
+    assert Localizer(unknown).correlated_errors == pytest.approx(known, rel=0.3)  # the file's points are rounded
     assert measurings == [unknown]
 
 
 @pytest.mark.parametrize(
     "config",
     [
-        LocalizerConfig(shared_errors=SharedErrorsConfig(percentile=50.0)),
+        LocalizerConfig(correlated_errors=CorrelatedErrorsConfig(percentile=50.0)),
         LocalizerConfig(guided=GuidedConfig(radius_px=7.0)),
         LocalizerConfig(pose=AbsolutePoseConfig(max_reprojection_error_px=5.0)),
     ],
-    ids=["shared errors", "guided", "pose"],
+    ids=["correlated errors", "guided", "pose"],
 )
 def test_with_other_settings_it_is_measured_anew(config: LocalizerConfig, saved: Path, measurings: list[TopoMetricMap]):
     loaded = TopoMetricMap.load(saved)
-    rho = Localizer(loaded, config).shared_errors
+    rho = Localizer(loaded, config).correlated_errors
     assert measurings == [loaded]
-    assert rho == Localizer(replace(loaded, shared_errors=None), config).shared_errors
+    assert rho == Localizer(replace(loaded, shared_errors=None), config).correlated_errors
 
 
 def test_settings_that_it_does_not_depend_on_may_change(saved: Path, measurings: list[TopoMetricMap]):
     loaded = TopoMetricMap.load(saved)
     assert loaded.shared_errors is not None
-    assert Localizer(loaded, LocalizerConfig(num_candidates=2)).shared_errors == loaded.shared_errors.rho
+    assert Localizer(loaded, LocalizerConfig(num_candidates=2)).correlated_errors == loaded.shared_errors.rho
     assert not measurings
 
 
 def test_of_other_nodes_it_is_measured_anew(saved: Path, measurings: list[TopoMetricMap]):
     moved = _disturbed(TopoMetricMap.load(saved), 0.02, 0.005)
     assert moved.shared_errors is not None
-    assert Localizer(moved).shared_errors > moved.shared_errors.rho
+    assert Localizer(moved).correlated_errors > moved.shared_errors.rho
     assert measurings == [moved]
 
 
@@ -110,6 +110,6 @@ def test_a_map_of_one_node_is_taken_to_be_of_middling_quality(tiny_recording: Pa
     assert _rho(single) == WEIGHTS.unknown
 
 
-def test_without_shared_errors_the_covariance_stays_as_it_is():
+def test_without_correlated_errors_the_covariance_stays_as_it_is():
     assert inflation(500, 0.0) == 1.0
     assert inflation(100, 0.1) == pytest.approx(11.0)

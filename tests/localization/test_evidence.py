@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from topoloc.localization.verification import (
+
+from topoloc.localization.evidence import (
     Evidence,
-    VerificationConfig,
+    EvidenceConfig,
     doubt_of,
     even_share_of,
     is_only_imprecise,
-    probability_of,
+    log_odds_of,
+    precision_of,
     spread_of,
     tolerated_translation,
 )
+from topoloc.localization.fitted_weights import FittedWeights, weights_of
 
-from topoloc.localization.fitted_weights import weights_of
-
-CONFIG, WEIGHTS = VerificationConfig(), weights_of("surf").evidence
+CONFIG, WEIGHTS = EvidenceConfig(), weights_of("surf")
 STRONG = Evidence(
     num_matches=150, num_inliers=90, num_found=300, num_visible=1700, num_by_chance=20, spread=0.8, doubt=0.1, even_share=0.15
 )
@@ -41,34 +43,40 @@ evidences = st.builds(
     st.floats(0.0, 1.0, allow_nan=False),
     st.floats(0.0, 1e3, allow_nan=False),
     st.floats(0.0, 1.0, allow_nan=False),
+    st.none() | counts,
 )
+
+
+def _probability(evidence: Evidence, weights: FittedWeights) -> float:
+    """Of "here" against "nowhere"."""
+    return 1.0 / (1.0 + math.exp(-log_odds_of(evidence, weights)))
 
 
 @given(evidences)
 def test_what_speaks_for_a_pose_never_makes_it_less_probable(evidence: Evidence):
-    probability = probability_of(evidence, WEIGHTS)
-    assert 0.0 <= probability <= 1.0
+    log_odds = log_odds_of(evidence, WEIGHTS)
+    assert math.isfinite(log_odds)
     for better in (
         replace(evidence, num_found=evidence.num_found + 5),
         replace(evidence, spread=min(evidence.spread + 0.1, 1.0)),
         replace(evidence, even_share=min(evidence.even_share + 0.01, 1.0)),
         replace(evidence, num_inliers=evidence.num_inliers + 1),
     ):
-        assert probability_of(better, WEIGHTS) >= probability
+        assert log_odds_of(better, WEIGHTS) >= log_odds
     for worse in (
         replace(evidence, num_by_chance=evidence.num_by_chance + 5),
         replace(evidence, num_matches=evidence.num_matches + 5),
         replace(evidence, doubt=evidence.doubt * 2.0),
     ):
-        assert probability_of(worse, WEIGHTS) <= probability
+        assert log_odds_of(worse, WEIGHTS) <= log_odds
 
 
 def test_strong_evidence_is_believed():
-    assert probability_of(STRONG, WEIGHTS) > 0.97
+    assert _probability(STRONG, WEIGHTS) > 0.97
 
 
 def test_many_found_of_very_many_that_should_be_is_still_improbable():
-    assert probability_of(MANY_OF_VERY_MANY, WEIGHTS) < 0.3
+    assert _probability(MANY_OF_VERY_MANY, WEIGHTS) < 0.3
 
 
 @pytest.mark.parametrize(
@@ -81,12 +89,12 @@ def test_many_found_of_very_many_that_should_be_is_still_improbable():
     ],
 )
 def test_no_single_part_of_the_evidence_carries_a_pose(weaker: dict[str, float]):
-    assert probability_of(replace(STRONG, **weaker), WEIGHTS) < 0.7
+    assert _probability(replace(STRONG, **weaker), WEIGHTS) < 0.7
 
 
 def test_a_pose_that_is_only_imprecise_is_told_from_one_that_has_nothing_to_stand_on():
     small = replace(STRONG, num_inliers=24, num_matches=40, num_found=110, num_by_chance=12, spread=0.2, doubt=30.0, even_share=0.08)
-    assert probability_of(small, WEIGHTS) < CONFIG.min_probability
+    assert _probability(small, WEIGHTS) < CONFIG.min_probability
     assert is_only_imprecise(small, WEIGHTS, CONFIG)
     assert not is_only_imprecise(MANY_OF_VERY_MANY, WEIGHTS, CONFIG)
 
@@ -120,3 +128,35 @@ def test_points_found_everywhere_are_a_larger_even_share_than_as_many_in_one_hal
     assert uneven < 0.6 * even
     assert even_share_of(np.zeros((0, 2)), visible, 640, 480) < 0.02
     assert even_share_of(everywhere, np.zeros((0, 2)), 640, 480) == 0.0
+
+
+OF_WALLS = Evidence(
+    num_matches=150, num_inliers=40, num_found=60, num_visible=200, num_by_chance=12, spread=0.5, doubt=0.3, even_share=0.2, num_distinct=30
+)
+MORE = {
+    "found": replace(OF_WALLS, num_found=90),
+    "less must be in view": replace(OF_WALLS, num_visible=120),
+    "less by chance": replace(OF_WALLS, num_by_chance=3),
+    "inliers": replace(OF_WALLS, num_inliers=60),
+    "fewer matches that agree with nothing": replace(OF_WALLS, num_matches=80),
+    "spread": replace(OF_WALLS, spread=0.8),
+    "precise": replace(OF_WALLS, doubt=0.1),
+    "distinct": replace(OF_WALLS, num_distinct=50),
+}
+
+
+@pytest.mark.parametrize("evidence", MORE.values(), ids=MORE.keys())
+def test_more_evidence_of_walls_means_better_odds(evidence: Evidence):
+    assert log_odds_of(evidence, WEIGHTS) > log_odds_of(OF_WALLS, WEIGHTS) + 0.1
+
+
+def test_no_evidence_of_walls_at_all_is_odds_all_the_same():
+    nothing = Evidence(0, 0, 0, 0, 0, spread=0.0, doubt=50.0, even_share=0.0, num_distinct=0)
+    assert log_odds_of(nothing, WEIGHTS) < -5.0
+
+
+def test_only_a_pose_by_the_walls_is_asked_for_its_precision_beside_its_odds():
+    assert precision_of(replace(STRONG, doubt=8.0)) == 1.0
+    assert precision_of(replace(OF_WALLS, doubt=1.0)) == pytest.approx(0.6827, abs=1e-4)  # one standard deviation
+    assert precision_of(replace(OF_WALLS, doubt=0.3)) > 0.99
+    assert precision_of(replace(OF_WALLS, doubt=8.0)) < 0.11

@@ -14,8 +14,10 @@ from topoloc.errors import EmptyMapError, MapError, QueryError
 from topoloc.features.features import Features
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
+from topoloc.localization.belief import Belief
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.trace import Trace
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.coarse import NodeScore
 
@@ -152,3 +154,54 @@ def test_an_unknown_coarse_localizer_names_those_there_are(localizer: Localizer)
         Localizer(localizer.topomap, LocalizerConfig(coarse="netvlad"))
     with pytest.raises(MapError, match="it has: none"):
         Localizer(replace(localizer.topomap, coarse_models={}))
+
+
+# time
+
+
+NOISE = np.random.default_rng(0).integers(0, 256, (240, 320), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("picture", [*(picture for picture, _ in unseen_views(step=4.0)), NOISE, np.zeros_like(NOISE)])
+def test_without_any_time_the_first_hypothesis_is_answered_or_it_is_said_that_time_was_up(picture: np.ndarray, localizer: Localizer):
+    trace = Trace()
+    result = localizer.localize(picture, CAMERA, max_ms=0.0, trace=trace)
+    assert [tried.source for tried in trace.tried] == ["retrieval"]
+    assert isinstance(result, Localization) or "time was up" in result.detail
+
+
+def test_a_query_s_own_time_comes_before_that_of_the_settings(localizer: Localizer):
+    hurried = Localizer(localizer.topomap, LocalizerConfig(max_ms=0.0))
+    results = [hurried.localize(NOISE, CAMERA), hurried.localize(NOISE, CAMERA, max_ms=1e6), localizer.localize(NOISE, CAMERA)]
+    assert ["time was up" in result.detail for result in results if isinstance(result, NotLocalized)] == [True, False, False]
+
+
+# what was tried
+
+
+@pytest.mark.parametrize("picture", [PICTURE, (0.05 * PICTURE).astype(np.uint8), NOISE], ids=["here", "dark", "noise"])
+def test_the_trace_holds_all_that_was_tried_and_the_answer_follows_from_it(picture: np.ndarray, localizer: Localizer):
+    trace, weights, evidence = Trace(), localizer.weights.rivals, localizer.config.evidence
+    result = localizer.localize(picture, CAMERA, trace=trace)
+    assert trace.tried[0].source == "retrieval"
+    assert len(trace.tried[0].first.features) == len(trace.tried[-1].first.features)
+    times_ms = [tried.milliseconds for tried in trace.tried]
+    assert times_ms == sorted(times_ms)
+    assert times_ms[-1] <= result.times_ms["total"]
+    belief = Belief()
+    for tried in trace.tried:
+        if tried.hypothesis is not None:
+            assert tried.hypothesis.source == tried.source
+            assert tried.hypothesis.fit is tried.refined
+            belief = belief.given(tried.hypothesis, evidence, weights)
+    best = belief.best(weights)
+    if isinstance(result, Localization):
+        assert best is not None
+        np.testing.assert_array_equal(result.world_from_cam.matrix(), best.world_from_cam.matrix())
+        assert result.evidence == best.evidence
+    else:
+        assert best is None or best.probability < evidence.min_probability or result.reason == "ambiguous"
+
+
+def test_who_is_traced_gets_the_same_answer(localizer: Localizer):
+    assert _facts(localizer.localize(PICTURE, CAMERA, trace=Trace())) == _facts(localizer.localize(PICTURE, CAMERA))

@@ -1,4 +1,4 @@
-"""First poses from what nodes saw: found where the ratio test leaves too little, and no answer where the picture is of elsewhere."""
+"""Where first poses come from, and when they are not sought: look-alikes, what nodes saw, a prior."""
 
 from __future__ import annotations
 
@@ -7,21 +7,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from topoloc.localization.attempt import Attempt
-from topoloc.localization.standpoints import StandpointsConfig, strongest_and_distinct
 
 from built_room import built_room, unseen_views
 from tiny_world import CAMERA
-from topoloc.features.features import Features, Matches
-from topoloc.geometry.absolute_pose import AbsolutePose
 from topoloc.geometry.alignment import translation_error
-from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.local_map import LocalMap
-from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.localization.result import Localization
-from topoloc.map.topomap import TopoMetricMap
+from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.localization import propose
+from topoloc.localization.config import LocalizerConfig, LookAlikesConfig, ViewpointsConfig
+from topoloc.localization.fitted_weights import weights_of
+from topoloc.localization.localizer import Localizer
+from topoloc.localization.pose_fit import PoseFit
+from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.trace import Trace
+from topoloc.map.topomap import TopoMetricMap, TopoNode
+from topoloc.places.vlad import SurfVlad
 
+ELSEWHERE = Rigid3(exp_so3(np.array([0.0, 0.0, 1.0])), np.array([40.0, -15.0, 0.0]))
+"""Where the second room stands, in the world of the first."""
 LIGHTS = (0.055, 0.05, 0.045)
+ONLY_RETRIEVAL = LocalizerConfig(look_alikes=LookAlikesConfig(max_groups=0), viewpoints=ViewpointsConfig(num_nodes=0))
 
 
 @pytest.fixture(scope="module")
@@ -29,48 +33,200 @@ def room(tiny_recording: Path) -> TopoMetricMap:
     return built_room(tiny_recording)
 
 
+def _moved(node: TopoNode, node_id: int) -> TopoNode:
+    summary = node.summary
+    return replace(node, summary=replace(summary, node_id=node_id, world_from_cam=ELSEWHERE @ summary.world_from_cam))
+
+
+def _twice(topomap: TopoMetricMap, share_alike: float = 1.0) -> TopoMetricMap:
+    """A map that holds the room a second time, elsewhere; only this share of its points looks the same there."""
+    num_nodes, rng = len(topomap.nodes), np.random.default_rng(0)
+    copies = []
+    for node in topomap.nodes:
+        descriptors = node.features.descriptors.copy()
+        other = rng.random(len(descriptors)) >= share_alike
+        descriptors[other] = rng.normal(size=(np.count_nonzero(other), descriptors.shape[1]))
+        descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+        changed = replace(node, features=replace(node.features, descriptors=descriptors))
+        copies.append(_moved(changed, num_nodes + node.summary.node_id))
+    nodes = [*topomap.nodes, *copies]
+    model = topomap.coarse_models[SurfVlad.name]
+    ids = model.arrays["node_ids"]
+    arrays = dict(model.arrays) | {
+        "vectors": np.concatenate([model.arrays["vectors"]] * 2),
+        "node_ids": np.concatenate([ids, ids + num_nodes]).astype(ids.dtype),
+    }
+    coarse = {SurfVlad.name: replace(model, arrays=arrays)}
+    return replace(topomap, nodes=nodes, summaries=[node.summary for node in nodes], coarse_models=coarse, edges=[])
+
+
+def _sources(trace: Trace) -> list[str]:
+    return [tried.source for tried in trace.tried]
+
+
+# look-alikes
+
+
+def test_a_place_that_is_in_the_map_twice_is_ambiguous_and_both_poses_are_named(room: TopoMetricMap):
+    localizer = Localizer(_twice(room))
+    results = [(localizer.localize(picture, CAMERA), truth) for picture, truth in unseen_views()]
+    assert not any(isinstance(result, Localization) for result, _ in results)
+    ambiguous = [(r, truth) for r, truth in results if isinstance(r, NotLocalized) and r.reason == "ambiguous"]
+    assert len(ambiguous) >= 0.9 * len(results)
+    for result, truth in ambiguous:
+        first, second = result.alternatives[:2]
+        assert sorted(one.node_id < len(room.nodes) for one in (first, second)) == [False, True]
+        for one in (first, second):
+            expected = truth if one.node_id < len(room.nodes) else ELSEWHERE @ truth
+            assert translation_error(one.world_from_cam, expected) < 0.05
+        assert 0.8 < sum(one.probability for one in result.alternatives) <= 1.0
+        named = result.to_json("view.png")["alternatives"]
+        assert [one["node"] for one in named] == [one.node_id for one in result.alternatives]
+
+
+def test_by_retrieval_alone_the_second_place_goes_unnoticed_or_the_image_without_an_answer(room: TopoMetricMap):
+    """What other proposals are for: without them the reason is a wrong one."""
+    localizer = Localizer(_twice(room), ONLY_RETRIEVAL)
+    results = [localizer.localize(picture, CAMERA) for picture, _ in unseen_views()]
+    assert not any(isinstance(result, NotLocalized) and result.reason == "ambiguous" for result in results)
+
+
+def test_a_place_that_is_only_partly_like_another_is_told_apart(room: TopoMetricMap):
+    localizer = Localizer(_twice(room, share_alike=0.2))
+    found = [(localizer.localize(picture, CAMERA), truth) for picture, truth in unseen_views()]
+    right = [isinstance(r, Localization) and translation_error(r.world_from_cam, truth) < 0.05 for r, truth in found]
+    assert np.mean(right) >= 0.8
+    assert not any(isinstance(r, Localization) and translation_error(r.world_from_cam, truth) > 0.5 for r, truth in found)
+
+
+def test_a_place_that_is_in_the_map_once_is_answered_as_by_retrieval_alone(room: TopoMetricMap):
+    with_them, without = Localizer(room), Localizer(room, ONLY_RETRIEVAL)
+    for picture, _ in unseen_views():
+        one, other = with_them.localize(picture, CAMERA), without.localize(picture, CAMERA)
+        assert isinstance(one, Localization)
+        assert isinstance(other, Localization)
+        np.testing.assert_array_equal(one.world_from_cam.matrix(), other.world_from_cam.matrix())
+
+
+# viewpoints
+
+
 def _dark(picture: np.ndarray, light: float, seed: int) -> np.ndarray:
     noise = np.random.default_rng(seed).normal(0.0, 5.0, picture.shape)
     return np.clip(light * picture + noise, 0, 255).astype(np.uint8)
 
 
-def test_dark_pictures_are_localized_that_are_not_without(room: TopoMetricMap):
+def test_dark_images_are_localized_that_are_not_without_viewpoints(room: TopoMetricMap):
     views = [(_dark(picture, light, k), truth) for light in LIGHTS for k, (picture, truth) in enumerate(unseen_views())]
-    num_right = {}
-    for num_nodes in (0, StandpointsConfig().num_nodes):
-        localizer = Localizer(room, LocalizerConfig(standpoints=StandpointsConfig(num_nodes=num_nodes)))
-        found = [(localizer.localize(picture, CAMERA), truth) for picture, truth in views]
-        errors = [translation_error(r.world_from_cam, truth) for r, truth in found if isinstance(r, Localization)]
+    num_right, sources = {}, []
+    for num_nodes in (0, ViewpointsConfig().num_nodes):
+        localizer = Localizer(room, LocalizerConfig(viewpoints=ViewpointsConfig(num_nodes=num_nodes)))
+        errors = []
+        for picture, truth in views:
+            trace = Trace()
+            result = localizer.localize(picture, CAMERA, trace=trace)
+            errors += [translation_error(result.world_from_cam, truth)] if isinstance(result, Localization) else []
+            sources += _sources(trace) if num_nodes == 0 else []
         assert max(errors, default=0.0) < 0.25
         num_right[num_nodes] = len(errors)
-    assert num_right[StandpointsConfig().num_nodes] > num_right[0]
+    assert num_right[ViewpointsConfig().num_nodes] > num_right[0]
+    assert "viewpoints" not in sources
 
 
-def _attempt(world_from_cam: Rigid3 | None, num_inliers: int) -> Attempt:
-    features = Features.empty(64)
-    rows = np.zeros(num_inliers, np.int32)
-    empty, one = np.zeros((0, 3)), np.zeros(0)
-    local_map = LocalMap(features.descriptors, empty, np.zeros((0, 3, 3)), one, np.zeros(0, int), one, empty)
-    pose = None
-    if world_from_cam is not None:
-        pose = AbsolutePose(world_from_cam.inverse(), np.ones(num_inliers, bool), np.eye(6), np.zeros(num_inliers))
-    return Attempt(features, CAMERA, CAMERA, local_map, Matches(rows, rows, np.zeros(num_inliers, np.float32)), pose)
+def _never_clear(room: TopoMetricMap, config: LocalizerConfig | None = None) -> Localizer:
+    """Every image is treated as one that is not clear."""
+    weights = weights_of("surf")
+    return Localizer(room, config, weights=replace(weights, evidence=replace(weights.evidence, clear_log_odds=1e9)))
 
 
-def test_poses_close_to_one_another_are_looked_into_once_and_the_strongest_first():
-    def at(x: float) -> Rigid3:
-        return Rigid3(np.eye(3), np.array([x, 0.0, 0.0]))
-
-    attempts = [_attempt(at(0.0), 20), _attempt(at(0.1), 30), _attempt(None, 0), _attempt(at(0.5), 40), _attempt(at(0.6), 10)]
-    kept = strongest_and_distinct(attempts, lambda_rot=1.0, max_distance=0.25, max_poses=6)
-    assert [attempts.index(attempt) for attempt in kept] == [3, 1]
-    assert strongest_and_distinct(attempts, 1.0, 0.25, max_poses=1) == [attempts[3]]
-
-
-def test_pictures_of_elsewhere_stay_unanswered_and_those_of_here_are_answered(room: TopoMetricMap):
-    """With every query treated as one that is not clear."""
-    config = LocalizerConfig()
-    localizer = Localizer(room, replace(config, verification=replace(config.verification, clear_log_odds=1e9)))
+def test_images_that_are_never_clear_are_answered_all_the_same_and_those_of_elsewhere_are_not(room: TopoMetricMap):
+    localizer = _never_clear(room)
     here = [(localizer.localize(picture, CAMERA), truth) for picture, truth in unseen_views()]
     assert all(isinstance(result, Localization) and translation_error(result.world_from_cam, truth) < 0.05 for result, truth in here)
     assert not any(isinstance(localizer.localize(picture, CAMERA), Localization) for picture, _ in unseen_views(seed=7))
+
+
+def test_poses_that_viewpoints_agree_on_are_looked_into_once_the_one_with_most_inliers_first(room: TopoMetricMap):
+    """All nodes around show the same place: one pose comes of them."""
+    trace = Trace()
+    _never_clear(room).localize(unseen_views()[2][0], CAMERA, trace=trace)
+    fits = [tried.first for tried in trace.tried if tried.source == "viewpoints"]
+    assert 1 <= len(fits) <= ViewpointsConfig().max_poses
+    assert [fit.num_inliers for fit in fits] == sorted((fit.num_inliers for fit in fits), reverse=True)
+    centres = [fit.pose.cam_from_world.inverse().translation for fit in fits if fit.pose is not None]
+    assert len(centres) == len(fits)
+    assert all(np.linalg.norm(a - b) > 0.05 for k, a in enumerate(centres) for b in centres[:k])
+
+
+def test_only_so_many_viewpoints_are_followed_up_as_are_asked_for(room: TopoMetricMap):
+    config = LocalizerConfig(viewpoints=ViewpointsConfig(max_poses=1))
+    trace = Trace()
+    _never_clear(room, config).localize(unseen_views()[2][0], CAMERA, trace=trace)
+    assert _sources(trace).count("viewpoints") == 1
+
+
+# when nothing more is sought
+
+
+@pytest.fixture
+def fits(monkeypatch: pytest.MonkeyPatch) -> list[PoseFit]:
+    """The first poses that were sought by RANSAC since."""
+    found: list[PoseFit] = []
+    fit_pose = propose.fit_pose
+
+    def told(*arguments: object) -> PoseFit:
+        found.append(fit_pose(*arguments))  # pyright: ignore[reportArgumentType]
+        return found[-1]
+
+    monkeypatch.setattr(propose, "fit_pose", told)
+    return found
+
+
+def test_an_image_from_elsewhere_is_refused_after_the_first_pose(room: TopoMetricMap, fits: list[PoseFit]):
+    """Neither look-alikes nor RANSAC on what viewpoints show: refusing is as quick as answering."""
+    localizer = Localizer(room)
+    noise = np.random.default_rng(0).integers(0, 256, (240, 320), dtype=np.uint8)
+    for picture in (noise, *(picture for picture, _ in unseen_views(seed=1, step=4.0))):
+        fits.clear()
+        trace = Trace()
+        assert isinstance(localizer.localize(picture, CAMERA, trace=trace), NotLocalized)
+        assert _sources(trace) == ["retrieval"]
+        assert len(fits) <= 1
+
+
+def test_a_clear_image_is_compared_with_no_viewpoint(room: TopoMetricMap, fits: list[PoseFit]):
+    trace = Trace()
+    result = Localizer(room).localize(unseen_views()[2][0], CAMERA, trace=trace)
+    assert isinstance(result, Localization)
+    assert "viewpoints" not in _sources(trace)
+    assert _sources(trace)[0] == "retrieval"
+    assert len(fits) == len(trace.tried)
+
+
+# a prior
+
+
+def _no_search(*_: object) -> None:
+    pytest.fail("the coarse localizer was asked")
+
+
+def test_a_prior_replaces_the_coarse_search(room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch):
+    localizer, (picture, truth) = Localizer(room), unseen_views()[2]
+    monkeypatch.setattr(localizer.map.coarse, "rank", _no_search)
+    about = truth @ Rigid3(exp_so3(np.array([0.0, 0.05, 0.0])), np.array([0.1, 0.0, -0.1]))
+    trace = Trace()
+    result = localizer.localize(picture, CAMERA, prior=about, trace=trace)
+    assert isinstance(result, Localization)
+    assert translation_error(result.world_from_cam, truth) < 0.02
+    assert _sources(trace) == ["prior"]
+    assert len(result.candidates) == localizer.config.num_candidates
+    scores = [candidate.score for candidate in result.candidates]
+    assert scores == sorted(scores, reverse=True)
+    nearest = min(room.summaries, key=lambda summary: translation_error(summary.world_from_cam, truth))
+    assert nearest.node_id in {candidate.node_id for candidate in result.candidates}
+
+
+def test_a_prior_that_is_wrong_makes_no_place_of_an_image_from_elsewhere(room: TopoMetricMap):
+    localizer, (_, somewhere) = Localizer(room), unseen_views()[2]
+    for picture, _ in unseen_views(seed=1, step=4.0):
+        assert isinstance(localizer.localize(picture, CAMERA, prior=somewhere), NotLocalized)

@@ -7,7 +7,7 @@ import json
 import numpy as np
 
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.result import Alternative, Localization, NotLocalized
 from topoloc.places.coarse import NodeScore
 
 POSE = Rigid3(exp_so3(np.array([0.1, -0.2, 0.3])), np.array([1.0, -2.0, 0.5]))
@@ -72,3 +72,13 @@ def test_the_cameras_own_covariance_is_that_of_a_perturbation_on_its_side():
 def test_a_probability_that_is_not_calibrated_says_so():
     result = Localization(POSE, np.eye(6), 0.9, 0, [], 1, 1, calibrated=False)
     assert result.to_json("a.png")["calibrated"] is False
+
+
+def test_an_ambiguity_names_its_alternatives_but_no_answer():
+    alternatives = (Alternative(POSE, 0.5, 3), Alternative(POSE.inverse(), 0.4, 8))
+    line = NotLocalized("ambiguous", CANDIDATES, 96, 61, TIMES_MS, "as much like node 8 as like node 3", alternatives).to_json("a.png")
+    assert line == json.loads(json.dumps(line, allow_nan=False))
+    assert "world_from_cam" not in line
+    assert [(one["node"], one["probability"]) for one in line["alternatives"]] == [(3, 0.5), (8, 0.4)]
+    assert line["alternatives"][0]["world_from_cam"] == Localization(POSE, np.eye(6), 1.0, 3, [], 1, 1).to_json("")["world_from_cam"]
+    assert "covariance" not in line["alternatives"][0]

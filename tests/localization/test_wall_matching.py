@@ -6,7 +6,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from topoloc.localization.side_matching import SeenSide, estimate_pose, match_sides, nearest_sides, of_picture
 
 from built_corridor import WIDE, back, built_corridor, seen_on_the_way_back
 from topoloc.features.extraction import extract_features
@@ -18,6 +17,7 @@ from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.local_map import LocalMap
+from topoloc.localization.wall_matching import SeenSide, estimate_pose, match_sides, nearest_sides, of_picture
 from topoloc.map.topomap import SideNodes
 
 PICTURE, TRUTH = seen_on_the_way_back()[2]

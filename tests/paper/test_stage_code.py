@@ -56,7 +56,7 @@ def _done_again(change: Callable[[], object]) -> set[str]:
     ("module", "stages"),
     [
         ("topoloc/localization/localizer.py", ASKING),
-        ("topoloc/localization/verification.py", ASKING),
+        ("topoloc/localization/evidence.py", ASKING),
         ("topoloc/geometry/absolute_pose_kernels.py", ASKING),
         ("topoloc/tracking/tracker.py", set()),
         ("topoloc/slam/odometry.py", set()),

@@ -86,7 +86,7 @@ def test_smoothing_halves_the_jitter_of_single_pictures(localizer: Localizer, an
 def test_no_coarse_search_while_tracked(localizer: Localizer, monkeypatch: pytest.MonkeyPatch):
     tracker = Tracker(localizer)
     _stream(tracker, 0, 3)
-    monkeypatch.setattr(Localizer, "_rank_nodes", lambda *_: pytest.fail("the coarse localizer was asked"))
+    monkeypatch.setattr(localizer.map.coarse, "rank", lambda *_: pytest.fail("the coarse localizer was asked"))
     assert {answer.state for answer in _stream(tracker, 3, 25)} == {"localized", "tracked"}
 
 
@@ -100,7 +100,7 @@ def test_the_smoothed_covariance_is_of_the_size_of_the_error(answers: list[Strea
 def test_what_the_map_is_wrong_by_is_no_noise(tiny_recording: Path, answers: list[StreamedPose]):
     """A map that says more of its own errors is followed as closely, and the answers say as much more."""
     doubtful = Localizer(built_room(tiny_recording))
-    vars(doubtful)["shared_errors"] = 0.5
+    vars(doubtful)["correlated_errors"] = 0.5
     others = _stream(Tracker(doubtful), 0, 30)
     for other, answer in zip(others, answers, strict=False):
         assert translation_error(_smoothed(other), _smoothed(answer)) < 0.01

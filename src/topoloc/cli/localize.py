@@ -75,6 +75,8 @@ class Command:
     """The recordings' format: kitti, euroc, tum, seven_scenes, video or folder."""
     coarse: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")] = None
     """Coarse localizer that is asked; `topoloc info` names those of the map."""
+    max_ms: Annotated[float | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: no limit)")] = None
+    """After so many milliseconds no further hypothesis is sought for an image; the first one is always tried."""
     json: File = None
     """Write one JSON line a query to this file (- for standard output)."""
     tum: File = None

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from topoloc.bounds import Above, AtLeast, Between
-from topoloc.localization.fitted_weights import FittedWeights, WallWeights
+from topoloc.localization.fitted_weights import EvidenceWeights, FittedWeights, WallWeights
 
 COLUMNS, ROWS = 8, 6
 """The cells of a picture whose number with an inlier in it measures the inliers' spread."""
@@ -125,8 +125,12 @@ def log_odds_of(evidence: Evidence, weights: FittedWeights) -> float:
     """Logarithm of the odds that the pose is right."""
     if evidence.num_distinct is not None:
         return _wall_log_odds(evidence, evidence.num_distinct, weights.walls)
-    w = weights.evidence
-    return sum(weight * x for weight, x in zip(w.in_order, score_features(evidence), strict=True)) + w.bias
+    return node_log_odds(evidence, weights.evidence)
+
+
+def node_log_odds(evidence: Evidence, weights: EvidenceWeights) -> float:
+    """The same of a pose that the map's nodes let expect, not its walls."""
+    return sum(weight * x for weight, x in zip(weights.in_order, score_features(evidence), strict=True)) + weights.bias
 
 
 def _wall_log_odds(e: Evidence, num_distinct: int, weights: WallWeights) -> float:

@@ -1,6 +1,6 @@
 """What a localization is wrong by, in two parts: what differs from picture to picture, and what lasts.
 
-The noise of a picture's matches is another one in the next picture. What the map's points have in common (`shared_errors.py`) is not: a
+The noise of a picture's matches is another one in the next picture. What the map's points have in common (`correlated_errors.py`) is not: a
 picture taken close by stands on the same points and is wrong by the same, so no number of pictures averages it away. Where the
 camera moves on, other points take over, and the lasting part changes by and by, the sooner the nearer the points are. It is taken for
 a Gauss-Markov process of first order (Gelb, *Applied Optimal Estimation*, 1974, section 3.8) in s = way / depth + turn: two pictures have

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from topoloc.localization.verification import Evidence, log_odds_of
 
+from topoloc.localization.evidence import Evidence, node_log_odds
 from topoloc.localization.fitted_weights import EvidenceWeights, RivalWeights, SharedErrorWeights, read_weights
 from topoloc_paper.fit import __main__ as command
 from topoloc_paper.fit.evidence import Judged, calibration_error, decided, fit_evidence, fit_shared_errors, judged, try_on_other_families
@@ -41,7 +41,7 @@ def _drawn(num: int, seed: int = 0) -> list[TriedPose]:
     rng, poses = np.random.default_rng(seed), []
     for k in range(num):
         evidence = _evidence(rng)
-        is_right = rng.random() < 1.0 / (1.0 + math.exp(-log_odds_of(evidence, TRUE)))
+        is_right = rng.random() < 1.0 / (1.0 + math.exp(-node_log_odds(evidence, TRUE)))
         poses.append(_pose(RIGHT if is_right else WRONG, evidence, k, MAPS[k % 3]))
     return poses
 
@@ -66,9 +66,9 @@ def test_weights_that_poses_were_drawn_with_are_found_again():
 
 def test_a_picture_from_elsewhere_lowers_the_bias_until_it_is_not_believed():
     poses = _drawn(1500)
-    strongest = max((pose.evidence for pose in poses), key=lambda evidence: log_odds_of(evidence, TRUE))
+    strongest = max((pose.evidence for pose in poses), key=lambda evidence: node_log_odds(evidence, TRUE))
     fitted = fit_evidence([*poses, _pose(None, strongest)], doubt=-0.5)
-    assert 1.0 / (1.0 + math.exp(-log_odds_of(strongest, fitted))) == pytest.approx(0.35, abs=1e-6)
+    assert 1.0 / (1.0 + math.exp(-node_log_odds(strongest, fitted))) == pytest.approx(0.35, abs=1e-6)
     assert fitted.bias < fit_evidence(poses, doubt=-0.5).bias - 1.0
 
 

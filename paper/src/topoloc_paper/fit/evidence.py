@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import minimize
-from topoloc.localization.verification import log_odds_of, score_features
 
+from topoloc.localization.evidence import node_log_odds, score_features
 from topoloc.localization.fitted_weights import EvidenceWeights, SharedErrorWeights
 from topoloc_paper.fit.corpus import family_of
 from topoloc_paper.fit.tried_poses import TriedPose
@@ -50,10 +50,10 @@ def fit_evidence(poses: list[TriedPose], doubt: float) -> EvidenceWeights:
     x, is_right = np.array([score_features(pose.evidence) for pose in poses]), np.array([pose.is_right for pose in poses])
     fitted = _logistic_regression(x[:, :-1], is_right, doubt * x[:, -1])
     weights = EvidenceWeights(*fitted[:-1], doubt=doubt, bias=fitted[-1], clear_log_odds=_LEAST_CLEAR)
-    elsewhere = [log_odds_of(pose.evidence, weights) for pose in poses if pose.error_m is None]
+    elsewhere = [node_log_odds(pose.evidence, weights) for pose in poses if pose.error_m is None]
     most = math.log(_MOST_ELSEWHERE / (1.0 - _MOST_ELSEWHERE))
     weights = replace(weights, bias=weights.bias - max(max(elsewhere, default=most) - most, 0.0))
-    clearest = max((log_odds_of(pose.evidence, weights) for pose in poses if pose.is_wrong), default=0.0)
+    clearest = max((node_log_odds(pose.evidence, weights) for pose in poses if pose.is_wrong), default=0.0)
     return replace(weights, clear_log_odds=max(clearest + _CLEAR_MARGIN, _LEAST_CLEAR))
 
 
@@ -86,7 +86,7 @@ def try_on_other_families(poses: list[TriedPose], doubt: float) -> list[Judged]:
 
 def judged(family: str, poses: list[TriedPose], weights: EvidenceWeights) -> Judged:
     """What these weights say of these poses."""
-    odds, is_right = [log_odds_of(pose.evidence, weights) for pose in poses], [pose.is_right for pose in poses]
+    odds, is_right = [node_log_odds(pose.evidence, weights) for pose in poses], [pose.is_right for pose in poses]
     return Judged(family, np.array(odds, dtype=float), np.array(is_right, dtype=bool))
 
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import minimize
-from topoloc.localization.verification import log_odds_of, score_features
 
+from topoloc.localization.evidence import node_log_odds, score_features
 from topoloc.localization.fitted_weights import EvidenceWeights, RivalWeights
 from topoloc_paper.fit.tried_poses import TriedPose
 
@@ -66,4 +66,4 @@ def num_mistaken(differences: Float[np.ndarray, "n 3"], weights: RivalWeights) -
 def _terms(pose: TriedPose, weights: EvidenceWeights) -> np.ndarray:
     """What is weighed between two poses, in the order of the weights."""
     features = score_features(pose.evidence)
-    return np.array([log_odds_of(pose.evidence, weights), features[0], features[-1]])
+    return np.array([node_log_odds(pose.evidence, weights), features[0], features[-1]])

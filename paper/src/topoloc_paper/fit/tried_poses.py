@@ -11,24 +11,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from topoloc.localization.attempt import Attempt, Judgement, judge
-from topoloc.localization.verification import Evidence, VerificationConfig, tolerated_translation
 
 from topoloc.features.kinds import FeatureConfig
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.building import build_map
+from topoloc.localization.evidence import Evidence, EvidenceConfig, tolerated_translation
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.stages import StageClock
+from topoloc.localization.trace import Trace
 from topoloc.map.build import BuildConfig
 from topoloc.map.side_nodes import SideNodesConfig
 from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.coarse import NodeScore
 from topoloc.sequences.frame import StereoSequence
 from topoloc_paper.fit.corpus import GAMMAS, AskedPlace, read_rigid
 from topoloc_paper.fit.pictures import darkened, drawn_pictures
 
-ASKED = VerificationConfig()
+ASKED = EvidenceConfig()
 _NUM_DRAWN = 25
 
 
@@ -68,27 +66,6 @@ class TriedPose:
         return (self.mapping, self.queries, self.index, self.light)
 
 
-class ListeningLocalizer(Localizer):
-    """Keeps every pose that was judged: of the candidates, of other parts of the map, of what single nodes saw."""
-
-    def __init__(self, topomap: TopoMetricMap) -> None:
-        super().__init__(topomap)
-        self.tried: list[tuple[Judgement, Evidence | None]] = []
-
-    def _judge(self, first: Attempt, candidates: list[NodeScore], shared_errors: float, clock: StageClock) -> Judgement:
-        judgement = super()._judge(first, candidates, shared_errors, clock)
-        if judgement.final.pose is not None and judgement.evidence is not None:
-            c, of_first = self.config, None
-            if not first.is_guided:
-                always = replace(self.weights.evidence, clear_log_odds=-math.inf)
-                again = judge(
-                    first, judgement.final, candidates, shared_errors, c.min_matches, c.matching, c.guided, c.verification, always, clock
-                )
-                of_first = again.evidence
-            self.tried.append((judgement, of_first))
-        return judgement
-
-
 def ask_place(place: AskedPlace, recordings: dict[str, StereoSequence], data: Path, kind: str, step: int) -> list[TriedPose]:
     """Every pose that the place's map, of features of this kind, leads to; none where its recording is missing.
 
@@ -102,7 +79,7 @@ def ask_place(place: AskedPlace, recordings: dict[str, StereoSequence], data: Pa
         path = Path(folder) / "place.topo"
         config = BuildConfig(features=FeatureConfig(kind=kind), sides=SideNodesConfig(spacing=0.0))
         build_map(recordings[place.mapping], config).save(path)
-        localizer = ListeningLocalizer(TopoMetricMap.load(path))
+        localizer = Localizer(TopoMetricMap.load(path))
         world_from_truth = read_rigid(data / place.map_from_truth) if place.map_from_truth else Rigid3.identity()
         for name, index, frame in _frames(place.own, recordings, step):
             truth = world_from_truth @ frame.world_from_cam
@@ -140,16 +117,20 @@ def _frames(asked: dict[str, int], recordings: dict[str, StereoSequence], step: 
 
 
 def _tried(
-    localizer: ListeningLocalizer, image: np.ndarray, camera: Camera, world_from_cam: Rigid3 | None, picture: tuple[str, str, int, str]
+    localizer: Localizer, image: np.ndarray, camera: Camera, world_from_cam: Rigid3 | None, picture: tuple[str, str, int, str]
 ) -> Iterator[TriedPose]:
     """`world_from_cam` is the truth, in the map's world; None for a picture from elsewhere."""
-    localizer.tried.clear()
-    localizer.localize(image, camera)
-    rho = localizer.shared_errors
-    for judgement, first_evidence in localizer.tried:
-        final = judgement.final
+    trace = Trace()
+    localizer.localize(image, camera, trace=trace)
+    rho = localizer.correlated_errors
+    for tried in trace.tried:
+        if tried.hypothesis is None:
+            continue
+        final, evidence = tried.hypothesis.fit, tried.hypothesis.evidence
         assert final.pose is not None
-        assert judgement.evidence is not None
+        first_evidence = None
+        if tried.source != "viewpoints":
+            first_evidence = replace(evidence, num_matches=len(tried.first.matches), num_inliers=tried.first.num_inliers)
         cam_from_world, error_m, error_deg, square = final.pose.cam_from_world, None, None, None
         if world_from_cam is not None:
             error = cam_from_world @ world_from_cam
@@ -158,4 +139,4 @@ def _tried(
             square = float(xi @ np.linalg.solve(final.pose.covariance, xi))
         points_world = final.local_map.points_world[final.matches.train_idx[final.pose.inliers]]
         depth = float(np.median(cam_from_world.apply(points_world)[:, 2]))
-        yield TriedPose(*picture, error_m, error_deg, depth, judgement.evidence, first_evidence, square, rho)
+        yield TriedPose(*picture, error_m, error_deg, depth, evidence, first_evidence, square, rho)
