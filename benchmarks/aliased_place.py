@@ -73,12 +73,11 @@ def main() -> None:
     localizer = Localizer(build_map(open_sequence(args.mapped)))
     sequence = single_pictures(open_sequence(args.asked))
     frames = [frame for frame in (sequence[i] for i in range(len(sequence))) if frame.world_from_cam is not None]
-    alone, streamed = asked_alone(localizer, frames, args.period), asked_as_stream(localizer, frames, args.period)
+    alone, streamed = asked_alone(localizer, frames, args.seed), asked_as_stream(localizer, frames)
     report(len(localizer.topomap.nodes), alone, streamed)
     if args.json:
-        args.json.write_text(
-            json.dumps({"nodes": len(localizer.topomap.nodes), "alone": asdict(alone), "stream": asdict(streamed)}, indent=1)
-        )
+        figures = {"nodes": len(localizer.topomap.nodes), "alone": asdict(alone), "stream": asdict(streamed)}
+        args.json.write_text(json.dumps(figures, indent=1))
 
 
 def asked_alone(localizer: Localizer, frames: list[StereoFrame], seed: int) -> Alone:
