@@ -102,7 +102,7 @@ def test_interrupted_it_says_how_to_go_on(tmp_path: Path, capsys: pytest.Capture
 
 
 def test_unknown_worlds_and_conditions_get_the_list(complaint: Complaint, tmp_path: Path):
-    assert "lab, corridor, street" in complaint("simulate", "moon", tmp_path / "a")
+    assert "lab, corridor, hospital, street" in complaint("simulate", "moon", tmp_path / "a")
     assert "day, evening, night, cloudy, rain" in complaint("simulate", "lab", tmp_path / "a", "--condition", "fog")
 
 

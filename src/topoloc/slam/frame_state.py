@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Int, UInt8
+from jaxtyping import Float32, Int
 
 from topoloc.geometry.rigid import Rigid3
+from topoloc.slam.disparity import MeasuredView
 from topoloc.slam.keyframes import KeyFrame
 
 
@@ -41,8 +42,5 @@ class Tracks:
 class LastFrame:
     """The frame before."""
 
-    t_ns: int
-    grey: UInt8[np.ndarray, "h w"]
+    measured: MeasuredView
     cam_from_world: Rigid3
-    motion: Rigid3 | None
-    interval_ns: int

@@ -1,8 +1,8 @@
 """Loops: key frames that see a place that another one, long before or in another recording, has seen.
 
-The coarse place search proposes, local features and PnP verify (`place_matching`), and two guards keep what is left from ruining
-the map: a link needs a second one beside it that says the same, and within a sub-map it may not ask for more drift than the
-odometry can have.
+The coarse place search proposes, local features and PnP verify (`place_matching`), and three guards keep what is left from ruining
+the map: within a sub-map a link may not ask for more drift than the odometry can have, none beside it may say otherwise as well
+as it does (of equal panels, one is as good as the next), and a second one beside it must say the same.
 """
 
 from __future__ import annotations
@@ -36,6 +36,10 @@ class LoopConfig:
     """Two links that support each other may differ by this (metres), and by this share of the way between their ends."""
     max_disagreement_deg: Annotated[float, Above(0)] = 2.0
     """The same, in degrees."""
+    rival_places: Annotated[int, AtLeast(0)] = 15
+    """A link is contradicted by another one of the same place whose other end is within so many places of its own ..."""
+    rival_share: Annotated[float, Between(0, 1)] = 0.5
+    """... and that has this share of its matches."""
     max_drift: Annotated[float, AtLeast(0)] = 0.05
     """Share of the way travelled by which the odometry may be wrong, besides half a metre."""
     max_drift_deg: Annotated[float, AtLeast(0)] = 15.0
@@ -68,8 +72,9 @@ def find_links(
         if match is not None:
             links.append(Link(source, target, match))
         progress("loops", done + 1, len(proposals))
-    plausible = [link for link in links if _within_drift(link, keyframes, config)]
     rank = {keyframe: place for place, keyframe in enumerate(places)}
+    clear = [link for link in links if not any(_contradicts(other, link, keyframes, rank, config) for other in links)]
+    plausible = [link for link in clear if _within_drift(link, keyframes, config)]
     return [link for link in plausible if any(_supports(other, link, keyframes, rank, config) for other in plausible)]
 
 
@@ -106,16 +111,31 @@ def _within_drift(link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig)
     return bool(drift[0] < 0.5 + config.max_drift * way and drift[1] < np.deg2rad(config.max_drift_deg))
 
 
+def _contradicts(other: Link, link: Link, keyframes: Sequence[KeyFrame], rank: dict[int, int], config: LoopConfig) -> bool:
+    """Whether one of the link's ends is linked nearly as well with a neighbour of its other end, and cannot be at both."""
+    if (other.target == link.target) == (other.source == link.source):
+        return False
+    apart = abs(rank[other.target] - rank[link.target]) + abs(rank[other.source] - rank[link.source])
+    if apart > config.rival_places or len(other.match.source_rows) < config.rival_share * len(link.match.source_rows):
+        return False
+    return _agreement(other, link, keyframes, config) is False
+
+
 def _supports(other: Link, link: Link, keyframes: Sequence[KeyFrame], rank: dict[int, int], config: LoopConfig) -> bool:
-    """Whether going from source to target by the one link and back by the other ends where it began."""
+    """Whether a link of other key frames nearby says the same."""
     if other is link or other.target == link.target:
         return False
     near = config.support_places
     if abs(rank[other.target] - rank[link.target]) > near or abs(rank[other.source] - rank[link.source]) > near:
         return False
+    return _agreement(other, link, keyframes, config) is True
+
+
+def _agreement(other: Link, link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig) -> bool | None:
+    """Whether going from source to target by the one link and back by the other ends where it began; None across sub-maps."""
     a, b, c, d = (keyframes[i] for i in (link.source, link.target, other.source, other.target))
     if a.submap != c.submap or b.submap != d.submap:
-        return False
+        return None
     sources, targets = c.cam_from_world @ a.cam_from_world.inverse(), d.cam_from_world @ b.cam_from_world.inverse()
     expected = targets.inverse() @ other.match.target_from_source @ sources
     way = float(np.linalg.norm(sources.translation) + np.linalg.norm(targets.translation) + np.linalg.norm(expected.translation))

@@ -23,7 +23,8 @@ from topoloc.slam.global_map import GlobalMapConfig, adjust_all, close_loops, jo
 from topoloc.slam.input_checks import InputCheckConfig, InputChecks
 from topoloc.slam.keyframes import KeyFrame, Landmarks
 from topoloc.slam.loop_closure import LoopConfig, find_links
-from topoloc.slam.odometry import Odometry, OdometryConfig
+from topoloc.slam.odometry import Odometry
+from topoloc.slam.odometry_config import OdometryConfig
 
 Progress = Callable[[str, int, int], None]
 """Called with a stage's name, steps done and steps in all."""

@@ -79,7 +79,7 @@ class Command:
     """What `topoloc simulate` takes."""
 
     world: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="WORLD")]
-    """lab, corridor or street; `demo` renders the recordings of `topoloc demo` into the folder OUT, and takes no setting."""
+    """lab, corridor, hospital or street; `demo` renders the recordings of `topoloc demo` into the folder OUT, and takes no setting."""
     out: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="OUT")]
     """The recording's folder, which is made. A recording that was interrupted goes on where it stopped."""
     condition: Annotated[str, tyro.conf.arg(metavar="NAME")] = "day"

@@ -92,6 +92,17 @@ WORLDS = {
             view_offsets=(-0.4, 0.4),
         ),
         World(
+            "hospital",
+            "a loop of 21 x 13 m: walls of panels a metre wide, each the copy of the next; a door now and then",
+            "topoloc_worlds.hospital.world",
+            speed=1.2,
+            spacing=0.2,
+            corner_radius=0.6,
+            depth_factor=2000.0,
+            view_spacing=0.8,
+            view_offsets=(-0.4, 0.4),
+        ),
+        World(
             "street",
             "a loop of 333 x 81 m: lanes, façades, trees, parked cars, signs, sky",
             "topoloc_worlds.street.world",

@@ -1,0 +1,123 @@
+"""Where the camera will be if it goes on as it went, and how far from there it may be.
+
+Constant velocity; how wrong that is has been seen at every frame so far, as an acceleration. A camera without a picture for a time T
+is off by the acceleration times T^2 / 2, so that four frames lost are bridged where somebody walks steadily, and are not where he
+starts and stops.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+
+from topoloc.bounds import Above, AtLeast, Between
+from topoloc.geometry.rigid import Rigid3
+
+
+@dataclass(frozen=True)
+class PredictionConfig:
+    """How far a prediction is trusted."""
+
+    gap: Annotated[float, AtLeast(1)] = 1.5
+    """A frame that comes later than so many usual intervals comes after a gap."""
+    max_intervals: Annotated[float, AtLeast(0)] = 10.0
+    """A motion is carried on over so many intervals at most."""
+    remembered: Annotated[int, Between(1, 10_000)] = 20
+    """Steps from which the acceleration is known ..."""
+    min_remembered: Annotated[int, AtLeast(1)] = 3
+    """... and the fewest that say anything."""
+    way_share: Annotated[float, AtLeast(0)] = 0.1
+    """Sigma of a prediction is at least this share of its way, and of its turn."""
+    stop_share: Annotated[float, AtLeast(0)] = 0.7
+    """From a frame to the very next a camera may stop or turn back: sigma is this share of its way and turn there."""
+    max_sigmas: Annotated[float, Above(0)] = 3.0
+    """A step that is further from the prediction than this is not what the motion lets expect, ..."""
+    clear_sigmas: Annotated[float, Above(0)] = 3.5
+    """... and where another step is as expected, it must be this much less so: root of the difference of their squares."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """cam_from_world, one sigma of its position (metres) and of its direction (radians), infinite where no motion is known."""
+
+    cam_from_world: Rigid3
+    step: Rigid3
+    sigma: float
+    sigma_rad: float
+    is_gap: bool
+
+    def distance(self, cam_from_world: Rigid3) -> float:
+        """How far from the prediction a pose is, in sigma."""
+        away = cam_from_world @ self.cam_from_world.inverse()
+        return float(max(np.linalg.norm(away.translation) / self.sigma, away.angle() / self.sigma_rad))
+
+
+def expected_one(prediction: Prediction | None, poses: Sequence[Rigid3], config: PredictionConfig) -> Rigid3 | None:
+    """Which of several cam_from_world the motion singles out: near the prediction, and all others far; None where it cannot tell."""
+    if len(poses) == 1:
+        return poses[0]
+    if prediction is None or not poses:
+        return None
+    distances = np.array([prediction.distance(pose) for pose in poses])
+    nearest, next_one = np.argsort(distances, kind="stable")[:2]
+    clear = distances[nearest] < config.max_sigmas and distances[next_one] > np.hypot(distances[nearest], config.clear_sigmas)
+    return poses[int(nearest)] if clear else None
+
+
+class MotionHistory:
+    """The velocity of the last step, and the accelerations of those before it."""
+
+    def __init__(self, config: PredictionConfig) -> None:
+        self._config = config
+        self._squares: deque[tuple[float, float]] = deque(maxlen=config.remembered)
+        self._intervals: deque[float] = deque(maxlen=config.remembered)
+        self._velocity: np.ndarray | None = None  # twist, left of cam_from_world, a second
+        self._t_ns: int | None = None
+        self._cam_from_world: Rigid3 | None = None
+
+    def remember(self, t_ns: int, cam_from_world: Rigid3, moved: Rigid3 | None = None) -> None:
+        """A frame was at `cam_from_world`; `moved` is its motion since the frame before, None where that is not known."""
+        if moved is not None and self._t_ns is not None and t_ns > self._t_ns:
+            interval = 1e-9 * (t_ns - self._t_ns)
+            velocity = moved.log() / interval
+            if self._velocity is not None:
+                change = (velocity - self._velocity) * interval
+                between = 0.5 * (interval + self._intervals[-1])
+                rates = np.linalg.norm(change[:3]), np.linalg.norm(change[3:])
+                self._squares.append((float(rates[0] / (interval * between)) ** 2, float(rates[1] / (interval * between)) ** 2))
+            self._velocity = velocity
+            self._intervals.append(interval)
+        self._t_ns, self._cam_from_world = t_ns, cam_from_world
+
+    def move(self, cam_from_world: Rigid3) -> None:
+        """The last frame's pose has been adjusted."""
+        self._cam_from_world = cam_from_world
+
+    def stop(self) -> None:
+        """The camera was lost, and its motion with it."""
+        self._velocity, self._t_ns, self._cam_from_world = None, None, None
+
+    def predict(self, t_ns: int) -> Prediction | None:
+        """Where the camera is at a time after the last frame; None where there is none."""
+        if self._t_ns is None or self._cam_from_world is None:
+            return None
+        time = max(1e-9 * (t_ns - self._t_ns), 0.0)
+        if self._velocity is None or not self._intervals:
+            return Prediction(self._cam_from_world, Rigid3.identity(), np.inf, np.inf, False)
+        config, last = self._config, self._intervals[-1]
+        step = self._velocity * min(time, config.max_intervals * last)
+        way, turn = float(np.linalg.norm(step[:3])), float(np.linalg.norm(step[3:]))
+        is_gap = time > config.gap * float(np.median(self._intervals))
+        moved = Rigid3.exp(step)
+        if len(self._squares) < config.min_remembered:
+            return Prediction(moved @ self._cam_from_world, moved, np.inf, np.inf, is_gap)
+        growth = 0.5 * time * (time + last)
+        acceleration, turning = np.sqrt(np.mean(np.array(self._squares), axis=0))
+        share = config.way_share if is_gap else config.stop_share
+        sigma = max(float(acceleration) * growth, share * way, 1e-3)
+        sigma_rad = max(float(turning) * growth, share * turn, 1e-3)
+        return Prediction(moved @ self._cam_from_world, moved, sigma, sigma_rad, is_gap)

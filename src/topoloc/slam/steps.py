@@ -1,0 +1,152 @@
+"""One step of the camera, from the last frame to the next: points followed, robust PnP. And which other steps would do as well.
+
+Where a wall repeats itself, the points of one panel are found on the next one just as well. That is not seen in the step that was
+found: it is seen by seeking from other places too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Float32, Int
+
+from topoloc.geometry.absolute_pose import AbsolutePose, estimate_absolute_pose
+from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.stereo import ray_covariances
+from topoloc.slam.disparity import MeasuredView
+from topoloc.slam.frame_state import LastFrame, Tracks
+from topoloc.slam.keyframes import KeyFrame, Landmarks, StereoCamera
+from topoloc.slam.motion_prediction import Prediction
+from topoloc.slam.odometry_config import OdometryConfig
+from topoloc.slam.tracking import align_with_reference, follow
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A pose that enough points agree on. `share` is that of the points that should be in the picture."""
+
+    cam_from_world: Rigid3
+    covariance: Float[np.ndarray, "6 6"]
+    tracks: Tracks
+    share: float
+
+
+@dataclass(frozen=True, eq=False)
+class StepSeeker:
+    """What is followed from the last frame into the next one, `measured`."""
+
+    last: LastFrame
+    reference: KeyFrame
+    reference_picture: Float32[np.ndarray, "h w"]
+    tracks: Tracks
+    landmarks: Landmarks
+    measured: MeasuredView
+    config: OdometryConfig
+
+    def seek(self, predicted: Rigid3) -> Step | None:
+        """The step that is found from a predicted cam_from_world."""
+        tracks = self._follow(predicted)
+        pose = self._estimate_pose(tracks)
+        if pose is None:
+            return None
+        should = max(int(np.count_nonzero(self._in_picture(pose.cam_from_world))), 1)
+        share = min(np.count_nonzero(pose.inliers) / should, 1.0)
+        return Step(pose.cam_from_world, pose.covariance, tracks.select(pose.inliers), share)
+
+    def repeats(self, prediction: Prediction) -> list[Rigid3]:
+        """What moves a camera to where the last picture would look the same; nothing where nothing repeats itself."""
+        itself, last = replace(self, measured=self.last.measured), self.last.cam_from_world
+        steps = (itself.seek(cam_from_world) for cam_from_world in self._starts(last, prediction))
+        shifts = [step.cam_from_world @ last.inverse() for step in steps if step is not None and step.share > self.config.repeat_share]
+        shifts = [shift for shift in shifts if not self.is_same(shift, Rigid3.identity())]
+        if not shifts:
+            return []
+        least = min(shifts, key=lambda shift: float(np.linalg.norm(shift.translation))).log()
+        return [Rigid3.exp(k * least) for k in range(-self.config.max_repeats, self.config.max_repeats + 1) if k]
+
+    def _starts(self, centre: Rigid3, prediction: Prediction) -> list[Rigid3]:
+        """Places around one along the predicted motion, as far apart as points are found again."""
+        config = self.config
+        direction = prediction.step.log()
+        way = float(np.linalg.norm(direction[:3]))
+        if way < 1e-6:
+            direction, way = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]), 1.0
+        direction = np.concatenate([direction[:3] / way, np.zeros(3)])
+        apart = self._metres_apart(centre, direction)
+        sigma = prediction.sigma if np.isfinite(prediction.sigma) else 0.0
+        moved = float(np.linalg.norm(prediction.step.translation))
+        reach = max(config.prediction.max_sigmas * sigma, moved, config.repeat_depth * self._depth())
+        num = min(int(np.ceil(reach / apart)), config.max_starts)
+        return [Rigid3.exp(k * apart * direction) @ centre for k in range(-num, num + 1) if k]
+
+    def _metres_apart(self, cam_from_world: Rigid3, direction: Float[np.ndarray, "6"]) -> float:
+        """How far along a direction the points move by what one step of tracking covers."""
+        points = self.landmarks.positions[self.tracks.landmark_ids]
+        little = 0.01 * self._depth()
+        poses = (cam_from_world, Rigid3.exp(little * direction) @ cam_from_world)
+        here, there = (self.measured.stereo.project(pose.apply(points))[:, :2] for pose in poses)
+        moved = np.linalg.norm(there - here, axis=1)
+        moved = moved[np.isfinite(moved)]
+        pixels = float(np.median(moved)) if len(moved) else 0.0
+        return little * self.config.start_spacing_px / max(pixels, 1e-3)
+
+    def _depth(self) -> float:
+        """Median depth of the points in the last frame."""
+        points = self.last.cam_from_world.apply(self.landmarks.positions[self.tracks.landmark_ids])
+        return float(np.median(points[:, 2])) if len(points) else 1.0
+
+    def is_same(self, a: Rigid3, b: Rigid3) -> bool:
+        """Whether two cam_from_world are one place."""
+        away = a @ b.inverse()
+        return bool(np.linalg.norm(away.translation) < self.config.same_step * self._depth() and away.angle() < self.config.same_step)
+
+    def _in_picture(self, cam_from_world: Rigid3) -> np.ndarray:
+        camera = self.measured.stereo.camera
+        points = self.measured.stereo.project(cam_from_world.apply(self.landmarks.positions[self.tracks.landmark_ids]))
+        with np.errstate(invalid="ignore"):
+            return np.all((points[:, :2] > 8.0) & (points[:, :2] < [camera.width - 9.0, camera.height - 9.0]), axis=1)
+
+    def _follow(self, predicted: Rigid3) -> Tracks:
+        config, tracks, measured = self.config.tracking, self.tracks, self.measured
+        points_world = self.landmarks.positions[tracks.landmark_ids]
+        before, after = (measured.stereo.project(pose.apply(points_world))[:, :2] for pose in (self.last.cam_from_world, predicted))
+        limit = np.array([measured.view.camera.width, measured.view.camera.height]) / 2.0
+        guesses = (tracks.points_img + np.clip(np.nan_to_num(after - before), -limit, limit)).astype(np.float32)
+        found, is_found = follow(self.last.measured.view.grey, measured.view.grey, tracks.points_img, guesses, config)
+        tracks = Tracks(tracks.landmark_ids, found, tracks.points_ref).select(is_found)
+        scales = self._patch_scales(tracks.landmark_ids, predicted)
+        refined, alike = align_with_reference(self.reference_picture, measured.left, tracks.points_ref, tracks.points_img, scales, config)
+        return Tracks(tracks.landmark_ids, refined, tracks.points_ref).select(alike)
+
+    def _patch_scales(self, landmark_ids: Int[np.ndarray, " n"], predicted: Rigid3) -> Float32[np.ndarray, " n"]:
+        """How much larger each landmark's surroundings look than in the last key frame: what is approached grows."""
+        points_world = self.landmarks.positions[landmark_ids]
+        before, now = (pose.apply(points_world)[:, 2] for pose in (self.reference.cam_from_world, predicted))
+        return np.clip(before / np.maximum(now, 1e-3), 0.5, 2.0).astype(np.float32)
+
+    def _estimate_pose(self, tracks: Tracks) -> AbsolutePose | None:
+        config, stereo = self.config, self.measured.stereo
+        if len(tracks.landmark_ids) < config.min_tracked:
+            return None
+        points_world = self.landmarks.positions[tracks.landmark_ids]
+        pose = estimate_absolute_pose(
+            tracks.points_img.astype(np.float64),
+            points_world,
+            stereo.camera,
+            config.pose,
+            point_covariances=self._landmark_covariances(points_world, stereo),
+        )
+        if pose is None:
+            return None
+        num_inliers = int(np.count_nonzero(pose.inliers))
+        enough = max(config.min_tracked, config.min_tracked_share * len(tracks.landmark_ids))
+        return pose if num_inliers >= enough else None
+
+    def _landmark_covariances(self, points_world: Float[np.ndarray, "n 3"], stereo: StereoCamera) -> Float[np.ndarray, "n 3 3"]:
+        """In the world's axes, as the last key frame measured them."""
+        rotation = self.reference.cam_from_world.rotation
+        points_cam = self.reference.cam_from_world.apply(points_world)
+        sigma_z = self.config.sigma_landmark_px * points_cam[:, 2] ** 2 / stereo.bf
+        covariances = ray_covariances(points_cam, sigma_z, stereo.camera, np.full(len(points_cam), 0.1))
+        return rotation.T @ covariances @ rotation

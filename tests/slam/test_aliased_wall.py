@@ -1,0 +1,87 @@
+"""SLAM along a wall of equal panels: frames that are missing never cost a whole panel in silence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from aliased_wall import PERIOD, STEP, walk_along
+from room_frames import FrameList
+
+from topoloc.slam.slam import SlamResult, run_slam
+
+GONE = range(10, 14)
+
+
+def kept(num: int, gone: Sequence[int] = GONE, step: float = STEP, jump: float = 0.0) -> tuple[list[float], list[float]]:
+    """Places and times of a walk without some frames, after which the camera is `jump` metres further than it walked."""
+    rows = [k for k in range(num) if k not in gone]
+    return [step * k + (jump if k > gone[-1] else 0.0) for k in rows], [0.1 * k for k in rows]
+
+
+def along_the_wall(sequence: FrameList, result: SlamResult) -> np.ndarray:
+    """Metres by which each frame is off along the wall, NaN without pose."""
+    first = sequence.poses[0]
+    assert first is not None
+    errors = []
+    for true, pose in zip(sequence.poses, result.poses[0], strict=True):
+        assert true is not None
+        errors.append(np.nan if pose is None else (first @ pose).translation[0] - true.translation[0])
+    return np.array(errors)
+
+
+@pytest.mark.parametrize("step", [STEP, 0.2])
+def test_four_frames_lost_are_bridged_by_the_motion(step: float):
+    walked = walk_along(*kept(20, step=step))
+    result = run_slam(walked)
+    assert (result.num_submaps, result.num_lost) == (1, 0)
+    assert np.abs(along_the_wall(walked, result)).max() < 0.1
+
+
+def test_eight_frames_lost_are_bridged_although_another_panel_is_nearer():
+    """The camera has gone a whole panel on: to stand still would explain the picture as well."""
+    walked = walk_along(*kept(24, range(10, 18)))
+    result = run_slam(walked)
+    assert result.num_submaps == 1
+    assert np.abs(along_the_wall(walked, result)).max() < 0.1
+
+
+@pytest.mark.parametrize("jump", [0.4, 0.5, 0.6])
+def test_what_the_motion_cannot_decide_is_a_submap_of_its_own(jump: float):
+    """Half a panel further than expected, one panel is as likely as the other: none of them is claimed."""
+    walked = walk_along(*kept(20, jump=jump * PERIOD))
+    result = run_slam(walked)
+    assert (result.num_submaps, result.num_joined) == (2, 1)
+    errors = along_the_wall(walked, result)
+    assert np.nanmax(np.abs(errors)) < 0.1
+    assert np.isfinite(errors[:10]).all()
+    assert np.isnan(errors[10:]).all()
+
+
+def test_a_submap_is_joined_by_what_is_unique_and_by_no_panel():
+    """There and back: the gap was too long for the motion, and a board before it is seen again on the way back."""
+    there, times = kept(24, jump=0.5)
+    back = list(np.arange(there[-1] - STEP, 0.3, -STEP))
+    walked = walk_along([*there, *back], [*times, *(times[-1] + 0.1 * np.arange(1, len(back) + 1))], boards=(0.6,))
+    result = run_slam(walked)
+    assert result.num_submaps == result.num_joined == 2
+    assert result.num_loops > 0
+    assert np.abs(along_the_wall(walked, result)).max() < 0.1
+
+
+def test_who_turns_back_before_the_wall_is_not_taken_for_lost():
+    there = list(np.arange(0.0, 2.0, STEP))
+    walked = walk_along([*there, *there[::-1]], 0.1 * np.arange(2 * len(there)))
+    result = run_slam(walked)
+    assert (result.num_submaps, result.num_lost) == (1, 0)
+    assert np.abs(along_the_wall(walked, result)).max() < 0.05
+
+
+def test_without_panels_a_jump_is_followed():
+    """What does not repeat itself needs no motion to be told apart."""
+    boards = tuple(np.arange(-2.0, 6.0, 0.65))
+    walked = walk_along(*kept(20, jump=0.5), boards=boards)
+    result = run_slam(walked)
+    assert result.num_submaps == 1
+    assert np.abs(along_the_wall(walked, result)).max() < 0.1

@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from topoloc.geometry.rigid import Rigid3
+from topoloc.slam.motion_prediction import MotionHistory, Prediction, PredictionConfig, expected_one
+
+CONFIG = PredictionConfig()
+TENTH = 100_000_000
+
+
+def ahead(metres: float) -> Rigid3:
+    """cam_from_world of a camera `metres` along x."""
+    return Rigid3(np.eye(3), np.array([-metres, 0.0, 0.0]))
+
+
+def walked(places: list[float]) -> MotionHistory:
+    history = MotionHistory(CONFIG)
+    before = None
+    for number, place in enumerate(places):
+        pose = ahead(place)
+        history.remember(number * TENTH, pose, None if before is None else pose @ before.inverse())
+        before = pose
+    return history
+
+
+def predicted(history: MotionHistory, frames: float) -> Prediction:
+    found = history.predict(round(9 * TENTH + frames * TENTH))
+    assert found is not None
+    return found
+
+
+def test_a_steady_walk_goes_on():
+    history = walked([0.1 * k for k in range(10)])
+    for frames in (1, 5):
+        assert -predicted(history, frames).cam_from_world.translation[0] == pytest.approx(0.9 + 0.1 * frames)
+    assert not predicted(history, 1).is_gap
+    assert predicted(history, 5).is_gap
+    assert predicted(history, 5).sigma == pytest.approx(CONFIG.way_share * 0.5, rel=0.01)
+
+
+def test_an_unsteady_walk_is_trusted_less_and_less_as_time_goes():
+    steps = 0.1 + 0.02 * np.array([0, 1, -1, 1, 1, -1, 0, -1, 1, -1])
+    history = walked(list(np.cumsum(steps)))
+    three, six = predicted(history, 3).sigma, predicted(history, 6).sigma
+    assert three > CONFIG.way_share * 0.3
+    assert six / three == pytest.approx((6 * 7) / (3 * 4), rel=0.05)
+
+
+def test_sigma_covers_what_acceleration_does():
+    """Walks whose acceleration is noise: how far they are from the prediction four frames later, in sigma."""
+    rng = np.random.default_rng(0)
+    distances = []
+    for _ in range(200):
+        speeds = 0.1 + np.cumsum(rng.normal(0.0, 0.01, 14))
+        places = np.cumsum(speeds)
+        distances.append(predicted(walked(list(places[:10])), 4).distance(ahead(float(places[13]))))
+    assert np.mean(np.array(distances) < CONFIG.max_sigmas) > 0.99
+    assert np.median(distances) > 0.1, "nor is it boundless"
+
+
+def test_nothing_is_known_before_anything_moved():
+    history = MotionHistory(CONFIG)
+    assert history.predict(0) is None
+    history.remember(0, ahead(0.0))
+    first = history.predict(TENTH)
+    assert first is not None
+    assert first.sigma == np.inf
+    assert first.distance(ahead(3.0)) == 0.0
+    history.stop()
+    assert history.predict(TENTH) is None
+
+
+def test_the_motion_singles_out_one_of_two_or_none():
+    gap = predicted(walked([0.1 * k for k in range(10)]), 5)
+    near, far, half = ahead(1.42), ahead(2.42), ahead(1.9)
+    assert expected_one(gap, [far, near], CONFIG) is near
+    assert expected_one(gap, [half, ahead(0.9)], CONFIG) is None, "half a metre to either side"
+    assert expected_one(gap, [ahead(1.42), ahead(1.45)], CONFIG) is None
+    assert expected_one(gap, [far], CONFIG) is far, "alone, it has no rival"
+    assert expected_one(None, [near, far], CONFIG) is None

@@ -1,0 +1,1 @@
+"""The hospital: a loop of equal wall panels, with a door now and then."""
