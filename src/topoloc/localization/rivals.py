@@ -38,7 +38,7 @@ class RivalsConfig:
     """Nodes that the coarse localizer ranks, the candidates among them; rivals come from these."""
     min_score_share: Annotated[tuple[float, float], Between(0, 1)] = (0.85, 0.4)
     """A rival's score is at least this share of the best one's: where the pose is clear, and where it is not."""
-    reach: Annotated[float, AtLeast(0)] = 5.0
+    reach: Annotated[float, AtLeast(1)] = 5.0
     """Nodes within so many D_thresh of a pose (Eq. 1) belong to it; rivals are farther away."""
     agreement: Annotated[float, AtLeast(0)] = 3.0
     """Two poses within so many D_thresh are one."""
