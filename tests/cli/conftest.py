@@ -1,4 +1,4 @@
-"""A map file and query pictures of the rendered room, and how a failing command must look."""
+"""A map file and query pictures of the rendered room."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from built_room import built_room, unseen_views, write_pictures
-from topoloc.cli import main
 
 
 @pytest.fixture(scope="session")
@@ -36,24 +35,6 @@ def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def recording(tiny_recording: Path, tmp_path: Path) -> Path:
     """A copy of `tiny_recording`, to be broken."""
     return Path(shutil.copytree(tiny_recording, tmp_path / "recording"))
-
-
-@pytest.fixture
-def complaint(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., str]:
-    """Runs a command that must fail: its one line on stderr. No file may appear, change size or go."""
-
-    def run(*args: object, status: int = 1) -> str:
-        before = {path: path.stat().st_size for path in tmp_path.rglob("*")}
-        capfd.readouterr()
-        assert main([str(arg) for arg in args]) == status
-        printed = capfd.readouterr()
-        assert printed.err.startswith("error: ")
-        assert printed.err.count("\n") == 1
-        assert "Traceback" not in printed.err
-        assert {path: path.stat().st_size for path in tmp_path.rglob("*")} == before
-        return printed.err
-
-    return run
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""A map that is ready to be asked: as `mapping/build.py` constructs it, and with what only localizing can tell of it."""
+"""A map that is ready to be asked: as `map/build.py` constructs it, and with what only localizing can tell of it."""
 
 from __future__ import annotations
 
