@@ -16,7 +16,7 @@ import numpy as np
 import poselib
 from jaxtyping import Bool, Float
 
-from topoloc.bounds import Above, AtLeast, Between
+from topoloc.bounds import Above, Between
 from topoloc.geometry.absolute_pose_kernels import normal_equations, refine, squared_errors
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
@@ -54,7 +54,7 @@ class AbsolutePoseConfig:
     """RANSAC ends where it is so sure that no better pose is left."""
     max_refinement_steps: Annotated[int, Between(0, 1000)] = 10
     """Of the least squares on the inliers."""
-    seed: Annotated[int, AtLeast(0)] = 0
+    seed: Annotated[int, Between(0, 1_000_000_000)] = 0
     """Of RANSAC's samples."""
 
     @property

@@ -42,7 +42,7 @@ class TrainingConfig:
     """Of AdamW."""
     held_out: Annotated[float, Between(0, 0.9)] = 0.12
     """Share of the images that are held out; never the only image of a node."""
-    seed: Annotated[int, AtLeast(0)] = 0
+    seed: Annotated[int, Between(0, 1_000_000_000)] = 0
     """Of the order of the images, how they are varied, and layers that begin at random."""
     num_threads: Annotated[int | None, Between(1, 1024)] = None
     """Threads (None: as many as there are cores). Runs are the same to the bit with the same number of threads."""
@@ -117,7 +117,7 @@ class TripletConfig:
     """Images within this share of D_thresh by Eq. 1 show the same place."""
     far: Annotated[float, Above(0)] = 3.0
     """Images further apart than this share of D_thresh do not."""
-    seed: Annotated[int, AtLeast(0)] = 0
+    seed: Annotated[int, Between(0, 1_000_000_000)] = 0
     """Of the order of the images."""
 
 
@@ -135,7 +135,7 @@ class VladNnConfig:
     dimension: Annotated[int, Between(1, 65_536)] = 256
     """Length of a place vector after whitening, at most."""
     tuning: TripletConfig = field(default_factory=TripletConfig)
-    seed: Annotated[int, AtLeast(0)] = 0
+    seed: Annotated[int, Between(0, 1_000_000_000)] = 0
     """Of the vocabulary."""
 
 

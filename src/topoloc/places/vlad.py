@@ -36,7 +36,7 @@ class VladConfig:
     """Length of a place vector after PCA, at most."""
     max_training_descriptors: Annotated[int, AtLeast(1)] = 100_000
     """Descriptors that the vocabulary is learnt from, at most."""
-    seed: Annotated[int, AtLeast(0)] = 0
+    seed: Annotated[int, Between(0, 1_000_000_000)] = 0
     """Of the vocabulary."""
 
 

@@ -64,7 +64,7 @@ class TrackerConfig:
     """Sigma of a localization's noise is at least this share of the points' depth, and so many radians."""
     reach: Annotated[float, Above(0)] = 2.0
     """How far (way in depths of the points, plus radians) what the map is wrong by lasts (to 1/e)."""
-    blend_time: Annotated[float, AtLeast(0)] = 0.2
+    blend_time: Annotated[float, Above(0)] = 0.2
     """Seconds (to 1/e) in which what a new localization corrects is worked into the smoothed pose, so that it does not jump."""
     followed_share: Annotated[float, AtLeast(0)] = 0.05
     """Sigma of a followed motion, as a share of its way and turn, beside what the points say."""
