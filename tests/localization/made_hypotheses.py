@@ -55,7 +55,9 @@ def believed(hypotheses: list[Hypothesis], config: LocalizerConfig | None = None
     """A search that came upon these hypotheses, in this order. Its map is not open: what is believed asks it nothing."""
     query = Query(np.zeros((CAMERA.height, CAMERA.width), np.uint8), CAMERA, 1.0, FeatureConfig())
     resolved = (config or LocalizerConfig()).for_kind(SURF)
-    search = Search(query, object.__new__(OpenMap), resolved, WEIGHTS, rho=0.0, ranked=CANDIDATES)
+    not_open = object.__new__(OpenMap)
+    not_open.node_ids = list(range(10))
+    search = Search(query, not_open, resolved, WEIGHTS, rho=0.0, ranked=CANDIDATES)
     for hypothesis in hypotheses:
         search.belief = search.belief.given(hypothesis, resolved.evidence, WEIGHTS.rivals)
     return search

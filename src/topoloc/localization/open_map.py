@@ -14,12 +14,15 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.guided import expected_key_points
 from topoloc.localization.local_map import LocalMap
+from topoloc.localization.repetition import NUM_NEIGHBOURS, shifts_of
 from topoloc.localization.viewing import viewing_distances
 from topoloc.localization.wall_index import WallIndex
 from topoloc.map.memory import RememberedNodes
 from topoloc.map.nodes import NodePoses
 from topoloc.map.topomap import TopoMetricMap, open_coarse_of
 from topoloc.places.coarse import CoarseLocalizer, NodeScore
+
+_LEAST_REACH, _LEAST_SHIFT = 2.5, 0.3  # metres: how far repetitions are looked for, and from what shift on they are another place
 
 
 class OpenMap:
@@ -41,9 +44,11 @@ class OpenMap:
         self.coarse: CoarseLocalizer = coarse if by_name is None else by_name  # pyright: ignore[reportAttributeAccessIssue]
         self.feature_config = topomap.config.features
         self.kind = find_kind(self.feature_config.kind)
+        self.node_ids = [summary.node_id for summary in topomap.summaries]
         self.node_poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
         self.lambda_rot, self.d_thresh = topomap.config.lambda_rot, topomap.config.d_thresh
         self._local_map = RememberedNodes(lambda row: LocalMap.of_node(topomap.nodes[row]))
+        self._repeats = RememberedNodes(self._find_repeats)
         self._expected: tuple[Camera, RememberedNodes[Float32[np.ndarray, "n 5"]]] | None = None
 
     @cached_property
@@ -61,7 +66,7 @@ class OpenMap:
 
     def with_ids(self, candidates: list[NodeScore]) -> list[NodeScore]:
         """Candidates as they are reported: until then a candidate's `node_id` is the row of its node."""
-        return [NodeScore(self.topomap.summaries[candidate.node_id].node_id, candidate.score) for candidate in candidates]
+        return [NodeScore(self.node_ids[candidate.node_id], candidate.score) for candidate in candidates]
 
     def cam_from_world(self, row: int) -> Rigid3:
         """Of a node's camera."""
@@ -78,6 +83,20 @@ class OpenMap:
             read = RememberedNodes(lambda row: expected_key_points(self._local_map(row), self.cam_from_world(row), camera))
             self._expected = kept = (camera, read)
         return kept[1](row)
+
+    def repeats(self, row: int) -> Float[np.ndarray, "k 3"]:
+        """The shifts (metres, world) by which what a node shows repeats itself, see `repetition.py`."""
+        return self._repeats(row)
+
+    def _find_repeats(self, row: int) -> Float[np.ndarray, "k 3"]:
+        node, poses = self._local_map(row), self.node_poses
+        depths = self.cam_from_world(row).apply(node.points_world)[:, 2]
+        away = np.linalg.norm(poses.centres - poses.centres[row], axis=1)
+        looks_alike = poses.rotations[:, :, 2] @ poses.rotations[row, :, 2] > 0.85
+        near = np.flatnonzero(looks_alike & (away < max(_LEAST_REACH, 1.5 * float(np.median(depths)))))
+        near = near[np.argsort(away[near], kind="stable")]
+        spread = np.unique(np.linspace(0, len(near) - 1, NUM_NEIGHBOURS).round().astype(int))
+        return shifts_of(node, self.local_map(near[spread]), _LEAST_SHIFT)
 
     def distances(self, world_from_cam: Rigid3) -> Float[np.ndarray, " nodes"]:
         """D_total of Eq. 1 (metres) between a camera and each node, whichever side of the camera is up."""

@@ -10,6 +10,7 @@
   the most similar one is right far more often. So each node that ranks high lends its pose as if it were the camera's. Wrong nodes give
   matches that are displaced anyhow, the right one matches that are displaced alike: only nodes whose displacements agree are followed up.
 
+- **repetition**: where a place repeats itself (`repetition.py`), a hypothesis is one of many: the poses shifted so are proposed, too.
 - **walls**: what is seen of the walls along the way, from the other side (`walls.py`).
 
 Each proposer looks at what is believed so far and proposes nothing where that is settled.
@@ -25,7 +26,7 @@ import numpy as np
 from topoloc.features.matching import match_pooled
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.belief import is_same_pose
-from topoloc.localization.guided import largest_shift, match_expected
+from topoloc.localization.guided import largest_shift, match_expected, match_guided
 from topoloc.localization.pose_fit import PoseFit, fit_pose
 from topoloc.localization.search import Proposal, Search, Source
 from topoloc.localization.walls import propose_walls
@@ -48,6 +49,7 @@ def propose(search: Search, prior: Rigid3 | None) -> Iterator[Proposal]:
     yield from viewpoints
     if search.is_clear or viewpoints or retrieved.fit.num_inliers >= search.config.num_chance_inliers:
         yield from _look_alikes(search)
+    yield from _repetitions(search)
     yield from propose_walls(search)
 
 
@@ -126,3 +128,32 @@ def _viewpoints(search: Search) -> Iterator[Proposal]:
             yield Proposal("viewpoints", fit, is_guided=True)
         if len(kept) == config.max_poses:
             return
+
+
+def _repetitions(search: Search) -> Iterator[Proposal]:
+    """The poses that a repetition of the place allows as well as those that are believed, and theirs in turn."""
+    query, config, asked = search.query, search.config, 0
+    tried: list[np.ndarray] = []
+    waiting = list(search.belief.hypotheses)
+    while waiting and asked < config.max_repetitions:
+        hypothesis = waiting.pop(0)
+        if hypothesis.is_from_walls or hypothesis.probability < config.evidence.min_probability:
+            continue
+        tried.append(hypothesis.world_from_cam.translation)
+        for shift in search.map.repeats(search.map.topomap.row_of(hypothesis.fit.node_id)):
+            world_from_cam = Rigid3(hypothesis.world_from_cam.rotation, hypothesis.world_from_cam.translation + shift)
+            known = [*tried, *(other.world_from_cam.translation for other in search.belief.hypotheses)]
+            apart = np.linalg.norm(np.array(known) - world_from_cam.translation, axis=1).min()
+            if apart < 0.5 * np.linalg.norm(shift) or asked == config.max_repetitions:
+                continue
+            asked += 1
+            tried.append(world_from_cam.translation)
+            with query.clock.stage("matching"):
+                local_map = search.map.local_map(search.map.nearest(world_from_cam, config.guided.num_nodes))
+                start = (world_from_cam.inverse(), hypothesis.fit.camera)
+                matches = match_guided(query.features, local_map, *start, replace(config.guided, radius_px=2.0 * config.guided.radius_px))
+            with query.clock.stage("pnp"):
+                fit = fit_pose(query.features, query.lens, local_map, matches, config.pose, start)
+            before = set(map(id, search.belief.hypotheses))
+            yield Proposal("repetition", fit, is_guided=True)
+            waiting += [other for other in search.belief.hypotheses if id(other) not in before]

@@ -20,6 +20,7 @@ from topoloc.localization.correlated_errors import inflation
 from topoloc.localization.evidence import Evidence, doubt_of, even_share_of, log_odds_of, spread_of
 from topoloc.localization.guided import count_by_chance, match_guided, visible_pixels
 from topoloc.localization.pose_fit import PoseFit, fit_pose
+from topoloc.localization.repetition import copies, folded
 from topoloc.localization.search import Proposal, Search
 from topoloc.localization.trace import Tried
 from topoloc.localization.walls import WallProposal, refine_wall, weigh_wall
@@ -114,21 +115,28 @@ def _with_unguided(search: Search, evidence: Evidence, unguided: PoseFit, final:
     assert final.pose is not None
     # points that share errors differ by them from node to node, so that even true matches agree with a pose less well
     agreement_px = search.config.evidence.agreement_px * math.sqrt(1.0 + search.rho)
-    num_agreeing = _num_agreeing(unguided, final.pose.cam_from_world, final.camera, agreement_px)
+    num_agreeing = _num_agreeing(unguided, final.pose.cam_from_world, final.camera, agreement_px, _repeats(search, final))
     return replace(evidence, num_matches=len(unguided.matches), num_inliers=num_agreeing)
 
 
 def _unguided(search: Search, final: PoseFit) -> PoseFit:
     """Matches with the points around the final pose that owe nothing to it."""
     points = final.local_map
-    matches = match_pooled(final.features.descriptors, points.descriptors, points.points_world, points.radii, search.config.matching)
+    positions = folded(points.points_world, _repeats(search, final))  # copies of a point are no rivals of it
+    matches = match_pooled(final.features.descriptors, points.descriptors, positions, points.radii, search.config.matching)
     return replace(final, matches=matches, pose=None)
 
 
-def _num_agreeing(unguided: PoseFit, cam_from_world: Rigid3, camera: Camera, agreement_px: float) -> int:
-    """How many of these matches agree with a pose that is not theirs."""
-    points_cam = cam_from_world.apply(unguided.local_map.points_world[unguided.matches.train_idx])
-    with np.errstate(invalid="ignore"):
-        offsets = camera.img_from_cam(points_cam) - unguided.features.points_img[unguided.matches.query_idx]
-        is_near = np.linalg.norm(offsets, axis=1) < agreement_px * max(max(camera.width, camera.height) / 640.0, 0.5)
+def _num_agreeing(unguided: PoseFit, cam_from_world: Rigid3, camera: Camera, agreement_px: float, shifts: Float[np.ndarray, "k 3"]) -> int:
+    """How many of these matches agree with a pose that is not theirs, by their point or a copy of it."""
+    is_near = np.zeros(len(unguided.matches), bool)
+    for points_world in copies(unguided.local_map.points_world[unguided.matches.train_idx], shifts):
+        with np.errstate(invalid="ignore"):
+            offsets = camera.img_from_cam(cam_from_world.apply(points_world)) - unguided.features.points_img[unguided.matches.query_idx]
+            is_near |= np.linalg.norm(offsets, axis=1) < agreement_px * max(max(camera.width, camera.height) / 640.0, 0.5)
     return int(np.count_nonzero(is_near))
+
+
+def _repeats(search: Search, final: PoseFit) -> Float[np.ndarray, "k 3"]:
+    """The shifts by which what the pose's node shows repeats itself."""
+    return search.map.repeats(search.map.topomap.row_of(final.node_id))
