@@ -10,9 +10,10 @@ import pytest
 
 from built_room import built_room, unseen_views, write_pictures
 from topoloc.evaluation.experiments import answer_queries
-from topoloc.evaluation.metrics import summarize
+from topoloc.evaluation.metrics import Answer, summarize
+from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.result import Localization
+from topoloc.localization.result import Alternative, Localization, NotLocalized
 from topoloc.sequences.open import open_sequence
 from topoloc_paper.stored_answers import answers_of, rows_of
 
@@ -38,3 +39,13 @@ def test_stored_answers_are_the_same_answers(tiny_recording: Path, tmp_path: Pat
             assert isinstance(after.result, Localization)
             assert after.result.evidence == before.result.evidence
             assert np.allclose(after.result.covariance, before.result.covariance)
+
+
+def test_the_alternatives_of_an_ambiguity_are_stored():
+    poses = [Rigid3.identity(), Rigid3(np.eye(3), np.array([9.0, 0.0, 1.0]))]
+    alternatives = tuple(Alternative(pose, 0.5 - 0.1 * k, k) for k, pose in enumerate(poses))
+    answer = Answer("a.png", NotLocalized("ambiguous", alternatives=alternatives), None, None, "walk", None, None, frozenset())
+    (again,) = answers_of(json.loads(json.dumps(rows_of([answer]))), "walk")
+    assert isinstance(again.result, NotLocalized)
+    assert again.result.to_json("a.png") == answer.result.to_json("a.png")
+    assert len(again.result.alternatives) == 2
