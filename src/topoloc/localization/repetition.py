@@ -20,6 +20,7 @@ _MIN_SIMILARITY = 0.9
 _CELL = 0.1  # metres; and a share of the shift's own length
 _MIN_VOTES, _MIN_VOTE_SHARE = 12, 0.15
 _MAX_SHIFTS = 6
+_HALF = 1000  # cells to either side: more than any shift is long
 
 
 def shifts_of(node: LocalMap, around: LocalMap, min_shift: float) -> Float[np.ndarray, "k 3"]:
@@ -50,12 +51,13 @@ def _densest(shifts: Float[np.ndarray, "n 3"], rows: np.ndarray) -> Float[np.nda
     """The middle of the cell that most points vote for, of two grids that overlap."""
     best, most = shifts[0], 0
     for offset in (0.0, 0.5):
-        cells = np.floor(shifts / (2.0 * _CELL) + offset).astype(np.int64)
-        votes = np.unique(np.column_stack([cells, rows]), axis=0)[:, :3]  # of each point once a cell
-        found, counts = np.unique(votes, axis=0, return_counts=True)
+        cells = np.floor(shifts / (2.0 * _CELL) + offset).astype(np.int64) + _HALF
+        keys = (cells[:, 0] * 2 * _HALF + cells[:, 1]) * 2 * _HALF + cells[:, 2]
+        votes = np.unique(keys * _NUM_POINTS + rows) // _NUM_POINTS  # of each point once a cell
+        found, counts = np.unique(votes, return_counts=True)
         if counts.max() > most:
             most = int(counts.max())
-            best = np.median(shifts[(cells == found[counts.argmax()]).all(axis=1)], axis=0)
+            best = np.median(shifts[keys == found[counts.argmax()]], axis=0)
     return best
 
 
