@@ -9,12 +9,14 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from topoloc.compiled import set_num_threads
     from topoloc.errors import TopolocError
     from topoloc.geometry.camera import Camera
     from topoloc.geometry.rigid import Rigid3
     from topoloc.localization.building import build_map
     from topoloc.localization.localizer import Localizer, LocalizerConfig
     from topoloc.localization.result import Localization, NotLocalized
+    from topoloc.localization.warm_up import warm_up
     from topoloc.map.build import BuildConfig
     from topoloc.map.topomap import TopoMetricMap
     from topoloc.sequences.open import open_sequence
@@ -39,6 +41,8 @@ __all__ = [
     "__version__",
     "build_map",
     "open_sequence",
+    "set_num_threads",
+    "warm_up",
 ]
 
 _MODULES = {
@@ -56,6 +60,8 @@ _MODULES = {
     "TrackerConfig": "topoloc.tracking.tracker",
     "build_map": "topoloc.localization.building",
     "open_sequence": "topoloc.sequences.open",
+    "set_num_threads": "topoloc.compiled",
+    "warm_up": "topoloc.localization.warm_up",
 }
 
 
