@@ -9,6 +9,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from topoloc.compiled import set_num_threads
     from topoloc.errors import TopolocError
     from topoloc.geometry.camera import Camera
     from topoloc.geometry.rigid import Rigid3
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from topoloc.localization.localizer import Localizer, LocalizerConfig
     from topoloc.localization.result import Alternative, Localization, NotLocalized
     from topoloc.localization.trace import Trace
+    from topoloc.localization.warm_up import warm_up
     from topoloc.map.build import BuildConfig
     from topoloc.map.topomap import TopoMetricMap
     from topoloc.sequences.open import open_sequence
@@ -42,6 +44,8 @@ __all__ = [
     "__version__",
     "build_map",
     "open_sequence",
+    "set_num_threads",
+    "warm_up",
 ]
 
 _MODULES = {
@@ -61,6 +65,8 @@ _MODULES = {
     "TrackerConfig": "topoloc.tracking.tracker",
     "build_map": "topoloc.localization.building",
     "open_sequence": "topoloc.sequences.open",
+    "set_num_threads": "topoloc.compiled",
+    "warm_up": "topoloc.localization.warm_up",
 }
 
 

@@ -7,6 +7,8 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
+from topoloc import compiled
+
 
 @functools.cache
 def _pool(process_id: int) -> ThreadPoolExecutor:
@@ -14,12 +16,12 @@ def _pool(process_id: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix=f"bands-{process_id}")
 
 
-def run_in_bands(run: Callable[[int, int], object], num_rows: int, num_threads: int) -> None:
+def run_in_bands(run: Callable[[int, int], object], num_rows: int, num_threads: int | None = None) -> None:
     """Call run(first_row, last_row) for `num_threads` bands of about equal height that cover the rows, at the same time.
 
-    The calling thread takes one band itself; an exception of any band is raised here.
+    None is as many as `set_num_threads` said. The calling thread takes one band itself; an exception of any band is raised here.
     """
-    num_bands = max(1, min(num_threads, num_rows))
+    num_bands = max(1, min(num_threads or compiled.num_threads(), num_rows))
     borders = [num_rows * band // num_bands for band in range(num_bands + 1)]
     pool = _pool(os.getpid())
     others = [pool.submit(run, borders[band], borders[band + 1]) for band in range(1, num_bands)]

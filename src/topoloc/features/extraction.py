@@ -20,21 +20,15 @@ NORMALIZATIONS: dict[str, PatchNormalizationConfig | None] = {
 }
 
 
-def extract_features(image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int = 2) -> Features:
-    """The features of a grey image, strongest first; the same for any `num_threads`.
-
-    Raises:
-        FeatureKindError: there is no such kind.
-    """
     return extract_normalized(normalize_image(image, config, num_threads), config, num_threads)
 
 
-def normalize_image(image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int = 2) -> UInt8[np.ndarray, "h w"]:
+def normalize_image(image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None = None) -> UInt8[np.ndarray, "h w"]:
     """First step of `extract_features`: the picture that key points are sought in."""
     normalization = NORMALIZATIONS[config.normalization or find_kind(config.kind).normalization]
     return image if normalization is None else patch_normalize(image, normalization, num_threads)
 
 
-def extract_normalized(normalized: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int = 2) -> Features:
+def extract_normalized(normalized: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None = None) -> Features:
     """Second step of `extract_features`: the features of what `normalize_image` gave."""
     return find_kind(config.kind).extract(normalized, config, num_threads)

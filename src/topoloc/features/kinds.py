@@ -72,7 +72,7 @@ class FeatureKind:
     """
 
     name: str
-    extract: Callable[[UInt8[np.ndarray, "h w"], FeatureConfig, int], Features]
+    extract: Callable[[UInt8[np.ndarray, "h w"], FeatureConfig, int | None], Features]
     descriptor_size: int
     guided: GuidedThresholds
     distant: GuidedThresholds
@@ -85,12 +85,12 @@ class FeatureKind:
     wall_ratio: float = 0.9
 
 
-def _extract_surf(image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int) -> Features:
+def _extract_surf(image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None) -> Features:
     settings = SurfConfig(hessian_threshold=config.hessian_threshold, max_features=config.max_features, num_threads=num_threads)
     return extract_surf(image, settings)
 
 
-def _extract_sift(image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int) -> Features:
+def _extract_sift(image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None) -> Features:
     return extract_sift(image, SiftConfig(max_features=config.max_features, contrast_threshold=config.contrast_threshold))
 
 

@@ -51,7 +51,7 @@ def match_features(
     query_descriptors: Float32[np.ndarray, "n d"],
     train_descriptors: Float32[np.ndarray, "m d"],
     config: MatchingConfig,
-    num_threads: int = 2,
+    num_threads: int | None = None,
 ) -> Matches:
     """Matches between two images, at most one for a query feature, in the order of the query features."""
     return _match(query_descriptors, train_descriptors, _NO_POINTS, _NO_RADII, config, num_threads)
@@ -63,7 +63,7 @@ def match_pooled(
     train_points_world: Float[np.ndarray, "m 3"],
     train_radii: Float[np.ndarray, " m"],
     config: MatchingConfig,
-    num_threads: int = 2,
+    num_threads: int | None = None,
 ) -> Matches:
     """Matches between an image and the features of several map nodes thrown together.
 
@@ -80,7 +80,7 @@ def _match(
     points: Float32[np.ndarray, "p 3"],
     radii: Float32[np.ndarray, " p"],
     config: MatchingConfig,
-    num_threads: int,
+    num_threads: int | None,
 ) -> Matches:
     if len(query) == 0 or len(train) == 0:
         return Matches(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros(0, np.float32))
@@ -106,7 +106,7 @@ def _nearest(
     ratio: float,
     points: Float32[np.ndarray, "p 3"],
     radii: Float32[np.ndarray, " p"],
-    num_threads: int,
+    num_threads: int | None,
 ) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
     """The nearest train row of each query row, -1 where the ratio test fails, and their scalar product."""
     packed = _packed(train)
@@ -119,9 +119,9 @@ def _nearest(
         for start in range(ROWS * first_pair, ROWS * last_pair, _ROWS_AT_ONCE):
             rows = slice(start, min(start + _ROWS_AT_ONCE, ROWS * last_pair))
             multiply(padded[rows], packed, table)
-            block = table[: rows.stop - start, : len(train)]
-            nearest_idx[rows] = np.argmax(block, axis=1)
-            reject_rivalled(block, nearest_idx[rows], ratio, points, radii, products[rows])
+            block = table[: rows.stop - start]  # whole rows: a part of them would be another type to Numba, compiled apart
+            nearest_idx[rows] = np.argmax(block[:, : len(train)], axis=1)
+            reject_rivalled(block, len(train), nearest_idx[rows], ratio, points, radii, products[rows])
 
     run_in_bands(run, len(padded) // ROWS, num_threads)
     return nearest_idx[: len(query)], products[: len(query)]

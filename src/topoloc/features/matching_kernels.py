@@ -5,7 +5,8 @@ call then costs a time slice of the scheduler, some 15 ms. It reaches about two 
 """
 
 import numpy as np
-from numba import njit
+
+from topoloc.compiled import kernel
 
 CHUNK = 256
 TILE = 64  # columns of a block of train descriptors, which stays in the first-level cache
@@ -13,7 +14,7 @@ ROWS = 2  # query rows worked on together, and components: what the registers ho
 GROUP = 4
 
 
-@njit(nogil=True, cache=True, fastmath={"contract"})
+@kernel(fastmath={"contract"})
 def multiply(query, packed, out):
     """out[i, j] = query[i] . train[j]; the rows of `query` are a multiple of ROWS, `packed` is made by `matching._packed`."""
     sums = np.empty(ROWS * TILE, np.float32)
@@ -33,7 +34,7 @@ def multiply(query, packed, out):
                     out[i + row, tile * TILE + j] = sums[row * TILE + j]
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _are_twins(points, radii, a, b):
     squared = np.float32(0.0)
     for axis in range(3):
@@ -41,14 +42,13 @@ def _are_twins(points, radii, a, b):
     return squared <= max(radii[a], radii[b]) ** 2
 
 
-@njit(nogil=True, cache=True)
-def reject_rivalled(products, winners, ratio, points, radii, out_product):
+@kernel()
+def reject_rivalled(products, num_columns, winners, ratio, points, radii, out_product):
     """Set the winner of each row (the column of its largest product) to -1 if a rival comes within the ratio test, or it is NaN.
 
-    Column k belongs to the map point `points[k]`; columns within `radii` of the winner's point are its twins and no rivals.
-    No points at all (0, 3): every other column is a rival. A ratio of 0 switches the test off.
+    Columns from `num_columns` on do not count. Column k belongs to the map point `points[k]`; columns within `radii` of the winner's point
+    are its twins and no rivals. No points at all (0, 3): every other column is a rival. A ratio of 0 switches the test off.
     """
-    num_columns = products.shape[1]
     for row_idx in range(products.shape[0]):
         row, winner = products[row_idx], winners[row_idx]
         best = row[winner]

@@ -53,7 +53,9 @@ class PatchNormalizationConfig:
         return self.window_px + 1 - second, second
 
 
-def patch_normalize(image: UInt8[np.ndarray, "h w"], config: PatchNormalizationConfig, num_threads: int = 2) -> UInt8[np.ndarray, "h w"]:
+def patch_normalize(
+    image: UInt8[np.ndarray, "h w"], config: PatchNormalizationConfig, num_threads: int | None = None
+) -> UInt8[np.ndarray, "h w"]:
     """The normalised image N as 8 bit: 128 + gain N, rounded, clipped to 0 .. 255.
 
     The picture is reflected at its borders (the border row itself not repeated). Where sigma + epsilon is 0, N is 0.

@@ -1,10 +1,11 @@
 """Numba kernel of `patch_normalization`: one band of rows, by sliding sums."""
 
 import numpy as np
-from numba import njit
+
+from topoloc.compiled import kernel
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _slide(values, width, out):
     """out[x] = the sum of values[x : x + width]."""
     total = np.int32(0)
@@ -16,7 +17,7 @@ def _slide(values, width, out):
         total = np.int32(total - values[x])
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _normalize_row(centre, sums, sums_sq, weight, floor, gain, out):
     """128 + gain (I - mean) / (sigma + epsilon), numerator and denominator times the window's weight."""
     for x in range(out.shape[0]):
@@ -28,7 +29,7 @@ def _normalize_row(centre, sums, sums_sq, weight, floor, gain, out):
         out[x] = np.uint8(min(max(value, np.float32(0.0)), np.float32(255.0)))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def normalize_band(padded, out, first_row, last_row, first_box, second_box, epsilon, gain):
     """Rows [first_row, last_row) of `out`, from the image padded on each side by (first_box + second_box) / 2 - 1.
 

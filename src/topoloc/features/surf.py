@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32, Int64, UInt8
 
 from topoloc.bounds import AtLeast, Between
+from topoloc.compiled import num_threads
 from topoloc.features.bands import run_in_bands
 from topoloc.features.features import Features
 from topoloc.features.surf_descriptor_kernels import describe, orient, smooth_rows
@@ -51,11 +52,12 @@ class SurfConfig:
     """All orientations are 0: for cameras that never roll."""
     max_features: Annotated[int, Between(0, 100_000)] = 2000
     """The strongest are kept."""
-    num_threads: Annotated[int, Between(1, 1024)] = 2
-    """Threads; the features are the same for any number."""
+    num_threads: Annotated[int | None, Between(1, 1024)] = None
+    """Threads; the features are the same for any number. Unset: as many as `set_num_threads` said."""
 
     def __post_init__(self) -> None:
-        if self.hessian_threshold < 0 or min(self.num_octaves, self.num_layers, self.num_threads) < 1 or self.max_features < 0:
+        counts = (self.num_octaves, self.num_layers, 1 if self.num_threads is None else self.num_threads)
+        if self.hessian_threshold < 0 or min(counts) < 1 or self.max_features < 0:
             raise ValueError(f"SURF: threshold and max_features must be at least 0, the other numbers at least 1: {self}")
         if (SMALLEST_FILTER_PX + FILTER_INCREMENT_PX * (self.num_layers + 1)) << (self.num_octaves - 1) > LARGEST_FILTER_PX:
             raise ValueError(f"SURF: filters beyond {LARGEST_FILTER_PX} px, fewer octaves or layers are needed: {self}")
@@ -123,7 +125,7 @@ def _detect(integral: Int32[np.ndarray, "h1 w1"], config: SurfConfig) -> Float32
         """Numbers in the largest band of reordered sums, of all octaves but the first."""
         return max(((part_rows + 3 * (1 << o) + 2 * int(e[-1, -1])) * split_width(1 << o) for o, e in octaves.items() if o > 0), default=0)
 
-    num_parts, threshold = config.num_threads, np.float32(config.hessian_threshold)
+    num_parts, threshold = config.num_threads or num_threads(), np.float32(config.hessian_threshold)
     # Allocated here, not in the threads: the allocator gives a helper thread's memory back to the system after each call.
     scratch = np.empty((num_parts, largest_split(-(-height // num_parts))), np.int32)
     found: dict[tuple[int, int], Float32[np.ndarray, "m 4"]] = {}
@@ -185,7 +187,7 @@ def _describe(
     integral: Int32[np.ndarray, "h1 w1"], points: Float32[np.ndarray, "n 2"], scales: Float32[np.ndarray, " n"], config: SurfConfig
 ) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, "n 64"]]:
     """Angles in radians and descriptors of key points at these scales (sigma, pixels)."""
-    num_parts = config.num_threads
+    num_parts = config.num_threads or num_threads()
     angles = np.zeros(len(points), np.float32)
     descriptors = np.empty((len(points), DESCRIPTOR_LENGTH), np.float32)
     # OpenCV averages over a whole number of pixels a side

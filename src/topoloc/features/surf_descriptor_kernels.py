@@ -1,7 +1,8 @@
 """Numba kernels of `surf`, second half: orientation and descriptor of each key point."""
 
 import numpy as np
-from numba import njit
+
+from topoloc.compiled import kernel
 
 PATCH_SIZE = 20  # samples a side of the described window, in units of the key point's scale s
 ORIENTATION_RADIUS = 6  # in units of s
@@ -33,7 +34,7 @@ PATCH_WEIGHTS = np.zeros((PATCH_SIZE, PADDED_SIZE), np.float32)
 PATCH_WEIGHTS[:, :PATCH_SIZE] = np.outer(_gaussian(PATCH_SIZE, 3.3), _gaussian(PATCH_SIZE, 3.3))
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@kernel(fastmath=True, error_model="numpy")
 def smooth_rows(integral, box, share, step, level, first, last):
     """Rows [first, last) of `level`: at every step-th pixel `share` of the mean over box x box, the rest over box + 2 a side.
 
@@ -62,7 +63,7 @@ def smooth_rows(integral, box, share, step, level, first, last):
                 level[i, j] = line[j * step]
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@kernel(fastmath=True, error_model="numpy")
 def _haar_samples(integral, centre_x, centre_y, scale, corners, weights, gradients):
     """Fill gradients (2, n) with the weighted Haar responses (side about 4 s) around a key point, zero beyond the image.
 
@@ -93,7 +94,7 @@ def _haar_samples(integral, centre_x, centre_y, scale, corners, weights, gradien
         gradients[1, k] = np.float32(down) * weights[k]
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@kernel(fastmath=True, error_model="numpy")
 def _sectors(gradients, sectors, first_degree):
     """The sector of each gradient's direction, rounded to whole degrees; first_degree (2, n) repeats those at a sector's first.
 
@@ -121,7 +122,7 @@ def _sectors(gradients, sectors, first_degree):
         first_degree[1, k] = y if is_first else np.float32(0.0)
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@kernel(fastmath=True, error_model="numpy")
 def _dominant_angle(gradients, sectors, first_degree, sums, threes, windows):
     """The direction of the longest sum of gradients within any window of 60 degrees (Bay et al. 2008, 4.1).
 
@@ -149,7 +150,7 @@ def _dominant_angle(gradients, sectors, first_degree, sums, threes, windows):
     return np.arctan2(best_y, best_x)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def orient(integral, points, scales, rows, angles):
     """Fill angles[rows] of the key points at points[rows] (x, y) of scales[rows]."""
     num_samples, num_sectors = ORIENTATION_SAMPLES.shape[1], 360 // SECTOR_DEG
@@ -165,7 +166,7 @@ def orient(integral, points, scales, rows, angles):
         angles[row] = _dominant_angle(gradients, sectors, first_degree, sums, threes, windows)
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@kernel(fastmath=True, error_model="numpy")
 def _sample_patch(level, origin_x, origin_y, step_x, step_y, indices, fractions, patch):
     """Bilinear samples of `level` on the grid origin + column * (step_x, step_y) + row * (-step_y, step_x), clamped to the image."""
     stride = np.int32(level.shape[1])
@@ -189,7 +190,7 @@ def _sample_patch(level, origin_x, origin_y, step_x, step_y, indices, fractions,
         patch[k] = upper + fractions[1, k] * (lower - upper)
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@kernel(fastmath=True, error_model="numpy")
 def _describe_patch(patch, sums, descriptor):
     """Sums of dx, dy, |dx|, |dy| in 4x4 cells of the (21, 21) patch, Gaussian-weighted, to unit length (Bay et al. 2008, 4.2)."""
     side = PATCH_SIZE + 1
@@ -219,7 +220,7 @@ def _describe_patch(patch, sums, descriptor):
         descriptor[k] *= scale
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def describe(level, offset, level_step, points, spacings, angles, rows, descriptors):
     """Fill descriptors[rows] from one level of the pyramid, whose pixel (0, 0) is at (offset, offset) of the image."""
     side = PATCH_SIZE + 1

@@ -4,10 +4,11 @@ All sums live in int32 that may wrap: a difference of wrapped sums is still righ
 """
 
 import numpy as np
-from numba import njit
+
+from topoloc.compiled import kernel
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def integral_image(image):
     """(h + 1, w + 1) int32, modulo 2^32: entry (y, x) is the sum of image[:y, :x]."""
     height, width = image.shape
@@ -27,7 +28,7 @@ def integral_image(image):
     return integral
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def split_columns(integral, step, first, split):
     """Fill `split` with rows of the integral image from `first` on, columns reordered: those at 0, step, 2 step, ..., then 1, 1 + step, ...
 
@@ -43,7 +44,7 @@ def split_columns(integral, step, first, split):
 
 
 # No fastmath: a fused product here rounded differently when compiled in this process and when read from the compiler's cache.
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _hessian_row(sums, top, edges, columns, rows, out):
     """Determinants of one row of filters with their upper edge at row `top` of `sums`.
 
@@ -70,7 +71,7 @@ def _hessian_row(sums, top, edges, columns, rows, out):
         out[x] = dxx * dyy - dxy * dxy
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@kernel(fastmath=True, error_model="numpy")
 def _mark_candidates(below, up, mid, down, above, first, last, threshold, marks):
     """marks[j] = 1 where mid[j] exceeds the threshold and six of its 26 neighbours: a cheap sieve that vectorises."""
     count = last - first
@@ -82,7 +83,7 @@ def _mark_candidates(below, up, mid, down, above, first, last, threshold, marks)
         marks[j] = np.uint8(value > ring)
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _is_maximum(ring, layer, up, mid, down, j):
     value = ring[layer, mid, j]
     for other in range(layer - 1, layer + 2):
@@ -93,7 +94,7 @@ def _is_maximum(ring, layer, up, mid, down, j):
     return True
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _refine(ring, layer, up, mid, down, j):
     """The vertex (x, y, scale) of the quadratic through the 27 determinants, in grid units; ok is False beyond one unit."""
     below, here, above = ring[layer - 1], ring[layer], ring[layer + 1]
@@ -118,7 +119,7 @@ def _refine(ring, layer, up, mid, down, j):
     return max(abs(dx), abs(dy), abs(ds)) <= 1.0, dx, dy, ds
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _collect_row(ring, layer, i, sizes, step, threshold, marks, words, found, count):
     """Append the maxima of row i of this layer to `found` (x, y, size, response); returns the (grown) array and its count."""
     num_columns = ring.shape[2]
@@ -157,7 +158,7 @@ def _collect_row(ring, layer, i, sizes, step, threshold, marks, words, found, co
     return found, count
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def detect_band(sums, sums_top, height, width, edges, columns, step, first, last, threshold):
     """Maxima (m, 4) = x, y, size, response in rows [first, last) of an octave's grid (every step-th pixel).
 

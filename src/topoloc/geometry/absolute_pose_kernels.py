@@ -1,10 +1,11 @@
 """Compiled inner loops of `absolute_pose`: one pass over the points a call, no allocation a point."""
 
 import numpy as np
-from numba import njit
+
+from topoloc.compiled import kernel
 
 
-@njit(cache=True)
+@kernel()
 def _whitened(rotation, translation, normalized, covariance, point_world, point_covariances, i):
     """(u, v, 1/z, e, S^-1, e' S^-1 e) of match i, with e = projected - observed on the plane z = 1; the last is infinite behind.
 
@@ -36,7 +37,7 @@ def _whitened(rotation, translation, normalized, covariance, point_world, point_
     return u, v, w, e0, e1, i00, i01, i11, e0 * e0 * i00 + 2.0 * e0 * e1 * i01 + e1 * e1 * i11
 
 
-@njit(cache=True)
+@kernel()
 def squared_errors(rotation, translation, normalized, covariances, points_world, point_covariances):
     """Squared Mahalanobis length of each match's reprojection error; infinite behind the camera."""
     squares = np.empty(len(normalized))
@@ -45,7 +46,7 @@ def squared_errors(rotation, translation, normalized, covariances, points_world,
     return squares
 
 
-@njit(cache=True)
+@kernel()
 def normal_equations(rotation, translation, normalized, covariances, points_world, point_covariances, active, cauchy_scale):
     """Gauss-Newton's normal equations of the whitened reprojection errors on the plane z = 1.
 
@@ -88,7 +89,7 @@ def normal_equations(rotation, translation, normalized, covariances, points_worl
     return information, gradient, cost, squares
 
 
-@njit(cache=True)
+@kernel()
 def refine(rotation, translation, normalized, covariances, points_world, point_covariances, active, cauchy_scale, max_steps):
     """Iteratively reweighted Gauss-Newton under Cauchy's loss; ends where the cost falls no more. Returns (rotation, translation)."""
     information, gradient, cost, _ = normal_equations(
@@ -118,7 +119,7 @@ def refine(rotation, translation, normalized, covariances, points_world, point_c
     return rotation, translation
 
 
-@njit(cache=True)
+@kernel()
 def _solve_definite(matrix, right):
     """(True, x) with matrix @ x = right by Cholesky's decomposition; (False, _) if not positive definite."""
     n = len(right)
@@ -148,7 +149,7 @@ def _solve_definite(matrix, right):
     return True, x
 
 
-@njit(cache=True)
+@kernel()
 def _exp_so3(omega):
     """Rodrigues' formula."""
     x, y, z = omega[0], omega[1], omega[2]

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from topoloc.compiled import kernel
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+@kernel(error_model="numpy", fastmath={"reassoc", "contract"})
 def match_projections(
     expected, map_descriptors, seen, descriptors, width, height, radius, max_scale, min_cosine, min_similarity, min_margin
 ):

@@ -6,6 +6,7 @@ with the network frozen into TorchScript, whose fused calls save a third of a sm
 
 from __future__ import annotations
 
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -16,6 +17,7 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor, nn
 
+from topoloc.compiled import chosen_threads
 from topoloc.places.backbones import normalize_pictures
 from topoloc.places.training_set import RgbPictures
 
@@ -40,8 +42,8 @@ class Predictor:
     def __init__(self, network: nn.Module) -> None:
         self._dtype = torch.bfloat16 if has_bfloat16() else torch.float32
         self._network = in_channels_last(network.eval().requires_grad_(False).to(self._dtype))
-        self._num_threads = torch.get_num_threads()
-        self._frozen: dict[tuple[int, ...], torch.jit.ScriptModule] = {}
+        self._frozen: dict[tuple[int, ...], tuple[torch.jit.ScriptModule, int]] = {}
+        self._freezing = threading.Lock()
 
     def __call__(self, pictures: RgbPictures) -> Float32[np.ndarray, "n d"]:
         """One row of outputs for each picture, whatever their number."""
@@ -56,30 +58,58 @@ class Predictor:
     def _single(self, image: Tensor) -> Tensor:
         """One picture through the frozen network, which is made at the first call: in small networks calls cost as much as arithmetic."""
         shape = tuple(image.shape)
-        if shape not in self._frozen:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # TorchScript calls itself outdated at every use
-                self._frozen[shape] = torch.jit.freeze(torch.jit.trace(self._network, image))
-            self._num_threads = _fastest_threads(lambda: self._frozen[shape](image))
-        with threads(self._num_threads):
-            return self._frozen[shape](image)
+        with self._freezing:
+            if shape not in self._frozen:
+                self._frozen[shape] = _freeze(self._network, image)
+            frozen, num_threads = self._frozen[shape]
+        with threads(num_threads):
+            return frozen(image)
 
 
-@contextmanager
-def threads(number: int) -> Iterator[None]:
-    """This many threads for PyTorch's operations; afterwards as many as before."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(number)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+class _Threads:
+    """`with threads(number)`: this many threads for PyTorch's operations; afterwards as many as before.
+
+    PyTorch has one number for the process and one for each thread of Python. Several of these may be in here at once: what each leaves is
+    the process's number from before the first came, not the one that another thread has set meanwhile.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._here = threading.Lock(), threading.local()
+        self._num_users, self._own = 0, 0
+
+    @contextmanager
+    def __call__(self, number: int) -> Iterator[None]:
+        outer: int | None = getattr(self._here, "number", None)
+        with self._lock:
+            if self._num_users == 0:
+                self._own = torch.get_num_threads()
+            self._num_users += 1
+            torch.set_num_threads(number)
+        self._here.number = number
+        try:
+            yield
+        finally:
+            self._here.number = outer
+            with self._lock:
+                self._num_users -= 1
+                torch.set_num_threads(self._own if outer is None else outer)
+
+
+threads = _Threads()
+
+
+def _freeze(network: nn.Module, image: Tensor) -> tuple[torch.jit.ScriptModule, int]:
+    """The network for images of this shape, and the number of threads that answers soonest."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # TorchScript calls itself outdated at every use
+        frozen = torch.jit.freeze(torch.jit.trace(network, image))
+    return frozen, _fastest_threads(lambda: frozen(image))
 
 
 def _fastest_threads(call: Callable[[], object]) -> int:
     """One thread or all, whichever answers sooner now: on a busy machine several threads wait for one another many times as long."""
     times = {}
-    for number in {1, torch.get_num_threads()}:
+    for number in {1, chosen_threads(torch.get_num_threads())}:
         with threads(number):
             for _ in range(2):  # these compile
                 call()

@@ -7,12 +7,13 @@ they save, and on a busy machine many times more.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from topoloc.compiled import kernel
 
 _FAST = {"reassoc", "contract", "arcp"}
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@kernel(error_model="numpy", fastmath=_FAST)
 def _dot(a, b):
     total = np.float32(0)
     for i in range(len(a)):
@@ -20,7 +21,7 @@ def _dot(a, b):
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@kernel(error_model="numpy", fastmath=_FAST)
 def add_residuals(descriptors, words, half_squares, sums):
     """Add each descriptor's unit residual from its nearest word to that word's row of `sums`; half_squares = |word|^2 / 2."""
     residual = np.empty(words.shape[1], np.float32)
@@ -39,7 +40,7 @@ def add_residuals(descriptors, words, half_squares, sums):
             total[i] += residual[i] * scale
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@kernel(error_model="numpy", fastmath=_FAST)
 def multiply_rows(rows, vector, products):
     """products[k] = rows[k] . vector."""
     for k in range(len(rows)):

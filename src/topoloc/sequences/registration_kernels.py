@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from topoloc.compiled import kernel
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def back_project(depth, normalized, rotation, translation, points):
     """Fill `points` (n, 3) with what the known pixels see, in the other camera's frame; returns n.
 
@@ -26,7 +27,7 @@ def back_project(depth, normalized, rotation, translation, points):
     return count
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def keep_nearest(pixels, points, registered):
     """Write each point's z into `registered` at its rounded pixel (NaN: none), where nothing nearer is."""
     height, width = registered.shape

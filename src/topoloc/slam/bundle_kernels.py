@@ -7,15 +7,16 @@ A key frame sees a point at (x, y, d): pixel and disparity, d = bf / depth + bia
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-_OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
+from topoloc.compiled import kernel
+
+_OPTIONS = {"error_model": "numpy"}
 _MIN_DEPTH = 0.02
 # What an observation costs whose point is behind the camera: as much as one that is off by a hundred sigma.
 _BEHIND = 1e4
 
 
-@njit(**_OPTIONS)
+@kernel(**_OPTIONS)
 def _residual(rotation, translation, camera, point, measured, weights, residual, seen):
     """Whitened (measured - predicted), and the point in the camera's frame; returns its square, negative behind the camera."""
     for axis in range(3):
@@ -29,7 +30,7 @@ def _residual(rotation, translation, camera, point, measured, weights, residual,
     return residual[0] ** 2 + residual[1] ** 2 + residual[2] ** 2
 
 
-@njit(**_OPTIONS)
+@kernel(**_OPTIONS)
 def squared_residuals(rotations, translations, cameras, points, frames, rows, measured, weights, squares):
     """Fill the squared whitened residual of each observation (frame and point rows given); infinite behind the camera."""
     residual, seen = np.empty(3), np.empty(3)
@@ -39,7 +40,7 @@ def squared_residuals(rotations, translations, cameras, points, frames, rows, me
         squares[k] = square if square >= 0.0 else np.inf
 
 
-@njit(**_OPTIONS)
+@kernel(**_OPTIONS)
 def robust_cost(squares, scale_squared):
     """Cauchy's loss, summed."""
     total = 0.0
@@ -48,7 +49,7 @@ def robust_cost(squares, scale_squared):
     return total
 
 
-@njit(**_OPTIONS)
+@kernel(**_OPTIONS)
 def _jacobians(rotation, camera, seen, weights, by_pose, by_point):
     """Derivatives of the whitened prediction by the pose's xi and by the point."""
     inverse = 1.0 / seen[2]
@@ -69,7 +70,7 @@ def _jacobians(rotation, camera, seen, weights, by_pose, by_point):
             by_point[r, axis] = a * rotation[0, axis] + b * rotation[1, axis] + c * rotation[2, axis]
 
 
-@njit(**_OPTIONS)
+@kernel(**_OPTIONS)
 def _invert_symmetric(m, inverse):
     a, b, c, d, e, f = m[0, 0], m[0, 1], m[0, 2], m[1, 1], m[1, 2], m[2, 2]
     inverse[0, 0] = d * f - e * e
@@ -85,7 +86,7 @@ def _invert_symmetric(m, inverse):
             inverse[s, r] = inverse[r, s]
 
 
-@njit(**_OPTIONS)
+@kernel(**_OPTIONS)
 def _subtract_point(n, first, last, column, slots, frames, couplings, inverses, bias_couplings, step, product, matrix, vector):
     """Take point n out of the system: what the poses and the bias that it ties together still know without it."""
     if column >= 0:
@@ -120,7 +121,7 @@ def _subtract_point(n, first, last, column, slots, frames, couplings, inverses, 
                     )
 
 
-@njit(**_OPTIONS)
+@kernel(**_OPTIONS)
 def eliminate_points(
     rotations, translations, cameras, slots, columns, points, starts, frames, measured, weights, scale_squared, damping,
     matrix, vector, couplings, inverses, gradients, bias_couplings,
@@ -182,7 +183,7 @@ def eliminate_points(
         _subtract_point(n, first, last, column, slots, frames, couplings, inverses, bias_couplings, step, product, matrix, vector)
 
 
-@njit(**_OPTIONS)
+@kernel(**_OPTIONS)
 def move_points(slots, columns, starts, frames, couplings, bias_couplings, inverses, gradients, steps, points, moved):
     """The points after the `steps` (s,) of poses and biases, into `moved`."""
     rest = np.empty(3)

@@ -71,7 +71,7 @@ def measure_disparities(
     points_img: Float32[np.ndarray, "n 2"],
     guesses_px: Float[np.ndarray, " n"],
     config: DisparityConfig,
-    num_threads: int = 2,
+    num_threads: int | None = None,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Disparity of points of the left picture, that of an infinitely far one being 0, and its standard deviation, pixels.
 

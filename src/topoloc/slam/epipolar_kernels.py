@@ -7,14 +7,14 @@ the points that the detector did not find twice. A thousand points cost a few mi
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from topoloc.compiled import kernel
 from topoloc.slam.sampling_kernels import sample_bilinear
 
-_OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"reassoc", "contract", "arcp"}}
+_OPTIONS = {"error_model": "numpy", "fastmath": {"reassoc", "contract", "arcp"}}
 
 
-@njit(**_OPTIONS)
+@kernel(**_OPTIONS)
 def _normalized_patch(image, x, y, half, patch):
     """Fill `patch` with the zero-mean, unit-norm patch around (x, y); return its norm before (0: no texture)."""
     side = 2 * half + 1
@@ -38,7 +38,7 @@ def _normalized_patch(image, x, y, half, patch):
     return norm
 
 
-@njit(**_OPTIONS)
+@kernel(**_OPTIONS)
 def _correlations(patch, half, image, x, y, shift_sign, num_disparities, strip, sums, scores):
     """NCC of `patch` (centre (x, y) in its own picture) with `image` at x + shift_sign * d for d = 0 .. num_disparities - 1."""
     side = 2 * half + 1
@@ -82,7 +82,7 @@ def _correlations(patch, half, image, x, y, shift_sign, num_disparities, strip, 
             scores[d] = dots[k] / np.sqrt(variance)
 
 
-@njit(**_OPTIONS)
+@kernel(**_OPTIONS)
 def _refine_disparity(patch, half, right, x, y, disparity, num_iterations):
     """Gauss-Newton on the disparity with gain and offset eliminated; returns (disparity, standard deviation in pixels)."""
     side = 2 * half + 1
@@ -130,7 +130,7 @@ def _refine_disparity(patch, half, right, x, y, disparity, num_iterations):
     return disparity, sigma
 
 
-@njit(**_OPTIONS)
+@kernel(**_OPTIONS)
 def _match_point(left, right, x, y, half, low, num_disparities, min_score, max_ratio, patch, back, strip, sums, scores):
     """(disparity, sigma) of one point, sought among low .. low + num_disparities - 1; NaN as `match_along_rows` says."""
     height, width = left.shape
@@ -162,7 +162,7 @@ def _match_point(left, right, x, y, half, low, num_disparities, min_score, max_r
     return disparity, sigma
 
 
-@njit(**_OPTIONS)
+@kernel(**_OPTIONS)
 def match_along_rows(left, right, points, half, max_disparity, min_score, max_ratio):
     """Disparity of each point (x, y) of `left` in `right` (float32 pictures of one size) with its standard deviation.
 
@@ -176,7 +176,7 @@ def match_along_rows(left, right, points, half, max_disparity, min_score, max_ra
     return disparities, sigmas
 
 
-@njit(**_OPTIONS)
+@kernel(**_OPTIONS)
 def match_in_ranges(left, right, points, lows, nums, half, min_score, max_ratio, disparities, sigmas):
     """As `match_along_rows`, the disparity of point n sought among lows[n] .. lows[n] + nums[n] - 1 only; fills the last two."""
     side = 2 * half + 1

@@ -7,12 +7,13 @@ preconditioner; what is left to iterate over are the loops.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-_OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
+from topoloc.compiled import kernel
+
+_OPTIONS = {"error_model": "numpy"}
 
 
-@njit(**_OPTIONS)
+@kernel(**_OPTIONS)
 def _cholesky(matrix, factor):
     size = len(matrix)
     for i in range(size):
@@ -23,7 +24,7 @@ def _cholesky(matrix, factor):
             factor[i, j] = np.sqrt(max(total, 1e-12)) if i == j else total / factor[j, j]
 
 
-@njit(**_OPTIONS)
+@kernel(**_OPTIONS)
 def _solve_lower(factor, vector):
     for i in range(len(vector)):
         for k in range(i):
@@ -31,7 +32,7 @@ def _solve_lower(factor, vector):
         vector[i] /= factor[i, i]
 
 
-@njit(**_OPTIONS)
+@kernel(**_OPTIONS)
 def _solve_upper(factor, vector):
     """With the transpose of `factor`."""
     for i in range(len(vector) - 1, -1, -1):
@@ -40,7 +41,7 @@ def _solve_upper(factor, vector):
         vector[i] /= factor[i, i]
 
 
-@njit(**_OPTIONS)
+@kernel(**_OPTIONS)
 def _factor_chain(diagonal, chain, factors, lowers):
     """Block Cholesky of the tridiagonal part: `chain[n]` is the block (n, n + 1)."""
     size = diagonal.shape[1]
@@ -56,7 +57,7 @@ def _factor_chain(diagonal, chain, factors, lowers):
         block = diagonal[n + 1] - lowers[n] @ lowers[n].T
 
 
-@njit(**_OPTIONS)
+@kernel(**_OPTIONS)
 def _solve_chain(factors, lowers, vector, out):
     out[:] = vector
     for n in range(len(factors)):
@@ -69,7 +70,7 @@ def _solve_chain(factors, lowers, vector, out):
         _solve_upper(factors[n], out[n])
 
 
-@njit(**_OPTIONS)
+@kernel(**_OPTIONS)
 def _multiply(diagonal, firsts, seconds, blocks, vector, out):
     for n in range(len(diagonal)):
         out[n] = diagonal[n] @ vector[n]
@@ -78,7 +79,7 @@ def _multiply(diagonal, firsts, seconds, blocks, vector, out):
         out[seconds[e]] += blocks[e].T @ vector[firsts[e]]
 
 
-@njit(**_OPTIONS)
+@kernel(**_OPTIONS)
 def solve_graph(diagonal, firsts, seconds, blocks, right, max_iterations, tolerance):
     """x (n, 6) with ``H x = right``; H has these diagonal blocks and the block `blocks[e]` at (firsts[e], seconds[e]), and mirrored."""
     num, size = right.shape

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from topoloc.compiled import kernel
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")  # inlined, it obeys the caller's rules of arithmetic
+@kernel(error_model="numpy", inline="always")  # inlined, it obeys the caller's rules of arithmetic
 def sample_bilinear(image, x, y):
     """Bilinear; the caller keeps (x, y) inside."""
     ix, iy = int(x), int(y)

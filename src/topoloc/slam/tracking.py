@@ -77,7 +77,7 @@ def align_with_reference(
             reference, picture, points_ref, points_img, scales, config.patch_half_px, 8, config.max_shift_px, first, last, refined, scores
         )
 
-    run_in_bands(run, len(points_img), num_threads=2)
+    run_in_bands(run, len(points_img))
     return refined, scores >= config.min_correlation
 
 

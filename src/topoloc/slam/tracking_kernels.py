@@ -6,14 +6,14 @@ Point trackers step from frame to frame and drift a little at each; the patch of
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from topoloc.compiled import kernel
 from topoloc.slam.sampling_kernels import sample_bilinear
 
-_OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"reassoc", "contract", "arcp"}}
+_OPTIONS = {"error_model": "numpy", "fastmath": {"reassoc", "contract", "arcp"}}
 
 
-@njit(**_OPTIONS)
+@kernel(**_OPTIONS)
 def _prepare(image, x, y, half, patch, slope_x, slope_y):
     """The zero-mean patch around (x, y) and its zero-mean slopes; returns its norm and the inverse of the 2x2 normal matrix."""
     side = 2 * half + 1
@@ -41,7 +41,7 @@ def _prepare(image, x, y, half, patch, slope_x, slope_y):
     return np.sqrt(norm), xx_sum, xy_sum, yy_sum
 
 
-@njit(**_OPTIONS)
+@kernel(**_OPTIONS)
 def _compare(image, x, y, scale, half, patch, window):
     """Fill `window` with the zero-mean patch around (x, y), `scale` times as large; returns its sum of squares and product with `patch`."""
     side = 2 * half + 1
@@ -60,7 +60,7 @@ def _compare(image, x, y, scale, half, patch, window):
     return squares, dot
 
 
-@njit(**_OPTIONS)
+@kernel(**_OPTIONS)
 def refine_tracks(reference, image, points_ref, points, scales, half, num_iterations, max_shift, first, last, refined, scores):
     """Fill `refined` and `scores` for the rows first .. last - 1.
 

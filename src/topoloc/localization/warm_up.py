@@ -1,0 +1,106 @@
+"""Everything that a query needs, compiled before the first one comes: a made-up place is mapped and asked about.
+
+The machine code is kept (see `compiled.py`): with it this takes a second or two, without it half a minute.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from topoloc.features.extraction import FeatureConfig, extract_features
+from topoloc.features.matching import MatchingConfig, match_features
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.building import build_map
+from topoloc.localization.localizer import Localizer
+from topoloc.map.topomap import TopoMetricMap
+from topoloc.sequences.frame import DepthImage, StereoFrame
+
+Progress = Callable[[str, int, int], None]
+STAGE = "compiling"
+
+_CAMERA = Camera.pinhole(320, 240, 260.0, 260.0, 159.5, 119.5)
+_TEXELS_PER_METRE = 130.0
+_WALL_Z, _WALL_SLOPE = 2.0, 0.4  # the wall: z = 2 m + 0.4 x
+
+
+def warm_up(progress: Progress | None = None) -> None:
+    """Compile, or load, all that localizing an image calls, so that the first query takes no longer than the later ones.
+
+    Also fills the cache of machine code where there is none: in a container's image, while it is built.
+
+    Args:
+        progress: called with ("compiling", steps done, steps in all).
+    """
+    wall = _texture(seed=0)
+    pictures = [_seen(wall, place)[0] for place in (0.0, 0.1, 0.2)]
+    lost = _seen(_texture(seed=1), 0.0)[0]
+    with tempfile.TemporaryDirectory() as folder:
+        map_file = Path(folder) / "wall.topo"
+
+        def features() -> None:
+            first, second = (extract_features(picture, FeatureConfig()) for picture in pictures[:2])
+            match_features(first.descriptors, second.descriptors, MatchingConfig())
+
+        def ask(image: UInt8[np.ndarray, "h w"], camera: Camera | None) -> None:
+            Localizer(TopoMetricMap.load(map_file)).localize(image, camera)
+
+        steps: tuple[Callable[[], object], ...] = (
+            features,
+            lambda: build_map(_Walk(wall)).save(map_file),
+            lambda: ask(pictures[1], _CAMERA),
+            lambda: ask(pictures[1], None),
+            lambda: ask(lost, _CAMERA),
+        )
+        for number, step in enumerate(steps):
+            if progress:
+                progress(STAGE, number, len(steps))
+            step()
+        if progress:
+            progress(STAGE, len(steps), len(steps))
+
+
+class _Walk:
+    """An RGB-D recording of two frames along the wall."""
+
+    name = "wall"
+
+    def __init__(self, wall: Float32[np.ndarray, "h w"]) -> None:
+        self._wall, self._places = wall, (0.0, 0.2)
+        self.names, self.t_ns = ["first", "second"], [0, 100_000_000]
+        self.poses: list[Rigid3 | None] = [Rigid3(np.eye(3), np.array([place, 0.0, 0.0])) for place in self._places]
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    def __getitem__(self, index: int) -> StereoFrame:
+        image, depth = _seen(self._wall, self._places[index])
+        registered = DepthImage(depth, _CAMERA, Rigid3.identity())
+        return StereoFrame(self.names[index], self.t_ns[index], image, _CAMERA, depth=registered, world_from_cam=self.poses[index])
+
+
+def _texture(seed: int) -> Float32[np.ndarray, "h w"]:
+    """Noise of several sizes, of which no two places look alike."""
+    rng = np.random.default_rng(seed)
+    total = np.zeros((480, 640), np.float32)
+    for sigma in (1.5, 3.0, 6.0, 12.0):
+        noise = cv2.GaussianBlur(rng.standard_normal(total.shape).astype(np.float32), (0, 0), sigma)
+        total += noise / noise.std()
+    return np.clip(127.5 + 20.0 * total, 0.0, 255.0)
+
+
+def _seen(wall: Float32[np.ndarray, "h w"], place: float) -> tuple[UInt8[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+    """The wall's picture and depth (metres) from `place` metres along x."""
+    camera = _CAMERA
+    wall_from_texel = np.array([[1.0, 0.0, -320.0], [0.0, 1.0, -240.0], [0.0, 0.0, _TEXELS_PER_METRE]]) / _TEXELS_PER_METRE
+    cam_from_wall = np.array([[1.0, 0.0, -place], [0.0, 1.0, 0.0], [_WALL_SLOPE, 0.0, _WALL_Z]])
+    image = cv2.warpPerspective(wall, camera.matrix() @ cam_from_wall @ wall_from_texel, (camera.width, camera.height))
+    rays_x = (np.arange(camera.width) - camera.cx) / camera.fx
+    depth = (_WALL_Z + _WALL_SLOPE * place) / (1.0 - _WALL_SLOPE * rays_x)
+    return np.rint(image).astype(np.uint8), np.tile(depth.astype(np.float32), (camera.height, 1))

@@ -1,0 +1,115 @@
+"""Machine code is read from where it lies and kept where it can be; without a place for it functions run all the same."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from topoloc.compiled import KERNELS, kernel
+
+_MODULE = """
+from topoloc.compiled import kernel
+
+@kernel(error_model="numpy")
+def twice(x):
+    return 2.0 * x
+
+@kernel()
+def more(x):
+    return twice(x) + 1.0
+"""
+_CALL = "import own_kernels as k; print(k.more(3.0), sum(k.more.stats.cache_hits.values()), sum(k.more.stats.cache_misses.values()))"
+
+
+@pytest.fixture
+def module(tmp_path: Path) -> Path:
+    """The folder of a module of two kernels."""
+    (tmp_path / "code").mkdir()
+    (tmp_path / "code" / "own_kernels.py").write_text(_MODULE)
+    return tmp_path / "code"
+
+
+def _run(module: Path, code: str = _CALL, **environment: str) -> tuple[str, str]:
+    path = os.pathsep.join([str(module), *sys.path])
+    environment = os.environ | {"PYTHONPATH": path, "XDG_CACHE_HOME": str(module.parent / "home"), "NUMBA_CACHE_DIR": ""} | environment
+    done = subprocess.run([sys.executable, "-B", "-c", code], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip(), done.stderr
+
+
+def test_code_is_kept_beside_the_function_and_read_where_nothing_can_be_written(module: Path):
+    assert _run(module) == ("7.0 0 1", "")
+    kept = module / "__pycache__"
+    kept.chmod(0o555)
+    try:
+        assert _run(module, XDG_CACHE_HOME="/dev/null") == ("7.0 1 0", "")
+    finally:
+        kept.chmod(0o755)
+
+
+def test_where_it_cannot_lie_beside_the_function_it_is_the_users(module: Path):
+    (module / "__pycache__").write_text("no folder")
+    assert _run(module) == ("7.0 0 1", "")
+    assert _run(module) == ("7.0 1 0", "")
+    assert list((module.parent / "home" / "topoloc" / "kernels").glob("code_*/own_kernels.more-*.nbi"))
+
+
+def test_without_any_place_it_is_compiled_each_time_and_said_once(module: Path):
+    (module / "__pycache__").write_text("no folder")
+    printed, said = _run(module, XDG_CACHE_HOME="/dev/null")
+    assert printed == "7.0 0 1"
+    assert said.startswith("topoloc compiles anew in every process")
+    assert said.count("\n") == 1
+
+
+def test_numbas_own_setting_is_kept(module: Path):
+    folder = module.parent / "named"
+    assert _run(module, NUMBA_CACHE_DIR=str(folder)) == ("7.0 0 1", "")
+    assert _run(module, NUMBA_CACHE_DIR=str(folder)) == ("7.0 1 0", "")
+    assert not (module / "__pycache__").exists()
+
+
+def test_damaged_code_is_made_again(module: Path):
+    _run(module)
+    for file in (module / "__pycache__").glob("*.nb?"):
+        file.write_bytes(file.read_bytes()[:20])
+    assert _run(module) == ("7.0 0 1", "")
+    assert _run(module) == ("7.0 1 0", "")
+
+
+def test_a_changed_kernel_beside_it_makes_it_another(module: Path):
+    _run(module)
+    (module / "own_kernels.py").write_text(_MODULE.replace("2.0 * x", "5.0 * x"))
+    assert _run(module) == ("16.0 0 1", "")
+
+
+def test_no_kernel_uses_numbas_own_threads():
+    """Which several threads of Python must not use at once: Numba ends the process where they do."""
+    import topoloc.localization.localizer  # noqa: F401
+
+    with pytest.raises(ValueError, match="parallel"):
+        kernel(parallel=True)
+    assert len(KERNELS) > 20
+    assert [k for k in KERNELS if k.targetoptions.get("parallel") or not k.targetoptions["nogil"]] == []
+
+
+def test_a_number_of_threads_is_taken_and_changes_no_feature():
+    code = (
+        "import sys, numpy as np, topoloc, cv2, faiss\n"
+        "from topoloc.features.extraction import FeatureConfig, extract_features\n"
+        "picture = np.random.default_rng(0).integers(0, 255, (200, 200), np.uint8)\n"
+        "first = extract_features(picture, FeatureConfig())\n"
+        "for number in (1, 3):\n"
+        "    topoloc.set_num_threads(number)\n"
+        "    again = extract_features(picture, FeatureConfig())\n"
+        "    assert again.descriptors.tobytes() == first.descriptors.tobytes() and len(again)\n"
+        "    print(cv2.getNumThreads(), faiss.omp_get_max_threads())\n"
+        "try:\n    topoloc.set_num_threads(0)\n"
+        "except ValueError as error: print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout.splitlines() == ["1 1", "3 3", "at least one thread is needed, not 0"], done.stderr
