@@ -104,13 +104,18 @@ def test_calibration_error_is_the_mean_gap_of_what_would_be_answered():
     assert calibration_error(part.log_odds, part.is_right) == pytest.approx(0.3)
 
 
-def test_the_factor_of_shared_errors_puts_95_percent_inside():
+def test_shared_errors_put_95_percent_inside():
     rng, before = np.random.default_rng(0), SharedErrorWeights(2.0, 0.005, 0.1)
     evidence = _evidence(rng)
-    true_factor, rho = 3.0, 0.01
-    inflation = 1.0 + evidence.num_found * true_factor * rho
-    poses = [replace(_pose(RIGHT, evidence), square=float(inflation * rng.chisquare(6)), rho=2.0 * rho) for _ in range(4000)]
-    assert fit_shared_errors(poses, before).factor == pytest.approx(true_factor, rel=0.15)
+
+    def poses(true_rho: float, said_rho: float) -> list[TriedPose]:
+        inflation = 1.0 + evidence.num_found * true_rho
+        return [replace(_pose(RIGHT, evidence), square=float(inflation * rng.chisquare(6)), rho=said_rho) for _ in range(4000)]
+
+    fitted = fit_shared_errors([*poses(0.03, 0.02), *poses(0.02, 0.005)], before)
+    assert fitted.factor == pytest.approx(3.0, rel=0.15)
+    assert fitted.least == pytest.approx(0.02, rel=0.15)
+    assert fit_shared_errors(poses(0.001, 0.02), before) == before  # never smaller
     assert fit_shared_errors([_pose(WRONG, evidence)], before) == before
 
 
@@ -147,7 +152,7 @@ def test_the_command_writes_a_file_that_ships(tmp_path: Path, monkeypatch: pytes
     assert "corridor, fitted without it" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("kind", "said"), [("orb", "no features of kind 'orb'"), ("sift", "right and wrong poses are needed")])
+@pytest.mark.parametrize(("kind", "said"), [("orb", "no features of kind 'orb'"), ("sift", "right and wrong poses of two families")])
 def test_what_cannot_be_fitted_is_told_in_one_line(kind: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     save_poses([pose for pose in _drawn(50) if pose.is_wrong], tmp_path / "poses.json")
     monkeypatch.setattr(sys, "argv", ["fit", "--kind", kind, "--load", str(tmp_path / "poses.json")])

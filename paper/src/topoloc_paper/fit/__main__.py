@@ -59,8 +59,9 @@ def main() -> None:
         poses = [pose for path in asked.load for pose in load_poses(path)]
     else:
         poses = ask_places(asked.kind, asked.shared.resolve() / "data", asked.rendered, asked.step, asked.save, asked.families)
-    if len({pose.is_right for pose in decided(poses)}) < 2:
-        raise SystemExit("error: right and wrong poses are needed, and there are not both")
+    verdicts = {(family_of(pose.mapping), pose.is_right) for pose in decided(poses)}
+    if sum((family, False) in verdicts and (family, True) in verdicts for family in set(FAMILIES.values())) < 2:
+        raise SystemExit("error: right and wrong poses of two families of places are needed")
     weights = fit(asked.kind, poses, asked.step)
     if asked.out:
         asked.out.write_text(json.dumps(weights.to_json(), indent=2) + "\n")
@@ -95,7 +96,7 @@ def fit(kind: str, poses: list[TriedPose], step: int) -> FittedWeights:
         evidence,
         rivals,
         before.walls,
-        fit_shared_errors(poses, before.shared_errors),
+        fit_shared_errors(poses, weights_of(STAND_IN).shared_errors),
     )
     report(poses, before, fitted, held_out)
     return fitted
@@ -110,7 +111,7 @@ def corpus_of(poses: list[TriedPose], strength: float, num_hard: int) -> str:
     return (
         f"{len(told)} poses tried, {num_right} of them right, {elsewhere} of pictures from elsewhere, of maps of {places}; "
         f"drawn to the weights of {STAND_IN} with the strength {strength:g}; rivals {rivals}; "
-        "taken over: the weight of the doubt, walls, shared_errors but for the factor. "
+        "taken over: the weight of the doubt, walls; shared_errors where fewer than 200 right poses tell. "
         "Calibration error: of poses that would be answered, each family of places judged by a fit without it"
     )
 
@@ -132,7 +133,7 @@ def report(poses: list[TriedPose], before: FittedWeights, fitted: FittedWeights,
     differences, is_hard = pairs_of(poses, fitted.evidence)
     was, now = (num_mistaken(differences[is_hard], rivals) for rivals in (before.rivals, fitted.rivals))
     print(f"rivals: {fitted.rivals}, {now} of {np.sum(is_hard)} hard pairs mistaken ({was})")
-    print(f"shared errors: factor {fitted.shared_errors.factor} ({before.shared_errors.factor})")
+    print(f"{fitted.shared_errors} ({before.shared_errors})")
     print(f"calibration error, every family judged by a fit without it: {fitted.calibration_error}")
 
 

@@ -25,6 +25,7 @@ _MOST_ELSEWHERE = 0.35
 _CLEAR_MARGIN = 0.6
 STRENGTHS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
 """Of the prior, in squared distances of the weights from it."""
+MIN_RIGHT_POSES = 200
 _CHI_SQUARE_6_AT_95 = 12.592
 _INSIDE = 0.95
 
@@ -80,7 +81,8 @@ def try_on_other_families(poses: list[TriedPose], prior: EvidenceWeights, streng
     for family in dict.fromkeys(family_of(pose.mapping) for pose in poses):
         here = [pose for pose in poses if family_of(pose.mapping) == family]
         rest = [pose for pose in poses if family not in (family_of(pose.mapping), family_of(pose.queries))]
-        tried.append(judged(family, here, fit_evidence(rest, prior, strength)))
+        if len({pose.is_right for pose in rest}) == 2:
+            tried.append(judged(family, here, fit_evidence(rest, prior, strength)))
     return tried
 
 
@@ -108,19 +110,29 @@ def calibration_error(log_odds: Float[np.ndarray, " n"], is_right: Bool[np.ndarr
 
 
 def fit_shared_errors(poses: list[TriedPose], before: SharedErrorWeights) -> SharedErrorWeights:
-    """The factor with which 95 % of the right poses' errors lie inside the 95 % ellipsoid.
+    """The least rho and the factor with which 95 % of the right poses' errors lie inside the 95 % ellipsoid, none smaller than before.
+
+    The least is fitted to maps whose own rho is below it, the factor to the others; each to `MIN_RIGHT_POSES` or not at all, for it
+    hangs on the few largest errors.
 
     Args:
-        before: the weights with which the poses' rho came about; they stay where the corpus holds no right pose.
+        before: the weights with which the poses' rho came about.
     """
     right = [pose for pose in poses if pose.is_right and pose.square is not None]
-    if not right:
-        return before
-    squares, num = np.array([pose.square for pose in right]), np.array([pose.evidence.num_found for pose in right])
-    per_factor = np.array([pose.rho for pose in right]) / before.factor
+    exact = [pose for pose in right if pose.rho <= before.least]
+    others = [pose for pose in right if pose.rho > before.least]
+    leasts, factors = before.least * np.arange(1.0, 20.1, 0.5), before.factor + np.arange(0.0, 8.01, 0.1)
+    least = _least_inflating(exact, [np.full(len(exact), least) for least in leasts])
+    factor = _least_inflating(others, [factor / before.factor * np.array([pose.rho for pose in others]) for factor in factors])
+    return replace(before, least=round(float(leasts[least]), 4), factor=round(float(factors[factor]), 1))
 
-    def share_inside(factor: float) -> float:
-        return float(np.mean(squares / (1.0 + num * np.maximum(factor * per_factor, before.least)) < _CHI_SQUARE_6_AT_95))
 
-    factors = np.round(np.arange(0.5, 8.01, 0.1), 1)
-    return replace(before, factor=float(next((f for f in factors if share_inside(f) >= _INSIDE), factors[-1])))
+def _least_inflating(poses: list[TriedPose], rhos: list[Float[np.ndarray, " n"]]) -> int:
+    """The first of the choices of rho (growing) that has enough of the poses' errors inside the ellipsoid; the last where none has."""
+    squares, num = np.array([pose.square for pose in poses]), np.array([pose.evidence.num_found for pose in poses])
+    enough = (
+        k
+        for k, rho in enumerate(rhos)
+        if len(poses) < MIN_RIGHT_POSES or np.mean(squares / (1.0 + num * rho) < _CHI_SQUARE_6_AT_95) >= _INSIDE
+    )
+    return next(enough, len(rhos) - 1)
