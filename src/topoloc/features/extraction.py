@@ -20,6 +20,12 @@ NORMALIZATIONS: dict[str, PatchNormalizationConfig | None] = {
 }
 
 
+def extract_features(image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None = None) -> Features:
+    """The features of a grey image, strongest first; the same for any `num_threads`.
+
+    Raises:
+        FeatureKindError: there is no such kind.
+    """
     return extract_normalized(normalize_image(image, config, num_threads), config, num_threads)
 
 

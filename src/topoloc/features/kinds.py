@@ -101,14 +101,7 @@ SURF = FeatureKind(
     guided=GuidedThresholds(min_similarity=0.75, min_margin=0.03, max_scale=1.6, max_turn=0.6),
     distant=GuidedThresholds(min_similarity=0.8, min_margin=0.02, max_scale=1.5, max_turn=0.35),
 )
-# Twice as long, its descriptors differ more where they are not of one thing: with less asked, chance still finds no more than with SURF.
-SIFT = FeatureKind(
-    "sift",
-    _extract_sift,
-    128,
-    guided=GuidedThresholds(min_similarity=0.7, min_margin=0.02, max_scale=1.6, max_turn=0.6),
-    distant=GuidedThresholds(min_similarity=0.75, min_margin=0.02, max_scale=1.5, max_turn=0.35),
-)
+SIFT = FeatureKind("sift", _extract_sift, 128, guided=SURF.guided, distant=SURF.distant)
 
 KINDS: dict[str, FeatureKind] = {kind.name: kind for kind in (SURF, SIFT)}
 

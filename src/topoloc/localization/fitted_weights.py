@@ -17,7 +17,8 @@ from typing import Any, TypeVar
 from topoloc.errors import FeatureKindError
 
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
-_STAND_IN = "surf"
+STAND_IN = "surf"
+"""The kind whose weights others take that have none."""
 
 _T = TypeVar("_T")
 
@@ -126,7 +127,7 @@ def weights_of(kind: str) -> FittedWeights:
     """
     path = WEIGHTS_FOLDER / f"{kind}.json"
     if not path.exists():
-        return replace(weights_of(_STAND_IN), kind=kind, calibration_error=None)
+        return replace(weights_of(STAND_IN), kind=kind, calibration_error=None)
     weights = read_weights(path)
     if weights.kind != kind:
         raise FeatureKindError(f"{path}: weights of {weights.kind}, not of {kind}")

@@ -11,13 +11,23 @@ import numpy as np
 import pytest
 
 from topoloc.localization.evidence import Evidence, node_log_odds
-from topoloc.localization.fitted_weights import EvidenceWeights, RivalWeights, SharedErrorWeights, read_weights
+from topoloc.localization.fitted_weights import EvidenceWeights, RivalWeights, SharedErrorWeights, read_weights, weights_of
 from topoloc_paper.fit import __main__ as command
-from topoloc_paper.fit.evidence import Judged, calibration_error, decided, fit_evidence, fit_shared_errors, judged, try_on_other_families
+from topoloc_paper.fit.evidence import (
+    Judged,
+    best_strength,
+    calibration_error,
+    decided,
+    fit_evidence,
+    fit_shared_errors,
+    judged,
+    try_on_other_families,
+)
 from topoloc_paper.fit.rivals import MIN_HARD_PAIRS, fit_rivals, num_mistaken, pairs_of
 from topoloc_paper.fit.tried_poses import TriedPose, load_poses, save_poses
 
 TRUE = EvidenceWeights(even_share=2.0, chance=1.0, inliers=0.3, inlier_share=1.5, spread=0.5, doubt=-0.5, bias=7.0, clear_log_odds=4.5)
+PRIOR = replace(TRUE, even_share=1.0, inliers=1.0, bias=4.0)
 RIGHT, WRONG, BETWEEN = (0.01, 0.2), (3.0, 5.0), (0.3, 5.0)
 MAPS = ("corridor_map", "demo/map_lap1", "seven_scenes/kitchen@0-59/100")
 
@@ -55,7 +65,7 @@ def test_poses_between_right_and_wrong_are_left_out():
 
 def test_weights_that_poses_were_drawn_with_are_found_again():
     poses = _drawn(6000)
-    fitted = fit_evidence(poses, doubt=-0.5)
+    fitted = fit_evidence(poses, PRIOR, 0.1)
     there, here = (judged("all", _drawn(2000, seed=1), weights) for weights in (TRUE, fitted))
     assert np.corrcoef(there.log_odds, here.log_odds)[0, 1] > 0.99
     assert calibration_error(here.log_odds, here.is_right) < 0.06
@@ -67,19 +77,25 @@ def test_weights_that_poses_were_drawn_with_are_found_again():
 def test_a_picture_from_elsewhere_lowers_the_bias_until_it_is_not_believed():
     poses = _drawn(1500)
     strongest = max((pose.evidence for pose in poses), key=lambda evidence: node_log_odds(evidence, TRUE))
-    fitted = fit_evidence([*poses, _pose(None, strongest)], doubt=-0.5)
+    fitted = fit_evidence([*poses, _pose(None, strongest)], PRIOR, 0.1)
     assert 1.0 / (1.0 + math.exp(-node_log_odds(strongest, fitted))) == pytest.approx(0.35, abs=1e-6)
-    assert fitted.bias < fit_evidence(poses, doubt=-0.5).bias - 1.0
+    assert fitted.bias < fit_evidence(poses, PRIOR, 0.1).bias - 1.0
 
 
 def test_every_family_is_judged_by_a_fit_without_it():
     poses = _drawn(3000)
     # in one family the evidence says the opposite: only a fit that has seen it could know
     turned = [replace(pose, error_m=3.0 if pose.is_right else 0.01) if pose.mapping == MAPS[0] else pose for pose in poses]
-    held_out = {part.family: part for part in try_on_other_families(turned, doubt=-0.5)}
+    held_out = {part.family: part for part in try_on_other_families(turned, PRIOR, 0.1)}
     assert set(held_out) == {"corridor", "lab", "kitchen"}
     assert calibration_error(held_out["corridor"].log_odds, held_out["corridor"].is_right) > 0.3
     assert sum(len(part.is_right) for part in held_out.values()) == len(decided(turned))
+
+
+def test_few_poses_stay_with_the_prior_and_the_strength_follows_what_was_not_fitted_to():
+    poses = _drawn(90)
+    assert fit_evidence(poses, TRUE, 1e4).in_order == pytest.approx(TRUE.in_order, abs=0.01)
+    assert best_strength(poses, TRUE) > best_strength(_drawn(3000), replace(PRIOR, even_share=0.2, bias=-2.0))
 
 
 def test_calibration_error_is_the_mean_gap_of_what_would_be_answered():
@@ -88,13 +104,18 @@ def test_calibration_error_is_the_mean_gap_of_what_would_be_answered():
     assert calibration_error(part.log_odds, part.is_right) == pytest.approx(0.3)
 
 
-def test_the_factor_of_shared_errors_puts_95_percent_inside():
+def test_shared_errors_put_95_percent_inside():
     rng, before = np.random.default_rng(0), SharedErrorWeights(2.0, 0.005, 0.1)
     evidence = _evidence(rng)
-    true_factor, rho = 3.0, 0.01
-    inflation = 1.0 + evidence.num_found * true_factor * rho
-    poses = [replace(_pose(RIGHT, evidence), square=float(inflation * rng.chisquare(6)), rho=2.0 * rho) for _ in range(4000)]
-    assert fit_shared_errors(poses, before).factor == pytest.approx(true_factor, rel=0.15)
+
+    def poses(true_rho: float, said_rho: float) -> list[TriedPose]:
+        inflation = 1.0 + evidence.num_found * true_rho
+        return [replace(_pose(RIGHT, evidence), square=float(inflation * rng.chisquare(6)), rho=said_rho) for _ in range(4000)]
+
+    fitted = fit_shared_errors([*poses(0.03, 0.02), *poses(0.02, 0.005)], before)
+    assert fitted.factor == pytest.approx(3.0, rel=0.15)
+    assert fitted.least == pytest.approx(0.02, rel=0.15)
+    assert fit_shared_errors(poses(0.001, 0.02), before) == before  # never smaller
     assert fit_shared_errors([_pose(WRONG, evidence)], before) == before
 
 
@@ -125,12 +146,13 @@ def test_the_command_writes_a_file_that_ships(tmp_path: Path, monkeypatch: pytes
     weights = read_weights(out)
     assert weights.kind == "sift"
     assert weights.is_calibrated
-    assert weights.evidence == fit_evidence(poses, weights.evidence.doubt)
+    prior = weights_of("surf").evidence
+    assert weights.evidence == fit_evidence(poses, prior, best_strength(poses, prior))
     assert "900 poses tried" in weights.corpus
     assert "corridor, fitted without it" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("kind", "said"), [("orb", "no features of kind 'orb'"), ("sift", "right and wrong poses are needed")])
+@pytest.mark.parametrize(("kind", "said"), [("orb", "no features of kind 'orb'"), ("sift", "right and wrong poses of two families")])
 def test_what_cannot_be_fitted_is_told_in_one_line(kind: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     save_poses([pose for pose in _drawn(50) if pose.is_wrong], tmp_path / "poses.json")
     monkeypatch.setattr(sys, "argv", ["fit", "--kind", kind, "--load", str(tmp_path / "poses.json")])

@@ -22,9 +22,18 @@ import numpy as np
 
 from topoloc.errors import TopolocError
 from topoloc.features.kinds import find_kind
-from topoloc.localization.fitted_weights import FittedWeights, weights_of
+from topoloc.localization.fitted_weights import STAND_IN, FittedWeights, weights_of
 from topoloc_paper.fit.corpus import FAMILIES, PLACES, family_of, open_recordings
-from topoloc_paper.fit.evidence import Judged, calibration_error, decided, fit_evidence, fit_shared_errors, judged, try_on_other_families
+from topoloc_paper.fit.evidence import (
+    Judged,
+    best_strength,
+    calibration_error,
+    decided,
+    fit_evidence,
+    fit_shared_errors,
+    judged,
+    try_on_other_families,
+)
 from topoloc_paper.fit.rivals import MIN_HARD_PAIRS, fit_rivals, num_mistaken, pairs_of
 from topoloc_paper.fit.tried_poses import TriedPose, ask_place, load_poses, save_poses
 
@@ -50,8 +59,9 @@ def main() -> None:
         poses = [pose for path in asked.load for pose in load_poses(path)]
     else:
         poses = ask_places(asked.kind, asked.shared.resolve() / "data", asked.rendered, asked.step, asked.save, asked.families)
-    if len({pose.is_right for pose in decided(poses)}) < 2:
-        raise SystemExit("error: right and wrong poses are needed, and there are not both")
+    verdicts = {(family_of(pose.mapping), pose.is_right) for pose in decided(poses)}
+    if sum((family, False) in verdicts and (family, True) in verdicts for family in set(FAMILIES.values())) < 2:
+        raise SystemExit("error: right and wrong poses of two families of places are needed")
     weights = fit(asked.kind, poses, asked.step)
     if asked.out:
         asked.out.write_text(json.dumps(weights.to_json(), indent=2) + "\n")
@@ -72,27 +82,27 @@ def ask_places(kind: str, data: Path, rendered: Path | None, step: int, kept: Pa
 
 def fit(kind: str, poses: list[TriedPose], step: int) -> FittedWeights:
     """Fitted weights of this kind, with a report of how they do beside those in use."""
-    before = weights_of(kind)
-    evidence = fit_evidence(poses, before.evidence.doubt)
-    held_out = try_on_other_families(poses, before.evidence.doubt)
+    before, prior = weights_of(kind), weights_of(STAND_IN).evidence
+    strength = best_strength(poses, prior)
+    evidence, held_out = fit_evidence(poses, prior, strength), try_on_other_families(poses, prior, strength)
     log_odds, is_right = (np.concatenate([getattr(part, name) for part in held_out]) for name in ("log_odds", "is_right"))
     rivals, num_hard = fit_rivals(poses, evidence, before.rivals)
     fitted = FittedWeights(
         kind,
-        corpus_of(poses, num_hard),
+        corpus_of(poses, strength, num_hard),
         datetime.date.today().isoformat(),
         f"python -m topoloc_paper.fit --kind {kind} --rendered FOLDER --step {step} --out FILE",
         round(calibration_error(log_odds, is_right), 4),
         evidence,
         rivals,
         before.walls,
-        fit_shared_errors(poses, before.shared_errors),
+        fit_shared_errors(poses, weights_of(STAND_IN).shared_errors),
     )
     report(poses, before, fitted, held_out)
     return fitted
 
 
-def corpus_of(poses: list[TriedPose], num_hard: int) -> str:
+def corpus_of(poses: list[TriedPose], strength: float, num_hard: int) -> str:
     """One sentence on what was fitted to."""
     num_right, told = sum(pose.is_right for pose in poses), decided(poses)
     places = ", ".join(dict.fromkeys(pose.mapping for pose in poses))
@@ -100,7 +110,8 @@ def corpus_of(poses: list[TriedPose], num_hard: int) -> str:
     rivals = f"fitted to {num_hard} hard pairs" if num_hard >= MIN_HARD_PAIRS else f"taken over, {num_hard} hard pairs being too few"
     return (
         f"{len(told)} poses tried, {num_right} of them right, {elsewhere} of pictures from elsewhere, of maps of {places}; "
-        f"rivals {rivals}; taken over: the weight of the doubt, walls, shared_errors but for the factor. "
+        f"drawn to the weights of {STAND_IN} with the strength {strength:g}; rivals {rivals}; "
+        "taken over: the weight of the doubt, walls; shared_errors where fewer than 200 right poses tell. "
         "Calibration error: of poses that would be answered, each family of places judged by a fit without it"
     )
 
@@ -122,7 +133,7 @@ def report(poses: list[TriedPose], before: FittedWeights, fitted: FittedWeights,
     differences, is_hard = pairs_of(poses, fitted.evidence)
     was, now = (num_mistaken(differences[is_hard], rivals) for rivals in (before.rivals, fitted.rivals))
     print(f"rivals: {fitted.rivals}, {now} of {np.sum(is_hard)} hard pairs mistaken ({was})")
-    print(f"shared errors: factor {fitted.shared_errors.factor} ({before.shared_errors.factor})")
+    print(f"{fitted.shared_errors} ({before.shared_errors})")
     print(f"calibration error, every family judged by a fit without it: {fitted.calibration_error}")
 
 

@@ -42,11 +42,11 @@ class AskedPlace:
 
 PLACES = (
     AskedPlace(
-        "corridor_map",
+        "corridor_map@0:268:2",
         {"corridor_night": 1, "corridor_evening": 1, "corridor_day": 6},
         {"demo/night": 3, "street_rain": 8, _KITCHEN: 12, _ZED: 10, _STREET_1: 8},
     ),
-    AskedPlace("corridor_map@0:268", {"corridor_reverse": 1}),  # one lap, in one direction
+    AskedPlace("corridor_map@0:268:2", {"corridor_reverse": 1}),  # one lap, in one direction
     AskedPlace(
         "demo/map_lap1",
         {"demo/day": 1, "demo/night": 1},

@@ -1,7 +1,9 @@
 """The weights of the evidence for one pose, and what the errors of a map's points share.
 
-A logistic regression, lightly shrunk, in which nothing that speaks for a pose may count against it. The weight of the doubt is given, not
-fitted: wrong places in a corridor of many doors come with precise poses, and a free weight would follow them to zero.
+A logistic regression in which nothing that speaks for a pose may count against it. The evidence of one kind of features is much like
+that of another, and corpora are small: so the weights are drawn to those of SURF, as strongly as judges families of places best that they
+were not fitted to. The weight of the doubt is given, not fitted: wrong places in a corridor of many doors come with precise poses, and a
+free weight would follow them to zero.
 """
 
 from __future__ import annotations
@@ -20,8 +22,10 @@ from topoloc_paper.fit.tried_poses import TriedPose
 
 _MOST_ELSEWHERE = 0.35
 """No pose of a picture from elsewhere that was fitted to may be more probable."""
-_CLEAR_MARGIN, _LEAST_CLEAR = 0.6, 3.0
-_SHRINKAGE = 5e-4
+_CLEAR_MARGIN = 0.6
+STRENGTHS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
+"""Of the prior, in squared distances of the weights from it."""
+MIN_RIGHT_POSES = 200
 _CHI_SQUARE_6_AT_95 = 12.592
 _INSIDE = 0.95
 
@@ -40,48 +44,56 @@ def decided(poses: list[TriedPose]) -> list[TriedPose]:
     return [pose for pose in poses if pose.is_right or pose.is_wrong]
 
 
-def fit_evidence(poses: list[TriedPose], doubt: float) -> EvidenceWeights:
-    """The weights that tell these poses' right ones from their wrong ones, with this weight of the doubt.
+def fit_evidence(poses: list[TriedPose], prior: EvidenceWeights, strength: float) -> EvidenceWeights:
+    """The weights that tell these poses' right ones from their wrong ones.
 
     The bias is lowered where a picture from elsewhere would be believed more than it may; a pose is clear that has more for it
-    than the clearest wrong one, by a margin.
+    than the clearest wrong one, by a margin, and no less than with the prior: few poses seldom hold the clearest.
+
+    Args:
+        prior: what the weights are drawn to, with `strength`; its weight of the doubt is kept.
     """
     poses = decided(poses)
-    x, is_right = np.array([score_features(pose.evidence) for pose in poses]), np.array([pose.is_right for pose in poses])
-    fitted = _logistic_regression(x[:, :-1], is_right, doubt * x[:, -1])
-    weights = EvidenceWeights(*fitted[:-1], doubt=doubt, bias=fitted[-1], clear_log_odds=_LEAST_CLEAR)
-    elsewhere = [node_log_odds(pose.evidence, weights) for pose in poses if pose.error_m is None]
+    fitted = _logistic_regression(poses, prior, strength)
+    elsewhere = judged("", [pose for pose in poses if pose.error_m is None], fitted).log_odds
     most = math.log(_MOST_ELSEWHERE / (1.0 - _MOST_ELSEWHERE))
-    weights = replace(weights, bias=weights.bias - max(max(elsewhere, default=most) - most, 0.0))
-    clearest = max((node_log_odds(pose.evidence, weights) for pose in poses if pose.is_wrong), default=0.0)
-    return replace(weights, clear_log_odds=max(clearest + _CLEAR_MARGIN, _LEAST_CLEAR))
+    fitted = replace(fitted, bias=fitted.bias - max(max(elsewhere, default=most) - most, 0.0))
+    of_wrong = judged("", [pose for pose in poses if pose.is_wrong], fitted).log_odds
+    return replace(fitted, clear_log_odds=round(max(max(of_wrong, default=0.0) + _CLEAR_MARGIN, prior.clear_log_odds), 3))
 
 
-def _logistic_regression(
-    x: Float[np.ndarray, "n k"], is_right: Bool[np.ndarray, " n"], given: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, " k1"]:
-    """Weights of the columns, none negative, and the bias. `given` is added to the logarithm of the odds."""
-    signs = 2.0 * is_right - 1.0
+def _logistic_regression(poses: list[TriedPose], prior: EvidenceWeights, strength: float) -> EvidenceWeights:
+    x, is_right = np.array([score_features(pose.evidence) for pose in poses]), np.array([pose.is_right for pose in poses])
+    signs, given = 2.0 * is_right - 1.0, prior.doubt * x[:, -1]
+    x, start = np.column_stack([x[:, :-1], np.ones(len(x))]), np.array([*prior.in_order[:-1], prior.bias])
 
     def loss(weights: np.ndarray) -> float:
-        odds = x @ weights[:-1] + weights[-1] + given
-        return float(np.sum(np.logaddexp(0.0, -signs * odds)) + _SHRINKAGE * len(x) * np.sum(weights[:-1] ** 2))
+        return float(np.sum(np.logaddexp(0.0, -signs * (x @ weights + given))) + strength * np.sum((weights - start) ** 2))
 
-    num = x.shape[1]
-    start, bounds = np.full(num + 1, 0.1), [(0.0, None)] * num + [(None, None)]
-    return np.round(minimize(loss, start, bounds=bounds, method="L-BFGS-B").x, 3)
+    bounds = [(0.0, None)] * (len(start) - 1) + [(None, None)]
+    *fitted, bias = (float(weight) for weight in np.round(minimize(loss, start, bounds=bounds, method="L-BFGS-B").x, 3))
+    return EvidenceWeights(*fitted, doubt=prior.doubt, bias=bias, clear_log_odds=prior.clear_log_odds)
 
 
-def try_on_other_families(poses: list[TriedPose], doubt: float) -> list[Judged]:
+def try_on_other_families(poses: list[TriedPose], prior: EvidenceWeights, strength: float) -> list[Judged]:
     """Each family's poses, judged by weights fitted to those that have nothing of it."""
     poses, tried = decided(poses), []
     for family in dict.fromkeys(family_of(pose.mapping) for pose in poses):
         here = [pose for pose in poses if family_of(pose.mapping) == family]
         rest = [pose for pose in poses if family not in (family_of(pose.mapping), family_of(pose.queries))]
         if len({pose.is_right for pose in rest}) == 2:
-            weights = fit_evidence(rest, doubt)
-            tried.append(judged(family, here, weights))
+            tried.append(judged(family, here, fit_evidence(rest, prior, strength)))
     return tried
+
+
+def best_strength(poses: list[TriedPose], prior: EvidenceWeights) -> float:
+    """With how much of the prior families that were not fitted to are judged best, by the logarithm of the likelihood."""
+
+    def loss(strength: float) -> float:
+        parts = try_on_other_families(poses, prior, strength)
+        return sum(float(np.sum(np.logaddexp(0.0, np.where(part.is_right, -part.log_odds, part.log_odds)))) for part in parts)
+
+    return min(STRENGTHS, key=loss)
 
 
 def judged(family: str, poses: list[TriedPose], weights: EvidenceWeights) -> Judged:
@@ -98,19 +110,29 @@ def calibration_error(log_odds: Float[np.ndarray, " n"], is_right: Bool[np.ndarr
 
 
 def fit_shared_errors(poses: list[TriedPose], before: SharedErrorWeights) -> SharedErrorWeights:
-    """The factor with which 95 % of the right poses' errors lie inside the 95 % ellipsoid.
+    """The least rho and the factor with which 95 % of the right poses' errors lie inside the 95 % ellipsoid, none smaller than before.
+
+    The least is fitted to maps whose own rho is below it, the factor to the others; each to `MIN_RIGHT_POSES` or not at all, for it
+    hangs on the few largest errors.
 
     Args:
-        before: the weights with which the poses' rho came about; they stay where the corpus holds no right pose.
+        before: the weights with which the poses' rho came about.
     """
     right = [pose for pose in poses if pose.is_right and pose.square is not None]
-    if not right:
-        return before
-    squares, num = np.array([pose.square for pose in right]), np.array([pose.evidence.num_found for pose in right])
-    per_factor = np.array([pose.rho for pose in right]) / before.factor
+    exact = [pose for pose in right if pose.rho <= before.least]
+    others = [pose for pose in right if pose.rho > before.least]
+    leasts, factors = before.least * np.arange(1.0, 20.1, 0.5), before.factor + np.arange(0.0, 8.01, 0.1)
+    least = _least_inflating(exact, [np.full(len(exact), least) for least in leasts])
+    factor = _least_inflating(others, [factor / before.factor * np.array([pose.rho for pose in others]) for factor in factors])
+    return replace(before, least=round(float(leasts[least]), 4), factor=round(float(factors[factor]), 1))
 
-    def share_inside(factor: float) -> float:
-        return float(np.mean(squares / (1.0 + num * np.maximum(factor * per_factor, before.least)) < _CHI_SQUARE_6_AT_95))
 
-    factors = np.round(np.arange(0.5, 8.01, 0.1), 1)
-    return replace(before, factor=float(next((f for f in factors if share_inside(f) >= _INSIDE), factors[-1])))
+def _least_inflating(poses: list[TriedPose], rhos: list[Float[np.ndarray, " n"]]) -> int:
+    """The first of the choices of rho (growing) that has enough of the poses' errors inside the ellipsoid; the last where none has."""
+    squares, num = np.array([pose.square for pose in poses]), np.array([pose.evidence.num_found for pose in poses])
+    enough = (
+        k
+        for k, rho in enumerate(rhos)
+        if len(poses) < MIN_RIGHT_POSES or np.mean(squares / (1.0 + num * rho) < _CHI_SQUARE_6_AT_95) >= _INSIDE
+    )
+    return next(enough, len(rhos) - 1)
