@@ -240,7 +240,7 @@ def _camera_of(file: MapFile, prefix: str, node_id: int) -> Camera:
     return file.kept(f"camera {camera_id}", read)
 
 
-class _StoredSums(Sequence[LandmarkSums]):
+class _StoredSums:
     """What each session knows of a node's points; no answer needs it, so it is read when asked for."""
 
     def __init__(self, file: MapFile, node_id: int, kind: str, num_points: int) -> None:
@@ -251,13 +251,10 @@ class _StoredSums(Sequence[LandmarkSums]):
             query = "SELECT session_id FROM landmark_sums WHERE node_id = ? AND kind = ? ORDER BY session_id LIMIT 100000"
             return [value_from(int, row[0], "landmark_sums.session_id") for row in database.execute(query, (self._node_id, self._kind))]
 
-    def __len__(self) -> int:
-        return len(self._sessions())
-
-    def __getitem__(self, index):  # type: ignore[override]
+    def __iter__(self) -> Iterator[LandmarkSums]:
         with self._file.reading():
-            session_ids = self._sessions()[index]
-            return [self._of(k) for k in session_ids] if isinstance(index, slice) else self._of(session_ids)
+            found = [self._of(session_id) for session_id in self._sessions()]
+        return iter(found)
 
     def _of(self, session_id: int) -> LandmarkSums:
         what = f"the sums of node {self._node_id}"

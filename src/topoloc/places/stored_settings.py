@@ -69,7 +69,7 @@ def value_from(of: Any, value: Any, path: str) -> Any:
         if not math.isfinite(number):
             raise SettingsError(f"{path}: a finite number is expected")
         return number if isinstance(value, float) else value
-    if of in (int, bool, str, NoneType) and type(value) is of:
+    if of in (int, bool, str, dict, NoneType) and type(value) is of:
         return value
     raise SettingsError(f"{path}: {getattr(of, '__name__', of)} is expected, not {type(value).__name__}")
 
