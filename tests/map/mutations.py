@@ -180,7 +180,7 @@ def _arrays(database: sqlite3.Connection, rng: Rng) -> str:
         lambda a: np.asfortranarray(a),
         lambda a: a.astype("U4"),
         lambda a: np.zeros(()),
-        lambda a: a + 10**6,
+        lambda a: (a.astype(np.float64) + 10**6).astype(np.float32),
     ]
     number = int(rng.integers(len(changes) + 1))
     if number == len(changes):

@@ -11,20 +11,23 @@ import numpy as np
 import pytest
 from mutations import mutate
 
-from built_corridor import built_corridor, seen_ahead
+from built_corridor import WIDE, WalkAhead, seen_ahead
+from topoloc.localization.building import build_map
 
 OPENING = Path(__file__).with_name("opening.py")
-NUM_MUTATIONS = 240
+NUM_MUTATIONS = 150
 
 
 @pytest.fixture(scope="module")
 def opened(tmp_path_factory: pytest.TempPathFactory) -> list[dict]:
     """Of each mutation what a process that opened it said."""
     folder = tmp_path_factory.mktemp("hostile")
-    built_corridor().save(folder / "corridor.topo")
+    topomap = build_map(WalkAhead(0, num_pairs=6))
+    assert topomap.sides is not None
+    topomap.save(folder / "corridor.topo")
     ((picture, _), *_) = seen_ahead()
     np.save(folder / "picture.npy", picture)
-    (folder / "camera.json").write_text(json.dumps(built_corridor().nodes[0].camera.to_json()))
+    (folder / "camera.json").write_text(json.dumps(WIDE.to_json()))
     maps = [folder / f"{seed}.topo" for seed in range(NUM_MUTATIONS)]
     done = [mutate(folder / "corridor.topo", path, seed) for seed, path in enumerate(maps)]
     command = [sys.executable, str(OPENING), str(folder / "picture.npy"), str(folder / "camera.json"), str(folder / "corridor.topo")]
@@ -35,7 +38,7 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> list[dict]:
 
 
 def test_the_map_itself_is_answered_from_and_whole(opened: list[dict]):
-    assert opened[0]["outcome"] == ["Localization, NotLocalized", "ok"]
+    assert opened[0]["outcome"] == ["Localization", "ok"]
 
 
 def test_every_mutation_is_an_answer_or_an_error_of_one_line(opened: list[dict]):
