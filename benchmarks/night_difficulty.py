@@ -1,6 +1,6 @@
 """How hard is the night of a rendered world? Queries localized by day and by night against a map made by day.
 
-    topoloc simulate lab /tmp/map                                     # and so on, or the recordings of `topoloc demo --render`
+    topoloc simulate lab /tmp/map                                     # and so on, or the recordings of `topoloc demo`
     python benchmarks/night_difficulty.py --map /tmp/map --day /tmp/day --night /tmp/night
 
 Plain SIFT (no normalisation, OpenCV's own contrast threshold, five candidate nodes pooled, no guided step, every pose with a

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pkgutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -47,3 +48,22 @@ def tiny_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from tiny_world import write_stereo_recording  # after the hook above
 
     return write_stereo_recording(tmp_path_factory.mktemp("tiny") / "room")
+
+
+@pytest.fixture
+def complaint(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., str]:
+    """Runs a command that must fail: its one line on stderr. No file may appear, change size or go."""
+    from topoloc.cli import main  # after the hook above
+
+    def run(*args: object, status: int = 1) -> str:
+        before = {path: path.stat().st_size for path in tmp_path.rglob("*")}
+        capfd.readouterr()
+        assert main([str(arg) for arg in args]) == status
+        printed = capfd.readouterr()
+        assert printed.err.startswith("error: ")
+        assert printed.err.count("\n") == 1
+        assert "Traceback" not in printed.err
+        assert {path: path.stat().st_size for path in tmp_path.rglob("*")} == before
+        return printed.err
+
+    return run

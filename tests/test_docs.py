@@ -52,7 +52,7 @@ def _code_blocks(text: str, language: str) -> list[str]:
 @pytest.mark.parametrize("command", all_commands())
 def test_every_command_and_setting_is_in_the_docs(command: str, capsys: pytest.CaptureFixture[str]):
     assert f"topoloc {command}" in README
-    settings = {setting for setting in _settings(command, capsys) if not setting.startswith("--config.")}
+    settings = _settings(command, capsys)
     documented = set(re.findall(r"`(--[a-z][\w-]*)", _section(command)))
     assert settings - documented == set()
     assert documented - settings == set(), "documented, but no setting of this command"
@@ -120,13 +120,14 @@ def test_python_examples_compile_and_use_public_names():
 
 
 def test_the_plan_names_the_files_that_are_there():
-    rooms = re.search(r"^src/topoloc/\n(.*?)^tests/", PLAN, re.MULTILINE | re.DOTALL)
-    assert rooms
-    named = set(re.findall(r"\b(\w+\.py)\b", rooms.group(1)))
-    there = {path.name for path in (ROOT / "src" / "topoloc").rglob("*.py") if path.stat().st_size > 0}
-    assert named <= there
-    if missing := sorted(name for name in there - named if not name.endswith("_kernels.py") and not name.startswith("__")):
-        warnings.warn("not in docs/architecture.md: " + ", ".join(missing), stacklevel=1)
+    for package in ("src/topoloc", "worlds/src/topoloc_worlds", "paper/src/topoloc_paper"):
+        rooms = re.search(rf"^{package}/\n(.*?)^\w", PLAN, re.MULTILINE | re.DOTALL)
+        assert rooms
+        named = set(re.findall(r"\b(\w+\.py)\b", rooms.group(1)))
+        there = {path.name for path in (ROOT / package).rglob("*.py") if path.stat().st_size > 0}
+        assert named - there == set(), package
+        if missing := sorted(name for name in there - named if not name.endswith("_kernels.py") and not name.startswith("__")):
+            warnings.warn(f"docs/architecture.md, {package}: not named: " + ", ".join(missing), stacklevel=1)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

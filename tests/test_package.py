@@ -106,7 +106,12 @@ def test_the_version_is_the_one_of_the_package(installed: Path):
 
 @pytest.mark.parametrize(
     ("args", "complaint"),
-    [((), ""), (("fly",), "error: unknown command 'fly'"), (("simulate", "--fly"), "--fly"), (("info", "x.topo", "--fly"), "--fly")],
+    [
+        ((), ""),
+        (("fly",), "error: unknown command 'fly'"),
+        (("simulate", "lab", "out", "--fly"), "--fly"),
+        (("info", "x.topo", "--fly"), "--fly"),
+    ],
 )
 def test_wrong_usage_exits_with_2(args: tuple[str, ...], complaint: str):
     answer = _run(sys.executable, "-m", "topoloc", *args, **os.environ)

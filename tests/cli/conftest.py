@@ -1,4 +1,4 @@
-"""A map file and query pictures of the rendered room, and how a failing command must look."""
+"""A map file and query pictures of the rendered room."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from built_room import built_room, unseen_views, write_pictures
-from topoloc.cli import main
 
 
 @pytest.fixture(scope="session")
@@ -39,18 +38,12 @@ def recording(tiny_recording: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def complaint(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., str]:
-    """Runs a command that must fail: its one line on stderr. No file may appear, change size or go."""
+def file_of(tmp_path: Path) -> Callable[[str | bytes], str]:
+    """Writes a TOML file and returns its path."""
 
-    def run(*args: object, status: int = 1) -> str:
-        before = {path: path.stat().st_size for path in tmp_path.rglob("*")}
-        capfd.readouterr()
-        assert main([str(arg) for arg in args]) == status
-        printed = capfd.readouterr()
-        assert printed.err.startswith("error: ")
-        assert printed.err.count("\n") == 1
-        assert "Traceback" not in printed.err
-        assert {path: path.stat().st_size for path in tmp_path.rglob("*")} == before
-        return printed.err
+    def write(content: str | bytes) -> str:
+        path = tmp_path / "my.toml"
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
+        return str(path)
 
-    return run
+    return write

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import pytest
 
 from built_room import unseen_views, write_pictures
 from tiny_world import write_stereo_recording
-from topoloc.cli import main
+from topoloc.cli import demo, main
 from topoloc.demo.recordings import SHIPPED, missing_recordings
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.trajectory import read_trajectory
@@ -63,6 +64,20 @@ def test_the_demo_maps_asks_and_reports(room: Path, tmp_path: Path, capsys: pyte
     assert page.count("</article>") == 4 + 6
 
 
+def test_without_matplotlib_all_but_the_report_is_done(
+    room: Path, room_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    for name in ("report", "figures", "map_figure", "figure_style"):
+        monkeypatch.delitem(sys.modules, f"topoloc.evaluation.{name}", raising=False)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    monkeypatch.setattr(demo, "_map_the_lab", lambda *_: TopoMetricMap.load(shutil.copy(room_map, tmp_path / "lab.topo")))
+    monkeypatch.setattr(demo, "ROLES", {"day": "queries", "night": "queries"})
+    assert main(["demo", "--recordings", str(room), "--out", str(tmp_path)]) == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last == "report: none; a report needs matplotlib: pip install 'topoloc[report]'"
+    assert {path.name for path in tmp_path.iterdir()} == {"lab.topo", "results.jsonl", "day.tum", "night.tum"}
+
+
 @pytest.mark.skipif(bool(missing_recordings(SHIPPED)), reason="the demo's recordings are not in this checkout")
 def test_the_recordings_brought_along_keep_the_promise(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert main(["demo", "--out", str(tmp_path / "out"), "--json", "-"]) == 0
@@ -80,7 +95,7 @@ def test_recordings_that_are_not_there_are_named(room: Path, tmp_path: Path, com
     (tmp_path / "out").mkdir()
     said = complaint("demo", "--recordings", part, "--out", tmp_path / "out")
     assert "(night, street)" in said
-    assert "topoloc demo --render" in said
+    assert "topoloc simulate demo" in said
     assert "no such folder" in complaint("demo", "--recordings", tmp_path / "nowhere", "--out", tmp_path / "out")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -72,3 +73,31 @@ def test_a_progress_bar_on_a_terminal_leaves_results_in_their_file(monkeypatch: 
         progress("nodes", 2, 2)
     assert "nodes" in terminal.getvalue()
     assert file.getvalue() == "a result\n"
+
+
+# The help of `build` is longer than Python's buffer: it fails in the middle, not at the end.
+SAYING = [(["--help"], "1"), (["--help"], ""), (["--version"], ""), (["build", "--help"], ""), (["info", "MAP"], "")]
+
+
+@pytest.mark.parametrize(("args", "unbuffered"), SAYING)
+def test_output_that_cannot_be_written_is_one_line_at_most(args: list[str], unbuffered: str, room_map: Path):
+    """To a device that is full, and to a reader that went away: neither leaves a traceback, not even as Python ends."""
+    command = [sys.executable, "-m", "topoloc", *(str(room_map) if arg == "MAP" else arg for arg in args)]
+    environment = os.environ | {"PYTHONUNBUFFERED": unbuffered}
+    reading, writing = os.pipe()
+    os.close(reading)
+    with open(writing, "wb") as gone:
+        done = subprocess.run(command, stdout=gone, stderr=subprocess.PIPE, text=True, env=environment, check=False)
+    assert (done.returncode, done.stderr) == (1, "")
+    if not Path("/dev/full").is_char_device():
+        pytest.skip("no /dev/full here")
+    with open("/dev/full", "wb") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, env=environment, check=False)
+    assert (done.returncode, done.stderr) == (1, "error: cannot write the output: No space left on device\n")
+
+
+def test_who_closes_the_output_wants_none(room_map: Path):
+    command = [sys.executable, "-m", "topoloc", "info", str(room_map), "--json", "-"]
+    close = "import os, sys; os.close(1); os.execv(sys.argv[1], sys.argv[1:])"
+    done = subprocess.run([sys.executable, "-c", close, *command], stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import tyro
 
-from topoloc.cli import simulate
 from topoloc.sequences.trajectory import Trajectory
 from topoloc_paper import datasets
 from topoloc_paper.datasets import RENDERED, PaperRecording, at_hand, is_complete, quick_datasets, real_datasets
+from topoloc_worlds import simulate
 from topoloc_worlds.conditions import find_condition
 from topoloc_worlds.layout import Layout, prepare
 from topoloc_worlds.recorder import _settings

@@ -51,7 +51,7 @@ def test_retrieval_gives_a_nodes_pose_whatever_it_sees(tiny_recording: Path, fra
 
 
 def test_pycolmap_finds_the_room(tiny_recording: Path, frames: list[StereoFrame], tmp_path: Path):
-    pytest.importorskip("pycolmap", reason="the extra `peers` is not installed")
+    pytest.importorskip("pycolmap", reason="pycolmap is not installed")
     peer = Colmap(built_room(tiny_recording), [open_sequence(tiny_recording)], 10, tmp_path)
     answers = peer.localize([*frames[:4], _blank()])
     assert answers[-1].world_from_cam is None

@@ -13,7 +13,7 @@ from topoloc_paper import targets
 from topoloc_paper.readme_block import BEGIN, END, block_of, update_readme
 from topoloc_paper.text_tables import accuracy_table, markdown_of, normalization_table, targets_table
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[2]
 STORED = ROOT / "docs" / "results" / "paper.json"
 
 

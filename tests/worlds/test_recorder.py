@@ -19,7 +19,7 @@ from topoloc_worlds.recorder import RecordConfig, record
 from topoloc_worlds.rendering.renderer import RenderConfig
 from topoloc_worlds.sensor import SensorConfig
 
-pytest.importorskip("mitsuba", reason="the extra `sim` is not installed")
+pytest.importorskip("mitsuba", reason="Mitsuba is not installed")
 
 DAY = CONDITIONS["day"]
 SMALL = Camera.pinhole(64, 40, 38.0, 38.0, 31.5, 19.5)

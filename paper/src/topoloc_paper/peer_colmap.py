@@ -45,7 +45,7 @@ class Colmap:
 
     def __init__(self, topomap: TopoMetricMap, sequences: Sequence[StereoSequence], max_images: int, folder: Path) -> None:
         if importlib.util.find_spec("pycolmap") is None:
-            raise MissingExtraError("pycolmap is not installed: pip install 'topoloc[peers]'")
+            raise MissingExtraError("pycolmap is not installed: pip install pycolmap")
         self._topomap, self._folder = topomap, folder
         self._retrieval = Retrieval(topomap)
         self._kept = evenly(len(topomap.summaries), max_images)

@@ -5,9 +5,12 @@ Other distributions add commands by an entry point of the group `topoloc.command
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import importlib
 import os
 import sys
+from typing import TextIO
 
 # name -> the module, which holds a dataclass of the settings, `Command`, with `run`; and what `topoloc --help` says of it
 COMMANDS = {
@@ -18,14 +21,33 @@ COMMANDS = {
     "localize": ("topoloc.cli.localize", "where were these images taken? 6-DoF poses of images, folders, recordings"),
     "evaluate": ("topoloc.cli.evaluate", "localize a recording with known truth and judge the poses"),
     "info": ("topoloc.cli.info", "what a map file holds"),
+    "config": ("topoloc.cli.config", "all other settings as a TOML file, with defaults and meanings"),
 }
 _BROUGHT = {"simulate": "topoloc-worlds", "benchmark": "topoloc-paper"}
-_IN_HELP = ("demo", "simulate", "slam", "build", "train", "localize", "evaluate", "benchmark", "info")
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+_IN_HELP = ("demo", "simulate", "slam", "build", "train", "localize", "evaluate", "benchmark", "info", "config")
 
 
 def main(args: list[str] | None = None) -> int:
     """Run one command. Returns the exit status: 0 done, 1 a known failure (one line on stderr), 2 wrong usage."""
-    args = sys.argv[1:] if args is None else args
+    if sys.stdout is None:  # closed by the caller, who wants no output; its number must not go to a file that we open
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+    try:
+        try:
+            return _dispatch(sys.argv[1:] if args is None else args)
+        finally:  # what is buffered fails here and not at exit, where nobody can tell of it any more
+            sys.stdout.flush()
+    except BrokenPipeError:  # the reader of our output went away
+        _abandon(sys.stdout)
+    except OSError as error:
+        if error.errno not in _FULL:
+            raise
+        _abandon(sys.stdout)
+        _print_error(f"cannot write the output: {error.strerror}")
+    return 1
+
+
+def _dispatch(args: list[str]) -> int:
     if not args or args[0] in ("-h", "--help"):
         print(_help())
         return 0 if args else 2
@@ -44,7 +66,7 @@ def main(args: list[str] | None = None) -> int:
         if name in _BROUGHT
         else f"unknown command {name!r}; {known}"
     )
-    print(f"error: {brought}", file=sys.stderr)
+    _print_error(brought)
     return 2
 
 
@@ -81,13 +103,20 @@ def _run(name: str, module_name: str, summary: str, args: list[str]) -> int:
         _print_error("out of memory; every file is as it was or whole")
     except KeyboardInterrupt:
         _print_error("interrupted; every file is as it was or whole")
-    except BrokenPipeError:  # the reader of our output went away; what is still buffered must not complain at exit
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 1
 
 
 def _print_error(text: str) -> None:
-    print("error: " + " ".join(text.split()), file=sys.stderr)
+    try:
+        print("error: " + " ".join(text.split()), file=sys.stderr)
+    except OSError:  # the exit status says it
+        _abandon(sys.stderr)
+
+
+def _abandon(stream: TextIO) -> None:
+    """What `stream` still holds goes nowhere, so that it does not complain at exit."""
+    with contextlib.suppress(OSError):  # a stream of its caller's without a file
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _place_in_help(name: str) -> int:

@@ -101,6 +101,8 @@ def report_writer() -> Callable[..., None]:
     try:
         from topoloc.evaluation.report import write_report
     except ModuleNotFoundError as error:
+        if error.name is None or error.name.split(".")[0] != "matplotlib":
+            raise
         raise MissingExtraError("a report needs matplotlib: pip install 'topoloc[report]'") from error
     return write_report
 

@@ -1,4 +1,4 @@
-"""A map that is ready to be asked: as `mapping/build.py` constructs it, and with what only localizing can tell of it."""
+"""A map that is ready to be asked: as `map/build.py` constructs it, and with what only localizing can tell of it."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ def build_map(
         poses_from: where the poses of each recording come from (`truth`, `slam`, a file), for the map to remember.
 
     Raises:
+        ConfigError: a value of `config` is out of its bounds.
         TrajectoryError: no frame of a recording has a pose.
         EmptyMapError: no picture gave a usable node.
         RecordingError, CalibrationError, UnreadableImageError: from reading the recordings.

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
+from topoloc.bounds import check_bounds
 from topoloc.errors import EmptyMapError, TrajectoryError
 from topoloc.features.extraction import extract_features
 from topoloc.features.features import Features
@@ -95,11 +96,13 @@ def build_map(
         poses_from: where the poses of each recording come from (`truth`, `slam`, a file), for the map to remember.
 
     Raises:
+        ConfigError: a value of `config` is out of its bounds.
         TrajectoryError: no frame of a recording has a pose.
         EmptyMapError: no picture gave a usable node.
         RecordingError, CalibrationError, UnreadableImageError: from reading the recordings.
     """
     config = config or BuildConfig()
+    check_bounds(config)
     progress = progress or (lambda stage, done, total: None)
     if isinstance(sequences, StereoSequence):
         sequences = [sequences]

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
+from topoloc.bounds import Between
 from topoloc.features.extraction import FeatureConfig
 from topoloc.map.landmarks import LandmarkConfig
 from topoloc.map.nodes import NodeConfig
 from topoloc.map.side_nodes import SideNodesConfig
-from topoloc.places.stored_settings import SettingsError, json_of, settings_from
+from topoloc.places.stored_settings import SettingsError, bounded_settings_from, json_of
 from topoloc.places.vlad import VladConfig
 from topoloc.slam.metric_points import MetricPointsConfig
 
@@ -38,13 +39,13 @@ class MapConfig:
     landmarks: LandmarkConfig = field(default_factory=LandmarkConfig)
     vlad: VladConfig = field(default_factory=VladConfig)
     sides: SideNodesConfig = field(default_factory=SideNodesConfig)
-    max_node_points: int = 800
+    max_node_points: Annotated[int, Between(1, 100_000)] = 800
     """Features that a node keeps, the strongest ones."""
-    min_node_points: int = 20
+    min_node_points: Annotated[int, Between(1, 100_000)] = 20
     """A picture with fewer located features becomes no node."""
-    template_side_px: int = 240
+    template_side_px: Annotated[int, Between(16, 4096)] = 240
     """Shorter side of the template picture that a node keeps, at most."""
-    place_side_px: int = 160
+    place_side_px: Annotated[int, Between(16, 4096)] = 160
     """Shorter side of the other mapping images, at most: what the coarse localizers of section III-B are trained with."""
 
     @property
@@ -80,7 +81,7 @@ def config_from_text(text: str) -> MapConfig:
 
 def resolved_config(data: Any) -> MapConfig:
     """The configuration of a map that was built, from its nested values. Raises SettingsError, which names the key."""
-    config = settings_from(MapConfig, data, "config")
+    config = bounded_settings_from(MapConfig, data, "config")
     for name in ("d_thresh", "lambda_rot"):
         value = getattr(config.nodes, name)
         if value is None or not 0.0 <= value < math.inf:

@@ -11,6 +11,9 @@ from dataclasses import MISSING, fields, is_dataclass
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from topoloc.bounds import check_bounds
+from topoloc.errors import ConfigError
+
 T = TypeVar("T")
 
 
@@ -49,6 +52,16 @@ def settings_from(of: type[T], data: Any, path: str = "") -> T:
         return of(**values)
     except ValueError as error:  # bounds that the dataclass itself checks
         raise SettingsError(f"{path or 'settings'}: {error}") from error
+
+
+def bounded_settings_from(of: type[T], data: Any, path: str = "") -> T:
+    """As `settings_from`, of settings that have bounds."""
+    config = settings_from(of, data, path)
+    try:
+        check_bounds(config, path or None)
+    except ConfigError as error:
+        raise SettingsError(str(error)) from error
+    return config
 
 
 def value_from(of: Any, value: Any, path: str) -> Any:

@@ -11,7 +11,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc_worlds.scene import Material, Scene, Sky, Surface
 from topoloc_worlds.shapes import box, panel
 
-pytest.importorskip("mitsuba", reason="rendering needs the extra sim")
+pytest.importorskip("mitsuba", reason="rendering needs Mitsuba")
 from topoloc_worlds.rendering.light_bake import LightBakeConfig
 from topoloc_worlds.rendering.light_filter import LightFilterConfig
 from topoloc_worlds.rendering.renderer import RenderConfig, Renderer

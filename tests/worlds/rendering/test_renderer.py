@@ -12,7 +12,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc_worlds.scene import Haze, Material, Scene, Sky, Surface
 from topoloc_worlds.shapes import box, panel
 
-pytest.importorskip("mitsuba", reason="rendering needs the extra sim")
+pytest.importorskip("mitsuba", reason="rendering needs Mitsuba")
 from topoloc_worlds.rendering.renderer import RenderConfig, Renderer  # after the check above
 
 CAMERA = Camera.pinhole(64, 40, 40.0, 40.0, 33.3, 17.2)

@@ -58,7 +58,7 @@ def use_best_variant(force: str | None = None) -> str:
     try:
         import mitsuba
     except ImportError:
-        raise MissingExtraError("rendering needs Mitsuba 3: pip install 'topoloc[sim]'") from None
+        raise MissingExtraError("rendering needs Mitsuba 3: pip install mitsuba") from None
     current = mitsuba.variant()
     wanted = force or os.environ.get(_FORCE) or None
     if wanted is None and current in (LLVM, SCALAR):
