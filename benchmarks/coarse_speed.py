@@ -83,7 +83,7 @@ def made(method: str, backbone: BackboneName, picture: PictureConfig) -> CoarseL
     vectors = rng.standard_normal((NUM_IMAGES, DIMENSION)).astype(np.float16)
     arrays = {"vectors": vectors, "node_ids": np.arange(NUM_IMAGES) // 20, "mean": np.zeros(num_raw, np.float32)}
     arrays["projection"] = rng.standard_normal((DIMENSION, num_raw)).astype(np.float16)
-    return VectorSearch(CoarseModel(method, settings, to_arrays(network) | arrays), network)
+    return VectorSearch(CoarseModel(method, settings, to_arrays(network) | arrays), network, picture)
 
 
 if __name__ == "__main__":

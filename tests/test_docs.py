@@ -17,7 +17,7 @@ from topoloc.cli import all_commands, main
 from topoloc.evaluation.metrics import Answer, summarize
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.map import storage
+from topoloc.map import schema
 from topoloc.places.coarse import NodeScore
 
 ROOT = Path(__file__).parents[1]
@@ -90,17 +90,16 @@ def test_result_and_evaluation_keys_are_documented():
 
 def test_every_table_and_column_of_the_map_is_documented():
     with closing(sqlite3.connect(":memory:")) as database:
-        for prefix in ("", storage.SIDE):
-            database.executescript(storage._NODE_TABLES.format(prefix=prefix))
-        database.executescript(storage._SCHEMA)
+        for table in schema.TABLES:
+            database.execute(schema.creation_of(table))
         tables = [name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
         for table in tables:
             (section,) = re.findall(rf"^### {table}$(.*?)(?=^##|\Z)", MAP_FORMAT, re.MULTILINE | re.DOTALL)
             columns = [row[1] for row in database.execute(f"PRAGMA table_info({table})")]
             assert [column for column in columns if f"`{column}`" not in section] == []
     assert set(re.findall(r"^### (\w+)$", MAP_FORMAT, re.MULTILINE)) == set(tables)
-    assert f"schema version is {storage.SCHEMA_VERSION}" in MAP_FORMAT
-    assert f"0x{storage.APPLICATION_ID:08X}" in MAP_FORMAT
+    assert f"schema version is {schema.SCHEMA_VERSION}" in MAP_FORMAT
+    assert f"0x{schema.APPLICATION_ID:08X}" in MAP_FORMAT
 
 
 @pytest.mark.parametrize("name", [name for name in topoloc.__all__ if name != "__version__"])

@@ -14,15 +14,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from built_corridor import WIDE, WalkAhead, back, built_corridor, corridor, seen_ahead
+from built_corridor import WalkAhead, built_corridor, corridor
 from tiny_world import render
 from topoloc.errors import MapError
 from topoloc.features.extraction import FeatureConfig
 from topoloc.features.side_views import SideViewConfig
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization.localizer import Localizer
-from topoloc.localization.result import Localization, NotLocalized
 from topoloc.map.build import BuildConfig, build_map
 from topoloc.map.nodes import NodeConfig, NodePoses, node_distances
 from topoloc.map.side_nodes import SideNodesConfig, describe_sides, gather_sides, nodes_with_sides
@@ -241,28 +239,6 @@ def changed(path: Path, script: str) -> Path:
     database.executescript(script)
     database.close()
     return path
-
-
-def without_sides(path: Path) -> Path:
-    """The file as it was written before there were side nodes: no tables, and nothing about them in the configuration."""
-    database = sqlite3.connect(path)
-    (config,) = database.execute("SELECT value FROM map WHERE key = 'config'").fetchone()
-    older = {key: value for key, value in json.loads(config).items() if key != "sides"}
-    database.execute("UPDATE map SET value = ? WHERE key = 'config'", (json.dumps(older),))
-    for table in ("side_coarse_models", "side_node_points", "side_nodes"):
-        database.execute(f"DROP TABLE {table}")
-    database.commit()
-    database.close()
-    return path
-
-
-def test_a_map_file_without_side_tables_is_a_map_without_sides(saved_corridor: Path):
-    topomap = TopoMetricMap.load(without_sides(saved_corridor))
-    assert topomap.sides is None
-    localizer = Localizer(topomap)
-    assert all(isinstance(localizer.localize(picture, WIDE), Localization) for picture, _ in seen_ahead())
-    picture, _ = render(corridor(), back(5.0), WIDE)
-    assert isinstance(localizer.localize(picture, WIDE), NotLocalized)
 
 
 def read_sides(path: Path) -> None:

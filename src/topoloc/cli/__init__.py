@@ -88,7 +88,8 @@ def _run(name: str, module_name: str, summary: str, args: list[str]) -> int:
 
         from topoloc.cli.output import UsageError, interruptible
 
-        module = importlib.import_module(module_name)
+        with interruptible():  # also says so where there is too little memory for the libraries
+            module = importlib.import_module(module_name)
         command = tyro.cli(module.Command, args=args, prog=f"topoloc {name}", description=summary[0].upper() + summary[1:])
         try:
             with interruptible():
@@ -98,6 +99,8 @@ def _run(name: str, module_name: str, summary: str, args: list[str]) -> int:
             return 2
     except TopolocError as error:
         _print_error(str(error))
+    except MemoryError:
+        _print_error("out of memory; every file is as it was or whole")
     except KeyboardInterrupt:
         _print_error("interrupted; every file is as it was or whole")
     return 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,7 +10,9 @@ import tyro
 
 from topoloc.cli.options import File
 from topoloc.cli.output import check_outputs, print_facts, write_json
-from topoloc.errors import EmptyMapError
+from topoloc.errors import EmptyMapError, MapError
+
+MAX_DAMAGES = 20
 
 
 @dataclass(frozen=True)
@@ -22,15 +24,32 @@ class Command:
     json: File = None
     """Write the same as JSON to this file (- for standard output)."""
 
+    check: bool = False
+    """Also look at every byte of the map, and whether its nodes agree with their neighbours; exit status 1 where something is wrong."""
+
     def run(self) -> int:
         from topoloc.map.topomap import TopoMetricMap
 
         check_outputs([self.json], inputs=[self.map])
-        info = describe_map(TopoMetricMap.load(self.map), Path(self.map))
+        with TopoMetricMap.load(self.map) as topomap:
+            found = _damages(topomap, Path(self.map)) if self.check else []
+            if found:
+                print("\n".join(found[:MAX_DAMAGES]))
+                raise MapError(f"map {self.map} is damaged: {len(found)} things are wrong, the first: {found[0]}")
+            info = describe_map(topomap, Path(self.map)) | ({"check": "ok"} if self.check else {})
         if self.json != "-":
             _print(info)
         write_json(self.json, info)
         return 0
+
+
+def _damages(topomap: Any, path: Path) -> list[str]:
+    """What is wrong with the bytes of the file, or, where nothing is, with what they say."""
+    from topoloc.localization.contradictions import contradictions
+    from topoloc.map.checking import damages
+
+    found = damages(path)
+    return found or [str(contradiction) for contradiction in contradictions(topomap)]
 
 
 def describe_map(topomap: Any, path: Path) -> dict[str, Any]:
@@ -56,11 +75,18 @@ def describe_map(topomap: Any, path: Path) -> dict[str, Any]:
         "length_m": round(topomap.length_m, 3),
         "extent_m": np.ptp(centres, axis=0).round(3).tolist(),
         "recordings": sorted({s.recording for s in topomap.summaries}),
+        "sessions": [_session_facts(session) for session in topomap.sessions],
+        "edits": [asdict(edit) for edit in topomap.edits],
         "coarse": sorted(topomap.coarse_models),
         "default_coarse": topomap.default_coarse,
         "coarse_models": list_coarse(path),
         "config": topomap.config.to_json(),
     }
+
+
+def _session_facts(session: Any) -> dict[str, Any]:
+    camera = None if session.camera is None else session.camera.to_json()
+    return asdict(session) | {"camera": camera, "start_date": session.start_date, "end_date": session.end_date}
 
 
 def _print(info: dict[str, Any]) -> None:
@@ -78,6 +104,7 @@ def _print(info: dict[str, Any]) -> None:
             *(("coarse localizer", _coarse_line(facts, info["default_coarse"])) for facts in info["coarse_models"]),
             ("Eq. 1", f"D_thresh {nodes.get('d_thresh', nan):.3g} m, lambda {nodes.get('lambda_rot', nan):.3g} m/rad"),
             ("features", ", ".join(f"{key} {value}" for key, value in features.items() if isinstance(value, str))),
+            *([("check", info["check"])] if "check" in info else []),
         ]
     )
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from topoloc.errors import MissingExtraError, TopolocError
-from topoloc.sequences.atomic import write_text
+from topoloc.sequences.atomic import remove_leftovers, write_text
 
 
 class UsageError(TopolocError):
@@ -40,21 +40,31 @@ def check_outputs(outputs: Sequence[str | None], inputs: Sequence[str] = ()) -> 
             raise TopolocError(f"cannot write {path}: folder {path.parent} is read-only")
         if path.resolve() in taken:
             raise TopolocError(f"cannot write {path}: this file is named for something else, too")
+        remove_leftovers(path)
         taken.add(path.resolve())
 
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Ctrl-C inside a compiled function comes out of it as a SystemError; here it becomes the KeyboardInterrupt that it was."""
+    """Ctrl-C or too little memory inside a compiled function come out of it as a SystemError; here they become what they were."""
     try:
         yield
-    except SystemError as error:
+    except Exception as error:
         cause: BaseException | None = error
-        while cause is not None:
-            if isinstance(cause, KeyboardInterrupt):
-                raise KeyboardInterrupt from error
+        while cause is not None and isinstance(error, SystemError):
+            if isinstance(cause, KeyboardInterrupt | MemoryError):
+                raise type(cause) from error
             cause = cause.__cause__ or cause.__context__
+        if _is_out_of_memory(error):
+            raise MemoryError from error
         raise
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    """OpenCV, FAISS and the loader of shared libraries have words of their own for it."""
+    text = str(error)
+    words = ("Insufficient memory", "std::bad_alloc", "Cannot allocate memory", "failed to map segment", "can't start new thread")
+    return (isinstance(error, OSError) and error.errno == 12) or any(word in text for word in words)
 
 
 @contextmanager

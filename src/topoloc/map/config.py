@@ -13,7 +13,7 @@ from topoloc.features.kinds import KINDS, FeatureConfig
 from topoloc.map.landmarks import LandmarkConfig
 from topoloc.map.nodes import NodeConfig
 from topoloc.map.side_nodes import SideNodesConfig
-from topoloc.places.stored_settings import SettingsError, json_of, settings_from
+from topoloc.places.stored_settings import SettingsError, bounded_settings_from, json_of
 from topoloc.places.vlad import VladConfig
 from topoloc.slam.metric_points import MetricPointsConfig
 
@@ -80,7 +80,7 @@ def config_from_text(text: str) -> MapConfig:
 
 def resolved_config(data: Any) -> MapConfig:
     """The configuration of a map that was built, from its nested values. Raises SettingsError, which names the key."""
-    config = settings_from(MapConfig, data, "config")
+    config = bounded_settings_from(MapConfig, data, "config")
     for name in ("d_thresh", "lambda_rot"):
         value = getattr(config.nodes, name)
         if value is None or not 0.0 <= value < math.inf:

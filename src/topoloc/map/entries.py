@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import no_type_check
 
@@ -52,7 +52,7 @@ class TopoNode:
     points_cam: Float32[np.ndarray, "n 3"]
     point_sqrt_covs: Float32[np.ndarray, "n 6"]
     template_jpeg: bytes
-    sums: Sequence[LandmarkSums] = ()
+    sums: Iterable[LandmarkSums] = ()
     stored_descriptors: Int8[np.ndarray, "n d"] | None = None
 
 

@@ -133,6 +133,15 @@ class MapFile:
             query = f"SELECT {', '.join(wanted)}, checksum FROM {table} WHERE {where}"
             return self._checked(table, database.execute(query, tuple(key.values())).fetchone())
 
+    def checksums(self, table: str) -> list[bytes]:
+        """Those of all rows in their order, but for that of the digest itself."""
+        with self.reading() as database:
+            where = " WHERE key != 'digest'" if table == "map" else ""
+            found = database.execute(f"SELECT checksum FROM {table}{where} ORDER BY {ORDER[table]} LIMIT {MAX_ROWS}").fetchall()
+            if not all(type(checksum) is bytes for (checksum,) in found):
+                raise Damage(f"a checksum of {table} is missing")
+            return [checksum for (checksum,) in found]
+
     def kept(self, name: str, make: Callable[[], Any]) -> Any:
         """What `make` gave when it was first asked for under this name. The lock is that of reading: with two, threads could wait for
         each other."""

@@ -17,9 +17,9 @@ from topoloc.map.entries import Edge, NodeSummary, PlaceImage, SharedErrors, Sid
 from topoloc.map.file import MapFile
 from topoloc.map.schema import SIDE
 from topoloc.map.sessions import Edit, Light, Session
-from topoloc.map.sums import LandmarkSums
+from topoloc.map.sums import LandmarkSums, sums_from
 from topoloc.map.topomap import NextIds, TopoMetricMap
-from topoloc.map.validation import MAX_POINTS, Damage, array_from, arrays_from, camera_from, count_within, pose_from, unpacked
+from topoloc.map.validation import MAX_POINTS, Damage, array_from, arrays_from, camera_from, count_within, pose_from
 from topoloc.places.coarse import CoarseModel
 from topoloc.places.stored_settings import json_of, settings_from, value_from
 
@@ -240,7 +240,7 @@ def _camera_of(file: MapFile, prefix: str, node_id: int) -> Camera:
     return file.kept(f"camera {camera_id}", read)
 
 
-class _StoredSums(Sequence[LandmarkSums]):
+class _StoredSums:
     """What each session knows of a node's points; no answer needs it, so it is read when asked for."""
 
     def __init__(self, file: MapFile, node_id: int, kind: str, num_points: int) -> None:
@@ -251,33 +251,15 @@ class _StoredSums(Sequence[LandmarkSums]):
             query = "SELECT session_id FROM landmark_sums WHERE node_id = ? AND kind = ? ORDER BY session_id LIMIT 100000"
             return [value_from(int, row[0], "landmark_sums.session_id") for row in database.execute(query, (self._node_id, self._kind))]
 
-    def __len__(self) -> int:
-        return len(self._sessions())
-
-    def __getitem__(self, index):  # type: ignore[override]
+    def __iter__(self) -> Iterator[LandmarkSums]:
         with self._file.reading():
-            session_ids = self._sessions()[index]
-            return [self._of(k) for k in session_ids] if isinstance(index, slice) else self._of(session_ids)
+            found = [self._of(session_id) for session_id in self._sessions()]
+        return iter(found)
 
     def _of(self, session_id: int) -> LandmarkSums:
         what = f"the sums of node {self._node_id}"
         row = _found(self._file.row("landmark_sums", node_id=self._node_id, kind=self._kind, session_id=session_id), what)
         return sums_from(session_id, row["sums"], count_within(row["num_rows"], 0, self._num_points, what), self._num_points)
-
-
-def sums_from(session_id: int, data: bytes, num_rows: int, num_points: int) -> LandmarkSums:
-    """Sums as `writing.sums_bytes` packed them."""
-    what = f"sums of session {session_id}"
-    planes = array_from(unpacked(data, 24 * num_rows, what), "u1", (2, 12 * num_rows), what)
-    words = np.ascontiguousarray(planes.T).tobytes()
-    m, parts, start = num_rows, [], 0
-    for dtype, width in (("<u2", 1), ("<f2", 6), ("<i2", 3), ("<u2", 1), ("<u2", 1)):
-        parts.append(array_from(words[start : start + 2 * m * width], dtype, (m, width) if width > 1 else (m,), what))
-        start += 2 * m * width
-    rows = parts[0].astype(np.int64)
-    if m and (int(rows[-1]) >= num_points or (np.diff(rows) <= 0).any()):
-        raise Damage(f"{what}: of points that are not there")
-    return LandmarkSums(session_id, rows, *parts[1:])
 
 
 class _StoredImages(_Stored[PlaceImage]):

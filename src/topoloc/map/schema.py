@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from hashlib import blake2b
+from typing import Any
 
 APPLICATION_ID = 0x544F504F  # "TOPO", in the database's header
 SCHEMA_VERSION = 2
@@ -106,7 +107,7 @@ def creation_of(table: str) -> str:
     return f"CREATE TABLE {table} ({', '.join([*declared, _CHECKSUM, *constraint])})"
 
 
-def checksum_of(table: str, row: Sequence[int | str | bytes]) -> bytes:
+def checksum_of(table: str, row: Sequence[Any]) -> bytes:
     """8 bytes (BLAKE2b) that change with the table's name and every bit of its row, columns in the order of `TABLES`."""
     digest = blake2b(table.encode(), digest_size=8)
     for value in row:

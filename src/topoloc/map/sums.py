@@ -11,11 +11,14 @@ the number of its observations: points that are gone are expected and no longer 
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Float16, Int, Int16, UInt16
+
+from topoloc.map.validation import Damage, array_from, unpacked
 
 PULL_SCALE = 1024.0
 """Pulls are kept as L^-1 g with A = L L', which has no unit and is about 1, in steps of one part in so many."""
@@ -107,3 +110,25 @@ class PointSums:
         """Positions (metres) and covariances of points kept at `points_cam`, as these sums have them."""
         covariances = np.linalg.inv(self.information)
         return points_cam - (covariances @ self.pulls[:, :, None])[:, :, 0], covariances
+
+
+def sums_bytes(sums: LandmarkSums) -> bytes:
+    """Rows, roots, pulls and counts as 16-bit words, all low bytes before all high ones, packed by zlib."""
+    parts = ((sums.rows, "<u2"), (sums.roots, "<f2"), (sums.pulls, "<i2"), (sums.expected, "<u2"), (sums.seen, "<u2"))
+    words = np.frombuffer(b"".join(part.astype(dtype).tobytes() for part, dtype in parts), np.uint8)
+    return zlib.compress(np.ascontiguousarray(words.reshape(-1, 2).T).tobytes(), 6)
+
+
+def sums_from(session_id: int, data: bytes, num_rows: int, num_points: int) -> LandmarkSums:
+    """Sums as `sums_bytes` packed them."""
+    what = f"sums of session {session_id}"
+    planes = array_from(unpacked(data, 24 * num_rows, what), "u1", (2, 12 * num_rows), what)
+    words = np.ascontiguousarray(planes.T).tobytes()
+    m, parts, start = num_rows, [], 0
+    for dtype, width in (("<u2", 1), ("<f2", 6), ("<i2", 3), ("<u2", 1), ("<u2", 1)):
+        parts.append(array_from(words[start : start + 2 * m * width], dtype, (m, width) if width > 1 else (m,), what))
+        start += 2 * m * width
+    rows = parts[0].astype(np.int64)
+    if m and (int(rows[-1]) >= num_points or (np.diff(rows) <= 0).any()):
+        raise Damage(f"{what}: of points that are not there")
+    return LandmarkSums(session_id, rows, *parts[1:])

@@ -107,8 +107,8 @@ class TopoMetricMap:
 
     def close(self) -> None:
         """Let go of the file, where the map was loaded; what is asked of it afterwards is a MapError."""
-        if self._file is not None:
-            self._file.close()
+        if self.file is not None:
+            self.file.close()
 
     def __enter__(self) -> TopoMetricMap:
         return self
@@ -117,14 +117,14 @@ class TopoMetricMap:
         self.close()
 
     @property
-    def _file(self) -> MapFile | None:
+    def file(self) -> MapFile | None:
         """Where the map comes from as it is; a changed one (`dataclasses.replace`) is no longer that of the file."""
         return self.__dict__.get("_opened")
 
     def __reduce__(self) -> Any:
-        if self._file is None:
+        if self.file is None:
             return super().__reduce__()
-        return _load_same, (str(self._file.path.absolute()), self._file.digest)
+        return _load_same, (str(self.file.path.absolute()), self.file.digest)
 
 
 def _load_same(path: str, digest: str) -> TopoMetricMap:
@@ -154,6 +154,8 @@ def in_rows(model: CoarseModel, ids: Sequence[int]) -> CoarseModel:
     if "vectors" not in model.arrays:  # one output a node
         return replace(model, arrays={**model.arrays, "node_ids": of_known})
     kept = of_known >= 0
+    if not kept.any():
+        raise MapError(f"the map's coarse localizer {model.name!r} knows none of its nodes")
     per_vector = {name: model.arrays[name][kept] for name in ("vectors", "centres") if len(model.arrays.get(name, ())) == len(kept)}
     return replace(model, arrays={**model.arrays, **per_vector, "node_ids": of_known[kept]})
 

@@ -10,7 +10,6 @@ import io
 import json
 import os
 import sqlite3
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -28,7 +27,7 @@ from topoloc.map.entries import TopoNode
 from topoloc.map.reading import unit_descriptors
 from topoloc.map.schema import APPLICATION_ID, DESCRIPTOR_SCALE, ORDER, SCHEMA_VERSION, SIDE, TABLES, checksum_of, creation_of
 from topoloc.map.sessions import Session, sessions_named
-from topoloc.map.sums import LandmarkSums
+from topoloc.map.sums import sums_bytes
 from topoloc.map.topomap import NextIds, TopoMetricMap
 from topoloc.places.coarse import CoarseModel
 from topoloc.sequences.atomic import replaced_file
@@ -171,13 +170,6 @@ def digest_of(checksums: Mapping[str, Sequence[bytes]]) -> str:
     for table in TABLES:
         digest.update(f"{table} {len(checksums[table])}\n".encode() + b"".join(checksums[table]))
     return digest.hexdigest()
-
-
-def sums_bytes(sums: LandmarkSums) -> bytes:
-    """Rows, roots, pulls and counts as 16-bit words, all low bytes before all high ones, packed by zlib."""
-    parts = ((sums.rows, "<u2"), (sums.roots, "<f2"), (sums.pulls, "<i2"), (sums.expected, "<u2"), (sums.seen, "<u2"))
-    words = np.frombuffer(b"".join(part.astype(dtype).tobytes() for part, dtype in parts), np.uint8)
-    return zlib.compress(np.ascontiguousarray(words.reshape(-1, 2).T).tobytes(), 6)
 
 
 def _quantised(node: TopoNode) -> Int8[np.ndarray, "n d"]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from topoloc.bounds import Above, AtLeast, Between
+from topoloc.places.stored_settings import bounded_settings_from
 
 T = TypeVar("T")
 
@@ -143,15 +144,13 @@ _NESTED = {"picture": PictureConfig, "training": TrainingConfig, "augmentation":
 
 
 def settings_of(kind: type[T], stored: Mapping[str, Any]) -> T:
-    """A configuration from the JSON that a map keeps of it."""
-    known = {item.name for item in fields(kind)}  # pyright: ignore[reportArgumentType]
-    values = {name: value for name, value in stored.items() if name in known}
-    for name, nested in (
-        ("picture", PictureConfig),
-        ("training", TrainingConfig),
-        ("augmentation", AugmentationConfig),
-        ("tuning", TripletConfig),
-    ):
-        if isinstance(values.get(name), Mapping):
-            values[name] = settings_of(nested, values[name])
-    return kind(**values)
+    """A configuration from the JSON that a map keeps of it. Raises SettingsError."""
+    return bounded_settings_from(kind, _known_of(kind, stored))
+
+
+def _known_of(kind: type[Any], stored: Any) -> Any:
+    """Without the keys of other versions."""
+    if not isinstance(stored, Mapping):
+        return stored
+    known = {item.name for item in fields(kind)}
+    return {name: _known_of(_NESTED[name], value) if name in _NESTED else value for name, value in stored.items() if name in known}

@@ -20,13 +20,14 @@ from topoloc.features.features import Features
 from topoloc.places.augmentation import augment
 from topoloc.places.backbones import Backbone, has_wide_classifier, normalize_pictures
 from topoloc.places.classifier_config import BackboneName, CnnFcConfig, PictureConfig, settings_of
-from topoloc.places.coarse import CoarseModel, Image, NodeScore
+from topoloc.places.coarse import CoarseModel, Image, NodeScore, model_array, setting
 from topoloc.places.inference import BATCH_SIZE, Predictor, from_arrays, in_channels_last, rounded_to_half, to_arrays
 from topoloc.places.training import Task, fit, hold_out
 from topoloc.places.training_set import PictureShape, Progress, TrainingSet, decode_pictures, network_pictures
 from topoloc.places.weights import Weights, describe
 
 NAME = "cnn-fc"
+MAX_OUTPUTS = 100_000
 _SQUEEZED, _ROWS, _COLUMNS = 64, 4, 5
 
 
@@ -108,14 +109,18 @@ class CnnFc:
     """
 
     def __init__(self, model: CoarseModel) -> None:
-        settings = model.settings
+        self._picture: PictureConfig = settings_of(CnnFcConfig, setting(model, "config", dict)).picture
+        self._shape = PictureShape(*setting(model, "picture_shape", tuple[int, int]))
+        self._temperature, num_outputs = setting(model, "temperature", float), setting(model, "num_nodes", int)
+        if not 0 < num_outputs <= MAX_OUTPUTS or self._temperature <= 0.0:
+            raise MapError(f"the map's coarse localizer {NAME!r} is damaged: {num_outputs} outputs, temperature {self._temperature}")
         try:
-            self._picture: PictureConfig = settings_of(CnnFcConfig, settings["config"]).picture
-            self._shape = PictureShape(*settings["picture_shape"])
-            self._temperature = float(settings["temperature"])
-            self._predict = Predictor(from_arrays(NodeClassifier(settings["backbone"], settings["num_nodes"]), model.arrays))
+            self._predict = Predictor(from_arrays(NodeClassifier(setting(model, "backbone", BackboneName), num_outputs), model.arrays))
         except (KeyError, RuntimeError, ValueError) as error:
             raise MapError(f"the map's coarse localizer {NAME!r} is damaged: {' '.join(str(error).split())[:200]}") from error
+        # the node of each output, as its row in the map; -1 of nodes that are no more
+        has_rows = "node_ids" in model.arrays
+        self._rows = model_array(model, "node_ids", "iu", (num_outputs,)) if has_rows else np.arange(num_outputs)
 
     def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
         """See `CoarseLocalizer.rank`; scores are probabilities. The local features are not looked at."""
@@ -123,10 +128,12 @@ class CnnFc:
 
     def rank_batch(self, images: Sequence[Image], num_candidates: int) -> list[list[NodeScore]]:
         """`rank` of many images, which go through the network together."""
-        return [
-            [NodeScore(int(node), float(row[node])) for node in np.argsort(-row, kind="stable")[:num_candidates]]
-            for row in self.probabilities(images)
-        ]
+        ranked = []
+        for row in self.probabilities(images):
+            outputs = np.argsort(-row, kind="stable")
+            outputs = outputs[self._rows[outputs] >= 0][:num_candidates]
+            ranked.append([NodeScore(int(self._rows[output]), float(row[output])) for output in outputs])
+        return ranked
 
     def probabilities(self, images: Sequence[Image]) -> Float32[np.ndarray, "n nodes"]:
         """Of each node, for each image."""

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from topoloc.places.backbones import Backbone
 from topoloc.places.classifier_config import BackboneName, CnnNnConfig, settings_of
-from topoloc.places.coarse import CoarseModel
+from topoloc.places.coarse import CoarseModel, setting
 from topoloc.places.training_set import Progress, TrainingSet
 from topoloc.places.vector_search import VectorSearch, fit_vectors
 from topoloc.places.weights import Weights, describe, load_features
@@ -56,8 +56,8 @@ def train(
 
 def open_model(model: CoarseModel) -> VectorSearch:
     """The localizer of what `train` made."""
-    settings = model.settings
-    return VectorSearch(model, _network(settings["backbone"], settings_of(CnnNnConfig, settings["config"])))
+    config = settings_of(CnnNnConfig, setting(model, "config", dict))
+    return VectorSearch(model, _network(setting(model, "backbone", BackboneName), config), config.picture)
 
 
 def _network(backbone: BackboneName, config: CnnNnConfig) -> PooledFeatures:

@@ -16,6 +16,7 @@ from jaxtyping import UInt8
 
 from topoloc.errors import MapError, MissingExtraError
 from topoloc.features.features import Features
+from topoloc.places.stored_settings import SettingsError, value_from
 
 CoarseName = Literal["surf-vlad", "cnn-fc", "cnn-nn", "vlad-nn"]
 COARSE_NAMES: tuple[CoarseName, ...] = get_args(CoarseName)
@@ -44,6 +45,23 @@ class CoarseModel:
     arrays: Mapping[str, np.ndarray]
 
 
+def model_array(model: CoarseModel, name: str, kinds: str, shape: tuple[int | None, ...]) -> np.ndarray:
+    """An array of a stored model, of this shape (None: any length but 0) and of one of these kinds of numbers (NumPy's letters).
+
+    Raises:
+        MapError: it is missing, of another shape or type, or not finite.
+    """
+    array = model.arrays.get(name)
+    fits = array is not None and array.dtype.kind in kinds and array.ndim == len(shape)
+    if array is None or not fits or any(n == 0 or (m is not None and n != m) for n, m in zip(array.shape, shape, strict=True)):
+        found = "missing" if array is None else f"{array.dtype} {array.shape}"
+        expected = " x ".join("any" if length is None else str(length) for length in shape)
+        raise MapError(f"the map's coarse localizer {model.name!r} is damaged: {name} is {found}, not {expected} numbers")
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise MapError(f"the map's coarse localizer {model.name!r} is damaged: {name} is not finite")
+    return array
+
+
 @runtime_checkable
 class CoarseLocalizer(Protocol):
     """Names the nodes that an image may belong to."""
@@ -63,7 +81,15 @@ def open_coarse(model: CoarseModel) -> CoarseLocalizer:
     """
     if model.name not in COARSE_NAMES:
         raise MapError(f"the map's coarse localizer {model.name!r} is not known to this version (known: {', '.join(COARSE_NAMES)})")
-    return module_of(model.name).open_model(model)
+    try:
+        return module_of(model.name).open_model(model)
+    except SettingsError as error:
+        raise MapError(f"the map's coarse localizer {model.name!r} is damaged: {error}") from error
+
+
+def setting(model: CoarseModel, name: str, of: Any) -> Any:
+    """A setting of a stored model, of this type. Raises SettingsError."""
+    return value_from(of, model.settings.get(name), name)
 
 
 def module_of(name: str) -> Any:

@@ -11,6 +11,9 @@ from dataclasses import MISSING, fields, is_dataclass
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from topoloc.bounds import check_bounds
+from topoloc.errors import ConfigError
+
 T = TypeVar("T")
 
 
@@ -51,6 +54,16 @@ def settings_from(of: type[T], data: Any, path: str = "") -> T:
         raise SettingsError(f"{path or 'settings'}: {error}") from error
 
 
+def bounded_settings_from(of: type[T], data: Any, path: str = "") -> T:
+    """As `settings_from`, of settings that have bounds."""
+    config = settings_from(of, data, path)
+    try:
+        check_bounds(config, path or None)
+    except ConfigError as error:
+        raise SettingsError(str(error)) from error
+    return config
+
+
 def value_from(of: Any, value: Any, path: str) -> Any:
     """One value as its annotation says. Raises SettingsError."""
     origin = get_origin(of)
@@ -69,7 +82,7 @@ def value_from(of: Any, value: Any, path: str) -> Any:
         if not math.isfinite(number):
             raise SettingsError(f"{path}: a finite number is expected")
         return number if isinstance(value, float) else value
-    if of in (int, bool, str, NoneType) and type(value) is of:
+    if of in (int, bool, str, dict, NoneType) and type(value) is of:
         return value
     raise SettingsError(f"{path}: {getattr(of, '__name__', of)} is expected, not {type(value).__name__}")
 

@@ -13,7 +13,7 @@ from torch import nn
 from topoloc.errors import MapError
 from topoloc.features.features import Features
 from topoloc.places.classifier_config import PictureConfig
-from topoloc.places.coarse import CoarseModel, Image, NodeScore
+from topoloc.places.coarse import CoarseModel, Image, NodeScore, model_array, setting
 from topoloc.places.inference import Predictor, from_arrays, rounded_to_half, to_arrays
 from topoloc.places.neighbours import PlaceIndex
 from topoloc.places.training_set import PictureShape, Progress, TrainingSet, decode_pictures, network_pictures
@@ -64,15 +64,17 @@ class VectorSearch:
         MapError: the model's arrays do not belong together.
     """
 
-    def __init__(self, model: CoarseModel, network: nn.Module) -> None:
+    def __init__(self, model: CoarseModel, network: nn.Module, picture: PictureConfig) -> None:
         try:
-            self._picture = PictureConfig(**model.settings["config"]["picture"])
-            self._shape = PictureShape(*model.settings["picture_shape"])
+            self._picture, self._shape = picture, PictureShape(*setting(model, "picture_shape", tuple[int, int]))
             self._predict = Predictor(from_arrays(network, model.arrays))
-            self._whitening = Whitening(model.arrays["mean"], model.arrays["projection"].astype(np.float32))
-            self._index = PlaceIndex(model.arrays["vectors"].astype(np.float32), model.arrays["node_ids"])
         except (KeyError, RuntimeError, ValueError) as error:
             raise MapError(f"the map's coarse localizer {model.name!r} is damaged: {' '.join(str(error).split())[:200]}") from error
+        self._name, mean = model.name, model_array(model, "mean", "f", (None,)).astype(np.float32, copy=False)
+        projection = model_array(model, "projection", "f", (None, len(mean))).astype(np.float32)
+        vectors = model_array(model, "vectors", "f", (None, len(projection))).astype(np.float32)
+        self._whitening = Whitening(mean, projection)
+        self._index = PlaceIndex(vectors, model_array(model, "node_ids", "iu", (len(vectors),)))
 
     def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
         """See `CoarseLocalizer.rank`; scores are cosines. The local features are not looked at."""
@@ -84,4 +86,7 @@ class VectorSearch:
 
     def vectors(self, images: Sequence[Image]) -> Float32[np.ndarray, "n d"]:
         """The images' unit vectors."""
-        return self._whitening.apply(self._predict(network_pictures(images, self._shape, self._picture)))
+        raw = self._predict(network_pictures(images, self._shape, self._picture))
+        if raw.shape[1] != len(self._whitening.mean):
+            raise MapError(f"the map's coarse localizer {self._name!r} is damaged: its whitening is not that of its network")
+        return self._whitening.apply(raw)

@@ -17,10 +17,12 @@ import numpy as np
 from jaxtyping import Float32, Int
 
 from topoloc.bounds import AtLeast, Between
+from topoloc.errors import MapError
 from topoloc.features.features import Features
-from topoloc.places.coarse import CoarseModel, Image, NodeScore
+from topoloc.places.coarse import CoarseModel, Image, NodeScore, model_array
 from topoloc.places.neighbours import PlaceIndex
 from topoloc.places.place_kernels import add_residuals, multiply_rows
+from topoloc.places.stored_settings import bounded_settings_from
 from topoloc.places.whitening import learn_whitening
 
 
@@ -70,7 +72,10 @@ class SurfVlad:
         """See `CoarseLocalizer.rank`; of the picture itself only the size is looked at."""
         vector = np.empty(len(self._projection), np.float32)
         height, width = image.shape[:2]
-        multiply_rows(self._projection, vlad(placed(features, width, height, self._config), self._words) - self._mean, vector)
+        descriptors = placed(features, width, height, self._config)
+        if descriptors.shape[1] != self._words.shape[1]:
+            raise MapError(f"the map's coarse localizer {self.name!r} is damaged: its words are not those of the map's features")
+        multiply_rows(self._projection, vlad(descriptors, self._words) - self._mean, vector)
         vector /= max(float(np.linalg.norm(vector)), 1e-6)
         return self._index.rank_nodes(vector, num_candidates)
 
@@ -82,10 +87,13 @@ class SurfVlad:
 
     @staticmethod
     def from_model(model: CoarseModel) -> SurfVlad:
-        """The inverse of `to_model`."""
-        a = model.arrays
-        projection, vectors = a["projection"].astype(np.float32), a["vectors"].astype(np.float32)
-        return SurfVlad(a["words"], a["mean"], projection, vectors, a["node_ids"], VladConfig(**{"position_weight": 0.0, **model.settings}))
+        """The inverse of `to_model`. Raises MapError where the arrays do not belong together, for kernels trust them, and SettingsError."""
+        config = bounded_settings_from(VladConfig, {"position_weight": 0.0, **model.settings})
+        words = model_array(model, "words", "f", (None, None)).astype(np.float32, copy=False)
+        projection = model_array(model, "projection", "f", (None, words.size)).astype(np.float32)
+        mean = model_array(model, "mean", "f", (words.size,)).astype(np.float32, copy=False)
+        vectors = model_array(model, "vectors", "f", (None, len(projection))).astype(np.float32)
+        return SurfVlad(words, mean, projection, vectors, model_array(model, "node_ids", "iu", (len(vectors),)), config)
 
 
 def open_model(model: CoarseModel) -> SurfVlad:

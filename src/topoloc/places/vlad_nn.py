@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from topoloc.places.backbones import Backbone, normalize_pictures
 from topoloc.places.classifier_config import BackboneName, VladNnConfig, settings_of
-from topoloc.places.coarse import CoarseModel
+from topoloc.places.coarse import CoarseModel, setting
 from topoloc.places.inference import BATCH_SIZE, rounded_to_half
 from topoloc.places.netvlad import NetVlad, learn_words
 from topoloc.places.training_set import Progress, RgbPictures, TrainingSet, decode_pictures, network_pictures
@@ -70,10 +70,10 @@ def train(
 
 def open_model(model: CoarseModel) -> VectorSearch:
     """The localizer of what `train` made."""
-    settings = model.settings
-    config = settings_of(VladNnConfig, settings["config"])
-    depth = config.depth if config.depth is not None else DEPTHS[settings["backbone"]]
-    return VectorSearch(model, VladNetwork(settings["backbone"], depth, settings["num_clusters"]))
+    config = settings_of(VladNnConfig, setting(model, "config", dict))
+    backbone, num_clusters = setting(model, "backbone", BackboneName), setting(model, "num_clusters", int)
+    depth = config.depth if config.depth is not None else DEPTHS[backbone]
+    return VectorSearch(model, VladNetwork(backbone, depth, min(num_clusters, 4096)), config.picture)
 
 
 def _sample_features(backbone: Backbone, pictures: RgbPictures, config: VladNnConfig, progress: Progress) -> Float32[np.ndarray, "n c"]:

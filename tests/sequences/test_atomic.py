@@ -1,0 +1,118 @@
+"""Files are whole or not there, whoever writes at the same time and however a writer ends."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from topoloc.errors import TopolocError
+from topoloc.sequences.atomic import remove_leftovers, replaced_file, write_bytes
+
+WRITER = """
+import sys
+from pathlib import Path
+from topoloc.sequences.atomic import replaced_file
+with replaced_file(Path(sys.argv[1])) as temporary:
+    temporary.write_bytes(b"half")
+    print(temporary.name, flush=True)
+    sys.stdin.readline()
+"""
+WRITERS = """
+import sys
+from pathlib import Path
+from topoloc.sequences.atomic import write_bytes
+for number in range(100):
+    write_bytes(Path(sys.argv[1]), bytes([number]) * 100_000)
+"""
+
+
+def is_whole(data: bytes) -> bool:
+    return len(data) == 100_000 and len(set(data)) == 1
+
+
+def test_threads_and_processes_that_write_one_file_leave_a_whole_one(tmp_path: Path):
+    path = tmp_path / "file"
+    children = [subprocess.Popen([sys.executable, "-c", WRITERS, str(path)]) for _ in range(2)]
+    failures: list[BaseException] = []
+
+    def write(letter: int) -> None:
+        try:
+            for _ in range(100):
+                write_bytes(path, bytes([letter]) * 100_000)
+                assert is_whole(path.read_bytes())
+        except BaseException as error:
+            failures.append(error)
+
+    threads = [threading.Thread(target=write, args=(letter,)) for letter in (200, 201)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert [child.wait() for child in children] == [0, 0]
+    assert failures == []
+    assert is_whole(path.read_bytes())
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def begun(path: Path) -> tuple[subprocess.Popen[str], Path]:
+    """A process in the middle of writing, and what it writes to."""
+    child = subprocess.Popen([sys.executable, "-c", WRITER, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert child.stdout is not None
+    return child, path.parent / child.stdout.readline().strip()
+
+
+def test_what_a_killed_writer_left_is_removed_and_what_a_living_one_writes_is_not(tmp_path: Path):
+    path = tmp_path / "map.topo"
+    (killed, left), (living, held) = begun(path), begun(path)
+    left.with_name(left.name + "-journal").write_bytes(b"of SQLite")
+    other = tmp_path / ".other.topo.0123456789abcdef.part"
+    other.write_bytes(b"of another output")
+    os.kill(killed.pid, signal.SIGKILL)
+    killed.wait()
+    assert left.is_file()
+    write_bytes(path, b"new")
+    assert sorted(tmp_path.iterdir()) == sorted([path, held, other])
+    living.communicate("\n")
+    assert path.read_bytes() == b"half"
+    assert sorted(tmp_path.iterdir()) == sorted([path, other])
+
+
+def test_leftovers_of_older_versions_go_too(tmp_path: Path):
+    (tmp_path / ".map.topo.1234.part").write_bytes(b"")
+    (tmp_path / ".map.topo.1234.part-journal").write_bytes(b"")
+    remove_leftovers(tmp_path / "map.topo")
+    assert list(tmp_path.iterdir()) == []
+
+
+def write_half(path: Path) -> None:
+    with replaced_file(path) as temporary:
+        temporary.write_bytes(b"half")
+        raise ValueError("stop")
+
+
+def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path):
+    path = tmp_path / "file"
+    write_bytes(path, b"old")
+    with pytest.raises(ValueError, match="stop"):
+        write_half(path)
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_places_that_cannot_be_written_are_errors_of_one_line(tmp_path: Path):
+    for path in (tmp_path / "missing" / "file", tmp_path / ("x" * 300), tmp_path):
+        with pytest.raises(TopolocError, match="cannot write") as caught:
+            write_bytes(path, b"")
+        assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_name_as_long_as_a_file_system_takes_can_be_written(tmp_path: Path):
+    write_bytes(tmp_path / ("x" * 250), b"data")
+    assert (tmp_path / ("x" * 250)).read_bytes() == b"data"
