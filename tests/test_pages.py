@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import importlib.util
 import os
 import re
@@ -14,6 +15,7 @@ import pytest
 
 import topoloc
 from topoloc.cli import all_commands
+from topoloc.cli.settings_file import TABLES, config_class, read_settings
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -80,9 +82,26 @@ def test_settings_that_the_pipeline_names_are_there(capsys: pytest.CaptureFixtur
             main([command, "--help"])
         helps += capsys.readouterr().out
     page = _read("pipeline.md")
-    settings = set(re.findall(r"(--[a-z][\w.-]*)", page))
-    assert len(settings) > 5
-    assert {setting for setting in settings if f"{setting} " not in helps} == set()
+    options = set(re.findall(r"(--[a-z][\w.-]*)", page))
+    assert len(options) > 3
+    assert {option for option in options if f"{option} " not in helps} == set()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_settings_of_files_that_a_page_names_are_there(page: Path, tmp_path: Path):
+    """Lines as `localize.num_candidates = 1`, keys as `train.vlad_nn.tuning.num_epochs`, and blocks of TOML."""
+    text, tables = page.read_text(encoding="utf-8"), "|".join(TABLES)
+    blocks = re.findall(r"^```toml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    blocks += re.findall(rf"`((?:{tables})\.[\w.]+ = [^`]+)`", text)
+    for block in blocks:
+        (tmp_path / "page.toml").write_text(block, encoding="utf-8")
+        read_settings(str(tmp_path / "page.toml"))
+    for key in re.findall(rf"`((?:{tables})(?:\.\w+)+)`", text):
+        table, *names = key.split(".")
+        if names[-1] != "py":
+            functools.reduce(getattr, names, config_class(table)())
+    if page.name == "pipeline.md":
+        assert len(blocks) >= 5
 
 
 def test_every_page_is_reached_from_the_index():

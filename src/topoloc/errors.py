@@ -11,6 +11,7 @@ TopolocError
 │   └── EmptyMapError         no node could be built, or the map holds none
 ├── WeightsError          weights of a network that are missing, damaged or of another network
 ├── TrainingError         a training that cannot begin or go on: nothing to learn from, a loss that is not finite
+├── ConfigError           a setting that is unknown, of the wrong type or out of its bounds; names the key
 ├── QueryError            the call of a query is wrong (no camera, camera of another image size)
 └── MissingExtraError     an optional dependency is not installed; names the extra
 """
@@ -58,6 +59,10 @@ class WeightsError(TopolocError):
 
 class TrainingError(TopolocError):
     """A training that cannot begin or go on."""
+
+
+class ConfigError(TopolocError):
+    """A setting that is unknown, of the wrong type or out of its bounds; the text names its key."""
 
 
 class QueryError(TopolocError):

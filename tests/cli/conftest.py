@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -34,3 +35,15 @@ def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def recording(tiny_recording: Path, tmp_path: Path) -> Path:
     """A copy of `tiny_recording`, to be broken."""
     return Path(shutil.copytree(tiny_recording, tmp_path / "recording"))
+
+
+@pytest.fixture
+def file_of(tmp_path: Path) -> Callable[[str | bytes], str]:
+    """Writes a TOML file and returns its path."""
+
+    def write(content: str | bytes) -> str:
+        path = tmp_path / "my.toml"
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
+        return str(path)
+
+    return write

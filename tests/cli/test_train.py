@@ -18,15 +18,12 @@ from topoloc.map.coarse_storage import list_coarse
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.backbones import Backbone
 
-SMALL = ("--config.cnn-nn.picture.width-px", "64", "--config.cnn-nn.picture.height-px", "48")
-ONE_EPOCH = (
-    "--config.cnn-fc.training.max-epochs",
-    "1",
-    "--config.cnn-fc.picture.width-px",
-    "64",
-    "--config.cnn-fc.picture.height-px",
-    "48",
-)
+SETTINGS = """
+[train]
+cnn_nn.picture = {width_px = 64, height_px = 48}
+cnn_fc.picture = {width_px = 64, height_px = 48}
+cnn_fc.training.max_epochs = 1
+"""
 
 
 @pytest.fixture(scope="session")
@@ -38,14 +35,24 @@ def weights_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
+def small(tmp_path: Path) -> tuple[str, ...]:
+    """Small pictures and one epoch."""
+    path = tmp_path / "small.toml"
+    path.write_text(SETTINGS)
+    return ("--config", str(path))
+
+
+@pytest.fixture
 def copied_map(room_map: Path, tmp_path: Path) -> Path:
     return Path(shutil.copy(room_map, tmp_path / "room.topo"))
 
 
-def test_a_map_learns_and_is_asked(copied_map: Path, queries: Path, weights_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_map_learns_and_is_asked(
+    copied_map: Path, small: tuple[str, ...], queries: Path, weights_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     before = TopoMetricMap.load(copied_map)
     facts = tmp_path / "facts.json"
-    assert main(["train", str(copied_map), "--coarse", "cnn-nn", "--weights", str(weights_file), *SMALL, "--json", str(facts)]) == 0
+    assert main(["train", str(copied_map), "--coarse", "cnn-nn", "--weights", str(weights_file), *small, "--json", str(facts)]) == 0
     written = json.loads(facts.read_text())
     assert written["weights"]["file"] == "squeezenet.pth"
     after = TopoMetricMap.load(copied_map)
@@ -62,30 +69,34 @@ def test_a_map_learns_and_is_asked(copied_map: Path, queries: Path, weights_file
     assert "surf-vlad (default)" in printed
 
 
-def test_the_default_changes_when_asked_to_and_the_map_can_stay_as_it_is(copied_map: Path, weights_file: Path, tmp_path: Path):
+def test_the_default_changes_when_asked_to_and_the_map_can_stay_as_it_is(
+    copied_map: Path, small: tuple[str, ...], weights_file: Path, tmp_path: Path
+):
     data, out = copied_map.read_bytes(), tmp_path / "new.topo"
-    options = ("--weights", str(weights_file), *SMALL, "--default", "--out", str(out))
+    options = ("--weights", str(weights_file), *small, "--default", "--out", str(out))
     assert main(["train", str(copied_map), "--coarse", "cnn-nn", *options]) == 0
     assert copied_map.read_bytes() == data
     assert TopoMetricMap.load(out).default_coarse == "cnn-nn"
     size = out.stat().st_size
-    assert main(["train", str(out), "--coarse", "cnn-nn", "--weights", str(weights_file), *SMALL]) == 0
+    assert main(["train", str(out), "--coarse", "cnn-nn", "--weights", str(weights_file), *small]) == 0
     assert abs(out.stat().st_size - size) < 20_000  # replaced, not added once more
     assert TopoMetricMap.load(out).default_coarse == "cnn-nn"
 
 
-def test_cnn_fc_needs_no_weights_and_says_what_that_costs(copied_map: Path, capsys: pytest.CaptureFixture[str]):
-    assert main(["train", str(copied_map), "--coarse", "cnn-fc", "--backbone", "compact", "--weights", "scratch", *ONE_EPOCH]) == 0
+def test_cnn_fc_needs_no_weights_and_says_what_that_costs(copied_map: Path, small: tuple[str, ...], capsys: pytest.CaptureFixture[str]):
+    assert main(["train", str(copied_map), "--coarse", "cnn-fc", "--backbone", "compact", "--weights", "scratch", *small]) == 0
     assert "knows these images alone" in capsys.readouterr().err
     (facts, _) = list_coarse(copied_map)
     assert facts["trained"]["epochs"] == 1
     assert facts["weights"] is None
 
 
-def test_build_can_train_at_once(tiny_recording: Path, tmp_path: Path, weights_file: Path):
+def test_build_can_train_at_once(tiny_recording: Path, small: tuple[str, ...], tmp_path: Path, weights_file: Path):
     path = tmp_path / "room.topo"
-    assert main(["build", f"{tiny_recording}@0:4", str(path), "--coarse", "cnn-nn", "--weights", str(weights_file)]) == 0
-    assert TopoMetricMap.load(path).default_coarse == "cnn-nn"
+    assert main(["build", f"{tiny_recording}@0:4", str(path), "--coarse", "cnn-nn", "--weights", str(weights_file), *small]) == 0
+    topomap = TopoMetricMap.load(path)
+    assert topomap.default_coarse == "cnn-nn"
+    assert topomap.coarse_models["cnn-nn"].settings["config"]["picture"] == {"width_px": 64, "height_px": 48}
 
 
 def test_known_failures_are_one_line(copied_map: Path, weights_file: Path, queries: Path, complaint: Callable[..., str]):

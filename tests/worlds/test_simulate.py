@@ -54,26 +54,26 @@ def test_it_writes_a_recording_and_says_so(tmp_path: Path, capsys: pytest.Captur
 
 @pytest.mark.usefixtures("no_rendering")
 def test_settings_reach_the_recording(tmp_path: Path):
-    words = "--num-frames 2 --condition clear --seed 3 --take 4 --arrangement 5 --lateral 0.1 --reverse --look 90 --wobble 0.5 --shake 2"
-    words += " --start 1 --spacing 0.3 --speed 0.6 --laps 0.5 --mono --depth --grey --motion-blur --lens-drops 2 --focal-scale 1.5 --draft"
+    words = "--num-frames 2 --condition clear --seed 3 --take 4 --arrangement 5 --lateral 0.1 --reverse --look 90 --sway hand"
+    words += " --start 1 --spacing 0.3 --laps 0.5 --mono --depth --grey --motion-blur --draft"
     assert simulate("lab", tmp_path / "a", *words.split(), "--camera", "40,40,23.5,15.5") == 0
     settings = json.loads((tmp_path / "a" / "world.json").read_text())
-    assert [settings[name] for name in ("condition", "seed", "arrangement", "grey", "depth", "lens_drops")] == ["day", 3, 5, True, True, 2]
+    assert [settings[name] for name in ("condition", "seed", "arrangement", "grey", "depth")] == ["day", 3, 5, True, True]
     assert settings["baseline"] is None
     assert settings["num_renderings"] > 1
-    assert settings["camera"]["fx"] == 60.0
+    assert settings["camera"]["fx"] == 40.0
     route = RouteConfig(**settings["route"])
-    assert (route.seed, route.lateral, route.reverse, route.wobble, route.shake) == (4, 0.1, True, 0.5, 2.0)
-    assert (route.start, route.spacing, route.speed, route.laps) == (1.0, 0.3, 0.6, 0.5)
+    assert (route.seed, route.lateral, route.reverse, route.wobble, route.shake) == (4, 0.1, True, 1.0, 1.0)
+    assert (route.start, route.spacing, route.laps) == (1.0, 0.3, 0.5)
     assert route.look == pytest.approx(np.pi / 2)
     assert open_sequence(tmp_path / "a")[0].depth is not None
 
 
 @pytest.mark.usefixtures("no_rendering")
-def test_a_camera_file_and_a_length(tmp_path: Path):
+def test_a_camera_file_and_a_part_of_a_lap(tmp_path: Path):
     camera = tmp_path / "camera.json"
     camera.write_text('{"model": "PINHOLE", "width": 48, "height": 32, "fx": 41, "fy": 41, "cx": 23, "cy": 15}')
-    assert simulate("corridor", tmp_path / "a", "--camera", camera, "--length", 0.9, "--wobble", 0) == 0
+    assert simulate("corridor", tmp_path / "a", "--camera", camera, "--laps", 0.0125, "--sway", "none") == 0
     sequence = open_sequence(tmp_path / "a")
     assert sequence[0].camera is not None
     assert sequence[0].camera.fx == 41
@@ -110,9 +110,7 @@ def test_unknown_worlds_and_conditions_get_the_list(complaint: Complaint, tmp_pa
 def test_bad_settings_are_named_before_anything_is_written(complaint: Complaint, tmp_path: Path):
     out = tmp_path / "a"
     assert "--size" in complaint("simulate", "lab", out, "--size", "40", status=2)
-    assert "--laps and --length" in complaint("simulate", "lab", out, "--laps", 2, "--length", 3, status=2)
     assert "--baseline" in complaint("simulate", "lab", out, "--mono", "--baseline", 0.1, status=2)
-    assert "--focal-scale" in complaint("simulate", "lab", out, "--focal-scale", 0, status=2)
     assert "four numbers" in complaint("simulate", "lab", out, "--camera", "1,2,3")
     assert "no such camera file" in complaint("simulate", "lab", out, "--camera", tmp_path / "none.json")
     assert "spacing" in complaint("simulate", "lab", out, "--spacing", -1)

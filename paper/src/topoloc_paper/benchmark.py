@@ -9,6 +9,7 @@ from typing import Annotated
 
 import tyro
 
+from topoloc.cli.options import File, Flag
 from topoloc.cli.output import UsageError, check_outputs, interruptible, progress_bar, write_json
 from topoloc.errors import TopolocError
 from topoloc.sequences.atomic import write_text
@@ -30,11 +31,11 @@ class Command:
     """paper: everything; or a part: conditions, nodes, speed, peers, recordings (real ones)."""
     out: Annotated[str, tyro.conf.arg(metavar="DIR")] = "topoloc-paper"
     """Where recordings, maps, finished stages, results and report.html lie. The same command goes on from what is there."""
-    quick: tyro.conf.FlagCreatePairsOff[bool] = False
+    quick: Flag = False
     """A small run on the lab that topoloc brings along: nothing is rendered, networks are trained for a few epochs."""
-    draft: tyro.conf.FlagCreatePairsOff[bool] = False
+    draft: Flag = False
     """Recordings of the renderer's draft quality."""
-    at_hand: tyro.conf.FlagCreatePairsOff[bool] = False
+    at_hand: Flag = False
     """Take the recordings that are complete and leave out the others, instead of rendering them."""
     worlds: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...", help_behavior_hint="")] = _WORLDS
     """The rendered places: lab, corridor, street, or some of them."""
@@ -42,9 +43,9 @@ class Command:
     """The folder of real recordings (seven_scenes, zed_lab, kitti); without one they are left out."""
     weights: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: none, from scratch)")] = None
     """SqueezeNet 1.1 trained on ImageNet, for PoseNet and for the learned coarse localizers."""
-    vgg11: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    vgg11: File = None
     """VGG-11 trained on ImageNet: cnn-fc then stands on it, as in the paper."""
-    vgg16: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    vgg16: File = None
     """VGG-16 trained on ImageNet, or a NetVLAD checkpoint: cnn-nn and vlad-nn then stand on it, as in the paper."""
     epochs: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: 40, quick 8)")] = None
     """Times that cnn-fc sees each image, at most."""
@@ -52,7 +53,7 @@ class Command:
     """The same for PoseNet."""
     json: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: DIR/results.json)")] = None
     """Write all the numbers as JSON to this file, too (- for standard output)."""
-    readme: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    readme: File = None
     """Write the table of results into this file, between its markers."""
 
     def run(self) -> int:

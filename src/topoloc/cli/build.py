@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
 from topoloc.cli.info import describe_map
+from topoloc.cli.options import File, Format
 from topoloc.cli.output import UsageError, check_outputs, progress_bar, write_json
+from topoloc.cli.settings_file import read_settings, with_option
 from topoloc.errors import RecordingError
 from topoloc.localization.building import build_map
 from topoloc.map.build import BuildConfig, Progress
-from topoloc.map.coarse_training import train_coarse
+from topoloc.map.coarse_training import CoarseTrainingConfig, train_coarse
 from topoloc.places.classifier_config import BackboneName
 from topoloc.places.coarse import CoarseName
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import open_sequence
 from topoloc.sequences.recording import SequenceView
 from topoloc.sequences.trajectory import with_trajectory
+from topoloc.slam.slam import SlamConfig, run_slam
 
 
 @dataclass(frozen=True)
@@ -34,37 +37,41 @@ class Command:
         tyro.conf.UseAppendAction[tuple[str, ...]],
         tyro.conf.arg(metavar="truth|slam|FILE", help_behavior_hint="(default: truth where there is one, else slam)"),
     ] = ()
-    """Where poses come from: `truth` (the recording's own), `slam`, or a TUM or KITTI trajectory file; for all, or once for each."""
-    format: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: recognised)")] = None
+    """Where poses come from: `truth` (the recording's own), `slam`, or a TUM or KITTI file; given once for all, or once for each."""
+    format: Format = None
     """The recordings' format: kitti, euroc, tum, seven_scenes or folder."""
-    d_thresh: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="(default: from the scene's median depth)")] = None
-    """D_thresh of Eq. 1, metres between nodes."""
+    d_thresh: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="(default: by what is seen)")] = None
+    """Metres between nodes (D_thresh of the paper's Eq. 1)."""
     lambda_rot: Annotated[
-        float | None, tyro.conf.arg(name="lambda", metavar="M/RAD", help_behavior_hint="(default: from an angle that alone makes a node)")
+        float | None, tyro.conf.arg(name="lambda", metavar="M/RAD", help_behavior_hint="(default: 2 degrees make a node)")
     ] = None
-    """lambda of Eq. 1, metres a radian."""
+    """How much turning counts beside metres (lambda of Eq. 1)."""
     coarse: CoarseName = "surf-vlad"
-    """The coarse localizer that answers; another than surf-vlad is trained once the map is built, as `topoloc train` does."""
+    """The coarse localizer that answers; all but surf-vlad are trained once the map is built, as by `topoloc train`."""
     backbone: BackboneName = "squeezenet1_1"
     """The network that a learned coarse localizer stands on."""
     weights: Annotated[str | None, tyro.conf.arg(metavar="FILE|scratch", help_behavior_hint="(default: the published)")] = None
-    """The network's weights: a PyTorch file of torchvision's or NetVLAD's layout, or `scratch` for random ones."""
+    """Weights of that network: a PyTorch file of torchvision's or NetVLAD's layout, or `scratch` for random ones."""
     features: Annotated[Literal["surf", "sift"] | None, tyro.conf.arg(metavar="surf|sift", help_behavior_hint="(default: surf)")] = None
     """Local features of the map, and of every query to it."""
-    json: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    json: File = None
     """Write what `topoloc info` says of the new map to this file (- for standard output)."""
-    config: BuildConfig = field(default_factory=BuildConfig)
+    config: File = None
+    """All other settings: a TOML file, as `topoloc config build` prints it."""
 
     def run(self) -> int:
         recordings, target = self._split_paths()
-        check_outputs([str(target), self.json], inputs=[path for path in self.trajectory if path not in ("truth", "slam")])
+        read = [path for path in (*self.trajectory, self.config) if path not in ("truth", "slam", None)]
+        check_outputs([str(target), self.json], inputs=read)
+        settings = read_settings(self.config)
+        config = self._with_options(settings.of(BuildConfig))
         sequences, poses_from = self._open(recordings)
         with progress_bar() as progress:
             if poses_from == "slam":
-                sequences = _with_slam(sequences, progress)
-            topomap = build_map(sequences, self._config(), progress)
+                sequences = _with_slam(sequences, settings.of(SlamConfig), progress)
+            topomap = build_map(sequences, config, progress)
             if self.coarse != "surf-vlad":
-                model = train_coarse(topomap, self.coarse, self.backbone, self.weights, progress=progress)
+                model = train_coarse(topomap, self.coarse, self.backbone, self.weights, settings.of(CoarseTrainingConfig), progress)
                 topomap = replace(topomap, coarse_models={**topomap.coarse_models, model.name: model}, default_coarse=model.name)
         topomap.save(target)
         info = describe_map(topomap, target)
@@ -86,16 +93,10 @@ class Command:
             raise UsageError(f"the last argument is the map file to write, but {last} is a file of another kind; was MAP forgotten?")
         return recordings, target
 
-    def _config(self) -> BuildConfig:
-        """The short settings where they are given, else those of --config."""
-        nodes, features = self.config.nodes, self.config.features
-        if self.d_thresh is not None:
-            nodes = replace(nodes, d_thresh=self.d_thresh)
-        if self.lambda_rot is not None:
-            nodes = replace(nodes, lambda_rot=self.lambda_rot)
-        if self.features is not None:
-            features = replace(features, kind=self.features)
-        return replace(self.config, nodes=nodes, features=features)
+    def _with_options(self, config: BuildConfig) -> BuildConfig:
+        config = with_option(config, "nodes.d_thresh", self.d_thresh, "--d-thresh")
+        config = with_option(config, "nodes.lambda_rot", self.lambda_rot, "--lambda")
+        return with_option(config, "features.kind", self.features, "--features")
 
     def _open(self, recordings: list[str]) -> tuple[list[StereoSequence], str]:
         """The recordings with their poses, and where these come from; with `slam` they are still to be found."""
@@ -114,15 +115,13 @@ class Command:
         return posed, " and ".join(sorted(set(trajectories)))
 
 
-def _with_slam(sequences: list[StereoSequence], progress: Progress) -> list[StereoSequence]:
+def _with_slam(sequences: list[StereoSequence], config: SlamConfig, progress: Progress) -> list[StereoSequence]:
     """The recordings with the poses that SLAM finds.
 
     Raises:
         RecordingError: one of them shares no place with the others.
     """
-    from topoloc.slam.slam import run_slam
-
-    result = run_slam(sequences, progress=progress)
+    result = run_slam(sequences, config, progress)
     for sequence, poses in zip(sequences, result.poses, strict=True):
         if not any(poses):
             raise RecordingError(f"{sequence.name}: no place of it was recognised in {sequences[0].name}; map it alone")

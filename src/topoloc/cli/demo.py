@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import tyro
 
 from topoloc.cli.info import describe_map
+from topoloc.cli.options import File
 from topoloc.cli.output import UsageError, check_outputs, progress_bar, report_writer, write_json
 from topoloc.cli.recordings_table import print_recordings
 from topoloc.demo.recordings import ROLES, SHIPPED, Role, missing_recordings
@@ -40,7 +41,7 @@ class Command:
     """Where map, results, trajectories and report.html are written."""
     recordings: Annotated[str | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="(default: those that topoloc brings along)")] = None
     """Take the recordings from here, as `topoloc simulate demo` renders them."""
-    json: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    json: File = None
     """Write the evaluation as JSON to this file (- for standard output)."""
 
     def run(self) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,8 +12,10 @@ import numpy as np
 import tyro
 
 from topoloc.cli.info import describe_map
+from topoloc.cli.options import File, Format
 from topoloc.cli.output import UsageError, check_outputs, print_facts, progress_bar, report_writer, write_json
 from topoloc.cli.recordings_table import print_recordings
+from topoloc.cli.settings_file import read_settings, with_option
 from topoloc.errors import TrajectoryError
 from topoloc.evaluation.experiments import answer_elsewhere, answer_queries
 from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION, Answer, summarize
@@ -36,29 +38,31 @@ class Command:
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="SEQ", help_behavior_hint="(may be given several times)")
     ] = ()
     """A recording of another place: every pose given for one of its images counts as a false accept."""
-    map_from_truth: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    map_from_truth: File = None
     """A JSON file with the 4x4 matrix (metres) that takes the world of the recordings' truth into the map's, where they differ."""
     coarse: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")] = None
-    """Which of the map's coarse localizers is asked; `topoloc info` names them."""
-    format: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: recognised)")] = None
+    """Coarse localizer that is asked; `topoloc info` names those of the map."""
+    format: Format = None
     """The recordings' format: kitti, euroc, tum, seven_scenes or folder."""
-    json: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    json: File = None
     """Write the evaluation as JSON to this file (- for standard output)."""
-    report: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
-    """Write a page with the table, the top-down map, the error curves and the worst queries to this file (report.html)."""
-    config: LocalizerConfig = field(default_factory=LocalizerConfig)
+    report: File = None
+    """Write a page with the table, the map from above, the error curves and the worst queries to this file (report.html)."""
+    config: File = None
+    """All other settings: a TOML file, as `topoloc config evaluate` prints it."""
 
     def run(self) -> int:
         if not self.sequences and not self.elsewhere:
             raise UsageError("evaluate takes a map and at least one recording, with truth or --elsewhere")
-        check_outputs([self.json, self.report], inputs=[self.map, *([self.map_from_truth] if self.map_from_truth else [])])
+        check_outputs([self.json, self.report], inputs=[path for path in (self.map, self.map_from_truth, self.config) if path])
+        config = with_option(read_settings(self.config).of(LocalizerConfig), "coarse", self.coarse, "--coarse")
         write_report = report_writer() if self.report else None
         topomap = TopoMetricMap.load(self.map)
         info = describe_map(topomap, Path(self.map))
         map_from_truth = _read_rigid(Path(self.map_from_truth)) if self.map_from_truth else None
         sequences = [open_sequence(path, self.format) for path in self.sequences]
         others = [open_sequence(path, self.format) for path in self.elsewhere]
-        localizer = Localizer(topomap, replace(self.config, coarse=self.coarse or self.config.coarse))
+        localizer = Localizer(topomap, config)
         labels = _labels([*self.sequences, *self.elsewhere], [*sequences, *others])
         answers: list[Answer] = []
         with progress_bar() as progress:

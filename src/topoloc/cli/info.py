@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from topoloc.cli.options import File
 from topoloc.cli.output import check_outputs, print_facts, write_json
 from topoloc.errors import EmptyMapError
 
@@ -18,7 +19,7 @@ class Command:
 
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP")]
     """The map file."""
-    json: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    json: File = None
     """Write the same as JSON to this file (- for standard output)."""
 
     def run(self) -> int:

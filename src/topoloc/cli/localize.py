@@ -11,8 +11,10 @@ from typing import Annotated
 
 import tyro
 
+from topoloc.cli.options import File, Flag, Format
 from topoloc.cli.output import UsageError, check_outputs, interruptible, progress_bar, write_text
 from topoloc.cli.query_answers import QueryAnswer, answer_line, exit_status, stream_summary, trajectory_of
+from topoloc.cli.settings_file import read_settings, with_option
 from topoloc.errors import CalibrationError, QueryError, TopolocError, UnreadableImageError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
@@ -42,6 +44,22 @@ class _Query:
 
 
 @dataclass(frozen=True)
+class StreamOptions:
+    """Videos and recordings are streams: each picture helps with the next."""
+
+    stream: Flag = False
+    """Take folders of pictures for streams, too."""
+    single: Flag = False
+    """Localize each picture alone, those of videos and recordings, too."""
+    smoothed: Flag = False
+    """--tum takes the smoothed poses instead of the raw ones."""
+    odometry: File = None
+    """Poses of the stream by external odometry, TUM format, in any world: they predict where the next picture was taken."""
+    max_jump: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="")] = None
+    """The paper's rule instead of the motion model: a pose further than this from the one before is refused, and that one copied."""
+
+
+@dataclass(frozen=True)
 class Command:
     """What `topoloc localize` takes."""
 
@@ -52,44 +70,37 @@ class Command:
     camera: Annotated[
         str | None, tyro.conf.arg(metavar="FILE|fx,fy,cx,cy|map|unknown", help_behavior_hint="(default: that of the recording)")
     ] = None
-    """The queries' calibration: a camera.json, `fx,fy,cx,cy` in pixels, `map` for the camera that the map was made with, or `unknown`:
-    the focal length is then found with the pose, as it is for single pictures without any calibration."""
-    format: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: recognised)")] = None
+    """Calibration of the queries: a camera.json, `fx,fy,cx,cy` in pixels, `map` for that of the map, `unknown` to find the focal length."""
+    format: Format = None
     """The recordings' format: kitti, euroc, tum, seven_scenes, video or folder."""
     coarse: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")] = None
-    """Which of the map's coarse localizers is asked; `topoloc info` names them."""
-    json: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    """Coarse localizer that is asked; `topoloc info` names those of the map."""
+    json: File = None
     """Write one JSON line a query to this file (- for standard output)."""
-    tum: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
-    """Write the poses found to this file, TUM format, world_from_cam. Single photos have no times: t is then the query's number."""
-    smoothed: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Of streams, --tum takes the smoothed poses instead of the raw ones."""
-    stream: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Take every input for a stream, folders of pictures, too."""
-    single: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Localize each picture alone, those of recordings and videos, too."""
-    odometry: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
-    """A stream's poses by external odometry, TUM format, in any world of its own: used to predict where the next picture was taken."""
-    max_jump: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="")] = None
-    """The paper's rule for streams, not the motion model: a pose further than this from the one before is refused, which is copied."""
-    tracker: Annotated[TrackerConfig, tyro.conf.arg(name="config.tracker")] = field(default_factory=TrackerConfig)
-    config: LocalizerConfig = field(default_factory=LocalizerConfig)
+    tum: File = None
+    """Write the poses found to this file: TUM format, world_from_cam. Single photos have no times: t is then the query's number."""
+    streams: Annotated[tyro.conf.OmitArgPrefixes[StreamOptions], tyro.conf.arg(name="stream")] = field(default_factory=StreamOptions)
+    config: File = None
+    """All other settings: a TOML file, as `topoloc config localize` prints it."""
 
     def run(self) -> int:
         if not self.inputs:
             raise UsageError("localize takes a map and at least one image, folder or recording")
         self._check_usage()
-        check_outputs([self.json, self.tum], inputs=[self.map, *self.inputs, *([self.odometry] if self.odometry else [])])
+        check_outputs([self.json, self.tum], inputs=[path for path in (self.map, *self.inputs, self.streams.odometry, self.config) if path])
+        settings = read_settings(self.config)
+        config = with_option(settings.of(LocalizerConfig), "coarse", self.coarse, "--coarse")
+        tracking = self._tracking(settings.of(TrackerConfig))
         topomap = TopoMetricMap.load(self.map)
         camera = None if self.camera is None else _camera_of_size(self.camera, topomap)
         queries = [self._open(path) for path in self.inputs]
-        localizer = Localizer(topomap, replace(self.config, coarse=self.coarse or self.config.coarse))
+        localizer = Localizer(topomap, config)
         answers: list[QueryAnswer] = []
         total = sum(len(query.sequence) for query in queries)
         start = time.perf_counter()
         try:
             with interruptible(), progress_bar() as progress:
-                for answer in self._answers(localizer, queries, camera):
+                for answer in _answers(localizer, tracking, queries, camera):
                     answers.append(answer)
                     as_json = self.json == "-"
                     print(json.dumps(answer.to_json()) if as_json else answer_line(answer), flush=True)
@@ -106,38 +117,26 @@ class Command:
         return exit_status(answers)
 
     def _check_usage(self) -> None:
-        if self.stream and self.single:
+        if self.streams.stream and self.streams.single:
             raise UsageError("--stream and --single cannot both be meant")
-        if self.odometry is not None and len(self.inputs) > 1:
+        if self.streams.odometry is not None and len(self.inputs) > 1:
             raise UsageError("--odometry is that of one stream: give one input with it")
-        if self.max_jump is not None and not self.max_jump > 0:
-            raise UsageError(f"--max-jump is a length in metres, not {self.max_jump:g}")
 
     def _open(self, path: str) -> _Query:
         """Recordings and videos are streams; pictures, and folders of them, are single unless they are said not to be."""
-        is_stream = self.stream or (not self.single and find_format(path, self.format) != "folder")
+        is_stream = self.streams.stream or (not self.streams.single and find_format(path, self.format) != "folder")
         sequence = single_pictures(open_sequence(path, self.format))
         is_stream = is_stream and len(sequence) > 1
         odometry = None
-        if self.odometry is not None:
+        if self.streams.odometry is not None:
             if not is_stream:
                 raise UsageError(f"--odometry is for streams, and {path} is none; --stream makes it one")
-            odometry = frame_poses(read_trajectory(Path(self.odometry)), sequence.t_ns, Path(self.odometry))
+            odometry = frame_poses(read_trajectory(Path(self.streams.odometry)), sequence.t_ns, Path(self.streams.odometry))
         return _Query(path, sequence, is_stream, odometry or [None] * len(sequence))
 
-    def _answers(self, localizer: Localizer, queries: list[_Query], camera_of_size: CameraOfSize | None) -> Iterator[QueryAnswer]:
-        for query in queries:
-            tracker = self._tracker(localizer) if query.is_stream else None
-            for i, frame_name in enumerate(query.sequence.names):
-                name = frame_name if len(queries) == 1 else query.path if len(query.sequence) == 1 else f"{query.path}/{frame_name}"
-                try:
-                    yield _answer(name, query, i, localizer, tracker, camera_of_size)
-                except (QueryError, CalibrationError) as error:
-                    raise type(error)(f"{name}: {error}") from error
-
-    def _tracker(self, localizer: Localizer) -> Tracker:
-        config = self.tracker
-        return Tracker(localizer, config if self.max_jump is None else replace(config, mode="paper", max_jump=self.max_jump))
+    def _tracking(self, config: TrackerConfig) -> TrackerConfig:
+        config = with_option(config, "max_jump", self.streams.max_jump, "--max-jump")
+        return config if self.streams.max_jump is None else replace(config, mode="paper")
 
     def _write_files(self, answers: list[QueryAnswer]) -> list[str]:
         """The paths written."""
@@ -146,9 +145,22 @@ class Command:
             write_text(Path(self.json), "".join(json.dumps(a.to_json()) + "\n" for a in answers))
             files.append(self.json)
         if self.tum is not None:
-            write_tum(Path(self.tum), trajectory_of(answers, self.smoothed))
+            write_tum(Path(self.tum), trajectory_of(answers, self.streams.smoothed))
             files.append(self.tum)
         return files
+
+
+def _answers(
+    localizer: Localizer, tracking: TrackerConfig, queries: list[_Query], camera_of_size: CameraOfSize | None
+) -> Iterator[QueryAnswer]:
+    for query in queries:
+        tracker = Tracker(localizer, tracking) if query.is_stream else None
+        for i, frame_name in enumerate(query.sequence.names):
+            name = frame_name if len(queries) == 1 else query.path if len(query.sequence) == 1 else f"{query.path}/{frame_name}"
+            try:
+                yield _answer(name, query, i, localizer, tracker, camera_of_size)
+            except (QueryError, CalibrationError) as error:
+                raise type(error)(f"{name}: {error}") from error
 
 
 def _answer(

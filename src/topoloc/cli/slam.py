@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import tyro
 
+from topoloc.cli.options import File, Format
 from topoloc.cli.output import check_outputs, print_facts, progress_bar, write_json
+from topoloc.cli.settings_file import read_settings
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.trajectory_error import absolute_trajectory_errors, relative_drift
 from topoloc.sequences.frame import StereoSequence
@@ -28,18 +30,20 @@ class Command:
     """A stereo or RGB-D recording. PATH@0::2 takes every second frame of PATH."""
     out: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="OUT.tum")]
     """The trajectory to write: t tx ty tz qx qy qz qw, world_from_cam; the world is the camera of the first frame."""
-    format: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: recognised)")] = None
+    format: Format = None
     """The recording's format: kitti, euroc, tum, seven_scenes or folder."""
-    json: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    json: File = None
     """Write what is printed to this file, too (- for standard output)."""
-    config: SlamConfig = field(default_factory=SlamConfig)
+    config: File = None
+    """All other settings: a TOML file, as `topoloc config slam` prints it."""
 
     def run(self) -> int:
-        check_outputs([self.out, self.json], inputs=[])
+        check_outputs([self.out, self.json], inputs=[self.config] if self.config else [])
+        config = read_settings(self.config).of(SlamConfig)
         sequence = open_sequence(self.sequence, self.format)
         start = time.perf_counter()
         with progress_bar() as progress:
-            result = run_slam(sequence, self.config, progress)
+            result = run_slam(sequence, config, progress)
         seconds = time.perf_counter() - start
         known = [(t_ns, pose) for t_ns, pose in zip(sequence.t_ns, result.poses[0], strict=True) if pose is not None]
         write_tum(Path(self.out), Trajectory([pose for _, pose in known], [t_ns for t_ns, _ in known]))

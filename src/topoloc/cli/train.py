@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
+from topoloc.cli.options import File, Flag
 from topoloc.cli.output import UsageError, check_outputs, progress_bar, write_json
+from topoloc.cli.settings_file import read_settings
 from topoloc.map.coarse_storage import list_coarse, store_coarse
 from topoloc.map.coarse_training import CoarseTrainingConfig, train_coarse
 from topoloc.map.topomap import TopoMetricMap
@@ -30,26 +32,28 @@ class Command:
     """The network it stands on."""
     weights: Annotated[str | None, tyro.conf.arg(metavar="FILE|scratch", help_behavior_hint="(default: the published)")] = None
     """The network's weights: a PyTorch file of torchvision's or NetVLAD's layout, or `scratch` for random ones."""
-    default: bool = False
+    default: Flag = False
     """From now on it answers where --coarse is not given."""
     out: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: MAP itself)")] = None
     """Write the map with the new coarse localizer to this file and leave MAP as it is."""
-    checkpoint: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    checkpoint: File = None
     """cnn-fc: write the state of the training to this file after each epoch, and go on from it if it is there already."""
-    json: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    json: File = None
     """Write what was trained to this file (- for standard output)."""
-    config: CoarseTrainingConfig = field(default_factory=CoarseTrainingConfig)
+    config: File = None
+    """All other settings: a TOML file, as `topoloc config train` prints it."""
 
     def run(self) -> int:
         target = Path(self.out or self.map)
         if self.checkpoint is not None and self.coarse != "cnn-fc":
             raise UsageError("--checkpoint is for cnn-fc; the others are done in one go")
-        check_outputs([str(target), self.json, self.checkpoint], inputs=[] if self.weights is None else [self.weights])
+        check_outputs([str(target), self.json, self.checkpoint], inputs=[path for path in (self.weights, self.config) if path is not None])
+        config = read_settings(self.config).of(CoarseTrainingConfig)
         checkpoint = None if self.checkpoint is None else Path(self.checkpoint)
         start = time.perf_counter()
         with progress_bar() as progress:
             topomap = TopoMetricMap.load(self.map)
-            model = train_coarse(topomap, self.coarse, self.backbone, self.weights, self.config, progress, checkpoint)
+            model = train_coarse(topomap, self.coarse, self.backbone, self.weights, config, progress, checkpoint)
         store_coarse(Path(self.map), target, model, self.default)
         (facts,) = [facts for facts in list_coarse(target) if facts["name"] == self.coarse]
         facts |= {"seconds": round(time.perf_counter() - start, 1), "default": self.default}

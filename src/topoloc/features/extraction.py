@@ -6,11 +6,12 @@ Maps and the queries put to them must be made with the same `FeatureConfig`: a m
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import UInt8
 
+from topoloc.bounds import AtLeast, Between
 from topoloc.features.features import Features
 from topoloc.features.patch_normalization import PatchNormalizationConfig, patch_normalize
 from topoloc.features.sift import SiftConfig, extract_sift
@@ -26,19 +27,20 @@ NORMALIZATIONS: dict[str, PatchNormalizationConfig | None] = {
 
 @dataclass(frozen=True)
 class FeatureConfig:
-    """Which features an image gives. Plain values only: it is stored in the map and built again from them.
-
-    normalization: `none`; `paper`, 17x17 windows and no noise floor; `wide`, 65x65 windows and a floor of 24 grey levels,
-    which keeps what the paper's form gains when the light changes and loses little where it does not.
-    max_features: the strongest are kept. The detector's own threshold is low on purpose: a fixed one is a threshold on
-    contrast, and finds next to nothing in a dark picture.
-    """
+    """Which features an image gives. Plain values only: it is stored in the map and built again from them."""
 
     kind: Literal["surf", "sift"] = "surf"
+    """Local features of the map, and of every query to it."""
     normalization: Literal["none", "paper", "wide"] = "wide"
-    max_features: int = 1000
-    hessian_threshold: float = 20.0
-    contrast_threshold: float = 0.01
+    """`paper`: 17x17 windows and no noise floor. `wide`: 65x65 windows and a floor of 24 grey levels, which keeps what the paper's form
+    gains when the light changes and loses little where it does not."""
+    max_features: Annotated[int, Between(1, 100_000)] = 1000
+    """The strongest are kept."""
+    hessian_threshold: Annotated[float, AtLeast(0)] = 20.0
+    """Of SURF, for images of 0..255. Low on purpose: a fixed one is a threshold on contrast, and finds next to nothing in a dark
+    picture."""
+    contrast_threshold: Annotated[float, AtLeast(0)] = 0.01
+    """The same of SIFT, as OpenCV's."""
 
 
 def extract_features(image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None = None) -> Features:

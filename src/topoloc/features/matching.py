@@ -7,12 +7,13 @@ matching", section III-B). Descriptors must have unit length, so that distance^2
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
+from topoloc.bounds import Between
 from topoloc.features.bands import run_in_bands
 from topoloc.features.features import Matches
 from topoloc.features.matching_kernels import GROUP, ROWS, TILE, multiply, reject_rivalled
@@ -26,16 +27,18 @@ _NO_RADII = np.zeros(0, np.float32)
 
 @dataclass(frozen=True)
 class MatchingConfig:
-    """How to match. ratio: a match must be nearer than `ratio` times its nearest rival; 0 accepts every nearest neighbour.
-
-    mutual: the train feature's nearest query feature must be this one. trees and checks are FLANN's: KD-trees built, leaves visited.
-    """
+    """How to match."""
 
     method: Literal["exact", "flann"] = "exact"
-    ratio: float = 0.8
+    """Every descriptor compared with every other, or FLANN's KD-trees."""
+    ratio: Annotated[float, Between(0, 1)] = 0.8
+    """A match must be nearer than `ratio` times its nearest rival; 0 accepts every nearest neighbour."""
     mutual: bool = True
-    trees: int = 5
-    checks: int = 50
+    """The train feature's nearest query feature must be this one."""
+    trees: Annotated[int, Between(1, 64)] = 5
+    """Of FLANN: KD-trees built."""
+    checks: Annotated[int, Between(1, 1_000_000)] = 50
+    """Of FLANN: leaves visited."""
 
 
 def match_features(

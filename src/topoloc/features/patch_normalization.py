@@ -7,30 +7,31 @@ makes the features outlive a change of lighting (Zhang and Kleeman, 2009).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from topoloc.bounds import Above, AtLeast, Between
 from topoloc.features.bands import run_in_bands
 from topoloc.features.patch_normalization_kernels import normalize_band
 
 
 @dataclass(frozen=True)
 class PatchNormalizationConfig:
-    """How to normalise; `PatchNormalizationConfig.paper()` is the paper's own form.
+    """How to normalise; `PatchNormalizationConfig.paper()` is the paper's own form."""
 
-    window_px: side of the window, odd. epsilon: grey levels added to sigma; tiny as in the paper it only prevents the
-    division by zero, a few grey levels keep plain surfaces from becoming amplified sensor noise. shape: `square` weighs all
-    pixels of the window alike, `round` is the box of half the width applied twice, a pyramid-like bell of the same support
-    without the axis-parallel ringing. gain: grey levels of the result a unit of N, which is mapped to 128 + gain N and clipped.
-    """
-
-    window_px: int = 17
-    epsilon: float = 1e-3
+    window_px: Annotated[int, Between(3, 127)] = 17
+    """Side of the window, odd."""
+    epsilon: Annotated[float, AtLeast(0)] = 1e-3
+    """Grey levels added to sigma: tiny as in the paper it only prevents the division by zero, a few grey levels keep plain surfaces
+    from becoming amplified sensor noise."""
     shape: Literal["square", "round"] = "square"
-    gain: float = 40.0
+    """`square` weighs all pixels of the window alike, `round` is the box of half the width applied twice, a pyramid-like bell of the
+    same support without the axis-parallel ringing."""
+    gain: Annotated[float, Above(0)] = 40.0
+    """Grey levels of the result a unit of N, which is mapped to 128 + gain N and clipped."""
 
     def __post_init__(self) -> None:
         largest = 127 if self.shape == "square" else 37  # sums of squares stay within 32 bits

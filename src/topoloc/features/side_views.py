@@ -10,11 +10,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Annotated
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
+from topoloc.bounds import Between
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
@@ -24,15 +26,15 @@ from topoloc.geometry.rigid import Rigid3
 class SideViewConfig:
     """How much of the walls is looked at. Tangents are those of angles off the side camera's axis: 1 is 45 degrees ahead."""
 
-    farthest: float = 3.0
+    farthest: Annotated[float, Between(0.1, 10)] = 3.0
     """Farther ahead walls are too slanted to be seen well."""
-    half_height: float = 0.9
+    half_height: Annotated[float, Between(0.1, 10)] = 0.9
     """How far up and down."""
-    nearest: float = 1.5
+    nearest: Annotated[float, Between(0.1, 10)] = 1.5
     """A lens so narrow that it sees nothing nearer than this has no side views."""
-    max_side_px: int = 700
+    max_side_px: Annotated[int, Between(64, 4096)] = 700
     """The longer side of a side view, at most."""
-    margin_px: int = 8
+    margin_px: Annotated[int, Between(0, 1000)] = 8
     """Features nearer than this to the border of what the picture holds are none."""
 
 

@@ -3,27 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from topoloc.bounds import Above, AtLeast, Between
 from topoloc.features.features import Features
 
 
 @dataclass(frozen=True)
 class SiftConfig:
-    """OpenCV's settings under their own names. max_features: the strongest are kept, 0 keeps all.
+    """OpenCV's settings under their own names."""
 
-    root: descriptors are L1-normalised and their square root is taken, so that their distance is Hellinger's.
-    """
-
-    max_features: int = 2000
-    contrast_threshold: float = 0.02
-    edge_threshold: float = 10.0
-    sigma: float = 1.6
-    num_octave_layers: int = 3
+    max_features: Annotated[int, Between(0, 100_000)] = 2000
+    """The strongest are kept; 0 keeps all."""
+    contrast_threshold: Annotated[float, AtLeast(0)] = 0.02
+    """As OpenCV's."""
+    edge_threshold: Annotated[float, Above(0)] = 10.0
+    """As OpenCV's."""
+    sigma: Annotated[float, Above(0)] = 1.6
+    """As OpenCV's: blur of the first image of an octave, pixels."""
+    num_octave_layers: Annotated[int, Between(1, 16)] = 3
+    """As OpenCV's."""
     root: bool = True
+    """Descriptors are L1-normalised and their square root is taken, so that their distance is Hellinger's."""
 
 
 def extract_sift(image: UInt8[np.ndarray, "h w"], config: SiftConfig) -> Features:

@@ -14,10 +14,12 @@ one is still in force where you are has not been checked here, and this is not l
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, Int64, UInt8
 
+from topoloc.bounds import AtLeast, Between
 from topoloc.compiled import num_threads
 from topoloc.features.bands import run_in_bands
 from topoloc.features.features import Features
@@ -38,14 +40,20 @@ LEVEL_SPACINGS = 1.4 * LEVEL_RATIO ** np.arange(33)
 
 @dataclass(frozen=True)
 class SurfConfig:
-    """What to detect. hessian_threshold is for images of 0..255, as OpenCV's; num_layers are the layers kept of each octave."""
+    """What to detect."""
 
-    hessian_threshold: float = 400.0
-    num_octaves: int = 4
-    num_layers: int = 3
+    hessian_threshold: Annotated[float, AtLeast(0)] = 400.0
+    """For images of 0..255, as OpenCV's."""
+    num_octaves: Annotated[int, Between(1, 8)] = 4
+    """Octaves of filters, each of twice the size."""
+    num_layers: Annotated[int, Between(1, 64)] = 3
+    """Layers kept of each octave."""
     upright: bool = False
-    max_features: int = 2000
-    num_threads: int | None = None  # as `set_num_threads` said
+    """All orientations are 0: for cameras that never roll."""
+    max_features: Annotated[int, Between(0, 100_000)] = 2000
+    """The strongest are kept."""
+    num_threads: Annotated[int | None, Between(1, 1024)] = None
+    """Threads (None: as `set_num_threads` said); the features are the same for any number."""
 
     def __post_init__(self) -> None:
         counts = (self.num_octaves, self.num_layers, 1 if self.num_threads is None else self.num_threads)

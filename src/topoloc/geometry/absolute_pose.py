@@ -9,13 +9,14 @@ with EPnP and Levenberg-Marquardt refinement on the inliers.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
 import poselib
 from jaxtyping import Bool, Float
 
+from topoloc.bounds import Above, AtLeast, Between
 from topoloc.geometry.absolute_pose_kernels import normal_equations, refine, squared_errors
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
@@ -36,21 +37,25 @@ _VARIANCE_OF_ESTIMATE = 0.8265
 
 @dataclass(frozen=True)
 class AbsolutePoseConfig:
-    """`sigma_px` is the standard deviation of a matched key point along x and along y.
-
-    `max_reprojection_error_px` decides what an inlier is. With the poselib method, the uncertainty of a point, projected,
-    widens it up to threefold: in proportion to the standard deviation that it adds to `sigma_px`.
-    The opencv method ends at 1000 iterations or a confidence of 0.99, and takes no seed.
-    """
+    """How a pose is found from 2-D/3-D matches."""
 
     method: Literal["poselib", "opencv"] = "poselib"
-    max_reprojection_error_px: float = 4.0
-    sigma_px: float = 1.0
-    max_iterations: int = 3000
-    min_iterations: int = 50
-    confidence: float = 0.999
-    max_refinement_steps: int = 10
-    seed: int = 0
+    """PoseLib's RANSAC, or OpenCV's, which ends at 1000 iterations or a confidence of 0.99 and takes no seed."""
+    max_reprojection_error_px: Annotated[float, Above(0)] = 4.0
+    """Matches that miss by less are inliers. With poselib the uncertainty of a point, projected, widens it up to threefold: in
+    proportion to the standard deviation that it adds to `sigma_px`."""
+    sigma_px: Annotated[float, Above(0)] = 1.0
+    """Standard deviation of a matched key point along x and along y."""
+    max_iterations: Annotated[int, Between(1, 1_000_000)] = 3000
+    """Of RANSAC, at most."""
+    min_iterations: Annotated[int, Between(0, 1_000_000)] = 50
+    """Of RANSAC, at least."""
+    confidence: Annotated[float, Between(0, 1)] = 0.999
+    """RANSAC ends where it is so sure that no better pose is left."""
+    max_refinement_steps: Annotated[int, Between(0, 1000)] = 10
+    """Of the least squares on the inliers."""
+    seed: Annotated[int, AtLeast(0)] = 0
+    """Of RANSAC's samples."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,6 +19,7 @@ def build_map(
     """Build a topo-metric map from one or several recordings of one place whose poses share one world.
 
     Raises:
+        ConfigError: a value of `config` is out of its bounds.
         TrajectoryError: no frame of a recording has a pose.
         EmptyMapError: no picture gave a usable node.
         RecordingError, CalibrationError, UnreadableImageError: from reading the recordings.

@@ -8,10 +8,12 @@ same place.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
+from topoloc.bounds import AtLeast, Between
 from topoloc.features.features import Features, Matches
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
@@ -23,17 +25,17 @@ from topoloc.localization.local_map import LocalMap
 class GuidedConfig:
     """Settings of guided matching."""
 
-    num_nodes: int = 3
+    num_nodes: Annotated[int, Between(0, 1000)] = 3
     """Nodes nearest to the first pose (Eq. 1) whose points are sought; 0 keeps the first pose as it is."""
-    radius_px: float = 10.0
+    radius_px: Annotated[float, Between(0, 1000)] = 10.0
     """How far from its projection a map point is sought, in an image whose longer side is 640 pixels; grows with that."""
-    max_scale: float = 1.6
+    max_scale: Annotated[float, AtLeast(1)] = 1.6
     """Largest ratio of a key point's size to the one expected, or the other way round."""
-    max_turn: float = 0.6
+    max_turn: Annotated[float, AtLeast(0)] = 0.6
     """Largest difference of a key point's orientation from the one expected, radians."""
-    min_similarity: float = 0.75
+    min_similarity: Annotated[float, Between(-1, 1)] = 0.75
     """Least scalar product of the two descriptors."""
-    min_margin: float = 0.03
+    min_margin: Annotated[float, Between(0, 2)] = 0.03
     """By how much the best key point must lead the next one within the radius."""
 
 

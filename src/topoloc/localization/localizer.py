@@ -12,9 +12,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
+from typing import Annotated
 
 import numpy as np
 
+from topoloc.bounds import Above, AtLeast, Between, check_bounds
 from topoloc.errors import EmptyMapError, QueryError
 from topoloc.features.extraction import FeatureConfig, extract_normalized, normalize_image
 from topoloc.features.features import Features, Matches
@@ -52,25 +54,26 @@ class LocalizerConfig:
 
     coarse: str | None = None
     """Which of the map's coarse localizers is asked (None: the map's default)."""
-    num_candidates: int = 4
+    num_candidates: Annotated[int, Between(1, 1000)] = 4
     """Nodes whose points are pooled; 1 is the paper's single node."""
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     guided: GuidedConfig = field(default_factory=GuidedConfig)
     pose: AbsolutePoseConfig = field(default_factory=lambda: AbsolutePoseConfig(max_reprojection_error_px=8.0))
-    num_first_features: int = 500
+    num_first_features: Annotated[int, AtLeast(1)] = 500
     """The image's strongest features are matched first; the rest only where these give fewer inliers than the next number."""
-    num_clear_inliers: int = 40
-    min_matches: int = 8
+    num_clear_inliers: Annotated[int, AtLeast(0)] = 40
+    """Inliers from which on the first matches are enough."""
+    min_matches: Annotated[int, AtLeast(0)] = 8
     """With fewer first matches no pose is sought."""
     verification: VerificationConfig = field(default_factory=VerificationConfig)
     rivals: RivalsConfig = field(default_factory=RivalsConfig)
     standpoints: StandpointsConfig = field(default_factory=StandpointsConfig)
     sides: SidesConfig = field(default_factory=SidesConfig)
     shared_errors: SharedErrorsConfig = field(default_factory=SharedErrorsConfig)
-    max_finer: float = 1.15
+    max_finer: Annotated[float, Above(0)] = 1.15
     """An image of more than so many times the pixels a radian (focal length in pixels) of the map's finest camera is reduced to that
     camera's first: at larger sizes its key points find none alike in the map."""
-    max_side_px: int = 1600
+    max_side_px: Annotated[int, Between(64, 16_384)] = 1600
     """Larger images are reduced to this width or height first: nothing is gained from more, but time and memory."""
 
 
@@ -82,12 +85,14 @@ class Localizer:
             (`topoloc/places/coarse.py`), such as retrieval of another kind or a prior from elsewhere. `config.coarse` is then left aside.
 
     Raises:
+        ConfigError: a value of `config` is out of its bounds.
         EmptyMapError: the map has no node.
         MapError: the map has no such coarse localizer.
     """
 
     def __init__(self, topomap: TopoMetricMap, config: LocalizerConfig | None = None, coarse: CoarseLocalizer | None = None) -> None:
         self.config = config or LocalizerConfig()
+        check_bounds(self.config)
         self.topomap = topomap
         if len(topomap.summaries) == 0:
             raise EmptyMapError("the map has no nodes")

@@ -16,9 +16,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
+from topoloc.bounds import AtLeast, Between, Fitted
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.attempt import Judgement
 from topoloc.localization.result import Localization, NotLocalized
@@ -32,21 +34,21 @@ from topoloc.places.coarse import NodeScore
 class RivalsConfig:
     """When another part of the map is asked, and what makes an answer ambiguous."""
 
-    num_ranked: int = 48
+    num_ranked: Annotated[int, Between(1, 10_000)] = 48
     """Nodes that the coarse localizer ranks, the candidates among them; rivals come from these."""
-    min_score_share: tuple[float, float] = (0.85, 0.4)
+    min_score_share: Annotated[tuple[float, float], Between(0, 1)] = (0.85, 0.4)
     """A rival's score is at least this share of the best one's: where the pose is clear, and where it is not."""
-    reach: float = 5.0
+    reach: Annotated[float, AtLeast(0)] = 5.0
     """Nodes within so many D_thresh of a pose (Eq. 1) belong to it; rivals are farther away."""
-    agreement: float = 3.0
+    agreement: Annotated[float, AtLeast(0)] = 3.0
     """Two poses within so many D_thresh are one."""
-    max_groups: int = 3
+    max_groups: Annotated[int, Between(0, 100)] = 3
     """Parts of the map that are asked on their own, at most; 0 asks none, and compares no picture with what nodes saw."""
-    odds_weight: float = 0.3
-    even_share_weight: float = 6.0
-    doubt_weight: float = -3.0
+    odds_weight: Annotated[float, Fitted()] = 0.3
+    even_share_weight: Annotated[float, Fitted()] = 6.0
+    doubt_weight: Annotated[float, Fitted()] = -3.0
     """How much the odds, the even share found and the doubt count between two poses, in logarithms."""
-    min_lead: float = 2.0
+    min_lead: Annotated[float, AtLeast(0)] = 2.0
     """By how much the best pose must lead the next one, in logarithms of odds."""
 
 

@@ -15,10 +15,12 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import asdict, dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.bounds import AtLeast, Between
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.localization.guided import GuidedConfig, match_guided
 from topoloc.localization.local_map import LocalMap
@@ -33,22 +35,25 @@ _METHOD = 1  # part of the digest: one more whenever the same settings come to g
 class SharedErrorsConfig:
     """How rho is measured."""
 
-    num_nodes: int = 20
+    num_nodes: Annotated[int, Between(0, 1000)] = 20
     """Nodes that are localized by others, evenly along the map."""
-    min_distances: tuple[float, ...] = (3.0, 1.0)
+    min_distances: Annotated[tuple[float, ...], AtLeast(0)] = (3.0, 1.0)
     """Neighbours nearer than so many D_thresh (Eq. 1) do not help to localize a node, for their points were refined with its picture.
     The second number counts where the first leaves too few nodes to compare."""
-    num_helpers: int = 3
+    num_helpers: Annotated[int, Between(1, 100)] = 3
     """The nearest of the others, whose points do."""
-    min_inliers: int = 20
-    min_nodes: int = 5
+    min_inliers: Annotated[int, AtLeast(4)] = 20
+    """Nodes localized with fewer inliers are not compared."""
+    min_nodes: Annotated[int, AtLeast(1)] = 5
     """With fewer nodes compared, rho is taken to be `unknown`."""
-    percentile: float = 75.0
+    percentile: Annotated[float, Between(0, 100)] = 75.0
     """Of the nodes' rho; above the median, since some parts of a map are worse than others."""
-    factor: float = 2.0
+    factor: Annotated[float, AtLeast(0)] = 2.0
     """What neighbours share cannot be seen by comparing them: recordings with truth showed about as much again."""
-    least: float = 0.005
-    unknown: float = 0.1
+    least: Annotated[float, Between(0, 1)] = 0.005
+    """rho is at least this."""
+    unknown: Annotated[float, Between(0, 1)] = 0.1
+    """rho where too few nodes can be compared."""
 
 
 def inflation(num_inliers: int, rho: float) -> float:

@@ -12,10 +12,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from topoloc.bounds import Above, AtLeast, Between
 from topoloc.errors import MapError
 from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.matching import MatchingConfig, match_pooled
@@ -45,23 +47,24 @@ _NODES_IN_MEMORY = 512
 class SidesConfig:
     """How the walls along the way are asked, and what is believed of them."""
 
-    num_ranked: int = 32
+    num_ranked: Annotated[int, Between(0, 10_000)] = 32
     """Side nodes that are compared with each view; 0 asks none."""
-    num_hypotheses: int = 8
+    num_hypotheses: Annotated[int, Between(0, 1000)] = 8
     """First poses of each view that are followed up."""
-    num_nodes: int = 4
+    num_nodes: Annotated[int, Between(1, 1000)] = 4
     """Side nodes whose points are sought in each view around a pose."""
-    min_distance: float = 5.0
+    min_distance: Annotated[float, AtLeast(0)] = 5.0
     """Poses within so many D_thresh (Eq. 1) of a node would have been found by that node."""
     matching: MatchingConfig = field(default_factory=lambda: MatchingConfig(ratio=0.9))
-    rounds: tuple[tuple[float, float], ...] = ((0.0, 12.0), (0.0, 6.0), (30.0, 6.0), (25.0, 3.0), (25.0, 3.0))
+    rounds: Annotated[tuple[tuple[float, float], ...], AtLeast(0)] = ((0.0, 12.0), (0.0, 6.0), (30.0, 6.0), (25.0, 3.0), (25.0, 3.0))
     """Matches and pose in turn: search radius and largest error, pixels. Radius 0 are the unguided matches: guided ones draw a pose that
     is not yet right towards itself."""
-    sigma_px: float = 2.0
+    sigma_px: Annotated[float, Above(0)] = 2.0
     """Standard deviation of a key point found at such a slant."""
-    least_shared_errors: float = 0.2
+    least_shared_errors: Annotated[float, Between(0, 1)] = 0.2
     """rho (`shared_errors.py`) is at least this: what is wrong with a wall seen at a slant is wrong with all points on it."""
-    min_found: int = 20
+    min_found: Annotated[int, AtLeast(4)] = 20
+    """Points of a wall found where a pose says they must be, at least."""
     verdict: SideVerdictConfig = field(default_factory=SideVerdictConfig)
 
 

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Annotated
 
+from topoloc.bounds import AtLeast, Between, Fitted
 from topoloc.localization.attempt import Judgement
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.stages import StageClock
@@ -20,20 +22,20 @@ from topoloc.localization.verification import Evidence
 class SideVerdictConfig:
     """The weights of the evidence, and what is asked of an answer; all in logarithms of odds."""
 
-    found_weight: float = 0.89
-    chance_weight: float = 1.47
-    inliers_weight: float = 0.54
-    inlier_share_weight: float = 2.16
-    spread_weight: float = 0.6
-    doubt_weight: float = -0.5
-    distinct_weight: float = 0.8
-    bias: float = 2.96
-    min_lead: float = 2.0
+    found_weight: Annotated[float, Fitted()] = 0.89
+    chance_weight: Annotated[float, Fitted()] = 1.47
+    inliers_weight: Annotated[float, Fitted()] = 0.54
+    inlier_share_weight: Annotated[float, Fitted()] = 2.16
+    spread_weight: Annotated[float, Fitted()] = 0.6
+    doubt_weight: Annotated[float, Fitted()] = -0.5
+    distinct_weight: Annotated[float, Fitted()] = 0.8
+    bias: Annotated[float, Fitted()] = 2.96
+    min_lead: Annotated[float, AtLeast(0)] = 2.0
     """By how much the best of the walls' poses must lead the next one, and that of the nodes, be that believed or not; and by how much
     a believed one of the nodes must lead it, not to be called in question."""
-    rival_log_odds: float = 2.5
+    rival_log_odds: Annotated[float, Between(-100, 100)] = 2.5
     """Of a pose found by the nodes with more for it, the walls are not asked."""
-    min_probability: float = 0.5
+    min_probability: Annotated[float, Between(0, 1)] = 0.5
     """Of the right place and a precise pose together: less probable poses are not reported."""
 
 

@@ -10,7 +10,9 @@ That a picture was compared so is no evidence for the pose; it is judged by matc
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
+from topoloc.bounds import Between
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.attempt import Attempt
 from topoloc.localization.guided import GuidedConfig
@@ -21,11 +23,11 @@ from topoloc.map.nodes import NodePoses, node_distances
 class StandpointsConfig:
     """Where a picture that is not clear is compared with what nodes saw."""
 
-    num_nodes: int = 24
+    num_nodes: Annotated[int, Between(0, 10_000)] = 24
     """Nodes of the best coarse rank that are tried, one by one; 0 tries none."""
-    max_poses: int = 6
+    max_poses: Annotated[int, Between(0, 1000)] = 6
     """Of the poses found, those with the most inliers are looked into."""
-    max_iterations: int = 500
+    max_iterations: Annotated[int, Between(1, 1_000_000)] = 500
     """Of RANSAC, for each of them."""
     matching: GuidedConfig = field(
         default_factory=lambda: GuidedConfig(radius_px=64.0, max_scale=1.5, max_turn=0.35, min_similarity=0.8, min_margin=0.02)

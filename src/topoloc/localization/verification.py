@@ -17,9 +17,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Int
+
+from topoloc.bounds import Above, AtLeast, Between, Fitted
 
 COLUMNS, ROWS = 8, 6
 """The cells of a picture whose number with an inlier in it measures the inliers' spread."""
@@ -50,28 +53,30 @@ class Evidence:
 class VerificationConfig:
     """What a right pose is, the weights of the logistic regression, and what is asked of an answer."""
 
-    max_translation: float = 0.25
+    max_translation: Annotated[float, Above(0)] = 0.25
     """A right pose is no further off than this (metres), nor than `depth_share` of the distance of what is seen, if that is less."""
-    depth_share: float = 0.05
-    max_rotation_deg: float = 2.0
-    agreement_px: float = 4.0
+    depth_share: Annotated[float, Above(0)] = 0.05
+    """See `max_translation`."""
+    max_rotation_deg: Annotated[float, Between(0.001, 180)] = 2.0
+    """A right pose is turned by no more than this."""
+    agreement_px: Annotated[float, Above(0)] = 4.0
     """Unguided matches within this of the final pose agree with it, in an image whose longer side is 640 pixels; grows with that."""
-    min_inliers: int = 5
+    min_inliers: Annotated[int, AtLeast(4)] = 5
     """With fewer, a first pose is not even tried out."""
-    min_found: int = 12
+    min_found: Annotated[int, AtLeast(4)] = 12
     """Map points found where the pose says they must be, at least."""
-    min_probability: float = 0.5
+    min_probability: Annotated[float, Between(0, 1)] = 0.5
     """Poses less probable than this are not reported."""
-    clear_log_odds: float = 4.5
+    clear_log_odds: Annotated[float, Between(-100, 100)] = 4.5
     """A pose with more for it (logarithm of its odds) is clear: only parts of the map that look nearly the same are asked then.
     The clearest of 6,908 wrong poses had 3.9."""
-    even_share_weight: float = 2.13
-    chance_weight: float = 0.73
-    inliers_weight: float = 0.12
-    inlier_share_weight: float = 2.29
-    spread_weight: float = 0.8
-    doubt_weight: float = -0.5
-    bias: float = 7.64
+    even_share_weight: Annotated[float, Fitted()] = 2.13
+    chance_weight: Annotated[float, Fitted()] = 0.73
+    inliers_weight: Annotated[float, Fitted()] = 0.12
+    inlier_share_weight: Annotated[float, Fitted()] = 2.29
+    spread_weight: Annotated[float, Fitted()] = 0.8
+    doubt_weight: Annotated[float, Fitted()] = -0.5
+    bias: Annotated[float, Fitted()] = 7.64
     """Above the 7.34 of the fit, whose wrong poses are mostly twins in a corridor that repeats itself; those are left to `rivals.py`.
     Of 3,799 poses of pictures from elsewhere the most probable is then right with the probability 0.35."""
 

@@ -9,11 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
+from typing import Annotated
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
+from topoloc.bounds import Between, check_bounds
 from topoloc.errors import EmptyMapError, TrajectoryError
 from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.features import Features
@@ -42,13 +44,13 @@ class BuildConfig:
     landmarks: LandmarkConfig = field(default_factory=LandmarkConfig)
     vlad: VladConfig = field(default_factory=VladConfig)
     sides: SideNodesConfig = field(default_factory=SideNodesConfig)
-    max_node_points: int = 800
+    max_node_points: Annotated[int, Between(1, 100_000)] = 800
     """Features that a node keeps, the strongest ones."""
-    min_node_points: int = 20
+    min_node_points: Annotated[int, Between(1, 100_000)] = 20
     """A picture with fewer located features becomes no node."""
-    template_side_px: int = 240
+    template_side_px: Annotated[int, Between(16, 4096)] = 240
     """Shorter side of the template picture that a node keeps, at most."""
-    place_side_px: int = 160
+    place_side_px: Annotated[int, Between(16, 4096)] = 160
     """Shorter side of the other mapping images, at most: what the coarse localizers of section III-B are trained with."""
 
 
@@ -100,11 +102,13 @@ def build_map(
     """Build a topo-metric map from one or several recordings of one place whose poses share one world.
 
     Raises:
+        ConfigError: a value of `config` is out of its bounds.
         TrajectoryError: no frame of a recording has a pose.
         EmptyMapError: no picture gave a usable node.
         RecordingError, CalibrationError, UnreadableImageError: from reading the recordings.
     """
     config = config or BuildConfig()
+    check_bounds(config)
     progress = progress or (lambda stage, done, total: None)
     if isinstance(sequences, StereoSequence):
         sequences = [sequences]

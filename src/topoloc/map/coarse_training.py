@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from topoloc.bounds import check_bounds
 from topoloc.errors import EmptyMapError, TrainingError
 from topoloc.map.nodes import NodePoses, node_distances
 from topoloc.map.topomap import TopoMetricMap
@@ -40,6 +41,7 @@ def train_coarse(
         checkpoint: cnn-fc writes its state here after each epoch, and goes on from it if it is there.
 
     Raises:
+        ConfigError: a value of `config` is out of its bounds.
         MissingExtraError: torch is not installed.
         WeightsError: see `find_weights`.
         TrainingError: `name` does not learn, or the training failed.
@@ -51,6 +53,7 @@ def train_coarse(
     from topoloc.places.weights import find_weights  # needs torch
 
     config = config or CoarseTrainingConfig()
+    check_bounds(config)
     of_name = {"cnn-fc": config.cnn_fc, "cnn-nn": config.cnn_nn, "vlad-nn": config.vlad_nn}[name]
     found = find_weights(backbone, weights)
     arguments = (training_set_of(topomap), backbone, found, of_name, progress or (lambda stage, done, total: None))

@@ -8,10 +8,12 @@ long axis of its uncertainty, and shows up points that are not where they seemed
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from topoloc.bounds import Above, AtLeast, Between
 from topoloc.features.features import Features
 from topoloc.features.matching import MatchingConfig, match_features
 from topoloc.geometry.camera import Camera
@@ -24,15 +26,16 @@ _CAUCHY_SCALE = 2.385  # of a residual in standard deviations
 class LandmarkConfig:
     """How points are re-observed and refined."""
 
-    nodes_per_image: int = 3
+    nodes_per_image: Annotated[int, Between(0, 1000)] = 3
     """Each mapping image is matched with this many of its nearest nodes; 0 leaves every point as it was first measured."""
     matching: MatchingConfig = field(default_factory=lambda: MatchingConfig(ratio=0.85))
-    gate: float = 4.0
+    gate: Annotated[float, Above(0)] = 4.0
     """An observation further from the point's projection than this many standard deviations (of both) is none."""
-    pose_sigma_px: float = 0.7
+    pose_sigma_px: Annotated[float, AtLeast(0)] = 0.7
     """What the errors of the mapping poses and of rectification add to a key point's own uncertainty, pixels."""
-    num_iterations: int = 6
-    max_disagreement: float = 3.0
+    num_iterations: Annotated[int, Between(0, 1000)] = 6
+    """Steps of the least squares that refine a point."""
+    max_disagreement: Annotated[float, Above(0)] = 3.0
     """Points whose refined residuals stay above this many standard deviations (root mean square) are dropped."""
 
 

@@ -7,10 +7,12 @@ nearest node there is: on a first pass that is the last node, on a second lap th
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from topoloc.bounds import Above, AtLeast
 from topoloc.geometry.rigid import Rigid3
 
 # Where the user names no D_thresh, it is this share of the scene's median depth: the parallax from one node to the next
@@ -25,9 +27,9 @@ RADIANS_PER_NODE = np.deg2rad(2.0)
 class NodeConfig:
     """Eq. 1 of the paper. What is None follows from the scene: see `resolved`."""
 
-    d_thresh: float | None = None
+    d_thresh: Annotated[float | None, Above(0)] = None
     """D_thresh, metres: the distance at which a new node is placed (None: 15 % of the scene's median depth)."""
-    lambda_rot: float | None = None
+    lambda_rot: Annotated[float | None, AtLeast(0)] = None
     """lambda, metres a radian: how much rotation counts (None: so much that 2 degrees alone make a node)."""
 
     def resolved(self, median_depth: float) -> NodeConfig:

@@ -9,10 +9,12 @@ localizer asks them only where nothing else gave a pose (`localization/side_loca
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.bounds import AtLeast, Between
 from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.side_views import SideView, SideViewConfig, side_views
 from topoloc.geometry.rigid import Rigid3
@@ -27,14 +29,14 @@ from topoloc.slam.metric_points import MetricPointsConfig, locate_points
 class SideNodesConfig:
     """Which nodes have side nodes, and what these keep."""
 
-    spacing: float = 3.0
+    spacing: Annotated[float, AtLeast(0)] = 3.0
     """Eq. 1 with so many times the map's D_thresh chooses among the nodes, a turn counting half; 0 makes no side nodes."""
-    opposite: float = 10.0
+    opposite: Annotated[float, AtLeast(0)] = 10.0
     """Nodes that have another one looking the other way within so many D_thresh need no side nodes."""
     views: SideViewConfig = field(default_factory=SideViewConfig)
-    max_points: int = 400
+    max_points: Annotated[int, Between(1, 100_000)] = 400
     """Features that a side node keeps, the strongest ones."""
-    min_points: int = 20
+    min_points: Annotated[int, Between(1, 100_000)] = 20
     """With fewer a side view becomes no side node."""
     vlad: VladConfig = field(default_factory=lambda: VladConfig(position_weight=0.0))
     """Where on a wall things are seen depends on where the camera stands, so places in the picture do not count."""

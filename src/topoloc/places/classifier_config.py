@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal, TypeVar, get_args
+
+from topoloc.bounds import Above, AtLeast, Between
 
 T = TypeVar("T")
 
@@ -16,28 +18,33 @@ BACKBONES: tuple[BackboneName, ...] = get_args(BackboneName)
 class PictureConfig:
     """How a picture is brought to the network: cut to the mapping pictures' shape, reduced, and stretched to one size."""
 
-    width_px: int = 224
-    height_px: int = 168
+    width_px: Annotated[int, Between(32, 2048)] = 224
+    """Width that the network sees."""
+    height_px: Annotated[int, Between(32, 2048)] = 168
+    """Height that the network sees."""
 
 
 @dataclass(frozen=True)
 class TrainingConfig:
     """How a network is trained."""
 
-    max_epochs: int = 60
+    max_epochs: Annotated[int, Between(1, 100_000)] = 60
     """Times that every image is shown, at most."""
-    patience: int = 12
+    patience: Annotated[int, AtLeast(0)] = 12
     """Training stops after this many epochs without gain on the held-out images, and the best epoch is kept."""
-    batch_size: int = 32
-    learning_rate: float = 1e-3
+    batch_size: Annotated[int, Between(1, 4096)] = 32
+    """Images that are shown together."""
+    learning_rate: Annotated[float, Between(0, 10)] = 1e-3
     """Of layers that begin at random; at its height, in a cosine schedule with a short rise."""
-    backbone_rate: float = 0.1
+    backbone_rate: Annotated[float, Between(0, 10)] = 0.1
     """Learning rate of layers that begin with weights from elsewhere, as a share of `learning_rate`."""
-    weight_decay: float = 1e-2
-    held_out: float = 0.12
+    weight_decay: Annotated[float, Between(0, 10)] = 1e-2
+    """Of AdamW."""
+    held_out: Annotated[float, Between(0, 0.9)] = 0.12
     """Share of the images that are held out; never the only image of a node."""
-    seed: int = 0
-    num_threads: int | None = None
+    seed: Annotated[int, AtLeast(0)] = 0
+    """Of the order of the images, how they are varied, and layers that begin at random."""
+    num_threads: Annotated[int | None, Between(1, 1024)] = None
     """Threads (None: as many as there are cores). Runs are the same to the bit with the same number of threads."""
 
 
@@ -45,17 +52,21 @@ class TrainingConfig:
 class AugmentationConfig:
     """How much the pictures are varied while training; 0 switches a kind off."""
 
-    crop: float = 0.06
+    crop: Annotated[float, Between(0, 0.45)] = 0.06
     """Up to this share is cut from each side: more would show another node's view."""
-    rotation_deg: float = 2.0
-    brightness: float = 0.35
-    contrast: float = 0.35
-    gamma: float = 0.5
+    rotation_deg: Annotated[float, Between(0, 180)] = 2.0
+    """Up to this angle, either way."""
+    brightness: Annotated[float, Between(0, 1)] = 0.35
+    """Up to this share of the picture's range, either way."""
+    contrast: Annotated[float, Between(0, 1)] = 0.35
+    """Up to this share, either way."""
+    gamma: Annotated[float, Between(0, 5)] = 0.5
     """Up to this power of e, either way."""
-    colour_cast: float = 0.15
-    blur: float = 0.2
+    colour_cast: Annotated[float, Between(0, 1)] = 0.15
+    """Up to this share in each colour, either way."""
+    blur: Annotated[float, Between(0, 1)] = 0.2
     """Share of the pictures that are blurred."""
-    occlusion: float = 0.3
+    occlusion: Annotated[float, Between(0, 1)] = 0.3
     """Share of the pictures that have a rectangle hidden."""
 
 
@@ -66,7 +77,7 @@ class CnnFcConfig:
     picture: PictureConfig = field(default_factory=PictureConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
     augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
-    label_spread: float = 1.0
+    label_spread: Annotated[float, AtLeast(0)] = 1.0
     """An image belongs to its nearest node and, by a bell curve of D_total - D_nearest over this share of D_thresh, to those
     about as near; 0 is the paper's single label."""
 
@@ -76,14 +87,15 @@ class CnnNnConfig:
     """Settings of cnn-nn: features of a pretrained network, pooled, whitened; nearest neighbours."""
 
     picture: PictureConfig = field(default_factory=PictureConfig)
-    depth: int | None = None
+    depth: Annotated[int | None, Between(1, 100)] = None
     """Layers of the backbone's `features` that are used (None: what measured best for each backbone)."""
-    grid_rows: int = 2
+    grid_rows: Annotated[int, Between(1, 32)] = 2
     """Features are pooled in cells, since neighbouring nodes see the same things at other places of the picture."""
-    grid_columns: int = 3
-    power: float = 3.0
+    grid_columns: Annotated[int, Between(1, 32)] = 3
+    """The same, across."""
+    power: Annotated[float, Between(1, 100)] = 3.0
     """Exponent of the generalised mean (Radenovic et al. 2018): 1 is the mean, infinity the maximum."""
-    dimension: int = 256
+    dimension: Annotated[int, Between(1, 65_536)] = 256
     """Length of a place vector after whitening, at most."""
 
 
@@ -91,19 +103,22 @@ class CnnNnConfig:
 class TripletConfig:
     """How NetVLAD is tuned to the place by the triplet loss."""
 
-    num_epochs: int = 0
+    num_epochs: Annotated[int, Between(0, 100_000)] = 0
     """0: not at all."""
-    learning_rate: float = 2e-5
-    margin: float = 0.1
-    num_negatives: int = 5
+    learning_rate: Annotated[float, Between(0, 10)] = 2e-5
+    """Of all that is tuned."""
+    margin: Annotated[float, AtLeast(0)] = 0.1
+    """By how much a picture of the same place must be nearer than one from elsewhere (squared distance)."""
+    num_negatives: Annotated[int, Between(1, 1000)] = 5
     """The most similar images from elsewhere that each image is compared with."""
-    num_tuned: int = 2
+    num_tuned: Annotated[int, Between(0, 100)] = 2
     """Layers of the backbone that are tuned, the last ones, with NetVLAD itself."""
-    near: float = 1.0
+    near: Annotated[float, Above(0)] = 1.0
     """Images within this share of D_thresh by Eq. 1 show the same place."""
-    far: float = 3.0
+    far: Annotated[float, Above(0)] = 3.0
     """Images further apart than this share of D_thresh do not."""
-    seed: int = 0
+    seed: Annotated[int, AtLeast(0)] = 0
+    """Of the order of the images."""
 
 
 @dataclass(frozen=True)
@@ -111,16 +126,17 @@ class VladNnConfig:
     """Settings of vlad-nn: NetVLAD of a network's features; nearest neighbours."""
 
     picture: PictureConfig = field(default_factory=PictureConfig)
-    depth: int | None = None
+    depth: Annotated[int | None, Between(1, 100)] = None
     """Layers of the backbone's `features` that are used (None: what measured best for each backbone)."""
-    num_clusters: int = 64
+    num_clusters: Annotated[int, Between(1, 4096)] = 64
     """Words of the vocabulary, where none come with the weights."""
-    num_sampled_features: int = 100
+    num_sampled_features: Annotated[int, Between(1, 100_000)] = 100
     """Features of each mapping picture that the vocabulary is learnt from."""
-    dimension: int = 256
+    dimension: Annotated[int, Between(1, 65_536)] = 256
     """Length of a place vector after whitening, at most."""
     tuning: TripletConfig = field(default_factory=TripletConfig)
-    seed: int = 0
+    seed: Annotated[int, AtLeast(0)] = 0
+    """Of the vocabulary."""
 
 
 _NESTED = {"picture": PictureConfig, "training": TrainingConfig, "augmentation": AugmentationConfig, "tuning": TripletConfig}

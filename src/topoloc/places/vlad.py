@@ -10,11 +10,13 @@ images where there are enough of them to learn it from.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from typing import Annotated
 
 import faiss
 import numpy as np
 from jaxtyping import Float32, Int
 
+from topoloc.bounds import AtLeast, Between
 from topoloc.features.features import Features
 from topoloc.places.coarse import CoarseModel, Image, NodeScore
 from topoloc.places.neighbours import PlaceIndex
@@ -26,15 +28,16 @@ from topoloc.places.whitening import learn_whitening
 class VladConfig:
     """Settings of surf-vlad."""
 
-    num_words: int = 64
+    num_words: Annotated[int, Between(1, 65_536)] = 64
     """Visual words of the vocabulary."""
-    position_weight: float = 0.9
+    position_weight: Annotated[float, AtLeast(0)] = 0.9
     """How far two descriptors (of length 1) are apart for lying at opposite borders of the picture; 0 leaves their places out."""
-    dimension: int = 128
+    dimension: Annotated[int, Between(1, 65_536)] = 128
     """Length of a place vector after PCA, at most."""
-    max_training_descriptors: int = 100_000
+    max_training_descriptors: Annotated[int, AtLeast(1)] = 100_000
     """Descriptors that the vocabulary is learnt from, at most."""
-    seed: int = 0
+    seed: Annotated[int, AtLeast(0)] = 0
+    """Of the vocabulary."""
 
 
 class SurfVlad:

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from topoloc.bounds import Above, Between
 from topoloc.geometry.rigid import Rigid3
 from topoloc.slam.bundle_kernels import eliminate_points, move_points, robust_cost, squared_residuals
 from topoloc.slam.keyframes import DisparityBias, KeyFrame, Landmarks
@@ -21,12 +23,13 @@ from topoloc.slam.keyframes import DisparityBias, KeyFrame, Landmarks
 class BundleConfig:
     """How long and how robustly to optimise; residuals are in standard deviations of the measurements."""
 
-    max_steps: int = 6
-    cauchy_scale: float = 2.0
+    max_steps: Annotated[int, Between(0, 1000)] = 6
+    """Steps of Levenberg and Marquardt, at most."""
+    cauchy_scale: Annotated[float, Above(0)] = 2.0
     """Residuals beyond this count less and less."""
-    min_decrease: float = 1e-3
+    min_decrease: Annotated[float, Between(0, 1)] = 1e-3
     """A step that lowers the cost by less than this share of it is the last one."""
-    outlier_square: float = 25.0
+    outlier_square: Annotated[float, Above(0)] = 25.0
     """Squared residual, summed over x, y and disparity, from which on an observation is wrong and used no more."""
 
 

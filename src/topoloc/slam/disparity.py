@@ -7,10 +7,12 @@ disparity that a second camera 8 cm to the right would measure.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Float32
 
+from topoloc.bounds import Above, Between
 from topoloc.features.bands import run_in_bands
 from topoloc.geometry.stereo import DepthNoise, depth_sigmas
 from topoloc.sequences.frame import StereoFrame
@@ -27,19 +29,21 @@ _MIN_SIGMA_OF_DEPTH_PX = 0.03
 class DisparityConfig:
     """How disparities are measured."""
 
-    half_px: int = 5
+    half_px: Annotated[int, Between(1, 50)] = 5
     """Half side of the window that is correlated along the row."""
-    min_correlation: float = 0.8
-    max_second_correlation: float = 0.95
+    min_correlation: Annotated[float, Between(-1, 1)] = 0.8
+    """Least normalised correlation of the two pictures."""
+    max_second_correlation: Annotated[float, Between(0, 1)] = 0.95
     """A second place on the row that correlates with this share of the best makes the point ambiguous."""
-    search_px: int = 4
+    search_px: Annotated[int, Between(0, 1000)] = 4
     """A disparity that is known already is sought again this far on either side."""
-    min_sigma_px: float = 0.15
+    min_sigma_px: Annotated[float, Above(0)] = 0.15
     """Stereo: what calibration and interpolation leave even of a perfect correlation."""
-    max_sigma_px: float = 1.0
-    max_share_of_width: float = 0.2
+    max_sigma_px: Annotated[float, Above(0)] = 1.0
+    """Disparities that are less certain than this are not used."""
+    max_share_of_width: Annotated[float, Between(0, 1)] = 0.2
     """Largest disparity, as a share of the picture's width."""
-    max_depth_step: float = 0.05
+    max_depth_step: Annotated[float, Between(0, 1)] = 0.05
     """RGB-D: largest spread of depth around a point, as a share of depth; more is the edge of something."""
 
 

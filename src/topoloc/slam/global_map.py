@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Int
 
+from topoloc.bounds import Above, AtLeast
 from topoloc.geometry.rigid import Rigid3
 from topoloc.slam.bundle import BundleConfig, adjust_bundle
 from topoloc.slam.keyframes import KeyFrame, Landmarks, Observations
@@ -21,18 +23,19 @@ class GlobalMapConfig:
 
     graph: PoseGraphConfig = field(default_factory=PoseGraphConfig)
     bundle: BundleConfig = field(default_factory=lambda: BundleConfig(max_steps=12, min_decrease=1e-4))
-    max_bundle_keyframes: int = 600
+    max_bundle_keyframes: Annotated[int, AtLeast(0)] = 600
     """Beyond these the pose graph has the last word: the time of adjusting all together grows with the cube."""
-    motion_sigma: float = 0.004
+    motion_sigma: Annotated[float, Above(0)] = 0.004
     """Uncertainty of a motion between two key frames: this share of its length ..."""
-    motion_sigma_deg: float = 0.02
+    motion_sigma_deg: Annotated[float, Above(0)] = 0.02
     """... and this angle, besides what tracking says."""
-    link_sigma: float = 0.01
+    link_sigma: Annotated[float, Above(0)] = 0.01
     """Metres; of a link, besides what PnP says."""
-    link_sigma_deg: float = 0.1
-    link_covariance_scale: float = 4.0
+    link_sigma_deg: Annotated[float, Above(0)] = 0.1
+    """The same, in degrees."""
+    link_covariance_scale: Annotated[float, Above(0)] = 4.0
     """Matched features of one view share their errors: more than independent ones would be wrong by."""
-    sigma_feature_px: float = 0.8
+    sigma_feature_px: Annotated[float, Above(0)] = 0.8
     """Standard deviation of a feature's place in the picture, in the adjustment of all."""
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Float32
 
+from topoloc.bounds import Above, AtLeast, Between
 from topoloc.errors import CalibrationError, RecordingError
 from topoloc.sequences.frame import StereoFrame
 from topoloc.slam.disparity import DisparityConfig, MeasuredView, measure_disparities
@@ -18,16 +20,16 @@ from topoloc.slam.tracking import TrackingConfig, align_with_reference, follow
 class InputCheckConfig:
     """From when on a recording is refused."""
 
-    max_baseline: float = 5.0
+    max_baseline: Annotated[float, Above(0)] = 5.0
     """A stereo rig this wide (metres) is taken for one whose baseline is in millimetres."""
-    min_start_points: int = 40
+    min_start_points: Annotated[int, AtLeast(4)] = 40
     """Points with disparity that tracking can begin with."""
-    max_vertical_px: float = 0.9
+    max_vertical_px: Annotated[float, Above(0)] = 0.9
     """Vertical distance of left and right (median over a key frame's points, then over key frames): beyond it they are no pair."""
-    min_keyframes: int = 3
+    min_keyframes: Annotated[int, AtLeast(1)] = 3
     """Key frames seen before such a verdict."""
     tracking: TrackingConfig = field(default_factory=lambda: TrackingConfig(max_shift_px=5.0))
-    sampled_points: int = 80
+    sampled_points: Annotated[int, Between(1, 100_000)] = 80
     """Points a key frame at which the vertical distance is measured."""
 
 

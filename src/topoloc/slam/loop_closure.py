@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
+from topoloc.bounds import Above, AtLeast, Between
 from topoloc.geometry.rigid import Rigid3
 from topoloc.places.vlad import SurfVlad, VladConfig, learn_words, vlad
 from topoloc.slam.keyframes import KeyFrame
@@ -24,17 +26,20 @@ class LoopConfig:
 
     vlad: VladConfig = field(default_factory=lambda: VladConfig(num_words=32, position_weight=0.0))
     matching: PlaceMatchingConfig = field(default_factory=PlaceMatchingConfig)
-    num_candidates: int = 4
-    min_places_between: int = 12
+    num_candidates: Annotated[int, Between(0, 1000)] = 4
+    """Places that look most alike, which each one is compared with."""
+    min_places_between: Annotated[int, AtLeast(0)] = 12
     """Places nearer than this along one sub-map are no loop."""
-    support_places: int = 5
+    support_places: Annotated[int, AtLeast(0)] = 5
     """A link is supported by another one whose ends are within so many places of its own."""
-    max_disagreement: float = 0.05
+    max_disagreement: Annotated[float, Above(0)] = 0.05
     """Two links that support each other may differ by this (metres), and by this share of the way between their ends."""
-    max_disagreement_deg: float = 2.0
-    max_drift: float = 0.05
+    max_disagreement_deg: Annotated[float, Above(0)] = 2.0
+    """The same, in degrees."""
+    max_drift: Annotated[float, AtLeast(0)] = 0.05
     """Share of the way travelled by which the odometry may be wrong, besides half a metre."""
-    max_drift_deg: float = 15.0
+    max_drift_deg: Annotated[float, AtLeast(0)] = 15.0
+    """The same in degrees, whatever the way."""
 
 
 @dataclass(frozen=True, eq=False)

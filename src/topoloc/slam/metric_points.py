@@ -11,10 +11,12 @@ What is dropped, and why:
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from topoloc.bounds import Above, Between
 from topoloc.errors import RecordingError
 from topoloc.features.features import Features
 from topoloc.geometry.stereo import (
@@ -36,19 +38,19 @@ SCALES_PER_SIZE = 1.2 / 9.0
 class MetricPointsConfig:
     """How features get their 3-D position."""
 
-    max_relative_sigma: float = 0.3
+    max_relative_sigma: Annotated[float, Above(0)] = 0.3
     """Points whose depth is uncertain (one sigma) by more than this share of it are dropped."""
-    correlation_half_px: int = 5
+    correlation_half_px: Annotated[int, Between(1, 50)] = 5
     """Stereo: half side of the window that is correlated along the row."""
-    min_correlation: float = 0.8
+    min_correlation: Annotated[float, Between(-1, 1)] = 0.8
     """Stereo: least normalised correlation of the two pictures."""
-    max_second_correlation: float = 0.97
+    max_second_correlation: Annotated[float, Between(0, 1)] = 0.97
     """Stereo: a second place on the row that correlates with this share of the best makes the point ambiguous."""
-    min_sigma_disparity_px: float = 0.12
+    min_sigma_disparity_px: Annotated[float, Above(0)] = 0.12
     """Stereo: what calibration and interpolation leave even of a perfect correlation."""
-    max_depth_step: float = 0.05
+    max_depth_step: Annotated[float, Between(0, 1)] = 0.05
     """RGB-D: largest spread of depth over the 5x5 neighbourhood, as a share of depth; more is the edge of something."""
-    sigma_scale: float = 0.4
+    sigma_scale: Annotated[float, Above(0)] = 0.4
     """Standard deviation of a key point's position, in units of its scale."""
 
 

@@ -9,10 +9,12 @@ it starts a sub-map of its own.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
+from topoloc.bounds import Above, AtLeast, Between
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.stereo import ray_covariances
@@ -37,32 +39,33 @@ class OdometryConfig:
     )
     bundle: BundleConfig = field(default_factory=BundleConfig)
     places: PlaceMatchingConfig = field(default_factory=PlaceMatchingConfig)
-    sigma_px: float = 0.3
+    sigma_px: Annotated[float, Above(0)] = 0.3
     """Standard deviation of a tracked point."""
-    sigma_bias_px: float = 1.0
+    sigma_bias_px: Annotated[float, Above(0)] = 1.0
     """How wrong all disparities together may be before the recording has shown by how much."""
-    min_disparity_px: float = 0.5
+    min_disparity_px: Annotated[float, Above(0)] = 0.5
     """What seems further away than this becomes no landmark."""
-    sigma_landmark_px: float = 0.25
+    sigma_landmark_px: Annotated[float, Above(0)] = 0.25
     """Uncertainty of a landmark's depth, as a disparity."""
-    window: int = 8
+    window: Annotated[int, Between(1, 1000)] = 8
     """Key frames that are adjusted together."""
-    held: int = 5
+    held: Annotated[int, Between(0, 1000)] = 5
     """Key frames before these that hold them in place."""
-    min_tracked: int = 25
+    min_tracked: Annotated[int, AtLeast(4)] = 25
     """Points that agree on a pose; a frame with fewer is lost."""
-    min_tracked_share: float = 0.35
-    keyframe_share: float = 0.7
+    min_tracked_share: Annotated[float, Between(0, 1)] = 0.35
+    """Share of the points followed that must agree; a frame with fewer is lost."""
+    keyframe_share: Annotated[float, Between(0, 1)] = 0.7
     """A key frame is due when so few of the last one's points are left."""
-    keyframe_motion: float = 0.03
+    keyframe_motion: Annotated[float, Above(0)] = 0.03
     """... or when they have moved in the picture by this share of its width (median)."""
-    max_lost_tracked: int = 3
+    max_lost_tracked: Annotated[int, AtLeast(0)] = 3
     """The points of the last frame that was tracked are sought in so many more."""
-    max_lost_frames: int = 10
+    max_lost_frames: Annotated[int, AtLeast(0)] = 10
     """A camera that is lost for longer starts a new sub-map."""
-    place_distance: float = 0.1
+    place_distance: Annotated[float, AtLeast(0)] = 0.1
     """A key frame keeps what it looks like (for loops) when it is this share of the median depth from the last that did ..."""
-    place_angle_deg: float = 8.0
+    place_angle_deg: Annotated[float, AtLeast(0)] = 8.0
     """... or turned by this angle."""
 
 

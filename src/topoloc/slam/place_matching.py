@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from topoloc.bounds import Above, AtLeast, Between
 from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.matching import MatchingConfig, match_features
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
@@ -26,9 +28,11 @@ class PlaceMatchingConfig:
     pose: AbsolutePoseConfig = field(
         default_factory=lambda: AbsolutePoseConfig(max_reprojection_error_px=2.5, sigma_px=0.8, max_iterations=1000)
     )
-    min_inliers: int = 25
-    min_inlier_share: float = 0.35
-    max_sigma: float = 0.5
+    min_inliers: Annotated[int, AtLeast(4)] = 25
+    """Matches that agree on the relative pose, at least."""
+    min_inlier_share: Annotated[float, Between(0, 1)] = 0.35
+    """Share of the matches that agree on it, at least."""
+    max_sigma: Annotated[float, Above(0)] = 0.5
     """A relative position that is less certain than this (metres, one sigma) says nothing."""
 
 

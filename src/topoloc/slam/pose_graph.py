@@ -7,10 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.bounds import Above, AtLeast, Between
 from topoloc.geometry.rigid import Rigid3
 from topoloc.slam.pose_graph_kernels import solve_graph
 
@@ -19,12 +21,13 @@ from topoloc.slam.pose_graph_kernels import solve_graph
 class PoseGraphConfig:
     """How the edges are weighed and how long is optimised."""
 
-    max_steps: int = 15
-    min_step: float = 1e-5
+    max_steps: Annotated[int, Between(0, 1000)] = 15
+    """Steps of the optimisation, at most."""
+    min_step: Annotated[float, AtLeast(0)] = 1e-5
     """Metres or radians: smaller steps end it."""
-    cauchy_scale: float = 3.0
+    cauchy_scale: Annotated[float, Above(0)] = 3.0
     """Of loops: residuals (in sigma) beyond this count less and less."""
-    max_residual: float = 8.0
+    max_residual: Annotated[float, Above(0)] = 8.0
     """A loop that misses by more than this many sigma after all is dropped."""
 
 

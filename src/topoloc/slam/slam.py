@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.bounds import check_bounds
 from topoloc.errors import RecordingError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.frame import StereoFrame, StereoSequence
@@ -65,11 +66,13 @@ def run_slam(
     The same recordings give the same poses, byte for byte.
 
     Raises:
+        ConfigError: a value of `config` is out of its bounds.
         RecordingError: no frame could be tracked; left and right are swapped, or are no pairs; single pictures only.
         CalibrationError: no calibration, or a baseline that cannot be in metres.
         UnreadableImageError: from reading the recordings.
     """
     config = config or SlamConfig()
+    check_bounds(config)
     progress = progress or (lambda stage, done, total: None)
     sequences = [sequences] if isinstance(sequences, StereoSequence) else list(sequences)
     keyframes: list[KeyFrame] = []

@@ -8,11 +8,13 @@ the same point.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
+from topoloc.bounds import Above, AtLeast, Between
 from topoloc.features.bands import run_in_bands
 from topoloc.slam.tracking_kernels import refine_tracks
 
@@ -21,17 +23,21 @@ from topoloc.slam.tracking_kernels import refine_tracks
 class TrackingConfig:
     """What is followed, and how."""
 
-    num_corners: int = 450
+    num_corners: Annotated[int, Between(1, 100_000)] = 450
     """Cells of the grid; each holds a point where the picture has one."""
-    min_quality: float = 0.002
+    min_quality: Annotated[float, Between(0, 1)] = 0.002
     """Least corner strength (smaller eigenvalue), as a share of the strongest in the picture."""
-    min_eigenvalue: float = 2e-4
+    min_eigenvalue: Annotated[float, AtLeast(0)] = 2e-4
     """Least corner strength at all: weaker ones are noise."""
-    window_px: int = 15
-    levels: int = 3
-    patch_half_px: int = 5
-    min_correlation: float = 0.7
-    max_shift_px: float = 2.5
+    window_px: Annotated[int, Between(3, 101)] = 15
+    """Side of the window that optical flow (Lucas and Kanade) compares."""
+    levels: Annotated[int, Between(0, 10)] = 3
+    """Half-sized pictures above the full one that optical flow begins with."""
+    patch_half_px: Annotated[int, Between(1, 50)] = 5
+    """Half side of the patch by which a point is compared with what it looked like first."""
+    min_correlation: Annotated[float, Between(-1, 1)] = 0.7
+    """Least normalised correlation of the two patches."""
+    max_shift_px: Annotated[float, Above(0)] = 2.5
     """A point whose patch wants it further away than this has been lost."""
 
 

@@ -9,10 +9,12 @@ after the motion, and only wrong depths are left to disturb it.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
+from topoloc.bounds import AtLeast, Between
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
@@ -28,11 +30,11 @@ _RAY_SIGMA_PX = 0.1
 class FollowingConfig:
     """Which points are followed, and when they are too few."""
 
-    max_points: int = 320
+    max_points: Annotated[int, Between(4, 100_000)] = 320
     """Points followed, spread over the picture: more cost time and add little."""
-    min_points: int = 20
+    min_points: Annotated[int, AtLeast(4)] = 20
     """Points that agree on a pose; with fewer it is not believed."""
-    min_agreeing: float = 0.6
+    min_agreeing: Annotated[float, Between(0, 1)] = 0.6
     """Share of the points found again that must agree."""
     tracking: TrackingConfig = field(default_factory=lambda: TrackingConfig(max_shift_px=4.0))
     pose: AbsolutePoseConfig = field(

@@ -8,10 +8,12 @@ velocity is constant but for an unknown acceleration.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.bounds import Above, AtLeast
 from topoloc.geometry.rigid import Rigid3
 
 
@@ -19,19 +21,19 @@ from topoloc.geometry.rigid import Rigid3
 class MotionConfig:
     """What cameras do: in a hand, on a robot, on a car."""
 
-    sigma_acceleration: float = 3.0
+    sigma_acceleration: Annotated[float, Above(0)] = 3.0
     """Of an unknown acceleration, m/s^2."""
-    sigma_angular_acceleration: float = 12.0
+    sigma_angular_acceleration: Annotated[float, Above(0)] = 12.0
     """rad/s^2."""
-    sigma_velocity: float = 8.0
+    sigma_velocity: Annotated[float, Above(0)] = 8.0
     """Of the velocity of a camera seen once, m/s: it may be on a car."""
-    sigma_angular_velocity: float = 2.0
+    sigma_angular_velocity: Annotated[float, Above(0)] = 2.0
     """rad/s."""
-    max_step: float = 1.0
+    max_step: Annotated[float, Above(0)] = 1.0
     """Seconds: the velocity says nothing of what comes later, so that the predicted camera stands still from there on."""
-    odometry_share: float = 0.05
+    odometry_share: Annotated[float, AtLeast(0)] = 0.05
     """Standard deviation of external odometry, as a share of the way and of the turn ..."""
-    odometry_sigma: float = 0.002
+    odometry_sigma: Annotated[float, Above(0)] = 0.002
     """... and beside it, metres and radians."""
 
 

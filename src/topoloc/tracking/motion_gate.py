@@ -7,10 +7,12 @@ believed instead. So a camera that was carried elsewhere, or was placed wrongly 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.bounds import Above, AtLeast
 from topoloc.geometry.rigid import Rigid3
 from topoloc.tracking.motion import MotionConfig, MotionState, predict_motion, start_motion, surprise, update_motion
 
@@ -20,15 +22,15 @@ class GateConfig:
     """What is refused, what is believed after all, and how far a prediction reaches."""
 
     motion: MotionConfig = field(default_factory=MotionConfig)
-    max_surprise: float = 33.0
+    max_surprise: Annotated[float, Above(0)] = 33.0
     """Squared Mahalanobis distance from the prediction (chi^2 with 6 degrees of freedom: 1 in 100,000) beyond which a pose is refused."""
-    prediction_scale: float = 2.5
+    prediction_scale: Annotated[float, Above(0)] = 2.5
     """By how much the prediction may be more wrong than its sigma says: hands jerk, wheels meet kerbs."""
-    num_agreeing: int = 3
+    num_agreeing: Annotated[int, AtLeast(1)] = 3
     """So many refused poses in a row that agree with each other are believed after all."""
-    max_predicted: float = 1.0
+    max_predicted: Annotated[float, AtLeast(0)] = 1.0
     """Seconds without a measured pose after which the camera is lost ..."""
-    max_predicted_with_odometry: float = 20.0
+    max_predicted_with_odometry: Annotated[float, AtLeast(0)] = 20.0
     """... or with external odometry."""
 
 

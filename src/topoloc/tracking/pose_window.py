@@ -9,10 +9,12 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.bounds import Between
 from topoloc.geometry.rigid import Rigid3
 from topoloc.slam.pose_graph import Edge, PoseGraphConfig, optimise_graph
 
@@ -21,7 +23,8 @@ from topoloc.slam.pose_graph import Edge, PoseGraphConfig, optimise_graph
 class PoseWindowConfig:
     """How many localized pictures, and how they are weighed."""
 
-    size: int = 10
+    size: Annotated[int, Between(1, 1000)] = 10
+    """Localized pictures that are adjusted together."""
     graph: PoseGraphConfig = field(default_factory=lambda: PoseGraphConfig(max_steps=5, min_step=1e-4))
 
 

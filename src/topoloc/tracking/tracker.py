@@ -13,11 +13,12 @@ pictures are adjusted together in a sliding window; what comes out of it is the 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.bounds import Above, AtLeast, Between, check_bounds
 from topoloc.errors import QueryError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
@@ -41,38 +42,40 @@ class TrackerConfig:
     """When a picture is localized in full, and what is believed."""
 
     mode: Literal["motion", "paper"] = "motion"
-    max_jump: float = 1.0
+    """`paper`: each picture is localized alone, and a pose too far from the one before is refused, which is copied."""
+    max_jump: Annotated[float, Above(0)] = 1.0
     """mode "paper": metres from one pose to the next beyond which the new one is refused (the paper: 1 to 5, by the size of the place)."""
     gate: GateConfig = field(default_factory=GateConfig)
     following: FollowingConfig = field(default_factory=FollowingConfig)
     window: PoseWindowConfig = field(default_factory=PoseWindowConfig)
-    max_side_px: int = 800
+    max_side_px: Annotated[int, Between(64, 16_384)] = 800
     """Points are followed in pictures reduced to this width or height."""
-    localize_every: float = 0.25
+    localize_every: Annotated[float, AtLeast(0)] = 0.25
     """Seconds after which a picture that could be tracked is localized in full all the same ..."""
-    min_share_left: float = 0.6
+    min_share_left: Annotated[float, Between(0, 1)] = 0.6
     """... as it is where fewer of the followed points are left ..."""
-    max_shift: float = 0.04
+    max_shift: Annotated[float, Above(0)] = 0.04
     """... or where these have moved by this share of the picture's width."""
-    retry_after: float = 0.1
+    retry_after: Annotated[float, AtLeast(0)] = 0.1
     """Seconds to the next attempt where that failed and the points are still there."""
-    max_doubt: float = 0.3
+    max_doubt: Annotated[float, Above(0)] = 0.3
     """Where the prediction leaves open by more than this where points are seen (three sigma, radians), the coarse search is asked."""
-    floor_share: float = 0.001
+    floor_share: Annotated[float, AtLeast(0)] = 0.001
     """Sigma of a localization's noise is at least this share of the points' depth, and so many radians."""
-    reach: float = 2.0
+    reach: Annotated[float, Above(0)] = 2.0
     """How far (way in depths of the points, plus radians) what the map is wrong by lasts (to 1/e)."""
-    blend_time: float = 0.2
+    blend_time: Annotated[float, AtLeast(0)] = 0.2
     """Seconds (to 1/e) in which what a new localization corrects is worked into the smoothed pose, so that it does not jump."""
-    followed_share: float = 0.05
+    followed_share: Annotated[float, AtLeast(0)] = 0.05
     """Sigma of a followed motion, as a share of its way and turn, beside what the points say."""
 
 
 class Tracker:
-    """The state of one stream; `reset` begins another."""
+    """The state of one stream; `reset` begins another. Raises ConfigError where a value of `config` is out of its bounds."""
 
     def __init__(self, localizer: Localizer, config: TrackerConfig | None = None) -> None:
         self.localizer, self.config = localizer, config or TrackerConfig()
+        check_bounds(self.config)
         self._gate, self._window = MotionGate(self.config.gate), PoseWindow(self.config.window)
         self.reset()
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
+from topoloc.cli.options import File, Flag
 from topoloc.cli.output import UsageError, check_outputs, interruptible, progress_bar, write_json
 from topoloc.errors import CalibrationError, TopolocError
 from topoloc.geometry.camera import Camera
@@ -22,6 +23,55 @@ from topoloc_worlds.routes import RouteConfig
 from topoloc_worlds.worlds import World, find_world
 
 _MOMENTS_OF_BLUR = 5
+Sway = Literal["none", "natural", "hand"]
+# Sizes of the sway of who walks or drives, and of the tremble of a hand.
+_WOBBLE_AND_SHAKE: dict[Sway, tuple[float, float]] = {"none": (0.0, 0.0), "natural": (1.0, 0.0), "hand": (1.0, 1.0)}
+
+
+@dataclass(frozen=True)
+class RouteOptions:
+    """Where the camera goes, along the world's closed line."""
+
+    laps: Annotated[float, tyro.conf.arg(metavar="N")] = 1.0
+    """Times round; 0.25 is a quarter."""
+    num_frames: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    """Stop after N frames."""
+    start: Annotated[float, tyro.conf.arg(metavar="METRES")] = 0.0
+    """Where on the line the first frame is."""
+    spacing: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="(default: the world's)")] = None
+    """Metres between frames on the straight; in bends they come closer."""
+    lateral: Annotated[float, tyro.conf.arg(metavar="METRES")] = 0.0
+    """Metres to the left of the line, seen in the direction of travel; negative is to the right."""
+    reverse: Flag = False
+    """The other way round."""
+    look: Annotated[float, tyro.conf.arg(metavar="DEGREES")] = 0.0
+    """The camera is turned so far to the left."""
+    sway: Sway = "natural"
+    """That of who walks or drives; `none` is on rails, `hand` trembles as well."""
+
+
+@dataclass(frozen=True)
+class PictureOptions:
+    """What is recorded."""
+
+    camera: Annotated[str | None, tyro.conf.arg(metavar="FILE|fx,fy,cx,cy", help_behavior_hint="(default: 380,380, in the middle)")] = None
+    """A camera.json, or four numbers in pixels with --size."""
+    size: Annotated[str, tyro.conf.arg(metavar="WxH")] = "640x400"
+    """Size of the pictures. Without --camera the field of view stays 80 degrees across."""
+    baseline: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="(default: 0.12, street 0.54)")] = None
+    """Metres between the left and the right camera."""
+    mono: Flag = False
+    """A single camera: pictures in images/, and a camera.json."""
+    depth: Flag = False
+    """Exact depth pictures, too; with --mono this makes an RGB-D recording."""
+    grey: Flag = False
+    """Grey pictures."""
+    jpeg: Annotated[int | None, tyro.conf.arg(metavar="QUALITY", help_behavior_hint="(default: PNG)")] = None
+    """JPEG files of this quality, 1 to 100."""
+    motion_blur: Flag = False
+    """Average several moments of the exposure. Five times as slow."""
+    draft: Flag = False
+    """About ten times as fast, with rougher light."""
 
 
 @dataclass(frozen=True)
@@ -34,61 +84,19 @@ class Command:
     """The recording's folder, which is made. A recording that was interrupted goes on where it stopped."""
     condition: Annotated[str, tyro.conf.arg(metavar="NAME")] = "day"
     """day (or clear), evening, night, cloudy or rain."""
-    seed: int = 0
+    seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Another seed is another place of the same kind."""
-    take: int = 0
+    take: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Another take of the same place: another walk along the line, other noise, other drops."""
-    arrangement: int = 0
+    arrangement: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Another arrangement: chairs, boxes, cars are moved."""
-    laps: float = 1.0
-    """Times round; 0.25 is a quarter."""
-    length: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="")] = None
-    """Metres along the line, instead of --laps."""
-    num_frames: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
-    """Stop after N frames."""
-    start: Annotated[float, tyro.conf.arg(metavar="METRES")] = 0.0
-    """Where on the line the first frame is."""
-    spacing: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="(default: the world's)")] = None
-    """Metres between frames on the straight; in bends they come closer."""
-    speed: Annotated[float | None, tyro.conf.arg(metavar="M/S", help_behavior_hint="(default: the world's)")] = None
-    """With --spacing, this gives the times."""
-    lateral: Annotated[float, tyro.conf.arg(metavar="METRES")] = 0.0
-    """Metres to the left of the line, seen in the direction of travel; negative is to the right."""
-    reverse: tyro.conf.FlagCreatePairsOff[bool] = False
-    """The other way round."""
-    look: Annotated[float, tyro.conf.arg(metavar="DEGREES")] = 0.0
-    """The camera is turned so far to the left."""
-    wobble: Annotated[float, tyro.conf.arg(metavar="SIZE")] = 1.0
-    """The sway of who walks or drives: 1 is natural, 0 is on rails."""
-    shake: Annotated[float, tyro.conf.arg(metavar="SIZE")] = 0.0
-    """The tremble of a camera held in the hand: 1 is natural."""
-    camera: Annotated[str | None, tyro.conf.arg(metavar="FILE|fx,fy,cx,cy", help_behavior_hint="(default: 380,380, in the middle)")] = None
-    """A camera.json, or four numbers in pixels with --size."""
-    size: Annotated[str, tyro.conf.arg(metavar="WxH")] = "640x400"
-    """Size of the pictures. Without --camera the field of view stays 80 degrees across."""
-    focal_scale: Annotated[float, tyro.conf.arg(metavar="FACTOR")] = 1.0
-    """Lengthen the focal length: 1.5 is a longer lens, 0.8 a wider one."""
-    baseline: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="(default: 0.12, street 0.54)")] = None
-    """Metres between the left and the right camera."""
-    mono: tyro.conf.FlagCreatePairsOff[bool] = False
-    """A single camera: pictures in images/, and a camera.json."""
-    depth: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Exact depth pictures, too; with --mono this makes an RGB-D recording."""
-    grey: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Grey pictures."""
-    jpeg: Annotated[int | None, tyro.conf.arg(metavar="QUALITY", help_behavior_hint="(default: PNG)")] = None
-    """JPEG files of this quality, 1 to 100."""
-    motion_blur: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Average several moments of the exposure. Five times as slow."""
-    lens_drops: Annotated[int, tyro.conf.arg(metavar="N")] = 0
-    """Drops of rain on the lens."""
-    draft: tyro.conf.FlagCreatePairsOff[bool] = False
-    """About ten times as fast, with rougher light."""
+    route: tyro.conf.OmitArgPrefixes[RouteOptions] = field(default_factory=RouteOptions)
+    picture: tyro.conf.OmitArgPrefixes[PictureOptions] = field(default_factory=PictureOptions)
     processes: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: by the number of cores)")] = None
     """Processes that render; they have no influence on the pictures."""
-    overwrite: tyro.conf.FlagCreatePairsOff[bool] = False
+    overwrite: Flag = False
     """Remove the recording in OUT if its settings are others."""
-    json: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    json: File = None
     """Write what was recorded to this file (- for standard output)."""
 
     def run(self) -> int:
@@ -128,68 +136,44 @@ class Command:
         return 0
 
     def _config(self, world: World) -> RecordConfig:
-        if self.length is not None and self.laps != 1.0:
-            raise UsageError("--laps and --length cannot both be given")
-        if self.mono and self.baseline is not None:
+        pictures = self.picture
+        if pictures.mono and pictures.baseline is not None:
             raise UsageError("--mono has no --baseline")
         return RecordConfig(
             seed=self.seed,
             arrangement=self.arrangement,
             route=self._route(world),
-            camera=self._camera(),
-            baseline=None if self.mono else world.baseline if self.baseline is None else self.baseline,
-            render=RenderConfig.draft() if self.draft else RenderConfig(),
-            num_renderings=_MOMENTS_OF_BLUR if self.motion_blur else 1,
-            lens_drops=self.lens_drops,
-            grey=self.grey,
-            jpeg=self.jpeg,
-            depth=self.depth,
+            camera=_camera(pictures),
+            baseline=None if pictures.mono else world.baseline if pictures.baseline is None else pictures.baseline,
+            render=RenderConfig.draft() if pictures.draft else RenderConfig(),
+            num_renderings=_MOMENTS_OF_BLUR if pictures.motion_blur else 1,
+            grey=pictures.grey,
+            jpeg=pictures.jpeg,
+            depth=pictures.depth,
         )
 
     def _route(self, world: World) -> RouteConfig:
-        natural = world.route()
+        natural, route = world.route(), self.route
+        wobble, shake = _WOBBLE_AND_SHAKE[route.sway]
         return replace(
             natural,
-            laps=self.laps,
-            length=self.length,
-            num_frames=self.num_frames,
-            spacing=natural.spacing if self.spacing is None else self.spacing,
-            speed=natural.speed if self.speed is None else self.speed,
-            start=self.start,
-            lateral=self.lateral,
-            reverse=self.reverse,
-            look=math.radians(self.look),
-            wobble=self.wobble,
-            shake=self.shake,
+            laps=route.laps,
+            num_frames=route.num_frames,
+            spacing=natural.spacing if route.spacing is None else route.spacing,
+            start=route.start,
+            lateral=route.lateral,
+            reverse=route.reverse,
+            look=math.radians(route.look),
+            wobble=wobble,
+            shake=shake,
             seed=self.take,
         )
-
-    def _camera(self) -> Camera:
-        """What --camera, --size and --focal-scale say together. Raises UsageError, CalibrationError."""
-        width, height = _size(self.size)
-        if self.camera is None:
-            focal = ZED.fx * width / ZED.width
-            camera = Camera.pinhole(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
-        elif "," in self.camera and not Path(self.camera).exists():
-            try:
-                fx, fy, cx, cy = map(float, self.camera.split(","))
-            except ValueError:
-                raise CalibrationError(f"--camera {self.camera}: neither a file nor four numbers fx,fy,cx,cy") from None
-            camera = Camera.pinhole(width, height, fx, fy, cx, cy)
-        else:
-            camera = read_camera_json(Path(self.camera)).camera
-            if camera.is_distorted:
-                raise CalibrationError(f"{self.camera}: only undistorted cameras can be rendered, not {camera.model}")
-        scale = self.focal_scale
-        if not 0 < scale < math.inf:
-            raise UsageError(f"--focal-scale {scale:g}: must be positive")
-        return Camera.pinhole(camera.width, camera.height, camera.fx * scale, camera.fy * scale, camera.cx, camera.cy)
 
     def _tell(self, out: Path, recorded: Recorded, seconds: float) -> None:
         if self.json != "-":
             kept = recorded.num_frames - recorded.num_rendered
             before = f" ({kept} of them were there)" if kept else ""
-            what = "single pictures" if self.mono else "stereo pairs"
+            what = "single pictures" if self.picture.mono else "stereo pairs"
             print(f"{out}: {recorded.num_frames} {what}{before}, {recorded.length:.1f} m, in {seconds:.0f} s")
         write_json(
             self.json,
@@ -203,6 +187,24 @@ class Command:
                 "seconds": round(seconds, 3),
             },
         )
+
+
+def _camera(pictures: PictureOptions) -> Camera:
+    """What --camera and --size say together. Raises UsageError, CalibrationError."""
+    width, height = _size(pictures.size)
+    if pictures.camera is None:
+        focal = ZED.fx * width / ZED.width
+        return Camera.pinhole(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+    if "," in pictures.camera and not Path(pictures.camera).exists():
+        try:
+            fx, fy, cx, cy = map(float, pictures.camera.split(","))
+        except ValueError:
+            raise CalibrationError(f"--camera {pictures.camera}: neither a file nor four numbers fx,fy,cx,cy") from None
+        return Camera.pinhole(width, height, fx, fy, cx, cy)
+    camera = read_camera_json(Path(pictures.camera)).camera
+    if camera.is_distorted:
+        raise CalibrationError(f"{pictures.camera}: only undistorted cameras can be rendered, not {camera.model}")
+    return Camera.pinhole(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -1,0 +1,217 @@
+"""Settings as TOML: what `topoloc config` prints and `--config FILE` reads, both from the configurations as they are declared."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import json
+import re
+import textwrap
+import tomllib
+from collections.abc import Iterator, Sequence
+from dataclasses import is_dataclass, replace
+from difflib import get_close_matches
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args, get_origin
+
+from topoloc.bounds import Fitted, annotations_of, bare, bounds_of, complaint
+from topoloc.cli.output import UsageError
+from topoloc.errors import ConfigError, TopolocError
+
+T = TypeVar("T")
+
+# table of the file: module and class of its configuration, and the commands that it is for
+TABLES = {
+    "build": ("topoloc.map.build", "BuildConfig", ("build",)),
+    "localize": ("topoloc.localization.localizer", "LocalizerConfig", ("localize", "evaluate")),
+    "track": ("topoloc.tracking.tracker", "TrackerConfig", ("localize",)),
+    "slam": ("topoloc.slam.slam", "SlamConfig", ("slam", "build")),
+    "train": ("topoloc.map.coarse_training", "CoarseTrainingConfig", ("train", "build")),
+}
+_WIDTH = 110
+_LARGEST_FILE = 1_000_000
+
+
+class Settings:
+    """The configurations that a file sets; of all others the defaults."""
+
+    def __init__(self, configs: dict[type, Any]) -> None:
+        self._configs = configs
+
+    def of(self, kind: type[T]) -> T:
+        """The configuration of this class."""
+        return self._configs[kind] if kind in self._configs else kind()
+
+
+def read_settings(path: str | None) -> Settings:
+    """What the TOML file of `--config` says; None says nothing. Tables of other commands are read, too, and left aside.
+
+    Raises:
+        ConfigError: no such file, not TOML, or a key that is unknown, of the wrong type or out of its bounds; file and key are named.
+    """
+    if path is None:
+        return Settings({})
+    try:
+        configs = []
+        for name, table in _parsed(path).items():
+            if name not in TABLES:
+                raise ConfigError(f"{_key(name)}: no such table{_did_you_mean(name, TABLES)}")
+            configs.append(_configured(config_class(name)(), table, name))
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+    return Settings({type(config): config for config in configs})
+
+
+def config_class(table: str) -> type:
+    """The configuration that a table of the file sets."""
+    module, name, _ = TABLES[table]
+    return getattr(importlib.import_module(module), name)
+
+
+def with_option(config: T, key: str, value: Any, option: str) -> T:
+    """The configuration with an option of the command line at `key` ("nodes.d_thresh"), unless that is None: was not given.
+
+    Raises:
+        UsageError: out of bounds; names the option.
+    """
+    if value is None:
+        return config
+    name, _, rest = key.partition(".")
+    if rest:
+        return replace(config, **{name: with_option(getattr(config, name), rest, value, option)})  # pyright: ignore[reportArgumentType]
+    if wrong := complaint(value, annotations_of(type(config))[name]):
+        raise UsageError(f"{option}: {wrong}")
+    return replace(config, **{name: value})  # pyright: ignore[reportArgumentType]
+
+
+def settings_text(tables: Sequence[str]) -> str:
+    """The TOML of these tables: every setting with its default, what it means and its bounds."""
+    return "\n".join("\n".join(_table_lines(config_class(table)(), table)) for table in tables)
+
+
+def _table_lines(config: Any, key: str, note: str = "") -> Iterator[str]:
+    """A table and those in it."""
+    kinds, notes = _settable(type(config)), meanings_of(type(config))
+    nested = [name for name in kinds if is_dataclass(getattr(config, name))]
+    yield from _comment(" ".join(filter(None, (_about(type(config)), note))))
+    yield f"[{key}]"
+    for name, kind in kinds.items():
+        if name not in nested:
+            value = getattr(config, name)
+            yield from _comment(notes.get(name, ""))
+            line = f"# {name} =" if value is None else f"{name} = {_toml(value)}"
+            yield f"{line}  # {_range(kind)}" if _range(kind) else line
+    yield ""
+    for name in nested:
+        yield from _table_lines(getattr(config, name), f"{key}.{name}", notes.get(name, ""))
+
+
+def _comment(text: str) -> list[str]:
+    return textwrap.wrap(text, _WIDTH, initial_indent="# ", subsequent_indent="# ", break_on_hyphens=False)
+
+
+def _about(kind: type) -> str:
+    """The first paragraph of a class's docstring."""
+    return " ".join((inspect.getdoc(kind) or "").partition("\n\n")[0].split())
+
+
+def _range(kind: Any) -> str:
+    plain, _ = bare(kind)
+    if get_origin(plain) is Literal:
+        return "one of " + ", ".join(map(_toml, get_args(plain)))
+    return " and ".join(map(str, bounds_of(kind)))
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_toml, value))}]"
+    if isinstance(value, bool | str):
+        return json.dumps(value)
+    return repr(value)
+
+
+@cache
+def meanings_of(kind: type) -> dict[str, str]:
+    """The docstrings of a dataclass's fields, each in one line."""
+    (body,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
+    assert isinstance(body, ast.ClassDef)
+    meanings = {}
+    for item, after in zip(body.body, body.body[1:], strict=False):
+        if isinstance(item, ast.AnnAssign) and isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
+            meanings[ast.unparse(item.target)] = " ".join(str(after.value.value).split())
+    return meanings
+
+
+def _settable(kind: type) -> dict[str, Any]:
+    """The fields that are settings."""
+    return {name: declared for name, declared in annotations_of(kind).items() if Fitted() not in bounds_of(declared)}
+
+
+def _parsed(path: str) -> dict[str, Any]:
+    try:
+        with Path(path).open("rb") as file:
+            content = file.read(_LARGEST_FILE + 1)
+    except OSError as error:
+        raise ConfigError(error.strerror or "cannot be read") from None
+    if len(content) > _LARGEST_FILE:
+        raise ConfigError(f"larger than {_LARGEST_FILE} bytes, no file of settings")
+    try:
+        return tomllib.loads(content.decode())
+    except (ValueError, RecursionError) as error:  # tomllib's own error is a ValueError, as are those of bad UTF-8 and of numbers too long
+        raise ConfigError(f"not TOML ({error})") from None
+
+
+def _configured(config: T, table: Any, key: str) -> T:
+    """The configuration with what a table sets. Raises ConfigError, which names the key."""
+    if not isinstance(table, dict):
+        raise ConfigError(f"{key}: a table is expected, [{key}]")
+    kinds, changes = _settable(type(config)), {}
+    for name, value in table.items():
+        its_key = f"{key}.{_key(name)}"
+        if name not in kinds:
+            raise ConfigError(f"{its_key}: no such setting{_did_you_mean(name, kinds) or _elsewhere(name, key)}")
+        before = getattr(config, name)
+        if is_dataclass(before):
+            changes[name] = _configured(before, value, its_key)
+        else:
+            changes[name] = _as_declared(value, bare(kinds[name])[0])
+            if wrong := complaint(changes[name], kinds[name]):
+                raise ConfigError(f"{its_key}: {wrong}")
+    try:
+        return replace(config, **changes)  # pyright: ignore[reportArgumentType]
+    except (ValueError, TopolocError) as error:  # values that do not go together
+        raise ConfigError(f"{key}: {error}") from None
+
+
+def _as_declared(value: Any, plain: Any) -> Any:
+    """What TOML knows no type for: lists that are tuples, whole numbers where any will do."""
+    if get_origin(plain) is tuple and isinstance(value, list):
+        items = get_args(plain)
+        kinds = [items[0]] * len(value) if items[-1] is ... else [*items, *[None] * len(value)]
+        return tuple(map(_as_declared, value, kinds))
+    return float(value) if plain is float and type(value) is int and abs(value) < 2**53 else value
+
+
+def _key(name: str) -> str:
+    return name if re.fullmatch(r"[\w-]{1,60}", name) else json.dumps(name if len(name) <= 60 else name[:57] + "...")
+
+
+def _did_you_mean(name: str, names: Any) -> str:
+    near = get_close_matches(name[:100], names, n=1)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+def _elsewhere(name: str, key: str) -> str:
+    """The setting of this name in another place of the same table, where there is one."""
+    table = key.partition(".")[0]
+    found = [other for other in _keys(config_class(table)(), table) if other.rpartition(".")[2] == name]
+    return f"; did you mean {found[0]}?" if found else ""
+
+
+def _keys(config: Any, key: str) -> Iterator[str]:
+    for name in _settable(type(config)):
+        yield f"{key}.{name}"
+        if is_dataclass(value := getattr(config, name)):
+            yield from _keys(value, f"{key}.{name}")

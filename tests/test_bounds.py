@@ -1,0 +1,131 @@
+"""Bounds of settings: what they let through, what they say, and that every setting of topoloc has a meaning and bounds."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, is_dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import topoloc
+from built_room import built_room
+from topoloc.bounds import Above, AtLeast, Between, Fitted, annotations_of, bounds_of, check_bounds, complaint
+from topoloc.cli.settings_file import TABLES, config_class, meanings_of
+from topoloc.errors import ConfigError
+from topoloc.map.nodes import NodeConfig
+from topoloc.slam.odometry import OdometryConfig
+from topoloc.slam.slam import SlamConfig, run_slam
+from topoloc.tracking.motion_gate import GateConfig
+
+
+@dataclass(frozen=True)
+class Inner:
+    share: Annotated[float, Between(0, 1)] = 0.5
+    pairs: Annotated[tuple[tuple[float, float], ...], AtLeast(0)] = ((1.0, 2.0),)
+
+
+@dataclass(frozen=True)
+class Outer:
+    length: Annotated[float | None, Above(0)] = None
+    number: Annotated[int, AtLeast(1)] = 1
+    kind: Literal["a", "b"] = "a"
+    is_on: bool = False
+    weight: Annotated[float, Fitted()] = -3.0
+    inner: Inner = field(default_factory=Inner)
+
+
+@pytest.mark.parametrize(
+    "change", [{"length": 3}, {"length": np.float32(0.1)}, {"number": np.int64(7)}, {"weight": -1e300}, {"inner": Inner(1.0, ())}]
+)
+def test_what_is_within_passes(change: dict[str, Any]):
+    check_bounds(replace(Outer(), **change))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"length": 0.0}, "Outer.length: must be above 0, not 0.0"),
+        ({"length": math.nan}, "Outer.length: must be a finite number, not nan"),
+        ({"weight": math.inf}, "Outer.weight: must be a finite number, not inf"),
+        ({"length": 10**400}, "Outer.length: must be a finite number, not 1000"),
+        ({"number": 0}, "Outer.number: must be at least 1, not 0"),
+        ({"number": 1.5}, "Outer.number: a whole number is expected, not 1.5"),
+        ({"number": 2**31}, "Outer.number: must be at most 2147483647"),
+        ({"number": True}, "Outer.number: a whole number is expected, not True"),
+        ({"number": None}, "Outer.number: a whole number is expected, not None"),
+        ({"length": "far"}, "Outer.length: a number is expected, not 'far'"),
+        ({"kind": "c"}, "Outer.kind: one of a, b is expected, not 'c'"),
+        ({"is_on": 1}, "Outer.is_on: true or false is expected, not 1"),
+        ({"inner": {"share": 0.5}}, "Outer.inner: a Inner is expected, not {'share': 0.5}"),
+        ({"inner": Inner(share=1.01)}, "Outer.inner.share: must be from 0 to 1, not 1.01"),
+        ({"inner": Inner(pairs=((1.0, -2.0),))}, "Outer.inner.pairs: must be at least 0, not -2.0"),
+        ({"inner": Inner(pairs=((1.0, math.nan),))}, "Outer.inner.pairs: must be a finite number, not nan"),
+        ({"inner": Inner(pairs=((1.0,),))}, "Outer.inner.pairs: a list of values is expected"),  # type: ignore[arg-type]
+    ],
+)
+def test_what_is_not_is_said_with_its_key(change: dict[str, Any], said: str):
+    with pytest.raises(ConfigError) as raised:
+        check_bounds(replace(Outer(), **change))
+    assert str(raised.value).startswith(said)
+
+
+@given(st.sampled_from([Above(0), AtLeast(-2), Between(0, 1), Fitted()]), st.floats() | st.integers())
+def test_no_number_that_is_not_one_passes(bound: Any, number: float):
+    kind = Annotated[float, bound]
+    if complaint(number, kind) is None:
+        assert math.isfinite(number)
+        assert bound.holds(number)
+
+
+def _settings_of(kind: type, key: str) -> list[tuple[str, type, str, Any, Any]]:
+    """Key, class, name, annotation and default of every field, those of nested configurations too."""
+    config = kind()
+    found: list[tuple[str, type, str, Any, Any]] = []
+    for name, declared in annotations_of(kind).items():
+        default = getattr(config, name)
+        found += _settings_of(type(default), f"{key}.{name}") if is_dataclass(default) else []
+        found.append((f"{key}.{name}", kind, name, declared, default))
+    return found
+
+
+def _is_of_numbers(declared: Any) -> bool:
+    return declared in (int, float) or any(map(_is_of_numbers, get_args(declared)))
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_every_setting_has_a_meaning_and_every_number_bounds(table: str):
+    settings = _settings_of(config_class(table), table)
+    assert len(settings) > 10
+    for key, kind, name, declared, default in settings:
+        if is_dataclass(default):
+            about = type(default).__doc__ or ""
+            assert about, key
+            assert not about.startswith(f"{type(default).__name__}("), f"{key}: what a dataclass without a docstring is given"
+        elif Fitted() not in bounds_of(declared):
+            assert meanings_of(kind).get(name), f"{key} has no docstring that says what it means"
+        if _is_of_numbers(declared):
+            assert bounds_of(declared), f"{key} has no bounds"
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_defaults_are_within_their_bounds(table: str):
+    check_bounds(config_class(table)())
+
+
+def test_callers_from_python_are_told_too(tiny_recording: Path):
+    topomap = built_room(tiny_recording)
+    nodes = NodeConfig(d_thresh=-1.0)
+    with pytest.raises(ConfigError, match=r"^BuildConfig\.nodes\.d_thresh: must be above 0, not -1\.0$"):
+        topoloc.build_map([], topoloc.BuildConfig(nodes=nodes))
+    with pytest.raises(ConfigError, match=r"^LocalizerConfig\.num_candidates: must be from 1"):
+        topoloc.Localizer(topomap, topoloc.LocalizerConfig(num_candidates=0))
+    gate = GateConfig(max_surprise=math.nan)
+    with pytest.raises(ConfigError, match=r"^TrackerConfig\.gate\.max_surprise: must be a finite number"):
+        topoloc.Tracker(topoloc.Localizer(topomap), topoloc.TrackerConfig(gate=gate))
+    with pytest.raises(ConfigError, match=r"^SlamConfig\.odometry\.window: must be from 1"):
+        run_slam([], SlamConfig(odometry=OdometryConfig(window=0)))
