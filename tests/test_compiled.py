@@ -60,7 +60,12 @@ def test_where_it_cannot_lie_beside_the_function_it_is_the_users(module: Path):
 
 def test_without_any_place_it_is_compiled_each_time_and_said_once(module: Path):
     (module / "__pycache__").write_text("no folder")
-    printed, said = _run(module, XDG_CACHE_HOME="/dev/null")
+    (module / "others").mkdir()
+    (module / "others" / "__init__.py").write_text("")
+    (module / "others" / "__pycache__").write_text("no folder")
+    (module / "others" / "far_kernels.py").write_text(_MODULE)
+    code = f"import others.far_kernels as f; f.more(1.0); {_CALL}"
+    printed, said = _run(module, code, XDG_CACHE_HOME="/dev/null")
     assert printed == "7.0 0 1"
     assert said.startswith("topoloc compiles anew in every process")
     assert said.count("\n") == 1
@@ -73,12 +78,13 @@ def test_numbas_own_setting_is_kept(module: Path):
     assert not (module / "__pycache__").exists()
 
 
-def test_damaged_code_is_made_again(module: Path):
+@pytest.mark.parametrize("kind", ["nbi", "nbc"])
+def test_damaged_code_is_made_again(module: Path, kind: str):
     _run(module)
-    for file in (module / "__pycache__").glob("*.nb?"):
+    for file in (module / "__pycache__").glob(f"*.{kind}"):
         file.write_bytes(file.read_bytes()[:20])
-    assert _run(module) == ("7.0 0 1", "")
-    assert _run(module) == ("7.0 1 0", "")
+    assert _run(module, XDG_CACHE_HOME="/dev/null") == ("7.0 0 1", "")
+    assert _run(module, XDG_CACHE_HOME="/dev/null") == ("7.0 1 0", "")
 
 
 def test_a_changed_kernel_beside_it_makes_it_another(module: Path):

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-import pickle
 import sys
 from collections.abc import Callable
 from functools import cache
@@ -22,11 +21,11 @@ from numba.core import config
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, NullCache
 
 _USUAL_THREADS = 2
-_UNREADABLE = (OSError, EOFError, pickle.UnpicklingError)
 
 KERNELS: list[Any] = []
 """All that were declared by now."""
 _chosen: list[int] = []
+_told: list[str] = []
 
 
 def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -92,7 +91,11 @@ class _KeptCode(NullCache):
         for folder in self._caches:
             try:
                 found = folder.load_overload(sig, target_context)
-            except _UNREADABLE:
+            except OSError:
+                continue
+            except Exception:  # damaged: what unpickling raises then is anybody's guess
+                with contextlib.suppress(OSError):
+                    folder.flush()
                 continue
             if found is not None:
                 return found
@@ -100,11 +103,9 @@ class _KeptCode(NullCache):
 
     def save_overload(self, sig: Any, cres: Any) -> None:
         for folder in self._caches:
-            try:
+            with contextlib.suppress(OSError):
                 return folder.save_overload(sig, cres)
-            except _UNREADABLE:
-                continue
-        _tell_once(" or ".join(folder.cache_path for folder in self._caches))
+        _tell(" or ".join(folder.cache_path for folder in self._caches))
         return None
 
     def flush(self) -> None:
@@ -162,8 +163,11 @@ def _digest_of(file: str) -> str:
     return hashlib.sha256(b"".join(path.read_bytes() for path in sorted(files))).hexdigest()
 
 
-@cache
-def _tell_once(folders: str) -> None:
+def _tell(folders: str) -> None:
+    """Once a process."""
+    if _told:
+        return
+    _told.append(folders)
     print(
         f"topoloc compiles anew in every process, a minute in all: machine code cannot be kept ({folders}). While a container's image"
         " is built, `python -c 'import topoloc; topoloc.warm_up()'` fills the first; or NUMBA_CACHE_DIR names one that can be written.",
