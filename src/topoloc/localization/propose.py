@@ -119,14 +119,18 @@ def _viewpoints(search: Search) -> Iterator[Proposal]:
                 found.append((num_alike, local_map, matches))
     found.sort(key=lambda one: -one[0])
     quick = replace(search.config.pose, max_iterations=config.max_iterations)
+    # where a place repeats itself, many nodes see the same, and the right one is no better than the others
+    more = 3 if found and len(search.map.repeats(search.ranked[0].node_id)) else 1
     with query.clock.stage("pnp"):
-        fits = [fit_pose(query.features, query.lens, local_map, matches, quick) for _, local_map, matches in found[: config.max_fits]]
+        fits = [
+            fit_pose(query.features, query.lens, local_map, matches, quick) for _, local_map, matches in found[: more * config.max_fits]
+        ]
     kept: list[PoseFit] = []
     for fit in sorted(fits, key=lambda fit: -fit.num_inliers):
         if fit.pose is not None and not any(is_same_pose(fit, other, search.config.evidence) for other in kept):
             kept.append(fit)
             yield Proposal("viewpoints", fit, is_guided=True)
-        if len(kept) == config.max_poses:
+        if len(kept) == more * config.max_poses:
             return
 
 
@@ -146,7 +150,7 @@ def _repetitions(search: Search) -> Iterator[Proposal]:
             apart = np.linalg.norm(np.array(known) - world_from_cam.translation, axis=1).min()
             if apart < 0.5 * np.linalg.norm(shift) or asked == config.max_repetitions:
                 continue
-            asked += 1
+            asked, search.is_repeated = asked + 1, True
             tried.append(world_from_cam.translation)
             with query.clock.stage("matching"):
                 local_map = search.map.local_map(search.map.nearest(world_from_cam, config.guided.num_nodes))
@@ -155,5 +159,5 @@ def _repetitions(search: Search) -> Iterator[Proposal]:
             with query.clock.stage("pnp"):
                 fit = fit_pose(query.features, query.lens, local_map, matches, config.pose, start)
             before = set(map(id, search.belief.hypotheses))
-            yield Proposal("repetition", fit, is_guided=True)
+            yield Proposal("repetition", fit, is_guided=True, repeats=hypothesis.evidence)
             waiting += [other for other in search.belief.hypotheses if id(other) not in before]

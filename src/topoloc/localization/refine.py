@@ -80,6 +80,10 @@ def weigh(search: Search, proposal: Proposal, final: PoseFit) -> Hypothesis | No
         inflated = inflation(final.num_inliers, search.rho)
         covariance = inflated * final.pose.covariance
         evidence = None if proposal.is_guided else _evidence(search, first, final, covariance)
+        if proposal.repeats is not None:
+            before = proposal.repeats
+            evidence = replace(_evidence(search, final, final, covariance), num_matches=before.num_matches, num_inliers=before.num_inliers)
+            return Hypothesis(proposal.source, final, evidence, covariance, 1.0 / inflated, log_odds_of(evidence, search.weights))
         if evidence is None or log_odds_of(evidence, search.weights) <= search.weights.evidence.clear_log_odds:
             guessed = evidence or _evidence(search, final, final, covariance)
             at_best = replace(guessed, num_matches=final.num_inliers, num_inliers=final.num_inliers)

@@ -7,6 +7,7 @@ from typing import Literal
 
 from topoloc.localization.belief import Belief, Hypothesis
 from topoloc.localization.config import LocalizerConfig
+from topoloc.localization.evidence import Evidence
 from topoloc.localization.fitted_weights import FittedWeights
 from topoloc.localization.open_map import OpenMap
 from topoloc.localization.pose_fit import PoseFit
@@ -21,12 +22,14 @@ Source = Literal["prior", "retrieval", "look-alikes", "viewpoints", "repetition"
 class Proposal:
     """A first pose (`fit.pose`, None where the matches agree on none), and where it comes from.
 
-    `is_guided`: were the matches sought where a pose expects them? Then they are no evidence for it.
+    `is_guided`: were the matches sought where a pose expects them? Then they are no evidence for it. `repeats`: the evidence for the pose
+    that this one repeats; matches that no pose guided speak for both.
     """
 
     source: Source
     fit: PoseFit
     is_guided: bool
+    repeats: Evidence | None = None
 
 
 @dataclass(eq=False)
@@ -43,6 +46,8 @@ class Search:
     ranked: list[NodeScore] = field(default_factory=list)
     first: PoseFit | None = None
     """What was tried first: where nothing is believed, it says why."""
+    is_repeated: bool = False
+    """What is believed is one of many poses from which the place looks alike."""
     is_stopped: bool = False
     """Time was up before everything was tried."""
 

@@ -34,7 +34,7 @@ from topoloc.localization.wall_matching import SeenSide, SideMatches, estimate_p
 from topoloc.localization.wall_poses import agreeing_pose
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class WallProposal(Proposal):
     """A first pose from view `view` and a side node, on which `num_agreeing` of their matches agree."""
 
@@ -74,7 +74,13 @@ def propose_walls(search: Search) -> Iterator[Proposal]:
     """The first poses that most matches of a view agree with, some for each view."""
     config, best = search.config.walls, search.best
     is_settled = best is not None and best.probability >= search.config.evidence.min_probability and best.log_odds > config.clear_log_odds
-    if is_settled or config.num_ranked == 0 or isinstance(search.query.lens, RoughCamera) or (index := search.map.walls) is None:
+    if (
+        is_settled
+        or search.is_repeated
+        or config.num_ranked == 0
+        or isinstance(search.query.lens, RoughCamera)
+        or (index := search.map.walls) is None
+    ):
         return
     with search.query.clock.stage("walls"):
         walls = SeenWalls.of(search, index)
@@ -114,7 +120,10 @@ def _compared(walls: SeenWalls, view: int, row: int) -> WallProposal | None:
         return None
     num_agreeing, side_from_world = agreeing
     fit = PoseFit(side.in_picture, walls.camera, walls.camera, local_map, matches, None)
-    return WallProposal("walls", fit, True, view, row, num_agreeing, side.view.cam_from_side @ side_from_world, walls)
+    cam_from_world = side.view.cam_from_side @ side_from_world
+    return WallProposal(
+        "walls", fit, is_guided=True, view=view, side_row=row, num_agreeing=num_agreeing, cam_from_world=cam_from_world, walls=walls
+    )
 
 
 def refine_wall(proposal: WallProposal) -> tuple[PoseFit, SideMatches] | None:
