@@ -67,9 +67,9 @@ def find_links(
             links.append(link)
         progress("loops", done + 1, len(proposals))
     rank = {keyframe: place for place, keyframe in enumerate(places)}
-    clear = [link for link in links if not any(_contradicts(other, link, keyframes, config) for other in links)]
-    plausible = [link for link in clear if _within_drift(link, keyframes, config)]
-    supported = [link for link in plausible if any(_supports(other, link, keyframes, rank, config) for other in plausible)]
+    plausible = [link for link in links if _within_drift(link, keyframes, config)]
+    clear = [link for link in plausible if not any(_contradicts(other, link, keyframes, config) for other in plausible)]
+    supported = [link for link in clear if any(_supports(other, link, keyframes, rank, config) for other in clear)]
     sure = [link for link in supported if not _is_rivalled(link, keyframes, places, config)]
     return [link for link in sure if any(_supports(other, link, keyframes, rank, config) for other in sure)]
 
@@ -149,7 +149,7 @@ def _is_rivalled(link: Link, keyframes: Sequence[KeyFrame], places: list[int], c
     around = places[max(at - config.rival_places, 0) : at + config.rival_places + 1]
     for source in (i for i in around if i not in (link.source, link.target) and keyframes[i].submap == keyframes[link.source].submap):
         match = _match(source, link.target, keyframes, config)
-        if match is not None and _contradicts(match, link, keyframes, config):
+        if match is not None and _within_drift(match, keyframes, config) and _contradicts(match, link, keyframes, config):
             return True
     return False
 
