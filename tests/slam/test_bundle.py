@@ -27,7 +27,7 @@ def world(num: int = 5, bias_px: float = 0.0) -> tuple[list[KeyFrame], Landmarks
         measured = STEREO.project(pose.apply(points)) + rng.normal(0, NOISE_PX, (len(points), 3)) + [0.0, 0.0, bias_px]
         seen = Observations(ids, measured, np.full((len(points), 3), 1.0 / NOISE_PX), np.ones(len(points), np.bool_))
         wrong = Rigid3.exp(rng.normal(0, 0.02, 6)) @ pose if k else pose
-        keyframes.append(KeyFrame(0, k, 0, STEREO, wrong, seen, bias))
+        keyframes.append(KeyFrame(0, k, 100_000_000 * k, 0, STEREO, wrong, seen, bias))
         poses.append(pose)
     return keyframes, landmarks, poses, points
 

@@ -11,7 +11,7 @@ leads that, it is right with the probability 1 / (1 + 1/o + sum of e^-d).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
@@ -107,14 +107,22 @@ class Belief:
 
     hypotheses: tuple[Hypothesis, ...] = ()
     weighed: tuple[Hypothesis, ...] = ()
+    _compared: dict[tuple[int, int], bool] = field(default_factory=dict)
+    """Which pairs of these say the same: what was found out before need not be again."""
 
     def given(self, hypothesis: Hypothesis, config: EvidenceConfig, weights: RivalWeights) -> Belief:
         """With one more hypothesis."""
         weighed, kept = (*self.weighed, hypothesis), list[Hypothesis]()
         for one in _ranked(weighed, weights):
-            if not any(_say_the_same(one, other, config) for other in kept):
+            if not any(self._say_the_same(one, other, config) for other in kept):
                 kept.append(one)
-        return Belief(tuple(kept), weighed)
+        return Belief(tuple(kept), weighed, self._compared)
+
+    def _say_the_same(self, one: Hypothesis, other: Hypothesis, config: EvidenceConfig) -> bool:
+        pair = (min(id(one), id(other)), max(id(one), id(other)))
+        if pair not in self._compared:
+            self._compared[pair] = _say_the_same(one, other, config)
+        return self._compared[pair]
 
     def ranked(self, weights: RivalWeights) -> list[Hypothesis]:
         """The hypotheses, the one that leads all others first."""

@@ -14,8 +14,8 @@ from jaxtyping import Float
 
 from topoloc.localization.local_map import LocalMap
 
-NUM_NEIGHBOURS = 12
-_NUM_POINTS = 200
+NUM_NEIGHBOURS = 9
+_NUM_POINTS = 128
 _MIN_SIMILARITY = 0.9
 _CELL = 0.1  # metres; and a share of the shift's own length
 _MIN_VOTES, _MIN_VOTE_SHARE = 12, 0.15

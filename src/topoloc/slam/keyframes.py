@@ -104,6 +104,7 @@ class KeyFrame:
 
     recording: int
     frame_idx: int
+    t_ns: int
     submap: int
     stereo: StereoCamera
     cam_from_world: Rigid3

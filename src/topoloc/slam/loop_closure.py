@@ -36,14 +36,16 @@ class LoopConfig:
     """Two links that support each other may differ by this (metres), and by this share of the way between their ends."""
     max_disagreement_deg: Annotated[float, Above(0)] = 2.0
     """The same, in degrees."""
-    rival_places: Annotated[int, AtLeast(0)] = 15
-    """A link is contradicted by another one of the same place whose other end is within so many places of its own ..."""
     rival_share: Annotated[float, Between(0, 1)] = 0.5
-    """... and that has this share of its matches."""
+    """A link is contradicted by another one of the same place that has this share of its matches, and puts it elsewhere."""
+    rival_places: Annotated[int, AtLeast(0)] = 15
+    """Such links are looked for among so many places before and after its own, too."""
     max_drift: Annotated[float, AtLeast(0)] = 0.05
     """Share of the way travelled by which the odometry may be wrong, besides half a metre."""
     max_drift_deg: Annotated[float, AtLeast(0)] = 15.0
     """The same in degrees, whatever the way."""
+    max_speedup: Annotated[float, Above(0)] = 2.0
+    """Between two sub-maps of a recording a camera goes no faster than so many times its fastest within them, but for half a metre."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,17 +67,16 @@ def find_links(
     proposals = _propose(keyframes, places, config)
     links = []
     for done, (target, source) in enumerate(proposals):
-        a, b = keyframes[source].place, keyframes[target].place
-        assert a is not None
-        assert b is not None
-        match = match_places(a, b, keyframes[target].stereo, config.matching)
-        if match is not None:
-            links.append(Link(source, target, match))
+        link = _match(source, target, keyframes, config)
+        if link is not None:
+            links.append(link)
         progress("loops", done + 1, len(proposals))
     rank = {keyframe: place for place, keyframe in enumerate(places)}
-    clear = [link for link in links if not any(_contradicts(other, link, keyframes, rank, config) for other in links)]
-    plausible = [link for link in clear if _within_drift(link, keyframes, config)]
-    return [link for link in plausible if any(_supports(other, link, keyframes, rank, config) for other in plausible)]
+    plausible = [link for link in links if _within_drift(link, keyframes, config)]
+    clear = [link for link in plausible if not any(_contradicts(other, link, keyframes, config) for other in plausible)]
+    supported = [link for link in clear if any(_supports(other, link, keyframes, rank, config) for other in clear)]
+    sure = [link for link in supported if not _is_rivalled(link, keyframes, places, config)]
+    return [link for link in sure if any(_supports(other, link, keyframes, rank, config) for other in sure)]
 
 
 def _propose(keyframes: Sequence[KeyFrame], places: list[int], config: LoopConfig) -> list[tuple[int, int]]:
@@ -104,21 +105,66 @@ def _may_be_loop(keyframes: Sequence[KeyFrame], places: list[int], a: int, b: in
 def _within_drift(link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig) -> bool:
     source, target = keyframes[link.source], keyframes[link.target]
     if source.submap != target.submap:
-        return True
-    between = [k.cam_from_world.inverse().translation for k in keyframes[link.source : link.target + 1] if k.submap == source.submap]
-    way = float(np.linalg.norm(np.diff(between, axis=0), axis=1).sum())
+        return source.recording != target.recording or _within_reach(link, keyframes, config)
+    way = _way(keyframes, link.source, link.target)
     drift = _difference(link.match.target_from_source, target.cam_from_world @ source.cam_from_world.inverse())
     return bool(drift[0] < 0.5 + config.max_drift * way and drift[1] < np.deg2rad(config.max_drift_deg))
 
 
-def _contradicts(other: Link, link: Link, keyframes: Sequence[KeyFrame], rank: dict[int, int], config: LoopConfig) -> bool:
-    """Whether one of the link's ends is linked nearly as well with a neighbour of its other end, and cannot be at both."""
+def _within_reach(link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig) -> bool:
+    """Whether the camera can have come from the end of the earlier sub-map to the beginning of the later one, as the link has it."""
+    source, target = keyframes[link.source], keyframes[link.target]
+    before, after = ([k for k in keyframes if k.submap == end.submap] for end in (source, target))
+    end_in_source = source.cam_from_world @ before[-1].cam_from_world.inverse()
+    start_in_target = target.cam_from_world @ after[0].cam_from_world.inverse()
+    start_in_source = link.match.target_from_source.inverse() @ start_in_target
+    seconds = 1e-9 * (after[0].t_ns - before[-1].t_ns)
+    reach = 0.5 + config.max_speedup * max(_fastest(before), _fastest(after)) * seconds
+    return bool(np.linalg.norm(end_in_source.translation - start_in_source.translation) < reach)
+
+
+def _fastest(submap: Sequence[KeyFrame]) -> float:
+    """Metres a second."""
+    positions = np.array([k.cam_from_world.inverse().translation for k in submap])
+    seconds = 1e-9 * np.diff([k.t_ns for k in submap])
+    return float(np.max(np.linalg.norm(np.diff(positions, axis=0), axis=1) / np.maximum(seconds, 1e-9), initial=0.0))
+
+
+def _way(keyframes: Sequence[KeyFrame], first: int, last: int) -> float:
+    """Metres from one key frame to a later one of the same sub-map."""
+    submap = keyframes[first].submap
+    between = [k.cam_from_world.inverse().translation for k in keyframes[first : last + 1] if k.submap == submap]
+    return float(np.linalg.norm(np.diff(between, axis=0), axis=1).sum())
+
+
+def _contradicts(other: Link, link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig) -> bool:
+    """Whether one of the link's ends is linked nearly as well with another place, and cannot be at both."""
     if (other.target == link.target) == (other.source == link.source):
         return False
-    apart = abs(rank[other.target] - rank[link.target]) + abs(rank[other.source] - rank[link.source])
-    if apart > config.rival_places or len(other.match.source_rows) < config.rival_share * len(link.match.source_rows):
+    if len(other.match.source_rows) < config.rival_share * len(link.match.source_rows):
         return False
-    return _agreement(other, link, keyframes, config) is False
+    ends = (link.source, other.source) if other.target == link.target else (link.target, other.target)
+    drift = config.max_drift * _way(keyframes, min(ends), max(ends))
+    return _agreement(other, link, keyframes, config, drift) is False
+
+
+def _is_rivalled(link: Link, keyframes: Sequence[KeyFrame], places: list[int], config: LoopConfig) -> bool:
+    """Whether the target looks as if it were near a neighbour of the source, somewhere else."""
+    at = places.index(link.source)
+    around = places[max(at - config.rival_places, 0) : at + config.rival_places + 1]
+    for source in (i for i in around if i not in (link.source, link.target) and keyframes[i].submap == keyframes[link.source].submap):
+        match = _match(source, link.target, keyframes, config)
+        if match is not None and _within_drift(match, keyframes, config) and _contradicts(match, link, keyframes, config):
+            return True
+    return False
+
+
+def _match(source: int, target: int, keyframes: Sequence[KeyFrame], config: LoopConfig) -> Link | None:
+    a, b = keyframes[source].place, keyframes[target].place
+    assert a is not None
+    assert b is not None
+    match = match_places(a, b, keyframes[target].stereo, config.matching)
+    return None if match is None else Link(source, target, match)
 
 
 def _supports(other: Link, link: Link, keyframes: Sequence[KeyFrame], rank: dict[int, int], config: LoopConfig) -> bool:
@@ -131,8 +177,12 @@ def _supports(other: Link, link: Link, keyframes: Sequence[KeyFrame], rank: dict
     return _agreement(other, link, keyframes, config) is True
 
 
-def _agreement(other: Link, link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig) -> bool | None:
-    """Whether going from source to target by the one link and back by the other ends where it began; None across sub-maps."""
+def _agreement(other: Link, link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig, drift: float = 0.0) -> bool | None:
+    """Whether going from source to target by the one link and back by the other ends where it began; None across sub-maps.
+
+    Args:
+        drift: metres by which the odometry may be wrong between them.
+    """
     a, b, c, d = (keyframes[i] for i in (link.source, link.target, other.source, other.target))
     if a.submap != c.submap or b.submap != d.submap:
         return None
@@ -140,7 +190,7 @@ def _agreement(other: Link, link: Link, keyframes: Sequence[KeyFrame], config: L
     expected = targets.inverse() @ other.match.target_from_source @ sources
     way = float(np.linalg.norm(sources.translation) + np.linalg.norm(targets.translation) + np.linalg.norm(expected.translation))
     metres, radians = _difference(link.match.target_from_source, expected)
-    return bool(metres < config.max_disagreement * (1.0 + way) and radians < np.deg2rad(config.max_disagreement_deg))
+    return bool(metres < config.max_disagreement * (1.0 + way) + drift and radians < np.deg2rad(config.max_disagreement_deg))
 
 
 def _difference(a: Rigid3, b: Rigid3) -> tuple[float, float]:

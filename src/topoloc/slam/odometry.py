@@ -3,7 +3,7 @@
 Read from `Odometry.process`. A frame's points are followed from the frame before, their landmarks give its pose (robust PnP), and where
 too few of them are left, or the view has changed, it becomes a key frame: disparities are measured, new corners become
 landmarks, and the last key frames are adjusted together. A camera that is lost is sought in the last places; after a while
-it starts a sub-map of its own.
+it starts a sub-map of its own. So it does at once where a repeating wall admits several steps and the motion does not tell which.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Odometry:
         assert self._reference is not None
         cam_from_keyframe = step.cam_from_world @ self._reference.cam_from_world.inverse()
         if self._is_keyframe_due(measured):
-            self._add_keyframe(frame_idx, step.cam_from_world, measured, Motion(self._reference, step.covariance))
+            self._add_keyframe(frame, frame_idx, step.cam_from_world, measured, Motion(self._reference, step.covariance))
             cam_from_keyframe = Rigid3.identity()
         return FramePose(frame_idx, self._reference, cam_from_keyframe, measured.view.view_from_cam)
 
@@ -66,13 +66,14 @@ class Odometry:
         seeker = StepSeeker(self._last, self._reference, self._reference_picture, self._tracks, self._landmarks, measured, self._config)
         step = seeker.seek(prediction.cam_from_world) or seeker.seek(self._last.cam_from_world)
         trusted = self._config.prediction
-        if step is not None and not prediction.is_gap and prediction.distance(step.cam_from_world) < trusted.max_sigmas:
+        is_expected = step is not None and prediction.distance(step.cam_from_world) < trusted.max_sigmas
+        if is_expected and not prediction.is_gap:
             return step
         if self._num_lost == 0:
             self._repeats = seeker.repeats(prediction)
-        if step is None:
+        if step is None or (prediction.is_gap and not is_expected and step.share < self._config.min_gap_share):
             return None
-        expected = expected_one(prediction, self._with_repeats([step.cam_from_world]), trusted)
+        expected = expected_one(prediction, self._with_repeats(step.cam_from_world), trusted)
         if expected is not None and not seeker.is_same(expected, step.cam_from_world):
             step = seeker.seek(expected)
         if expected is None or step is None or not seeker.is_same(expected, step.cam_from_world):
@@ -80,9 +81,9 @@ class Odometry:
             return None
         return step
 
-    def _with_repeats(self, poses: list[Rigid3]) -> list[Rigid3]:
-        """All that the camera may be at where it looks as if it were at one of these, each cam_from_world."""
-        return [*poses, *(repeat @ pose for pose in poses for repeat in self._repeats)]
+    def _with_repeats(self, cam_from_world: Rigid3) -> list[Rigid3]:
+        """All that the camera may be at where it looks as if it were there."""
+        return [cam_from_world, *(repeat @ cam_from_world for repeat in self._repeats)]
 
     def _remember(self, frame: StereoFrame, measured: MeasuredView, cam_from_world: Rigid3) -> None:
         moved = cam_from_world @ self._last.cam_from_world.inverse() if self._last is not None else None
@@ -97,7 +98,9 @@ class Odometry:
         motion = np.median(np.linalg.norm(tracks.points_img - tracks.points_ref, axis=1))
         return bool(motion > config.keyframe_motion * measured.view.camera.width)
 
-    def _add_keyframe(self, frame_idx: int, cam_from_world: Rigid3, measured: MeasuredView, motion: Motion | None) -> None:
+    def _add_keyframe(
+        self, frame: StereoFrame, frame_idx: int, cam_from_world: Rigid3, measured: MeasuredView, motion: Motion | None
+    ) -> None:
         """Make the frame a key frame: measure, add landmarks, adjust the window, and follow its points from here on."""
         config = self._config
         points, landmark_ids = self._tracks.points_img, self._tracks.landmark_ids
@@ -117,6 +120,7 @@ class Odometry:
         keyframe = KeyFrame(
             self._recording,
             frame_idx,
+            frame.t_ns,
             submap,
             measured.stereo,
             cam_from_world,
@@ -191,14 +195,14 @@ class Odometry:
         self._last, self._chain = None, []
         self._history.stop()
         self._tracks = self._tracks.select(np.zeros(0, np.int64))
-        self._add_keyframe(frame_idx, cam_from_world, measured, motion)
+        self._add_keyframe(frame, frame_idx, cam_from_world, measured, motion)
         self._remember(frame, measured, cam_from_world)
         self._num_lost = 0
         assert self._reference is not None
         return FramePose(frame_idx, self._reference, Rigid3.identity(), measured.view.view_from_cam)
 
     def _relocalize(self, frame: StereoFrame, measured: MeasuredView) -> tuple[Rigid3, Motion] | None:
-        """Where the camera is by one of the last places. Where they say different things and the motion does not tell, the search ends."""
+        """Where the camera is by one of the last places; where the wall repeats itself and the motion does not tell, the search ends."""
         here = place_view(measured.view, self._config.places)
         prediction = self._history.predict(frame.t_ns)
         for keyframe in self._last_places(self._config.places_asked):
@@ -207,7 +211,7 @@ class Odometry:
             if match is None:
                 continue
             cam_from_world = match.target_from_source @ keyframe.cam_from_world
-            expected = expected_one(prediction, self._with_repeats([cam_from_world]), self._config.prediction)
+            expected = expected_one(prediction, self._with_repeats(cam_from_world), self._config.prediction)
             if expected is cam_from_world:
                 return cam_from_world, Motion(keyframe, match.covariance)
             self._reference = None

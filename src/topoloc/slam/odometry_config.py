@@ -46,6 +46,8 @@ class OdometryConfig:
     """A key frame is due when so few of the last one's points are left."""
     keyframe_motion: Annotated[float, Above(0)] = 0.03
     """... or when they have moved in the picture by this share of its width (median)."""
+    min_gap_share: Annotated[float, Between(0, 1)] = 0.5
+    """After a gap, a step that the motion does not let expect is believed where this share of the points is found again."""
     start_spacing_px: Annotated[float, Above(0)] = 25.0
     """Whether the last picture looks alike from elsewhere is tried from places this far apart (median over the points) ..."""
     max_starts: Annotated[int, Between(0, 1000)] = 16
