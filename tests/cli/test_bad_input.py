@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import sqlite3
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -235,3 +237,12 @@ def test_bugs_are_not_hidden(room_map: Path, monkeypatch: pytest.MonkeyPatch):
         monkeypatch.setattr("topoloc.cli.info.describe_map", bug)
         with pytest.raises(kind):
             main(["info", str(room_map)])
+
+
+@pytest.mark.parametrize("megabytes", [600, 1000])
+def test_too_little_address_space_is_one_line(megabytes: int, tmp_path: Path):
+    command = f"ulimit -v {megabytes * 1000}; exec {sys.executable} -m topoloc info {tmp_path / 'no.topo'}"
+    run = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    assert run.returncode == 1
+    assert run.stderr.startswith("error: too little memory")
+    assert len(run.stderr.splitlines()) == 1

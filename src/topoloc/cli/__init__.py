@@ -28,6 +28,9 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 _IN_HELP = ("demo", "simulate", "slam", "build", "train", "localize", "evaluate", "benchmark", "info", "config")
 
 
+LEAST_ADDRESS_SPACE = 1_600_000_000
+
+
 def main(args: list[str] | None = None) -> int:
     """Run one command. Returns the exit status: 0 done, 1 a known failure (one line on stderr), 2 wrong usage."""
     if sys.stdout is None:  # closed by the caller, who wants no output; its number must not go to a file that we open
@@ -84,6 +87,7 @@ def _run(name: str, module_name: str, summary: str, args: list[str]) -> int:
     from topoloc.errors import TopolocError
 
     try:
+        _check_address_space()
         import tyro
 
         from topoloc.cli.output import UsageError, interruptible
@@ -104,6 +108,20 @@ def _run(name: str, module_name: str, summary: str, args: list[str]) -> int:
     except KeyboardInterrupt:
         _print_error("interrupted; every file is as it was or whole")
     return 1
+
+
+def _check_address_space() -> None:
+    """Below this OpenBLAS, FAISS and LLVM end the process from within while they are loaded, with no word of their own."""
+    from topoloc.errors import TopolocError
+
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if 0 <= limit < LEAST_ADDRESS_SPACE:
+        least = LEAST_ADDRESS_SPACE // 10**6
+        raise TopolocError(f"too little memory: ulimit -v leaves {limit // 10**6} MB of address space, at least {least} are needed")
 
 
 def _print_error(text: str) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from topoloc.cli.options import File
+from topoloc.cli.options import File, Flag
 from topoloc.cli.output import check_outputs, print_facts, write_json
 from topoloc.errors import EmptyMapError, MapError
 
@@ -24,7 +24,7 @@ class Command:
     json: File = None
     """Write the same as JSON to this file (- for standard output)."""
 
-    check: bool = False
+    check: Flag = False
     """Also look at every byte of the map, and whether its nodes agree with their neighbours; exit status 1 where something is wrong."""
 
     def run(self) -> int:

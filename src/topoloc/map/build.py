@@ -25,7 +25,7 @@ from topoloc.map.entries import Edge, NodeSummary, PlaceImage, TopoNode
 from topoloc.map.landmarks import Observations, observe_points, refine_points, session_sums
 from topoloc.map.nodes import NodeConfig, NodePoses, node_distances, place_nodes
 from topoloc.map.schema import SCHEMA_VERSION
-from topoloc.map.sessions import Edit, Light, Session, light_of, mean_light, path_of, today
+from topoloc.map.sessions import Edit, Light, Session, light_of, mean_light, path_of, poses_source_of, today
 from topoloc.map.side_nodes import describe_sides, gather_sides, nodes_with_sides
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.map.views import MappingView, mapping_view
@@ -93,7 +93,8 @@ def build_map(
     """Build a topo-metric map from one or several recordings of one place whose poses share one world.
 
     Args:
-        poses_from: where the poses of each recording come from (`truth`, `slam`, a file), for the map to remember.
+        poses_from: where the poses of each recording come from (`truth`, `slam`, a file), for the map to remember; else what is
+            known of that.
 
     Raises:
         ConfigError: a value of `config` is out of its bounds.
@@ -112,7 +113,7 @@ def build_map(
     place_images, lights, coarse = _visit_all_images(frames, drafts, node_config, config, progress)
     nodes = [_finish_node(node_id, draft, config) for node_id, draft in enumerate(drafts)]
     sides = [replace(side, summary=replace(side.summary, of_node=node_id)) for node_id, draft in enumerate(drafts) for side in draft.sides]
-    poses_from = poses_from or ["given"] * len(sequences)
+    poses_from = poses_from or [poses_source_of(sequence) for sequence in sequences]
     return TopoMetricMap(
         summaries=[node.summary for node in nodes],
         nodes=nodes,

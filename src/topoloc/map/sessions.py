@@ -86,6 +86,15 @@ def path_of(sequence: StereoSequence) -> str | None:
     return str(sequence.root) if isinstance(sequence, Recording) else None
 
 
+def poses_source_of(sequence: StereoSequence) -> str:
+    """`truth` where the poses are those that the recording came with, else `given`."""
+    if isinstance(sequence, SequenceView):
+        before = sequence.base.poses
+        is_same = all(pose is before[index] for index, pose in zip(sequence.indices, sequence.poses, strict=True))
+        return poses_source_of(sequence.base) if is_same else "given"
+    return "truth" if isinstance(sequence, Recording) else "given"
+
+
 def light_of(image: Image) -> Light:
     """The light in one picture (uint8), of every fourth pixel each way."""
     sample = image[::4, ::4].astype(np.float64) / 255.0
