@@ -14,6 +14,7 @@ import time
 import numpy as np
 import torch
 
+from topoloc.compiled import set_num_threads
 from topoloc.features.features import Features
 from topoloc.places.backbones import Backbone
 from topoloc.places.classifier_config import BackboneName, CnnNnConfig, PictureConfig, VladNnConfig
@@ -40,13 +41,13 @@ NETWORKS: tuple[tuple[str, BackboneName], ...] = (
 def main() -> None:
     names = [f"{name}/{backbone}" for name, backbone in NETWORKS]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--networks", nargs="+", default=names, choices=names)
     parser.add_argument("--size", default="224x224")
     parser.add_argument("--runs", type=int, default=15)
     arguments = parser.parse_args()
-    torch.set_num_threads(arguments.threads)
-    print(f"{torch.backends.cpu.get_cpu_capability()}, bfloat16 in hardware: {has_bfloat16()}, up to {arguments.threads} threads")
+    set_num_threads(arguments.threads)
+    print(f"{torch.backends.cpu.get_cpu_capability()}, bfloat16 in hardware: {has_bfloat16()}, {arguments.threads} threads")
     width, height = map(int, arguments.size.split("x"))
     image = np.random.default_rng(0).integers(0, 255, (480, 640, 3), np.uint8)
     no_features = Features(*(np.zeros(shape, np.float32) for shape in ((0, 2), (0,), (0,), (0,), (0, 64))))

@@ -47,10 +47,12 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 def set_num_threads(number: int) -> None:
-    """At most so many threads work on one query, one frame or one mapping image; 2 unless it is said. Poses do not depend on it.
+    """At most so many threads work on one query, one frame or one mapping image.
 
-    Holds for topoloc in this process and for the libraries that it calls: OpenCV, FAISS, PyTorch where it is loaded. Of several threads
-    that share a `Localizer`, each uses as many. NumPy's own number is set before Python starts (`OPENBLAS_NUM_THREADS`).
+    Unless it is said these are 2, and 1 for the networks of learned coarse localizers. The answers do not depend on it, but for the last
+    digits of such a network's scores. Holds for topoloc in this process and for the libraries that it calls: OpenCV, FAISS, and PyTorch
+    where it is loaded. Of several threads that share a `Localizer`, each uses as many. NumPy's own number is set before Python starts
+    (`OPENBLAS_NUM_THREADS`).
 
     Raises:
         ValueError: `number` is below 1.

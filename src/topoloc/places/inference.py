@@ -7,9 +7,8 @@ with the network frozen into TorchScript, whose fused calls save a third of a sm
 from __future__ import annotations
 
 import threading
-import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
 import numpy as np
@@ -22,7 +21,6 @@ from topoloc.places.backbones import normalize_pictures
 from topoloc.places.training_set import RgbPictures
 
 BATCH_SIZE = 16
-NUM_TRIALS = 5
 
 
 def has_bfloat16() -> bool:
@@ -42,7 +40,7 @@ class Predictor:
     def __init__(self, network: nn.Module) -> None:
         self._dtype = torch.bfloat16 if has_bfloat16() else torch.float32
         self._network = in_channels_last(network.eval().requires_grad_(False).to(self._dtype))
-        self._frozen: dict[tuple[int, ...], tuple[torch.jit.ScriptModule, int]] = {}
+        self._frozen: dict[tuple[int, ...], torch.jit.ScriptModule] = {}
         self._freezing = threading.Lock()
 
     def __call__(self, pictures: RgbPictures) -> Float32[np.ndarray, "n d"]:
@@ -58,12 +56,12 @@ class Predictor:
     def _single(self, image: Tensor) -> Tensor:
         """One picture through the frozen network, which is made at the first call: in small networks calls cost as much as arithmetic."""
         shape = tuple(image.shape)
-        with self._freezing:
-            if shape not in self._frozen:
-                self._frozen[shape] = _freeze(self._network, image)
-            frozen, num_threads = self._frozen[shape]
-        with threads(num_threads):
-            return frozen(image)
+        # By default one: the last digits follow from the number, and on a busy machine several wait for one another many times as long.
+        with threads(chosen_threads(1)):
+            with self._freezing:
+                if shape not in self._frozen:
+                    self._frozen[shape] = _freeze(self._network, image)
+            return self._frozen[shape](image)
 
 
 class _Threads:
@@ -81,8 +79,9 @@ class _Threads:
     def __call__(self, number: int) -> Iterator[None]:
         outer: int | None = getattr(self._here, "number", None)
         with self._lock:
+            own = torch.get_num_threads()  # always asked: it makes a new thread take the process's number, which would else happen later
             if self._num_users == 0:
-                self._own = torch.get_num_threads()
+                self._own = own
             self._num_users += 1
             torch.set_num_threads(number)
         self._here.number = number
@@ -98,27 +97,14 @@ class _Threads:
 threads = _Threads()
 
 
-def _freeze(network: nn.Module, image: Tensor) -> tuple[torch.jit.ScriptModule, int]:
-    """The network for images of this shape, and the number of threads that answers soonest."""
+def _freeze(network: nn.Module, image: Tensor) -> torch.jit.ScriptModule:
+    """The network for images of this shape, ready."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # TorchScript calls itself outdated at every use
         frozen = torch.jit.freeze(torch.jit.trace(network, image))
-    return frozen, _fastest_threads(lambda: frozen(image))
-
-
-def _fastest_threads(call: Callable[[], object]) -> int:
-    """One thread or all, whichever answers sooner now: on a busy machine several threads wait for one another many times as long."""
-    times = {}
-    for number in {1, chosen_threads(torch.get_num_threads())}:
-        with threads(number):
-            for _ in range(2):  # these compile
-                call()
-            starts = [time.perf_counter()]
-            for _ in range(NUM_TRIALS):
-                call()
-                starts.append(time.perf_counter())
-        times[number] = float(np.median(np.diff(starts)))
-    return min(times, key=lambda number: times[number])
+    for _ in range(2):  # these compile
+        frozen(image)
+    return frozen
 
 
 def in_channels_last(network: nn.Module) -> nn.Module:
