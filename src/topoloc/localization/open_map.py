@@ -90,6 +90,8 @@ class OpenMap:
 
     def _find_repeats(self, row: int) -> Float[np.ndarray, "k 3"]:
         node, poses = self._local_map(row), self.node_poses
+        if len(shifts_of(node, node, _LEAST_SHIFT)) == 0:  # what repeats itself mostly does so within one picture
+            return np.zeros((0, 3))
         depths = self.cam_from_world(row).apply(node.points_world)[:, 2]
         away = np.linalg.norm(poses.centres - poses.centres[row], axis=1)
         looks_alike = poses.rotations[:, :, 2] @ poses.rotations[row, :, 2] > 0.85
