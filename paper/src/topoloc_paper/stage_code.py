@@ -80,7 +80,7 @@ def _imports(module: str) -> tuple[str, ...]:
             names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
         elif isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
-    paths = {name.replace(".", "/") + ".py" for name in names if name.split(".")[0] in ROOTS}
+    paths = {name.replace(".", "/") + ".py" for name in names if name.partition(".")[0] in ROOTS and "." in name}
     return tuple(sorted(path for path in paths if _file(path).is_file()))
 
 
