@@ -1,4 +1,4 @@
-"""The table of the paper's experiments in docs/benchmarks.md: a block between two markers, generated from the results and from nothing else."""
+"""The table of the paper's experiments in docs/benchmarks.md: a block between two markers, generated from the results alone."""
 
 from __future__ import annotations
 
