@@ -92,6 +92,7 @@ class Command:
         check_outputs([self.json, self.tum], inputs=[path for path in (self.map, *self.inputs, self.streams.odometry, self.config) if path])
         settings = read_settings(self.config)
         config = with_option(settings.of(LocalizerConfig), "coarse", self.coarse, "--coarse")
+        config = with_option(config, "max_ms", self.max_ms, "--max-ms")
         tracking = self._tracking(settings.of(TrackerConfig))
         topomap = TopoMetricMap.load(self.map)
         camera = None if self.camera is None else _camera_of_size(self.camera, topomap)
