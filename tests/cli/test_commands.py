@@ -219,7 +219,10 @@ def test_a_query_may_be_given_a_time(room_map: Path, queries: Path, tmp_path: Pa
         given.append(self.config.max_ms)
 
     monkeypatch.setattr(Localizer, "__init__", told)
-    for options in ([], ["--max-ms", "0"], ["--config.max-ms", "50"], ["--config.max-ms", "50", "--max-ms", "80"]):
+    settings_file = tmp_path / "my.toml"
+    settings_file.write_text("[localize]\nmax_ms = 50.0\n")
+    by_file = ["--config", str(settings_file)]
+    for options in ([], ["--max-ms", "0"], by_file, [*by_file, "--max-ms", "80"]):
         assert main(["localize", str(room_map), str(queries), "--json", str(tmp_path / "a.json"), *options]) == 0
         assert all(line["localized"] for line in _lines(tmp_path / "a.json"))  # the first hypothesis of each is clear
     assert given == [None, 0.0, 50.0, 80.0]
