@@ -48,6 +48,10 @@ def _is_right(result: Localization | NotLocalized, truth: Rigid3) -> bool:
     return isinstance(result, Localization) and _is_pose(result.world_from_cam, truth)
 
 
+def _is_by_walls(result: Localization | NotLocalized) -> bool:
+    return isinstance(result, Localization) and result.evidence is not None and result.evidence.num_distinct is not None
+
+
 def _is_pose(world_from_cam: Rigid3, truth: Rigid3) -> bool:
     return translation_error(world_from_cam, truth) < 0.3 and rotation_error(world_from_cam, truth) < np.deg2rad(5.0)
 
@@ -65,7 +69,9 @@ def test_an_answer_by_the_walls_says_what_it_stands_on(localizer: Localizer):
     topomap = localizer.topomap
     assert topomap.sides is not None
     with_sides = {summary.name for summary in topomap.sides.summaries}
-    for result, truth in _found_on_the_way_back():
+    by_walls = [(result, truth) for result, truth in _found_on_the_way_back() if _is_by_walls(result)]
+    assert len(by_walls) >= 3
+    for result, truth in by_walls:
         assert isinstance(result, Localization)
         assert localizer.config.walls.min_found <= result.num_inliers <= result.num_matches
         assert 0.5 <= result.probability <= 1.0
@@ -158,8 +164,9 @@ def _twice(topomap: TopoMetricMap, apart: float) -> TopoMetricMap:
 
 def test_walls_that_stand_in_two_places_are_no_answer():
     localizer = Localizer(_twice(built_corridor(), apart=60.0))
-    results = [localizer.localize(picture, WIDE) for picture, _ in seen_on_the_way_back()[::2]]
-    assert not any(isinstance(result, Localization) for result in results)
+    results = [(localizer.localize(picture, WIDE), truth) for picture, truth in seen_on_the_way_back()[::2]]
+    assert not any(_is_by_walls(result) for result, _ in results)
+    assert all(_is_right(result, truth) for result, truth in results if isinstance(result, Localization))  # of viewpoints
 
 
 def _by_the_walls(topomap: TopoMetricMap, picture: np.ndarray, config: WallsConfig | None = None) -> list[Hypothesis]:
@@ -216,5 +223,5 @@ def test_side_nodes_that_cannot_be_ranked_are_a_map_error_where_they_are_asked(t
     database.close()
     localizer = Localizer(TopoMetricMap.load(path))
     assert isinstance(localizer.localize(seen_ahead()[0][0], WIDE), Localization)
-    with pytest.raises(MapError, match="side nodes"):
+    with pytest.raises(MapError, match="side_coarse_models"):
         localizer.localize(seen_on_the_way_back()[0][0], WIDE)
