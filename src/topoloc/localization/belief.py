@@ -137,7 +137,7 @@ def _ranked(hypotheses: tuple[Hypothesis, ...], weights: RivalWeights) -> list[H
     def least_lead(one: Hypothesis) -> float:
         return min((lead(one, other, weights) for other in hypotheses if other is not one), default=math.inf)
 
-    return sorted(hypotheses, key=lambda one: (one.probability >= 0.5, least_lead(one)), reverse=True)
+    return sorted(hypotheses, key=lambda one: (one.probability >= 0.5, least_lead(one), one.log_odds), reverse=True)
 
 
 def _say_the_same(a: Hypothesis, b: Hypothesis, config: EvidenceConfig) -> bool:
