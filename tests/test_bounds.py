@@ -120,7 +120,7 @@ def test_defaults_are_within_their_bounds(table: str):
 def test_callers_from_python_are_told_too(tiny_recording: Path):
     topomap = built_room(tiny_recording)
     nodes = NodeConfig(d_thresh=-1.0)
-    with pytest.raises(ConfigError, match=r"^BuildConfig\.nodes\.d_thresh: must be above 0, not -1\.0$"):
+    with pytest.raises(ConfigError, match=r"^MapConfig\.nodes\.d_thresh: must be above 0, not -1\.0$"):
         topoloc.build_map([], topoloc.BuildConfig(nodes=nodes))
     with pytest.raises(ConfigError, match=r"^LocalizerConfig\.num_candidates: must be from 1"):
         topoloc.Localizer(topomap, topoloc.LocalizerConfig(num_candidates=0))

@@ -93,6 +93,7 @@ class LocalizerConfig:
     num_first_features: Annotated[int, AtLeast(1)] = 320
     """The image's strongest features are matched first; the rest only where these give fewer inliers than the next number."""
     num_clear_inliers: Annotated[int, AtLeast(0)] = 40
+    """With fewer inliers of the first pose, its surroundings are looked at twice."""
     num_chance_inliers: Annotated[int, AtLeast(0)] = 7
     """Fewer agree on a pose anywhere: where the first matches have no more, and no viewpoint stands out, look-alikes are not asked."""
     min_matches: Annotated[int, AtLeast(4)] = 8

@@ -139,7 +139,7 @@ def _repetitions(search: Search) -> Iterator[Proposal]:
     query, config, asked = search.query, search.config, 0
     tried: list[np.ndarray] = []
     waiting = list(search.belief.hypotheses)
-    while waiting and asked < config.max_repetitions:
+    while waiting and asked < config.max_repetitions and config.guided.num_nodes > 0:
         hypothesis = waiting.pop(0)
         if hypothesis.is_from_walls or hypothesis.probability < config.evidence.min_probability:
             continue

@@ -131,8 +131,8 @@ def _fastest(submap: Sequence[KeyFrame]) -> float:
 
 
 def _way(keyframes: Sequence[KeyFrame], first: int, last: int) -> float:
-    """Metres from one key frame to a later one of the same sub-map."""
-    submap = keyframes[first].submap
+    """Metres between two key frames of the same sub-map, along the way."""
+    submap, (first, last) = keyframes[first].submap, sorted((first, last))
     between = [k.cam_from_world.inverse().translation for k in keyframes[first : last + 1] if k.submap == submap]
     return float(np.linalg.norm(np.diff(between, axis=0), axis=1).sum())
 
