@@ -67,7 +67,7 @@ def _done_again(change: Callable[[], object]) -> set[str]:
         ("topoloc/places/cnn_nn.py", {"asking cnn-nn", "learning cnn-nn"}),
         ("topoloc/places/training.py", {"learning cnn-fc", "learning PoseNet"}),
         ("topoloc/map/coarse_training.py", {*LEARNING, "learning PoseNet"}),
-        ("topoloc/map/landmarks.py", {"mapping"}),
+        ("topoloc/map/landmarks.py", {"mapping", *ASKING, *PEERS}),
         ("topoloc/map/reading.py", {"mapping", *ASKING, *PEERS}),
         ("topoloc/features/surf_detector_kernels.py", {"mapping", *ASKING, *PEERS}),
         ("topoloc_paper/colmap_worker.py", {"pycolmap, SIFT"}),
