@@ -97,7 +97,7 @@ class Edge:
 
 @dataclass(frozen=True)
 class SharedErrors:
-    """rho, the share of a match's variance that the map's points have in common, as `localization/shared_errors.py` measured it.
+    """rho, the share of a match's variance that the map's points have in common, as `localization/correlated_errors.py` measured it.
 
     `digest` stands for the nodes and the settings that it was measured of and with: of others it says nothing.
     """
