@@ -14,7 +14,7 @@ from topoloc.localization.result import Alternative, Localization, NotLocalized,
 from topoloc.localization.search import Search
 from topoloc.localization.seen_points import SeenPoints
 
-_MIN_ALTERNATIVE = 0.01  # less probable ones are not named
+_MIN_ALTERNATIVE = 0.01  # ones that are less probable beside the best one are not named
 
 
 def answer(search: Search) -> tuple[Localization | NotLocalized, SeenPoints | None]:
@@ -54,7 +54,7 @@ def _ambiguity(search: Search, ranked: list[Hypothesis], leads: list[float], oth
     """It is one of these; how probable each is, beside "nowhere"."""
     best = ranked[0]
     shares = [1.0 / (1.0 + others), *(math.exp(-one) / (1.0 + others) for one in leads)]
-    named = [(one, share) for one, share in zip(ranked, shares, strict=True) if share >= _MIN_ALTERNATIVE]
+    named = [(one, share) for one, share in zip(ranked, shares, strict=True) if share >= _MIN_ALTERNATIVE * shares[0]]
     alternatives = [Alternative(one.world_from_cam, share, one.fit.node_id) for one, share in named]
     alternatives.sort(key=lambda one: -one.probability)
     if len(alternatives) > 1:

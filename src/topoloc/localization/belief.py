@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -43,8 +44,12 @@ class Hypothesis:
 
     @property
     def world_from_cam(self) -> Rigid3:
-        assert self.fit.pose is not None
-        return self.fit.pose.cam_from_world.inverse()
+        return self.fit.world_from_cam
+
+    @cached_property
+    def variance(self) -> float:
+        """No direction has more."""
+        return float(np.trace(self.covariance))
 
     @property
     def probability(self) -> float:
@@ -75,13 +80,10 @@ def is_same_pose(a: PoseFit, b: PoseFit, config: EvidenceConfig) -> bool:
     A pose that is not precise yet may be far from the one that it will become, but sees the same things in the same features; two places
     that look alike explain the same features by different points.
     """
-    assert a.pose is not None
-    assert b.pose is not None
-    apart = a.pose.cam_from_world @ b.pose.cam_from_world.inverse()
-    way = np.linalg.norm(a.pose.cam_from_world.inverse().translation - b.pose.cam_from_world.inverse().translation)
-    if way < 2.0 * config.max_translation and apart.angle() < math.radians(2.0 * config.max_rotation_deg):
+    way = np.linalg.norm(a.world_from_cam.translation - b.world_from_cam.translation)
+    if way < 2.0 * config.max_translation and _from_to(a, b).angle() < math.radians(2.0 * config.max_rotation_deg):
         return True
-    if a.features is not b.features:
+    if a.features is not b.features or not a.stands_near(b):
         return False
     rows_a, rows_b = (fit.matches.query_idx[fit.pose.inliers] for fit in (a, b) if fit.pose is not None)
     _, of_a, of_b = np.intersect1d(rows_a, rows_b, return_indices=True)
@@ -134,17 +136,31 @@ class Belief:
 
 
 def _ranked(hypotheses: tuple[Hypothesis, ...], weights: RivalWeights) -> list[Hypothesis]:
-    def least_lead(one: Hypothesis) -> float:
-        return min((lead(one, other, weights) for other in hypotheses if other is not one), default=math.inf)
-
-    return sorted(hypotheses, key=lambda one: (one.probability >= 0.5, least_lead(one), one.log_odds), reverse=True)
+    if len(hypotheses) < 2:
+        return list(hypotheses)
+    strength = np.array([_strength(one, weights) for one in hypotheses])
+    log_odds = np.array([one.log_odds for one in hypotheses])
+    from_walls = np.array([one.is_from_walls for one in hypotheses])
+    by_odds = from_walls[:, None] | from_walls
+    leads = np.where(by_odds, log_odds[:, None] - log_odds, strength[:, None] - strength)
+    np.fill_diagonal(leads, np.inf)
+    least = leads.min(axis=1)
+    order = sorted(range(len(hypotheses)), key=lambda k: (hypotheses[k].probability >= 0.5, least[k], log_odds[k]), reverse=True)
+    return [hypotheses[k] for k in order]
 
 
 def _say_the_same(a: Hypothesis, b: Hypothesis, config: EvidenceConfig) -> bool:
     """As `is_same_pose`; also where their covariances leave open that both are right."""
     if is_same_pose(a.fit, b.fit, config):
         return True
-    assert a.fit.pose is not None
-    assert b.fit.pose is not None
-    apart = (a.fit.pose.cam_from_world @ b.fit.pose.cam_from_world.inverse()).log()
-    return float(apart @ np.linalg.solve(a.covariance + b.covariance, apart)) < _CHI_SQUARE_6_AT_95
+    limit = _CHI_SQUARE_6_AT_95 * (a.variance + b.variance)
+    apart = a.world_from_cam.rotation.T @ (b.world_from_cam.translation - a.world_from_cam.translation)
+    if apart @ apart > limit or (turn := _from_to(a.fit, b.fit)).angle() ** 2 > limit:
+        return False  # the vector below is longer than either
+    vector = turn.log()
+    return float(vector @ np.linalg.solve(a.covariance + b.covariance, vector)) < _CHI_SQUARE_6_AT_95
+
+
+def _from_to(a: PoseFit, b: PoseFit) -> Rigid3:
+    """From the camera of one to that of the other."""
+    return a.world_from_cam.inverse() @ b.world_from_cam

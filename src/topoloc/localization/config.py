@@ -101,7 +101,7 @@ class LocalizerConfig:
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
     look_alikes: LookAlikesConfig = field(default_factory=LookAlikesConfig)
     viewpoints: ViewpointsConfig = field(default_factory=ViewpointsConfig)
-    max_repetitions: Annotated[int, Between(0, 1000)] = 24
+    max_repetitions: Annotated[int, Between(0, 1000)] = 64
     """Where a place repeats itself, so many other poses are looked into at most."""
     walls: WallsConfig = field(default_factory=WallsConfig)
     correlated_errors: CorrelatedErrorsConfig = field(default_factory=CorrelatedErrorsConfig)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -14,15 +14,17 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.guided import expected_key_points
 from topoloc.localization.local_map import LocalMap
-from topoloc.localization.repetition import NUM_NEIGHBOURS, shifts_of
+from topoloc.localization.repetition import LEAST_SHIFT, NUM_NEIGHBOURS, copy_of, shifts_of
 from topoloc.localization.viewing import viewing_distances
 from topoloc.localization.wall_index import WallIndex
 from topoloc.map.memory import RememberedNodes
 from topoloc.map.nodes import NodePoses
-from topoloc.map.topomap import TopoMetricMap, open_coarse_of
+from topoloc.map.topomap import TopoMetricMap, TopoNode, open_coarse_of
 from topoloc.places.coarse import CoarseLocalizer, NodeScore
+from topoloc.places.vlad import SurfVlad
 
-_LEAST_REACH, _LEAST_SHIFT = 2.5, 0.3  # metres: how far repetitions are looked for, and from what shift on they are another place
+_LEAST_REACH = 2.5  # metres: how far shifts are looked for, at least
+_NUM_ALIKE, _NUM_PARTS, _PART_REACH = 64, 8, 5.0  # nodes that look alike; parts of the map that they make up; a part, in D_thresh (Eq. 1)
 
 
 class OpenMap:
@@ -49,6 +51,7 @@ class OpenMap:
         self.lambda_rot, self.d_thresh = topomap.config.lambda_rot, topomap.config.d_thresh
         self._local_map = RememberedNodes(lambda row: LocalMap.of_node(topomap.nodes[row]))
         self._repeats = RememberedNodes(self._find_repeats)
+        self._moves = RememberedNodes(self._find_moves)
         self._expected: tuple[Camera, RememberedNodes[Float32[np.ndarray, "n 5"]]] | None = None
 
     @cached_property
@@ -88,9 +91,38 @@ class OpenMap:
         """The shifts (metres, world) by which what a node shows repeats itself, see `repetition.py`."""
         return self._repeats(row)
 
+    def moves(self, row: int) -> Float[np.ndarray, "k 4 4"]:
+        """The moves (world) by which what a node shows is found elsewhere in the map, those shifts among them."""
+        return self._moves(row)
+
+    def _find_moves(self, row: int) -> Float[np.ndarray, "k 4 4"]:
+        node = self.topomap.nodes[row]
+        found = [Rigid3(np.eye(3), shift) for shift in self.repeats(row)]
+        found += [move for part in self._alike(node) if (move := copy_of(node, self.local_map(part))) is not None]
+        return np.array([move.matrix() for move in found]).reshape(-1, 4, 4)
+
+    def _alike(self, node: TopoNode) -> Iterator[list[int]]:
+        """The rows of nodes that look like this one and are far from it, those near each other together, the most alike first."""
+        if self._by_looks is None:
+            return
+        blank = np.zeros((node.camera.height, node.camera.width), np.uint8)
+        far = self.distances(node.summary.world_from_cam) > _PART_REACH * self.d_thresh
+        left = [found.node_id for found in self._by_looks.rank(blank, node.features, _NUM_ALIKE) if far[found.node_id]]
+        for _ in range(_NUM_PARTS):
+            if not left:
+                return
+            near = self.distances(self.topomap.summaries[left[0]].world_from_cam) <= _PART_REACH * self.d_thresh
+            yield [row for row in left if near[row]][:3]
+            left = [row for row in left if not near[row]]
+
+    @cached_property
+    def _by_looks(self) -> CoarseLocalizer | None:
+        """What ranks nodes by features alone, where the map has it."""
+        return open_coarse_of(self.topomap, SurfVlad.name) if SurfVlad.name in self.topomap.coarse_models else None
+
     def _find_repeats(self, row: int) -> Float[np.ndarray, "k 3"]:
         node, poses = self._local_map(row), self.node_poses
-        if len(shifts_of(node, node, _LEAST_SHIFT)) == 0:  # what repeats itself mostly does so within one picture
+        if len(shifts_of(node, node, LEAST_SHIFT)) == 0:  # what repeats itself mostly does so within one picture
             return np.zeros((0, 3))
         depths = self.cam_from_world(row).apply(node.points_world)[:, 2]
         away = np.linalg.norm(poses.centres - poses.centres[row], axis=1)
@@ -98,7 +130,7 @@ class OpenMap:
         near = np.flatnonzero(looks_alike & (away < max(_LEAST_REACH, 1.5 * float(np.median(depths)))))
         near = near[np.argsort(away[near], kind="stable")]
         spread = np.unique(np.linspace(0, len(near) - 1, NUM_NEIGHBOURS).round().astype(int))
-        return shifts_of(node, self.local_map(near[spread]), _LEAST_SHIFT)
+        return shifts_of(node, self.local_map(near[spread]), LEAST_SHIFT)
 
     def distances(self, world_from_cam: Rigid3) -> Float[np.ndarray, " nodes"]:
         """D_total of Eq. 1 (metres) between a camera and each node, whichever side of the camera is up."""

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from jaxtyping import Float
 
 from topoloc.features.features import Features, Matches
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
@@ -40,6 +42,25 @@ class PoseFit:
             return -1
         node_ids, counts = np.unique(self.local_map.node_ids[self.matches.train_idx[self.pose.inliers]], return_counts=True)
         return int(node_ids[counts.argmax()])
+
+    @cached_property
+    def world_from_cam(self) -> Rigid3:
+        """Of a fit with a pose."""
+        assert self.pose is not None
+        return self.pose.cam_from_world.inverse()
+
+    @cached_property
+    def _box(self) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+        """The corners (metres, world) of what the inliers' points fill."""
+        assert self.pose is not None
+        columns = self.matches.train_idx[self.pose.inliers]
+        points, radii = self.local_map.points_world[columns], self.local_map.radii[columns][:, None]
+        return (points - radii).min(axis=0), (points + radii).max(axis=0)
+
+    def stands_near(self, other: PoseFit) -> bool:
+        """Might inliers of both be the same points of the map? Where even the boxes that they fill are apart they are not."""
+        (low, high), (other_low, other_high) = self._box, other._box
+        return bool(np.all(low <= other_high) and np.all(other_low <= high))
 
     def seen_points(self, scale: float) -> SeenPoints | None:
         """The inliers in a picture that is `scale` times as wide as that of the features; None without a pose."""

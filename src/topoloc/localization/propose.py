@@ -25,14 +25,17 @@ import numpy as np
 
 from topoloc.features.matching import match_pooled
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.belief import is_same_pose
+from topoloc.localization.belief import Hypothesis, is_same_pose
 from topoloc.localization.guided import largest_shift, match_expected, match_guided
 from topoloc.localization.pose_fit import PoseFit, fit_pose
+from topoloc.localization.repetition import LEAST_SHIFT
 from topoloc.localization.search import Proposal, Search, Source
 from topoloc.localization.walls import propose_walls
 from topoloc.map.nodes import node_distances
 from topoloc.places.coarse import NodeScore
 
+_BESIDE = 0.25  # radians
+_MIN_COPIED_SHARE = 0.2  # of what is found at a pose, that must be found at one that is as likely
 
 def propose(search: Search, prior: Rigid3 | None) -> Iterator[Proposal]:
     """All first poses worth a look, each made when it is asked for."""
@@ -136,28 +139,44 @@ def _viewpoints(search: Search) -> Iterator[Proposal]:
 
 def _repetitions(search: Search) -> Iterator[Proposal]:
     """The poses that a repetition of the place allows as well as those that are believed, and theirs in turn."""
-    query, config, asked = search.query, search.config, 0
-    tried: list[np.ndarray] = []
-    waiting = list(search.belief.hypotheses)
-    while waiting and asked < config.max_repetitions and config.guided.num_nodes > 0:
+    config, tried, num_asked = search.config, list[Rigid3](), 0
+    waiting = [one for one in search.belief.hypotheses if not one.is_from_walls]
+    while waiting and config.guided.num_nodes > 0:
         hypothesis = waiting.pop(0)
-        if hypothesis.is_from_walls or hypothesis.probability < config.evidence.min_probability:
+        if hypothesis.probability < config.evidence.min_probability:
             continue
-        tried.append(hypothesis.world_from_cam.translation)
-        for shift in search.map.repeats(search.map.topomap.row_of(hypothesis.fit.node_id)):
-            world_from_cam = Rigid3(hypothesis.world_from_cam.rotation, hypothesis.world_from_cam.translation + shift)
-            known = [*tried, *(other.world_from_cam.translation for other in search.belief.hypotheses)]
-            apart = np.linalg.norm(np.array(known) - world_from_cam.translation, axis=1).min()
-            if apart < 0.5 * np.linalg.norm(shift) or asked == config.max_repetitions:
+        tried.append(hypothesis.world_from_cam)
+        for move in search.map.moves(search.map.topomap.row_of(hypothesis.fit.node_id)):
+            world_from_cam = Rigid3.from_matrix(move) @ hypothesis.world_from_cam
+            if _is_beside(world_from_cam, [*tried, *(other.world_from_cam for other in search.belief.hypotheses)]):
                 continue
-            asked, search.is_repeated = asked + 1, True
-            tried.append(world_from_cam.translation)
-            with query.clock.stage("matching"):
-                local_map = search.map.local_map(search.map.nearest(world_from_cam, config.guided.num_nodes))
-                start = (world_from_cam.inverse(), hypothesis.fit.camera)
-                matches = match_guided(query.features, local_map, *start, replace(config.guided, radius_px=2.0 * config.guided.radius_px))
-            with query.clock.stage("pnp"):
-                fit = fit_pose(query.features, query.lens, local_map, matches, config.pose, start)
+            if num_asked == config.max_repetitions:
+                return
+            num_asked, search.is_repeated = num_asked + 1, True
+            tried.append(world_from_cam)
+            fit = _moved(search, world_from_cam, hypothesis)
+            if fit is None:
+                continue
             before = set(map(id, search.belief.hypotheses))
             yield Proposal("repetition", fit, is_guided=True, repeats=hypothesis.evidence)
             waiting += [other for other in search.belief.hypotheses if id(other) not in before]
+
+
+def _is_beside(world_from_cam: Rigid3, others: list[Rigid3]) -> bool:
+    """Is a pose one of these, not a repetition of it?"""
+    way = np.linalg.norm(np.array([other.translation for other in others]) - world_from_cam.translation, axis=1)
+    return any((world_from_cam.inverse() @ others[k]).angle() < _BESIDE for k in np.flatnonzero(way < LEAST_SHIFT))
+
+
+def _moved(search: Search, world_from_cam: Rigid3, hypothesis: Hypothesis) -> PoseFit | None:
+    """What is found around a pose that is known to a few centimetres; None where it is far less than at the one that it repeats."""
+    query, config, start = search.query, search.config, (world_from_cam.inverse(), hypothesis.fit.camera)
+    least = _MIN_COPIED_SHARE * hypothesis.evidence.num_found
+    with query.clock.stage("matching"):
+        local_map = search.map.local_map(search.map.nearest(world_from_cam, config.guided.num_nodes))
+        matches = match_guided(query.features, local_map, *start, replace(config.guided, radius_px=2.0 * config.guided.radius_px))
+    if len(matches) < least:
+        return None
+    with query.clock.stage("pnp"):
+        fit = fit_pose(query.features, query.lens, local_map, matches, config.pose, start)
+    return fit if fit.num_inliers >= least else None

@@ -36,7 +36,7 @@ def hypothesis_of(search: Search, proposal: Proposal) -> Hypothesis | None:
             final = refined[0] if refined is not None else None
             hypothesis = weigh_wall(proposal, *refined) if refined is not None else None
     else:
-        final = refine(search, proposal)
+        final = refine(search, proposal) if proposal.repeats is None else proposal.fit
         hypothesis = weigh(search, proposal, final)
     if search.first is None:
         search.first = proposal.fit if final is None or final.pose is None else final
@@ -79,39 +79,49 @@ def weigh(search: Search, proposal: Proposal, final: PoseFit) -> Hypothesis | No
     with search.query.clock.stage("evidence"):
         inflated = inflation(final.num_inliers, search.rho)
         covariance = inflated * final.pose.covariance
-        evidence = None if proposal.is_guided else _evidence(search, first, final, covariance)
-        if proposal.repeats is not None:
-            before = proposal.repeats
-            evidence = replace(_evidence(search, final, final, covariance), num_matches=before.num_matches, num_inliers=before.num_inliers)
-            return Hypothesis(proposal.source, final, evidence, covariance, 1.0 / inflated, log_odds_of(evidence, search.weights))
-        if evidence is None or log_odds_of(evidence, search.weights) <= search.weights.evidence.clear_log_odds:
-            guessed = evidence or _evidence(search, final, final, covariance)
-            at_best = replace(guessed, num_matches=final.num_inliers, num_inliers=final.num_inliers)
-            if log_odds_of(at_best, search.weights) < _HOPELESS:  # whatever the unguided matches say
-                return None
-            evidence = _with_unguided(search, guessed, _unguided(search, final), final)
+        evidence = _evidence(search, proposal, final, covariance)
+        if evidence is None:
+            return None
         log_odds = log_odds_of(evidence, search.weights)
     return Hypothesis(proposal.source, final, evidence, covariance, 1.0 / inflated, log_odds)
 
 
-def _evidence(search: Search, unguided: PoseFit, final: PoseFit, covariance: Float[np.ndarray, "6 6"]) -> Evidence:
-    """`covariance` is that of the left perturbation of cam_from_world."""
-    config, pose, camera = search.config, final.pose, final.camera
+def _evidence(search: Search, proposal: Proposal, final: PoseFit, covariance: Float[np.ndarray, "6 6"]) -> Evidence | None:
+    """None where it is hopeless."""
+    counted, repeats = _counted(search, final, covariance), proposal.repeats
+    if repeats is not None:
+        unguided = (repeats.num_matches, repeats.num_inliers)
+        return replace(counted, num_by_chance=repeats.num_by_chance, num_matches=unguided[0], num_inliers=unguided[1])
+    assert final.pose is not None
+    by_chance = count_by_chance(final.features, final.local_map, final.pose.cam_from_world, final.camera, search.config.guided)
+    counted = replace(counted, num_by_chance=by_chance)
+    if not proposal.is_guided:
+        evidence = _with_unguided(search, counted, proposal.fit, final)
+        if log_odds_of(evidence, search.weights) > search.weights.evidence.clear_log_odds:
+            return evidence
+    at_best = replace(counted, num_matches=final.num_inliers, num_inliers=final.num_inliers)
+    if log_odds_of(at_best, search.weights) < _HOPELESS:  # whatever the unguided matches say
+        return None
+    return _with_unguided(search, counted, _unguided(search, final), final)
+
+
+def _counted(search: Search, final: PoseFit, covariance: Float[np.ndarray, "6 6"]) -> Evidence:
+    """What is found where it must be seen. `covariance` is that of the left perturbation of cam_from_world."""
+    pose, camera = final.pose, final.camera
     assert pose is not None
     depths = pose.cam_from_world.apply(final.local_map.points_world[final.matches.train_idx[pose.inliers]])[:, 2]
     found_img = final.features.points_img[final.matches.query_idx[pose.inliers]].astype(np.float64)
     visible_img = visible_pixels(final.local_map, pose.cam_from_world, camera)
-    counted = Evidence(
+    return Evidence(
         num_matches=0,
         num_inliers=0,
         num_found=final.num_inliers,
         num_visible=len(visible_img),
-        num_by_chance=count_by_chance(final.features, final.local_map, pose.cam_from_world, camera, config.guided),
+        num_by_chance=0,
         spread=spread_of(found_img, camera.width, camera.height),
         even_share=even_share_of(found_img, visible_img, camera.width, camera.height),
-        doubt=doubt_of(covariance, float(np.median(depths)), config.evidence),
+        doubt=doubt_of(covariance, float(np.median(depths)), search.config.evidence),
     )
-    return _with_unguided(search, counted, unguided, final)
 
 
 def _with_unguided(search: Search, evidence: Evidence, unguided: PoseFit, final: PoseFit) -> Evidence:

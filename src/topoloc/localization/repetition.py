@@ -1,9 +1,13 @@
-"""Where a place repeats itself: a wall of equal panels, a row of equal windows, tiles.
+"""Where a place repeats itself: a wall of equal panels, a row of equal windows, tiles; and the same wall on the other side of the house.
 
 No picture of such a wall tells one panel from the next. Its features fail the ratio test, since the next panel has the same ones, and a
-pose that is found all the same is one of many. So for each node it is looked up once by which shifts what it shows repeats itself: its
-points that look like other points nearby vote for the shift between the two, and a repetition is a shift that many points vote for.
-A hypothesis there is not alone: the poses shifted so are proposed as well (`propose.py`), and a match with any copy of a point speaks for
+pose that is found all the same is one of many. So for each node it is looked up once how the place can be moved onto itself:
+
+- by **shifts**: its points that look like other points nearby vote for the shift between the two, and what many points vote for is one;
+- by **moves** in general: it is localized by nodes far from it that look like it. Where it is found among their points, as if it were
+  there, it has a copy there.
+
+A hypothesis there is not alone: the poses moved so are proposed as well (`propose.py`), and a match with any copy of a point speaks for
 all of them (`refine.py`). What tells them apart is what does not repeat itself, if the picture shows any of it.
 """
 
@@ -12,14 +16,22 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
+from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.local_map import LocalMap
+from topoloc.map.entries import TopoNode
 
 NUM_NEIGHBOURS = 9
+LEAST_SHIFT = 0.3
+"""Metres: from there on a copy is another place."""
 _NUM_POINTS = 128
 _MIN_SIMILARITY = 0.9
 _CELL = 0.1  # metres; and a share of the shift's own length
-_MIN_VOTES, _MIN_VOTE_SHARE = 12, 0.15
+_MIN_VOTES, _MIN_VOTE_SHARE, _MIN_OF_MOST = 12, 0.15, 0.5
 _MAX_SHIFTS = 6
+_MIN_COPIED, _MIN_COPIED_SHARE = 30, 0.25
+_NUM_LOCALIZED_BY = 256
+_POSE = AbsolutePoseConfig(max_reprojection_error_px=6.0, max_iterations=1000)
 _HALF = 1000  # cells to either side: more than any shift is long
 
 
@@ -39,12 +51,35 @@ def shifts_of(node: LocalMap, around: LocalMap, min_shift: float) -> Float[np.nd
     while len(shifts) and len(found) < _MAX_SHIFTS:
         centre = _densest(shifts, rows)
         near = np.linalg.norm(shifts - centre, axis=1) < 1.5 * _CELL
-        if len(np.unique(rows[near])) < least:
+        votes = len(np.unique(rows[near]))
+        if votes < least:
             break
+        least = max(least, _MIN_OF_MOST * votes)  # parts of a panel may resemble each other, too
         found.append(np.median(shifts[near], axis=0))
         kept = np.linalg.norm(shifts - found[-1], axis=1) > max(0.5 * min_shift, 3.0 * _CELL)
         rows, shifts = rows[kept], shifts[kept]
     return np.array(found).reshape(-1, 3)
+
+
+def copy_of(node: TopoNode, others: LocalMap) -> Rigid3 | None:
+    """The move (world) that takes what a node shows onto its copy among these points; None where there is none, or it is itself."""
+    features = node.features.select(np.arange(min(_NUM_LOCALIZED_BY, len(node.features))))
+    similar = features.descriptors @ others.descriptors.T
+    columns = similar.argmax(axis=1)
+    rows = np.flatnonzero(similar[np.arange(len(columns)), columns] >= _MIN_SIMILARITY)
+    least = max(_MIN_COPIED, _MIN_COPIED_SHARE * len(features))
+    if len(rows) < least:
+        return None
+    columns = columns[rows]
+    points_img = features.points_img[rows].astype(np.float64)
+    covariances = others.covariances[columns]
+    found = estimate_absolute_pose(points_img, others.points_world[columns], node.camera, _POSE, point_covariances=covariances)
+    if found is None or np.count_nonzero(found.inliers) < least:
+        return None
+    move = found.cam_from_world.inverse() @ node.summary.world_from_cam.inverse()
+    points_world = node.summary.world_from_cam.apply(node.points_cam[rows[found.inliers]].astype(np.float64))
+    way = np.linalg.norm(move.apply(points_world) - points_world, axis=1)
+    return move if float(np.median(way)) > LEAST_SHIFT else None
 
 
 def _densest(shifts: Float[np.ndarray, "n 3"], rows: np.ndarray) -> Float[np.ndarray, " 3"]:
