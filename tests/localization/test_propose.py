@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from doubled_room import ELSEWHERE, twice
 
 from built_room import built_room, unseen_views
 from tiny_world import CAMERA
@@ -19,45 +20,15 @@ from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import PoseFit
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.trace import Trace
-from topoloc.map.topomap import TopoMetricMap, TopoNode
-from topoloc.places.vlad import SurfVlad
+from topoloc.map.topomap import TopoMetricMap
 
-ELSEWHERE = Rigid3(exp_so3(np.array([0.0, 0.0, 1.0])), np.array([40.0, -15.0, 0.0]))
-"""Where the second room stands, in the world of the first."""
 LIGHTS = (0.055, 0.05, 0.045)
-ONLY_RETRIEVAL = LocalizerConfig(look_alikes=LookAlikesConfig(max_groups=0), viewpoints=ViewpointsConfig(num_nodes=0))
+ONLY_RETRIEVAL = LocalizerConfig(look_alikes=LookAlikesConfig(max_groups=0), viewpoints=ViewpointsConfig(num_nodes=0), max_repetitions=0)
 
 
 @pytest.fixture(scope="module")
 def room(tiny_recording: Path) -> TopoMetricMap:
     return built_room(tiny_recording)
-
-
-def _moved(node: TopoNode, node_id: int) -> TopoNode:
-    summary = node.summary
-    return replace(node, summary=replace(summary, node_id=node_id, world_from_cam=ELSEWHERE @ summary.world_from_cam))
-
-
-def _twice(topomap: TopoMetricMap, share_alike: float = 1.0) -> TopoMetricMap:
-    """A map that holds the room a second time, elsewhere; only this share of its points looks the same there."""
-    num_nodes, rng = len(topomap.nodes), np.random.default_rng(0)
-    copies = []
-    for node in topomap.nodes:
-        descriptors = node.features.descriptors.copy()
-        other = rng.random(len(descriptors)) >= share_alike
-        descriptors[other] = rng.normal(size=(np.count_nonzero(other), descriptors.shape[1]))
-        descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
-        changed = replace(node, features=replace(node.features, descriptors=descriptors))
-        copies.append(_moved(changed, num_nodes + node.summary.node_id))
-    nodes = [*topomap.nodes, *copies]
-    model = topomap.coarse_models[SurfVlad.name]
-    ids = model.arrays["node_ids"]
-    arrays = dict(model.arrays) | {
-        "vectors": np.concatenate([model.arrays["vectors"]] * 2),
-        "node_ids": np.concatenate([ids, ids + num_nodes]).astype(ids.dtype),
-    }
-    coarse = {SurfVlad.name: replace(model, arrays=arrays)}
-    return replace(topomap, nodes=nodes, summaries=[node.summary for node in nodes], coarse_models=coarse, edges=[])
 
 
 def _sources(trace: Trace) -> list[str]:
@@ -68,7 +39,7 @@ def _sources(trace: Trace) -> list[str]:
 
 
 def test_a_place_that_is_in_the_map_twice_is_ambiguous_and_both_poses_are_named(room: TopoMetricMap):
-    localizer = Localizer(_twice(room))
+    localizer = Localizer(twice(room))
     results = [(localizer.localize(picture, CAMERA), truth) for picture, truth in unseen_views()]
     assert not any(isinstance(result, Localization) for result, _ in results)
     ambiguous = [(r, truth) for r, truth in results if isinstance(r, NotLocalized) and r.reason == "ambiguous"]
@@ -85,14 +56,14 @@ def test_a_place_that_is_in_the_map_twice_is_ambiguous_and_both_poses_are_named(
 
 
 def test_by_retrieval_alone_the_second_place_goes_unnoticed_or_the_image_without_an_answer(room: TopoMetricMap):
-    """What other proposals are for: without them the reason is a wrong one."""
-    localizer = Localizer(_twice(room), ONLY_RETRIEVAL)
+    """What other proposals are for."""
+    localizer = Localizer(twice(room), ONLY_RETRIEVAL)
     results = [localizer.localize(picture, CAMERA) for picture, _ in unseen_views()]
     assert not any(isinstance(result, NotLocalized) and result.reason == "ambiguous" for result in results)
 
 
 def test_a_place_that_is_only_partly_like_another_is_told_apart(room: TopoMetricMap):
-    localizer = Localizer(_twice(room, share_alike=0.2))
+    localizer = Localizer(twice(room, share_alike=0.2))
     found = [(localizer.localize(picture, CAMERA), truth) for picture, truth in unseen_views()]
     right = [isinstance(r, Localization) and translation_error(r.world_from_cam, truth) < 0.05 for r, truth in found]
     assert np.mean(right) >= 0.8

@@ -14,7 +14,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.guided import expected_key_points
 from topoloc.localization.local_map import LocalMap
-from topoloc.localization.repetition import LEAST_SHIFT, NUM_NEIGHBOURS, copy_of, shifts_of
+from topoloc.localization.repetition import LEAST_SHIFT, NUM_NEIGHBOURS, copy_of, may_repeat, shifts_of
 from topoloc.localization.viewing import viewing_distances
 from topoloc.localization.wall_index import WallIndex
 from topoloc.map.memory import RememberedNodes
@@ -122,7 +122,7 @@ class OpenMap:
 
     def _find_repeats(self, row: int) -> Float[np.ndarray, "k 3"]:
         node, poses = self._local_map(row), self.node_poses
-        if len(shifts_of(node, node, LEAST_SHIFT)) == 0:  # what repeats itself mostly does so within one picture
+        if not may_repeat(node):
             return np.zeros((0, 3))
         depths = self.cam_from_world(row).apply(node.points_world)[:, 2]
         away = np.linalg.norm(poses.centres - poses.centres[row], axis=1)

@@ -37,6 +37,7 @@ from topoloc.places.coarse import NodeScore
 _BESIDE = 0.25  # radians
 _MIN_COPIED_SHARE = 0.2  # of what is found at a pose, that must be found at one that is as likely
 
+
 def propose(search: Search, prior: Rigid3 | None) -> Iterator[Proposal]:
     """All first poses worth a look, each made when it is asked for."""
     if prior is not None:

@@ -27,7 +27,7 @@ LEAST_SHIFT = 0.3
 _NUM_POINTS = 128
 _MIN_SIMILARITY = 0.9
 _CELL = 0.1  # metres; and a share of the shift's own length
-_MIN_VOTES, _MIN_VOTE_SHARE, _MIN_OF_MOST = 12, 0.15, 0.5
+_MIN_VOTES, _LEAST_WITHIN = 12, 0.15
 _MAX_SHIFTS = 6
 _MIN_COPIED, _MIN_COPIED_SHARE = 30, 0.25
 _NUM_LOCALIZED_BY = 256
@@ -35,11 +35,18 @@ _POSE = AbsolutePoseConfig(max_reprojection_error_px=6.0, max_iterations=1000)
 _HALF = 1000  # cells to either side: more than any shift is long
 
 
-def shifts_of(node: LocalMap, around: LocalMap, min_shift: float) -> Float[np.ndarray, "k 3"]:
+def may_repeat(node: LocalMap) -> bool:
+    """Is there anything in what a node shows that its own picture shows twice? What repeats itself mostly does."""
+    return len(shifts_of(node, node, LEAST_SHIFT, _LEAST_WITHIN)) > 0
+
+
+def shifts_of(node: LocalMap, around: LocalMap, min_shift: float, min_share: float = 0.5) -> Float[np.ndarray, "k 3"]:
     """The shifts (metres, world) by which what a node shows is there once more, those with most votes first; none in most places.
 
     Args:
         around: the points of the nodes nearby that look the same way. min_shift: metres; a smaller shift is no other place.
+        min_share: of the node's points must find a copy by the first shift, half as many by each other one: parts of a panel may
+            resemble each other, too, and smooth surfaces any part of themselves.
     """
     points, descriptors = node.points_world[:_NUM_POINTS], node.descriptors[:_NUM_POINTS]
     rows, columns = np.nonzero(descriptors @ around.descriptors.T >= _MIN_SIMILARITY)
@@ -47,14 +54,14 @@ def shifts_of(node: LocalMap, around: LocalMap, min_shift: float) -> Float[np.nd
     far = np.linalg.norm(shifts, axis=1) > min_shift
     rows, shifts = rows[far], shifts[far]
     found: list[Float[np.ndarray, " 3"]] = []
-    least = max(_MIN_VOTES, _MIN_VOTE_SHARE * len(points))
+    least = max(_MIN_VOTES, min_share * len(points))
     while len(shifts) and len(found) < _MAX_SHIFTS:
         centre = _densest(shifts, rows)
         near = np.linalg.norm(shifts - centre, axis=1) < 1.5 * _CELL
         votes = len(np.unique(rows[near]))
         if votes < least:
             break
-        least = max(least, _MIN_OF_MOST * votes)  # parts of a panel may resemble each other, too
+        least = max(_MIN_VOTES, 0.5 * max(votes, least)) if not found else least
         found.append(np.median(shifts[near], axis=0))
         kept = np.linalg.norm(shifts - found[-1], axis=1) > max(0.5 * min_shift, 3.0 * _CELL)
         rows, shifts = rows[kept], shifts[kept]

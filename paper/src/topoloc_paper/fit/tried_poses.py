@@ -124,7 +124,10 @@ def _tried(
     localizer.localize(image, camera, trace=trace)
     rho = localizer.correlated_errors
     for tried in trace.tried:
-        if tried.hypothesis is None:
+        if tried.hypothesis is None or tried.source in (
+            "repetition",
+            "walls",
+        ):  # these have weights of their own, or another pose's matches
             continue
         final, evidence = tried.hypothesis.fit, tried.hypothesis.evidence
         assert final.pose is not None

@@ -1,0 +1,131 @@
+"""Places that repeat themselves: by which moves the map finds them, and what is answered there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from doubled_room import ELSEWHERE, twice
+
+from built_room import built_room, unseen_views
+from tiny_world import CAMERA
+from topoloc.features.features import Features
+from topoloc.geometry.alignment import translation_error
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.config import LocalizerConfig
+from topoloc.localization.local_map import LocalMap
+from topoloc.localization.localizer import Localizer
+from topoloc.localization.open_map import OpenMap
+from topoloc.localization.repetition import copies, folded, shifts_of
+from topoloc.localization.result import Localization, NotLocalized
+from topoloc.map.topomap import TopoMetricMap
+from topoloc.places.coarse import Image, NodeScore
+
+PERIOD = np.array([0.8, 0.0, 0.0])
+PANEL = np.random.default_rng(3).uniform([0.0, -1.0, 2.0], [0.8, 1.0, 2.0], (40, 3))
+
+
+@pytest.fixture(scope="module")
+def room(tiny_recording: Path) -> TopoMetricMap:
+    return built_room(tiny_recording)
+
+
+def _wall(num_panels: int, noise: float = 0.0) -> LocalMap:
+    """A wall of equal panels; each sees every point of the panel a little differently."""
+    rng = np.random.default_rng(5)
+    looks = rng.normal(size=(len(PANEL), 64))
+    descriptors = np.concatenate([looks + noise * rng.normal(size=looks.shape) for _ in range(num_panels)])
+    descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+    points_world = np.concatenate([PANEL + k * PERIOD for k in range(num_panels)])
+    count, one = len(points_world), np.full(len(points_world), 0.02)
+    return LocalMap(
+        descriptors.astype(np.float32), points_world, np.zeros((count, 3, 3)), one, np.zeros(count, int), one, np.zeros((count, 3))
+    )
+
+
+# shifts within what is nearby
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.2])
+def test_a_wall_of_equal_panels_repeats_itself_by_whole_panels(noise: float):
+    wall = _wall(4, noise)
+    shifts = shifts_of(wall, wall, 0.3)
+    along = shifts[:, 0] / PERIOD[0]
+    np.testing.assert_allclose(shifts[:, 1:], 0.0, atol=0.01)
+    np.testing.assert_allclose(along, np.round(along), atol=0.02)
+    assert {-1, 1} <= set(np.round(along).astype(int))
+
+
+def test_what_is_there_once_does_not_repeat_itself():
+    assert len(shifts_of(_wall(1), _wall(1), 0.3)) == 0
+
+
+def test_parts_of_a_panel_that_resemble_each_other_are_no_repetition_beside_the_panels():
+    """A handle above a handle: a third of the points find a copy there, where all find one a panel on."""
+    wall = _wall(4)
+    few = np.tile(np.arange(len(PANEL)) < 13, 4)
+    above = LocalMap(
+        wall.descriptors[few], wall.points_world[few] + [0.0, 0.0, 0.5], wall.covariances[few], wall.radii[few],
+        wall.node_ids[few], wall.sizes[few], wall.directions[few],
+    )  # fmt: skip
+    np.testing.assert_allclose(shifts_of(wall, LocalMap.pooled([wall, above]), 0.3)[:, 2], 0.0, atol=0.01)
+
+
+def test_folded_points_of_all_panels_are_those_of_one():
+    points_world = folded(_wall(4).points_world, np.array([PERIOD, -PERIOD, 2 * PERIOD]))
+    spread = points_world.reshape(4, len(PANEL), 3) - points_world[: len(PANEL)]
+    np.testing.assert_allclose(spread, 0.0, atol=1e-9)
+
+
+def test_copies_are_the_points_and_what_each_shift_makes_of_them():
+    np.testing.assert_allclose(copies(PANEL, PERIOD[None])[1] - PANEL, np.tile(PERIOD, (len(PANEL), 1)))
+
+
+# moves across the whole map
+
+
+def _turned(opened: OpenMap, row: int) -> list[Rigid3]:
+    """The moves that are no shifts: all surfaces of this room are blobs, which resemble each other."""
+    return [move for move in map(Rigid3.from_matrix, opened.moves(row)) if move.angle() > 0.1]
+
+
+def test_a_room_that_stands_twice_in_the_map_is_moved_onto_its_copy_and_back(room: TopoMetricMap):
+    opened, num_nodes = OpenMap(twice(room)), len(room.nodes)
+    num_found = 0
+    for row in range(2 * num_nodes):
+        expected = ELSEWHERE if row < num_nodes else ELSEWHERE.inverse()
+        pose, moves = opened.topomap.summaries[row].world_from_cam, _turned(opened, row)
+        assert all(translation_error(move @ pose, expected @ pose) < 0.05 for move in moves)
+        num_found += len(moves) > 0
+    assert num_found >= 0.9 * 2 * num_nodes
+
+
+def test_a_room_that_stands_once_in_the_map_has_no_copy(room: TopoMetricMap):
+    opened = OpenMap(room)
+    assert not any(_turned(opened, row) for row in range(len(room.nodes)))
+
+
+class _OnlyTheFirstRoom:
+    """Retrieval that never names the second one."""
+
+    def __init__(self, num_nodes: int) -> None:
+        self._num_nodes = num_nodes
+
+    def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
+        return [NodeScore(row, 1.0 / (1 + row)) for row in range(min(num_candidates, self._num_nodes))]
+
+
+@pytest.mark.parametrize("max_repetitions", [LocalizerConfig().max_repetitions, 0])
+def test_a_copy_that_retrieval_does_not_name_is_found_by_the_map(room: TopoMetricMap, max_repetitions: int):
+    """Without repetitions one of the two is believed, and half of the time wrongly."""
+    localizer = Localizer(twice(room), LocalizerConfig(max_repetitions=max_repetitions), coarse=_OnlyTheFirstRoom(len(room.nodes)))
+    results = [(localizer.localize(picture, CAMERA), truth) for picture, truth in unseen_views()]
+    ambiguous = [(result, truth) for result, truth in results if isinstance(result, NotLocalized) and result.reason == "ambiguous"]
+    if max_repetitions == 0:
+        assert any(isinstance(result, Localization) for result, _ in results)
+        return
+    assert len(ambiguous) >= 0.8 * len(results)
+    assert not any(isinstance(result, Localization) for result, _ in results)
+    for result, truth in ambiguous:
+        assert min(translation_error(one.world_from_cam, ELSEWHERE @ truth) for one in result.alternatives) < 0.05
