@@ -167,8 +167,16 @@ def test_two_places_that_look_alike_are_ambiguous_and_both_are_named():
 
 
 def test_what_is_found_evenly_tells_two_poses_apart_that_have_the_same_odds():
-    full, half = made_hypothesis(4.0, even_share=0.2, doubt=0.1), made_hypothesis(4.0, x=9.0, even_share=0.02, doubt=0.5)
+    full, half = made_hypothesis(5.0, even_share=0.2, doubt=0.1), made_hypothesis(5.0, x=9.0, even_share=0.02, doubt=0.5)
     assert _along(_answered(half, full)) == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize(("log_odds", "other", "is_answered"), [(3.0, 0.5, True), (3.0, 1.5, False), (6.0, 5.0, True)])
+def test_a_pose_that_is_not_clear_must_lead_by_its_odds_too(log_odds: float, other: float, is_answered: bool):
+    """What a wrong place of the map has for it, a place that is not in the map may have as well."""
+    best, wrong = made_hypothesis(log_odds, even_share=0.2), made_hypothesis(other, x=9.0, even_share=0.02)
+    assert isinstance(_answered(best, wrong), Localization) is is_answered
+
 
 
 # the walls along the way

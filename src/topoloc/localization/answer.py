@@ -23,12 +23,20 @@ def answer(search: Search) -> tuple[Localization | NotLocalized, SeenPoints | No
     min_probability = search.config.evidence.min_probability
     if not ranked or ranked[0].probability < min_probability:
         return _refusal(search, ranked), None
-    best, leads = ranked[0], [lead(ranked[0], other, search.weights.rivals) for other in ranked[1:]]
+    best, leads = ranked[0], [_lead(search, ranked[0], other) for other in ranked[1:]]
     others = math.exp(-best.log_odds) + sum(math.exp(-one) for one in leads)
     probability = precision_of(best.evidence) / (1.0 + others)
     if min(leads, default=math.inf) >= MIN_LEAD and probability >= min_probability:
         return _localization(search, best, probability), best.fit.seen_points(search.query.scale)
     return _ambiguity(search, ranked, leads, others), None
+
+
+def _lead(search: Search, best: Hypothesis, other: Hypothesis) -> float:
+    """By how much the best hypothesis leads. One that is not clear must do so by its odds, too: where a wrong place of the map has nearly
+    as much for it, a place that is not in the map may as well."""
+    by_all = lead(best, other, search.weights.rivals)
+    is_clear = best.log_odds > search.weights.evidence.clear_log_odds
+    return by_all if is_clear else min(by_all, best.log_odds - other.log_odds)
 
 
 def _localization(search: Search, best: Hypothesis, probability: float) -> Localization:

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from topoloc.bounds import Above, AtLeast, Between
-from topoloc.localization.fitted_weights import EvidenceWeights, FittedWeights, WallWeights
+from topoloc.localization.fitted_weights import EvidenceWeights, FittedWeights
 
 COLUMNS, ROWS = 8, 6
 """The cells of a picture whose number with an inlier in it measures the inliers' spread."""
@@ -124,7 +124,8 @@ def score_features(evidence: Evidence) -> tuple[float, ...]:
 def log_odds_of(evidence: Evidence, weights: FittedWeights) -> float:
     """Logarithm of the odds that the pose is right."""
     if evidence.num_distinct is not None:
-        return _wall_log_odds(evidence, evidence.num_distinct, weights.walls)
+        features, walls = wall_score_features(evidence), weights.walls
+        return sum(weight * x for weight, x in zip(walls.in_order, features, strict=True)) + walls.bias
     return node_log_odds(evidence, weights.evidence)
 
 
@@ -133,16 +134,18 @@ def node_log_odds(evidence: Evidence, weights: EvidenceWeights) -> float:
     return sum(weight * x for weight, x in zip(weights.in_order, score_features(evidence), strict=True)) + weights.bias
 
 
-def _wall_log_odds(e: Evidence, num_distinct: int, weights: WallWeights) -> float:
+def wall_score_features(evidence: Evidence) -> tuple[float, ...]:
+    """As `score_features`, of a pose that the walls let expect."""
+    e = evidence
+    assert e.num_distinct is not None
     return (
-        weights.found * math.log((e.num_found + 1) / (e.num_visible + 20))
-        + weights.chance * math.log((e.num_found + 1) / (e.num_by_chance + 5))
-        + weights.inliers * math.log(e.num_inliers + 1)
-        + weights.inlier_share * math.log((e.num_inliers + 1) / (e.num_matches + 10))
-        + weights.spread * math.log(e.spread + 0.02)
-        + weights.doubt * math.log(max(e.doubt, 0.01))
-        + weights.distinct * math.log(num_distinct + 1)
-        + weights.bias
+        math.log((e.num_found + 1) / (e.num_visible + 20)),
+        math.log((e.num_found + 1) / (e.num_by_chance + 5)),
+        math.log(e.num_inliers + 1),
+        math.log((e.num_inliers + 1) / (e.num_matches + 10)),
+        math.log(e.spread + 0.02),
+        math.log(e.num_distinct + 1),
+        math.log(max(e.doubt, 0.01)),
     )
 
 

@@ -73,6 +73,11 @@ class WallWeights:
     sigma_px: float
     least_shared_errors: float
 
+    @property
+    def in_order(self) -> tuple[float, ...]:
+        """In the order of `wall_score_features`; without the bias."""
+        return (self.found, self.chance, self.inliers, self.inlier_share, self.spread, self.distinct, self.doubt)
+
 
 @dataclass(frozen=True)
 class SharedErrorWeights:

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from topoloc.localization.evidence import Evidence, node_log_odds
-from topoloc.localization.fitted_weights import EvidenceWeights, RivalWeights, SharedErrorWeights, read_weights, weights_of
+from topoloc.localization.evidence import Evidence, log_odds_of, node_log_odds
+from topoloc.localization.fitted_weights import EvidenceWeights, FittedWeights, RivalWeights, SharedErrorWeights, read_weights, weights_of
 from topoloc_paper.fit import __main__ as command
 from topoloc_paper.fit.evidence import (
     Judged,
@@ -25,6 +25,7 @@ from topoloc_paper.fit.evidence import (
 )
 from topoloc_paper.fit.rivals import MIN_HARD_PAIRS, fit_rivals, num_mistaken, pairs_of
 from topoloc_paper.fit.tried_poses import TriedPose, load_poses, save_poses
+from topoloc_paper.fit.walls import MIN_POSES, fit_walls
 
 TRUE = EvidenceWeights(even_share=2.0, chance=1.0, inliers=0.3, inlier_share=1.5, spread=0.5, doubt=-0.5, bias=7.0, clear_log_odds=4.5)
 PRIOR = replace(TRUE, even_share=1.0, inliers=1.0, bias=4.0)
@@ -158,3 +159,26 @@ def test_what_cannot_be_fitted_is_told_in_one_line(kind: str, said: str, tmp_pat
     monkeypatch.setattr(sys, "argv", ["fit", "--kind", kind, "--load", str(tmp_path / "poses.json")])
     with pytest.raises(SystemExit, match=said):
         command.main()
+
+
+def _on_walls(num: int, weights: FittedWeights, seed: int = 0) -> list[TriedPose]:
+    """Poses that walls let expect, right with the probability that these weights give them."""
+    rng, poses = np.random.default_rng(seed), []
+    for k in range(num):
+        evidence = replace(_evidence(rng), num_distinct=int(rng.integers(0, 60)))
+        is_right = rng.random() < 1.0 / (1.0 + math.exp(-log_odds_of(evidence, weights)))
+        poses.append(_pose(RIGHT if is_right else WRONG, evidence, k))
+    return poses
+
+
+def test_the_weights_of_walls_are_found_again_and_left_alone_where_poses_are_few():
+    before = weights_of("surf")
+    true = replace(before, walls=replace(before.walls, spread=2.0, bias=before.walls.bias - 2.0))
+    fitted, num = fit_walls(_on_walls(4000, true), before.walls)
+    assert num == 4000
+    told = _on_walls(500, true, seed=1)
+    there, here = (np.array([log_odds_of(pose.evidence, weights) for pose in told]) for weights in (true, replace(before, walls=fitted)))
+    assert np.mean(np.abs(there - here)) < 0.4
+    assert np.mean(np.abs(there - [log_odds_of(pose.evidence, before) for pose in told])) > 1.0
+    assert fitted.doubt == before.walls.doubt
+    assert fit_walls(_on_walls(MIN_POSES, true), before.walls) == (before.walls, 0)

@@ -6,8 +6,9 @@
 Each place of `corpus.py` is mapped with features of this kind, and asked about its own pictures (in good light and bad), about those of
 other places and about drawn pictures; every pose that was tried is kept, not only the one answered. A pose is right within 0.25 m (5 % of
 the distance, where that is less) and 2 degrees, wrong beyond 0.5 m or 10 degrees; what lies between is left out. The walls to both sides
-are not asked: their weights are taken over. --step N asks every N-th of the pictures, --families only of the maps of these places; --save
-keeps the poses, after each place, and --load fits to poses that were kept. FILE is what ships as `localization/weights/KIND.json`.
+are asked where a place is walked back that was mapped in one direction. --step N asks every N-th of the pictures, --families only of the
+maps of these places; --save keeps the poses, after each place, and --load fits to poses that were kept. FILE is what ships as
+`localization/weights/KIND.json`.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ from topoloc_paper.fit.evidence import (
 )
 from topoloc_paper.fit.rivals import MIN_HARD_PAIRS, fit_rivals, num_mistaken, pairs_of
 from topoloc_paper.fit.tried_poses import TriedPose, ask_place, load_poses, save_poses
+from topoloc_paper.fit.walls import fit_walls
 
 
 def main() -> None:
@@ -83,26 +85,29 @@ def ask_places(kind: str, data: Path, rendered: Path | None, step: int, kept: Pa
 def fit(kind: str, poses: list[TriedPose], step: int) -> FittedWeights:
     """Fitted weights of this kind, with a report of how they do beside those in use."""
     before, prior = weights_of(kind), weights_of(STAND_IN).evidence
+    walls, num_walls = fit_walls(poses, before.walls)
+    poses = [pose for pose in poses if pose.evidence.num_distinct is None]
     strength = best_strength(poses, prior)
     evidence, held_out = fit_evidence(poses, prior, strength), try_on_other_families(poses, prior, strength)
     log_odds, is_right = (np.concatenate([getattr(part, name) for part in held_out]) for name in ("log_odds", "is_right"))
     rivals, num_hard = fit_rivals(poses, evidence, before.rivals)
     fitted = FittedWeights(
         kind,
-        corpus_of(poses, strength, num_hard),
+        corpus_of(poses, strength, num_hard, num_walls),
         datetime.date.today().isoformat(),
         f"python -m topoloc_paper.fit --kind {kind} --rendered FOLDER --step {step} --out FILE",
         round(calibration_error(log_odds, is_right), 4),
         evidence,
         rivals,
-        before.walls,
+        walls,
         fit_shared_errors(poses, weights_of(STAND_IN).shared_errors),
     )
     report(poses, before, fitted, held_out)
+    print(f"{walls}, fitted to {num_walls} poses ({before.walls})")
     return fitted
 
 
-def corpus_of(poses: list[TriedPose], strength: float, num_hard: int) -> str:
+def corpus_of(poses: list[TriedPose], strength: float, num_hard: int, num_walls: int) -> str:
     """One sentence on what was fitted to."""
     num_right, told = sum(pose.is_right for pose in poses), decided(poses)
     places = ", ".join(dict.fromkeys(pose.mapping for pose in poses))
@@ -111,14 +116,14 @@ def corpus_of(poses: list[TriedPose], strength: float, num_hard: int) -> str:
     return (
         f"{len(told)} poses tried, {num_right} of them right, {elsewhere} of pictures from elsewhere, of maps of {places}; "
         f"drawn to the weights of {STAND_IN} with the strength {strength:g}; rivals {rivals}; "
-        "taken over: the weight of the doubt, walls; shared_errors where fewer than 200 right poses tell. "
+        f"walls {f'fitted to {num_walls} poses' if num_walls else 'taken over'}; "
+        "taken over: the weights of the doubt; shared_errors where fewer than 200 right poses tell. "
         "Calibration error: of poses that would be answered, each family of places judged by a fit without it"
     )
 
 
 def report(poses: list[TriedPose], before: FittedWeights, fitted: FittedWeights, held_out: list[Judged]) -> None:
-    told = decided(poses)
-    num_right = sum(pose.is_right for pose in told)
+    num_right, told = sum(pose.is_right for pose in poses), decided(poses)
     print(f"{len(told)} poses, {num_right} of them right; {len(poses) - len(told)} more are neither right nor wrong")
     for name, weights in (("in use", before), ("fitted", fitted)):
         all_poses = judged("all", told, weights.evidence)

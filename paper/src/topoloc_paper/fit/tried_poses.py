@@ -77,7 +77,8 @@ def ask_place(place: AskedPlace, recordings: dict[str, StereoSequence], data: Pa
     poses: list[TriedPose] = []
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "place.topo"
-        config = BuildConfig(features=FeatureConfig(kind=kind), sides=SideNodesConfig(spacing=0.0))
+        sides = SideNodesConfig() if place.asks_walls else SideNodesConfig(spacing=0.0)
+        config = BuildConfig(features=FeatureConfig(kind=kind), sides=sides)
         build_map(recordings[place.mapping], config).save(path)
         localizer = Localizer(TopoMetricMap.load(path))
         world_from_truth = read_rigid(data / place.map_from_truth) if place.map_from_truth else Rigid3.identity()
@@ -132,7 +133,7 @@ def _tried(
         final, evidence = tried.hypothesis.fit, tried.hypothesis.evidence
         assert final.pose is not None
         first_evidence = None
-        if tried.source != "viewpoints":
+        if tried.source not in ("viewpoints", "walls"):
             first_evidence = replace(evidence, num_matches=len(tried.first.matches), num_inliers=tried.first.num_inliers)
         cam_from_world, error_m, error_deg, square = final.pose.cam_from_world, None, None, None
         if world_from_cam is not None:

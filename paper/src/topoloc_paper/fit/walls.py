@@ -1,0 +1,44 @@
+"""The weights of the evidence for a pose that the walls along the way let expect.
+
+As those of the nodes: a logistic regression in which nothing that speaks for a pose may count against it, drawn to the weights in use, for
+there are few such poses. Whether a pose is precise enough is asked apart (`evidence.precision_of`), so a wrong one is one that is far off;
+the weight of the doubt is given.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import minimize
+
+from topoloc.localization.evidence import wall_score_features
+from topoloc.localization.fitted_weights import WallWeights
+from topoloc_paper.fit.evidence import decided
+from topoloc_paper.fit.tried_poses import TriedPose
+
+MIN_POSES = 20
+"""Right ones, and wrong ones; to fewer nothing is fitted."""
+_STRENGTH = 3.0
+"""Of the weights in use, in squared distances from them."""
+
+
+def fit_walls(poses: list[TriedPose], before: WallWeights) -> tuple[WallWeights, int]:
+    """The weights, and the number of poses that they were fitted to; `before` and 0 where these are too few."""
+    told = [pose for pose in decided(poses) if pose.evidence.num_distinct is not None]
+    is_right = np.array([pose.is_right for pose in told], dtype=bool)
+    if min(np.count_nonzero(is_right), np.count_nonzero(~is_right)) < MIN_POSES:
+        return before, 0
+    x = np.array([wall_score_features(pose.evidence) for pose in told])
+    signs, given = 2.0 * is_right - 1.0, before.doubt * x[:, -1]
+    x, start = np.column_stack([x[:, :-1], np.ones(len(x))]), np.array([*before.in_order[:-1], before.bias])
+
+    def loss(weights: np.ndarray) -> float:
+        return float(np.sum(np.logaddexp(0.0, -signs * (x @ weights + given))) + _STRENGTH * np.sum((weights - start) ** 2))
+
+    bounds = [(0.0, None)] * (len(start) - 1) + [(None, None)]
+    found, chance, inliers, share, spread, distinct, bias = (
+        float(weight) for weight in np.round(minimize(loss, start, bounds=bounds, method="L-BFGS-B").x, 3)
+    )
+    fitted = replace(before, found=found, chance=chance, inliers=inliers, inlier_share=share, spread=spread, distinct=distinct, bias=bias)
+    return fitted, len(told)
