@@ -24,7 +24,7 @@ from topoloc.places.coarse import CoarseLocalizer, NodeScore
 from topoloc.places.vlad import SurfVlad
 
 _LEAST_REACH = 2.5  # metres: how far shifts are looked for, at least
-_NUM_ALIKE, _NUM_PARTS, _PART_REACH = 64, 8, 5.0  # nodes that look alike; parts of the map that they make up; a part, in D_thresh (Eq. 1)
+_NUM_ALIKE, _NUM_PARTS, _PART_REACH = 64, 6, 5.0  # nodes that look alike; parts of the map that they make up; a part, in D_thresh (Eq. 1)
 
 
 class OpenMap:

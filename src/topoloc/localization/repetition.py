@@ -16,6 +16,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.features.matching import MatchingConfig, match_features
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.local_map import LocalMap
@@ -29,9 +30,9 @@ _MIN_SIMILARITY = 0.9
 _CELL = 0.1  # metres; and a share of the shift's own length
 _MIN_VOTES, _LEAST_WITHIN = 12, 0.15
 _MAX_SHIFTS = 6
-_MIN_COPIED, _MIN_COPIED_SHARE = 30, 0.25
-_NUM_LOCALIZED_BY = 256
-_POSE = AbsolutePoseConfig(max_reprojection_error_px=6.0, max_iterations=1000)
+_MIN_COPIED, _MIN_COPIED_SHARE = 20, 0.3
+_NEAREST = MatchingConfig(ratio=0.0, mutual=False)
+_POSE = AbsolutePoseConfig(max_reprojection_error_px=6.0, max_iterations=500)
 _HALF = 1000  # cells to either side: more than any shift is long
 
 
@@ -70,17 +71,16 @@ def shifts_of(node: LocalMap, around: LocalMap, min_shift: float, min_share: flo
 
 def copy_of(node: TopoNode, others: LocalMap) -> Rigid3 | None:
     """The move (world) that takes what a node shows onto its copy among these points; None where there is none, or it is itself."""
-    features = node.features.select(np.arange(min(_NUM_LOCALIZED_BY, len(node.features))))
-    similar = features.descriptors @ others.descriptors.T
-    columns = similar.argmax(axis=1)
-    rows = np.flatnonzero(similar[np.arange(len(columns)), columns] >= _MIN_SIMILARITY)
+    features = node.features.select(np.arange(min(_NUM_POINTS, len(node.features))))
+    matches = match_features(features.descriptors, others.descriptors, _NEAREST)
+    alike = 1.0 - matches.distances**2 / 2.0 >= _MIN_SIMILARITY
+    rows, columns = matches.query_idx[alike], matches.train_idx[alike]
     least = max(_MIN_COPIED, _MIN_COPIED_SHARE * len(features))
     if len(rows) < least:
         return None
-    columns = columns[rows]
     points_img = features.points_img[rows].astype(np.float64)
-    covariances = others.covariances[columns]
-    found = estimate_absolute_pose(points_img, others.points_world[columns], node.camera, _POSE, point_covariances=covariances)
+    points_world, covariances = others.points_world[columns], others.covariances[columns]
+    found = estimate_absolute_pose(points_img, points_world, node.camera, _POSE, point_covariances=covariances)
     if found is None or np.count_nonzero(found.inliers) < least:
         return None
     move = found.cam_from_world.inverse() @ node.summary.world_from_cam.inverse()

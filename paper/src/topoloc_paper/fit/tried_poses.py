@@ -125,10 +125,7 @@ def _tried(
     localizer.localize(image, camera, trace=trace)
     rho = localizer.correlated_errors
     for tried in trace.tried:
-        if tried.hypothesis is None or tried.source in (
-            "repetition",
-            "walls",
-        ):  # these have weights of their own, or another pose's matches
+        if tried.hypothesis is None or tried.source == "repetition":  # that counts the matches of another pose
             continue
         final, evidence = tried.hypothesis.fit, tried.hypothesis.evidence
         assert final.pose is not None
