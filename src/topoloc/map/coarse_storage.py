@@ -10,9 +10,8 @@ from topoloc.map.file import MapFile
 from topoloc.map.schema import SCHEMA_VERSION
 from topoloc.map.sessions import Edit, today
 from topoloc.map.topomap import TopoMetricMap
-from topoloc.map.validation import Damage
+from topoloc.map.validation import Damage, json_of
 from topoloc.places.coarse import CoarseModel
-from topoloc.places.stored_settings import json_of
 
 
 def store_coarse(path: Path, target: Path, model: CoarseModel, make_default: bool) -> None:

@@ -4,24 +4,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
+from topoloc.bounds import settings_from, value_from
 from topoloc.errors import MapError
 from topoloc.features.features import Features
+from topoloc.features.kinds import find_kind
 from topoloc.geometry.camera import Camera
-from topoloc.map.config import MapConfig, config_from_text, descriptor_size_of, resolved_config
+from topoloc.map.config import CONFIG_VERSION, MapConfig, config_from_text
 from topoloc.map.entries import Edge, NodeSummary, PlaceImage, SharedErrors, SideNodes, TopoNode
 from topoloc.map.file import MapFile
 from topoloc.map.schema import SIDE
-from topoloc.map.sessions import Edit, Light, Session
+from topoloc.map.sessions import Edit, Session
 from topoloc.map.sums import LandmarkSums, sums_from
 from topoloc.map.topomap import NextIds, TopoMetricMap
-from topoloc.map.validation import MAX_POINTS, Damage, array_from, arrays_from, camera_from, count_within, pose_from
+from topoloc.map.validation import MAX_POINTS, Damage, array_from, arrays_from, camera_from, count_within, json_of, pose_from
 from topoloc.places.coarse import CoarseModel
-from topoloc.places.stored_settings import json_of, settings_from, value_from
 
 T = TypeVar("T")
 MAX_ID = 2**53
@@ -55,7 +57,7 @@ def _map_of(file: MapFile) -> TopoMetricMap:
     missing = [key for key in ("config", "length_m") if key not in facts]
     if missing:
         raise Damage(f"key {missing[0]!r} of table map is missing")
-    config = config_from_text(facts["config"]) if file.version > 1 else _config_of_schema_1(facts["config"])
+    config = config_from_text(facts["config"], CONFIG_VERSION if file.version > 1 else None)
     kinds = _kinds_of(facts, config)
     sides = None
     if file.count(f"{SIDE}nodes") > 0:
@@ -78,10 +80,6 @@ def _map_of(file: MapFile) -> TopoMetricMap:
     )
 
 
-def _config_of_schema_1(text: str) -> MapConfig:
-    return resolved_config(json_of(text))
-
-
 def _kinds_of(facts: Mapping[str, str], config: MapConfig) -> list[str]:
     """The kinds of features that the map holds, the one that answers first."""
     kinds = json_of(facts["kinds"]) if "kinds" in facts else [config.features.kind]
@@ -90,7 +88,7 @@ def _kinds_of(facts: Mapping[str, str], config: MapConfig) -> list[str]:
     if kinds[:1] != [config.features.kind]:
         raise Damage(f"kinds: {kinds} do not begin with that of the configuration")
     for kind in kinds:
-        descriptor_size_of(kind)
+        find_kind(kind)
     return kinds
 
 
@@ -114,18 +112,9 @@ def _session(row: Mapping[str, Any]) -> Session:
     facts = json_of(row["json"])
     if not isinstance(facts, dict):
         raise Damage("a session that says nothing of itself")
-    camera, light = facts.pop("camera", None), facts.pop("light", None)
-    known = settings_from(Session, facts | {"session_id": row["session_id"], "name": row["name"]}, "session")
-    return Session(
-        known.session_id,
-        known.name,
-        known.recording,
-        known.poses_from,
-        known.start_ns,
-        known.end_ns,
-        None if camera is None else Camera.from_json(camera),
-        None if light is None else settings_from(Light, light, "session.light"),
-    )
+    camera = facts.pop("camera", None)
+    session = settings_from(Session, facts | {"session_id": row["session_id"], "name": row["name"]}, "session")
+    return session if camera is None else replace(session, camera=Camera.from_json(camera))
 
 
 class _Stored(Sequence[T]):
@@ -203,7 +192,7 @@ def read_node(file: MapFile, row: int, kind: str, prefix: str = "") -> TopoNode:
         node_id, what = summary.node_id, f"{prefix}node {summary.node_id}"
         points = _found(file.row(f"{prefix}node_points", node_id=node_id, kind=kind), f"the points of {what}")
         template = b"" if prefix else _found(file.row("node_templates", node_id=node_id), f"the template of {what}")["jpeg"]
-        n, size = count_within(points["num_points"], 0, MAX_POINTS, f"the points of {what}"), descriptor_size_of(kind)
+        n, size = count_within(points["num_points"], 0, MAX_POINTS, f"the points of {what}"), find_kind(kind).descriptor_size
         if points["descriptor_size"] != size:
             raise Damage(f"the points of {what} are not described as {kind} is")
         stored = array_from(points["descriptors"], "i1", (n, size), what)

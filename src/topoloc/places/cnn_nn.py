@@ -11,7 +11,7 @@ from dataclasses import asdict
 from torch import Tensor, nn
 
 from topoloc.places.backbones import Backbone
-from topoloc.places.classifier_config import BackboneName, CnnNnConfig, settings_of
+from topoloc.places.classifier_config import BackboneName, CnnNnConfig
 from topoloc.places.coarse import CoarseModel, setting
 from topoloc.places.training_set import Progress, TrainingSet
 from topoloc.places.vector_search import VectorSearch, fit_vectors
@@ -56,7 +56,7 @@ def train(
 
 def open_model(model: CoarseModel) -> VectorSearch:
     """The localizer of what `train` made."""
-    config = settings_of(CnnNnConfig, setting(model, "config", dict))
+    config = setting(model, "config", CnnNnConfig)
     return VectorSearch(model, _network(setting(model, "backbone", BackboneName), config), config.picture)
 
 

@@ -16,13 +16,12 @@ import faiss
 import numpy as np
 from jaxtyping import Float32, Int
 
-from topoloc.bounds import AtLeast, Between
+from topoloc.bounds import AtLeast, Between, settings_from
 from topoloc.errors import MapError
 from topoloc.features.features import Features
 from topoloc.places.coarse import CoarseModel, Image, NodeScore, model_array
 from topoloc.places.neighbours import PlaceIndex
 from topoloc.places.place_kernels import add_residuals, multiply_rows
-from topoloc.places.stored_settings import bounded_settings_from
 from topoloc.places.whitening import learn_whitening
 
 
@@ -87,8 +86,8 @@ class SurfVlad:
 
     @staticmethod
     def from_model(model: CoarseModel) -> SurfVlad:
-        """The inverse of `to_model`. Raises MapError where the arrays do not belong together, for kernels trust them, and SettingsError."""
-        config = bounded_settings_from(VladConfig, {"position_weight": 0.0, **model.settings})
+        """The inverse of `to_model`. Raises MapError where the arrays do not belong together, for kernels trust them, and ConfigError."""
+        config = settings_from(VladConfig, {"position_weight": 0.0, **model.settings}, "settings")
         words = model_array(model, "words", "f", (None, None)).astype(np.float32, copy=False)
         projection = model_array(model, "projection", "f", (None, words.size)).astype(np.float32)
         mean = model_array(model, "mean", "f", (words.size,)).astype(np.float32, copy=False)

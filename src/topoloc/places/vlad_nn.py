@@ -14,7 +14,7 @@ from jaxtyping import Float32
 from torch import Tensor, nn
 
 from topoloc.places.backbones import Backbone, normalize_pictures
-from topoloc.places.classifier_config import BackboneName, VladNnConfig, settings_of
+from topoloc.places.classifier_config import BackboneName, VladNnConfig
 from topoloc.places.coarse import CoarseModel, setting
 from topoloc.places.inference import BATCH_SIZE, rounded_to_half
 from topoloc.places.netvlad import NetVlad, learn_words
@@ -70,7 +70,7 @@ def train(
 
 def open_model(model: CoarseModel) -> VectorSearch:
     """The localizer of what `train` made."""
-    config = settings_of(VladNnConfig, setting(model, "config", dict))
+    config = setting(model, "config", VladNnConfig)
     backbone, num_clusters = setting(model, "backbone", BackboneName), setting(model, "num_clusters", int)
     depth = config.depth if config.depth is not None else DEPTHS[backbone]
     return VectorSearch(model, VladNetwork(backbone, depth, min(num_clusters, 4096)), config.picture)
