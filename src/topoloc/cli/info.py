@@ -60,7 +60,7 @@ def describe_map(topomap: Any, path: Path) -> dict[str, Any]:
     """
     import numpy as np
 
-    from topoloc.map.coarse_storage import list_coarse
+    from topoloc.map.coarse_training import list_coarse
 
     if len(topomap.summaries) == 0:
         raise EmptyMapError(f"map {path} has no nodes")

@@ -27,20 +27,17 @@ def align_points(points_a: Float[np.ndarray, "n 3"], points_b: Float[np.ndarray,
     Raises:
         TrajectoryError: fewer than three points, all on a line, or not finite: no single rotation fits best.
     """
-    rotation, _ = _umeyama_rotation(points_a, points_b)
-    return Rigid3(rotation, points_a.mean(axis=0) - rotation @ points_b.mean(axis=0))
-
-
-def align_points_with_scale(points_a: Float[np.ndarray, "n 3"], points_b: Float[np.ndarray, "n 3"]) -> tuple[Rigid3, float]:
-    """(a_from_b, scale) with ``points_a ~ a_from_b.apply(scale * points_b)``, for a b without metric scale (Umeyama 1991, Eq. 40-42).
-
-    Raises:
-        TrajectoryError: as `align_points`.
-    """
-    rotation, trace = _umeyama_rotation(points_a, points_b)
+    if len(points_a) != len(points_b):
+        raise TrajectoryError(f"point sets to align have {len(points_a)} and {len(points_b)} points")
+    if not (np.isfinite(points_a).all() and np.isfinite(points_b).all()):
+        raise TrajectoryError("points to align hold values that are not finite")
+    for points in (points_a, points_b):
+        spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) if len(points) >= 3 else np.zeros(3)
+        if spread[1] <= max(_MIN_SPREAD, _MIN_RELATIVE_SPREAD * spread[0]):
+            raise TrajectoryError(f"{len(points)} points on one line (or fewer than three) fix no rotation")
     centre_a, centre_b = points_a.mean(axis=0), points_b.mean(axis=0)
-    scale = float(trace / np.sum((points_b - centre_b) ** 2))
-    return Rigid3(rotation, centre_a - scale * rotation @ centre_b), scale
+    rotation = _nearest_rotation((points_a - centre_a).T @ (points_b - centre_b))
+    return Rigid3(rotation, centre_a - rotation @ centre_b)
 
 
 def align_trajectories(world_a_from_cams: Sequence[Rigid3], world_b_from_cams: Sequence[Rigid3]) -> Rigid3:
@@ -79,7 +76,7 @@ def align_poses(
         correlation += a.rotation @ b.rotation.T / (2.0 * sigma_rotation**2)
     if not np.isfinite(correlation).all():
         raise TrajectoryError("trajectories to align hold poses that are not finite")
-    rotation, _ = _nearest_rotation(correlation)
+    rotation = _nearest_rotation(correlation)
     return Rigid3(rotation, centre_a - rotation @ centre_b)
 
 
@@ -93,24 +90,10 @@ def rotation_error(a_from_b: Rigid3, estimated_a_from_b: Rigid3) -> float:
     return Rigid3(a_from_b.rotation.T @ estimated_a_from_b.rotation, np.zeros(3)).angle()
 
 
-def _umeyama_rotation(points_a: Float[np.ndarray, "n 3"], points_b: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3 3"], float]:
-    """The best rotation and the trace of the signed singular values (Umeyama's tr(D S), times n)."""
-    if len(points_a) != len(points_b):
-        raise TrajectoryError(f"point sets to align have {len(points_a)} and {len(points_b)} points")
-    if not (np.isfinite(points_a).all() and np.isfinite(points_b).all()):
-        raise TrajectoryError("points to align hold values that are not finite")
-    for points in (points_a, points_b):
-        spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) if len(points) >= 3 else np.zeros(3)
-        if spread[1] <= max(_MIN_SPREAD, _MIN_RELATIVE_SPREAD * spread[0]):
-            raise TrajectoryError(f"{len(points)} points on one line (or fewer than three) fix no rotation")
-    return _nearest_rotation((points_a - points_a.mean(axis=0)).T @ (points_b - points_b.mean(axis=0)))
-
-
-def _nearest_rotation(correlation: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarray, "3 3"], float]:
-    """The rotation R of the largest tr(R' C), and that trace."""
-    u, singular, vt = np.linalg.svd(correlation)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    return u * signs @ vt, float(singular @ signs)
+def _nearest_rotation(correlation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation R of the largest tr(R' C)."""
+    u, _, vt = np.linalg.svd(correlation)
+    return u * np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
 
 
 def _positions(world_from_cams: Sequence[Rigid3]) -> Float[np.ndarray, "n 3"]:

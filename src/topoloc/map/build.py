@@ -28,9 +28,9 @@ from topoloc.map.schema import SCHEMA_VERSION
 from topoloc.map.sessions import Edit, Light, Session, light_of, mean_light, path_of, poses_source_of, today
 from topoloc.map.side_nodes import describe_sides, gather_sides, nodes_with_sides
 from topoloc.map.topomap import TopoMetricMap
-from topoloc.map.views import MappingView, mapping_view
 from topoloc.places.vlad import SurfVlad, learn_words, placed, vlad
 from topoloc.sequences.frame import Image, StereoSequence
+from topoloc.sequences.frame_view import FrameView, frame_view
 from topoloc.slam.metric_points import keypoint_sigmas, locate_points
 
 Progress = Callable[[str, int, int], None]
@@ -51,8 +51,8 @@ class _MappingFrame:
     t_ns: int
     world_from_cam: Rigid3
 
-    def view(self, with_depth: bool = True) -> MappingView:
-        return mapping_view(self.sequence[self.index], with_depth)
+    def view(self, with_depth: bool = True) -> FrameView:
+        return frame_view(self.sequence[self.index], with_depth)
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +185,7 @@ def _draft_nodes(frames: list[_MappingFrame], node_config: NodeConfig, config: B
 
 def _draft_node(frame: _MappingFrame, with_sides: bool, config: BuildConfig) -> _NodeDraft:
     view = frame.view()
-    image = _mapping_image(view, config)
+    image = _mapping_image(frame, view, config)
     located = locate_points(image.features, view, config.points)
     rows = np.flatnonzero(located.valid)
     template_jpeg = _encode_jpeg(view.picture, config.template_side_px, quality=75)
@@ -194,9 +194,10 @@ def _draft_node(frame: _MappingFrame, with_sides: bool, config: BuildConfig) -> 
     return _NodeDraft(frame, image, template_jpeg, rows, located.points_cam[rows], located.covariances[rows], [], sides)
 
 
-def _mapping_image(view: MappingView, config: BuildConfig) -> _MappingImage:
+def _mapping_image(frame: _MappingFrame, view: FrameView, config: BuildConfig) -> _MappingImage:
     jpeg = _encode_jpeg(view.picture, config.place_side_px, quality=60)
-    return _MappingImage(view.camera, view.world_from_cam, extract_features(view.grey, config.features), jpeg, light_of(view.picture))
+    world_from_view = frame.world_from_cam @ view.view_from_cam.inverse()
+    return _MappingImage(view.camera, world_from_view, extract_features(view.grey, config.features), jpeg, light_of(view.picture))
 
 
 def _visit_all_images(
@@ -211,7 +212,7 @@ def _visit_all_images(
     images: list[PlaceImage] = []
     vlads, lights = [], []
     for done, frame in enumerate(frames):
-        image = drafted.get(frame) or _mapping_image(frame.view(with_depth=False), config)
+        image = drafted.get(frame) or _mapping_image(frame, frame.view(with_depth=False), config)
         nearest = np.argsort(node_distances(image.world_from_cam, node_poses, node_config.lambda_rot), kind="stable")
         for node_id in nearest[: config.landmarks.nodes_per_image]:
             if drafts[node_id].frame is not frame:

@@ -18,8 +18,18 @@ from pathlib import Path
 from typing import Any
 
 from topoloc.errors import CalibrationError, ConfigError, FeatureKindError, MapError, MapVersionError
-from topoloc.map.migration import SHOW_AS_SCHEMA_2
-from topoloc.map.schema import APPLICATION_ID, ORDER, SCHEMA_1, SCHEMA_VERSION, SIDE, TABLES, Columns, checksum_of, creation_of
+from topoloc.map.schema import (
+    APPLICATION_ID,
+    ORDER,
+    SCHEMA_1,
+    SCHEMA_VERSION,
+    SHOW_AS_SCHEMA_2,
+    SIDE,
+    TABLES,
+    Columns,
+    checksum_of,
+    creation_of,
+)
 from topoloc.map.validation import Damage, counts_from
 
 MAX_SECONDS = 5.0

@@ -17,7 +17,7 @@ from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.pictures import image_size
 from topoloc.sequences.recording import Recording, RightPictures, check_pairs, list_pictures
-from topoloc.sequences.truth import read_times, read_truth
+from topoloc.sequences.trajectory import read_times, read_truth
 
 LOOKS_FOR = "image_0/ and image_1/ (or image_2/ and image_3/) with calib.txt"
 _PAIRS = ((0, 1), (2, 3))

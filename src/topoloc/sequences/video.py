@@ -20,7 +20,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.camera_json import FILE_NAME, read_camera_json
 from topoloc.sequences.frame import Image, StereoFrame
 from topoloc.sequences.pictures import opencv_silent
-from topoloc.sequences.truth import read_truth
+from topoloc.sequences.trajectory import read_truth
 
 # FFmpeg prints its own lines about broken files on stderr, beside the error that says it; read once a process, at its first use.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")

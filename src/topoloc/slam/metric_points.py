@@ -20,7 +20,6 @@ from topoloc.bounds import Above, Between
 from topoloc.errors import RecordingError
 from topoloc.features.features import Features
 from topoloc.geometry.stereo import (
-    DepthNoise,
     depth_sigmas,
     depth_sigmas_of_disparity,
     points_from_depth,
@@ -111,7 +110,7 @@ def _from_depth(
     assert view.depth is not None
     depth = smooth_depth(view.depth, features.points_img, config.max_depth_step)
     points_cam = points_from_depth(features.points_img.astype(np.float64), depth, view.camera)
-    return points_cam, depth_sigmas(points_cam[:, 2], DepthNoise())
+    return points_cam, depth_sigmas(points_cam[:, 2])
 
 
 def smooth_depth(depth: np.ndarray, points_img: np.ndarray, max_step: float) -> Float[np.ndarray, " n"]:
