@@ -120,7 +120,7 @@ def checksum_of(table: str, row: Sequence[Any]) -> bytes:
 # Maps of schema 1, shown to the reader as schema 2: views of the connection's own stand before the file's tables; nothing is written, and
 # `save` makes a file of schema 2 of what they show. Sessions follow from the names of the recordings (two of one name cannot be told
 # apart any more), a side node's node from recording and picture; there are no checksums, no counts and no landmark sums.
-_COMMON = """
+_ALWAYS = """
 CREATE TEMP TABLE sessions (session_id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE, json TEXT NOT NULL, checksum BLOB);
 INSERT INTO sessions (session_id, name, json)
     SELECT row_number() OVER (ORDER BY first) - 1, name, '{}' FROM (
@@ -139,7 +139,7 @@ CREATE TEMP VIEW place_images AS SELECT image_id, session_id, i.name AS name, no
 CREATE TEMP VIEW landmark_sums AS SELECT 0 AS node_id, '' AS kind, 0 AS session_id, 0 AS num_rows, x'' AS sums, NULL AS checksum WHERE 0;
 """
 # Of nodes and of side nodes. Every map of schema 1 has one kind of features, named in its configuration.
-_POINTS = """
+_POINTS_OF = """
 CREATE TEMP VIEW {0}node_points AS SELECT node_id, k.kind AS kind, num_points, descriptor_size, points_img, shapes, descriptors, points_cam,
     sqrt_covs, NULL AS checksum FROM main.{0}node_points JOIN main.{0}nodes USING (node_id) JOIN kinds AS k;
 CREATE TEMP VIEW {0}coarse_models AS SELECT name, settings, arrays, NULL AS checksum FROM main.{0}coarse_models;
@@ -160,6 +160,6 @@ CREATE TEMP VIEW side_nodes AS SELECT 0 AS node_id, 0 AS of_node, '' AS name, 0 
 """
 
 SHOW_AS_SCHEMA_2 = {
-    False: _KINDS + _COMMON + _POINTS.format("") + _NO_SIDES,
-    True: _KINDS + _COMMON + _POINTS.format("") + _SIDES + _POINTS.format("side_"),
+    False: _KINDS + _ALWAYS + _POINTS_OF.format("") + _NO_SIDES,
+    True: _KINDS + _ALWAYS + _POINTS_OF.format("") + _SIDES + _POINTS_OF.format("side_"),
 }
