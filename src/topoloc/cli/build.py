@@ -9,8 +9,7 @@ from typing import Annotated
 import tyro
 
 from topoloc.cli.info import describe_map
-from topoloc.cli.options import File, Format
-from topoloc.cli.output import UsageError, check_outputs, progress_bar, write_json
+from topoloc.cli.output import File, Format, UsageError, check_outputs, progress_bar, write_json
 from topoloc.cli.settings_file import read_settings, with_option
 from topoloc.errors import RecordingError
 from topoloc.features.kinds import KINDS

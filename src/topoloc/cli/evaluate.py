@@ -12,9 +12,17 @@ import numpy as np
 import tyro
 
 from topoloc.cli.info import describe_map
-from topoloc.cli.options import File, Format
-from topoloc.cli.output import UsageError, check_outputs, print_facts, progress_bar, report_writer, write_json
-from topoloc.cli.recordings_table import print_recordings
+from topoloc.cli.output import (
+    File,
+    Format,
+    UsageError,
+    check_outputs,
+    print_facts,
+    print_recordings,
+    progress_bar,
+    report_writer,
+    write_json,
+)
 from topoloc.cli.settings_file import read_settings, with_option
 from topoloc.errors import TrajectoryError
 from topoloc.evaluation.experiments import answer_elsewhere, answer_queries

@@ -8,8 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from topoloc.cli.options import File, Flag
-from topoloc.cli.output import check_outputs, print_facts, write_json
+from topoloc.cli.output import File, Flag, check_outputs, print_facts, write_json
 from topoloc.errors import EmptyMapError, MapError
 
 MAX_DAMAGES = 20

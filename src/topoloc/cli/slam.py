@@ -11,8 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from topoloc.cli.options import File, Format
-from topoloc.cli.output import check_outputs, print_facts, progress_bar, write_json
+from topoloc.cli.output import File, Format, check_outputs, print_facts, progress_bar, write_json
 from topoloc.cli.settings_file import read_settings
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.trajectory_error import absolute_trajectory_errors, relative_drift

@@ -10,8 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from topoloc.cli.options import File, Flag
-from topoloc.cli.output import UsageError, check_outputs, progress_bar, write_json
+from topoloc.cli.output import File, Flag, UsageError, check_outputs, progress_bar, write_json
 from topoloc.cli.settings_file import read_settings
 from topoloc.map.coarse_training import CoarseTrainingConfig, list_coarse, store_coarse, train_coarse
 from topoloc.map.topomap import TopoMetricMap

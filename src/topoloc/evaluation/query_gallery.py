@@ -10,8 +10,7 @@ import numpy as np
 
 from topoloc.errors import UnreadableImageError
 from topoloc.evaluation.match_pictures import NodeMatches, decoded, draw_pair, jpeg_of, match_with_node
-from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION, Answer, by_recording
-from topoloc.evaluation.units import length_text
+from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION, Answer, by_recording, length_text
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.map.topomap import TopoMetricMap, TopoNode
 from topoloc.sequences.frame import Image

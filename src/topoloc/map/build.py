@@ -18,6 +18,7 @@ from topoloc.bounds import check_bounds
 from topoloc.errors import EmptyMapError, TrajectoryError
 from topoloc.features.extraction import extract_features
 from topoloc.features.features import Features
+from topoloc.features.kinds import find_kind
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.map.config import MapConfig
@@ -171,7 +172,9 @@ def _resolve_node_config(frames: list[_MappingFrame], config: BuildConfig) -> No
 def _draft_nodes(frames: list[_MappingFrame], node_config: NodeConfig, config: BuildConfig, progress: Progress) -> list[_NodeDraft]:
     """The trajectory discretised by Eq. 1; a picture with too few points (dark, blurred, blank) becomes no node."""
     frame_idx = place_nodes([frame.world_from_cam for frame in frames], node_config)
-    with_sides = nodes_with_sides([frames[i].world_from_cam for i in frame_idx], node_config, config.sides)
+    kind = find_kind(config.features.kind)
+    has_sides = kind.has_scale and kind.has_angle  # without them nobody asks for the walls
+    with_sides = nodes_with_sides([frames[i].world_from_cam for i in frame_idx], node_config, config.sides) if has_sides else set()
     drafts: list[_NodeDraft] = []
     for done, i in enumerate(frame_idx):
         draft = _draft_node(frames[i], done in with_sides, config)

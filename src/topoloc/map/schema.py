@@ -9,7 +9,6 @@ from typing import Any
 
 APPLICATION_ID = 0x544F504F  # "TOPO", in the database's header
 SCHEMA_VERSION = 2
-DESCRIPTOR_SCALE = 200.0  # components of unit descriptors stay below 127 / 200 = 0.63 but for rare spikes, which are clipped
 SIDE = "side_"
 
 Columns = dict[str, str]

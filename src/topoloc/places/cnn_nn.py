@@ -6,8 +6,6 @@ few cells instead of one: neighbouring nodes see the same things, at other place
 
 from __future__ import annotations
 
-from dataclasses import asdict
-
 from torch import Tensor, nn
 
 from topoloc.places.backbones import Backbone
@@ -49,9 +47,7 @@ def train(
     network = _network(backbone, config)
     if weights is not None:
         load_features(network.backbone, weights)
-    return fit_vectors(NAME, network, training_set, config.picture, config.dimension, progress).model(
-        {"backbone": backbone, "weights": describe(weights), "config": asdict(config)}
-    )
+    return fit_vectors(NAME, network, training_set, config, {"backbone": backbone, "weights": describe(weights)}, progress)
 
 
 def open_model(model: CoarseModel) -> VectorSearch:

@@ -12,7 +12,6 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Annotated
 
-import faiss
 import numpy as np
 from jaxtyping import Float32, Int
 
@@ -20,9 +19,8 @@ from topoloc.bounds import AtLeast, Between, settings_from
 from topoloc.errors import MapError
 from topoloc.features.features import Features
 from topoloc.places.coarse import CoarseModel, Image, NodeScore, model_array
-from topoloc.places.neighbours import PlaceIndex
+from topoloc.places.neighbours import PlaceIndex, learn_whitening, visual_words
 from topoloc.places.place_kernels import add_residuals, multiply_rows
-from topoloc.places.whitening import learn_whitening
 
 
 @dataclass(frozen=True)
@@ -123,8 +121,4 @@ def learn_words(descriptors: Float32[np.ndarray, "n d"], config: VladConfig) -> 
     rng = np.random.default_rng(config.seed)
     if len(descriptors) > config.max_training_descriptors:
         descriptors = descriptors[np.sort(rng.choice(len(descriptors), config.max_training_descriptors, replace=False))]
-    num_words = max(1, min(config.num_words, len(descriptors) // 40))
-    kmeans = faiss.Kmeans(descriptors.shape[1], num_words, niter=20, seed=config.seed + 1, min_points_per_centroid=1)
-    kmeans.train(np.ascontiguousarray(descriptors))
-    assert kmeans.centroids is not None
-    return np.asarray(kmeans.centroids, np.float32).reshape(num_words, -1)
+    return visual_words(descriptors, config.num_words, config.seed)

@@ -6,7 +6,7 @@ it is learnt from the map's own images, as NetVLAD begins its training; it can b
 
 from __future__ import annotations
 
-from dataclasses import asdict
+import math
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from topoloc.places.backbones import Backbone, normalize_pictures
 from topoloc.places.classifier_config import BackboneName, VladNnConfig
 from topoloc.places.coarse import CoarseModel, setting
 from topoloc.places.inference import BATCH_SIZE, rounded_to_half
-from topoloc.places.netvlad import NetVlad, learn_words
+from topoloc.places.neighbours import visual_words
 from topoloc.places.training_set import Progress, RgbPictures, TrainingSet, decode_pictures, network_pictures
 from topoloc.places.triplets import tune
 from topoloc.places.vector_search import VectorSearch, fit_vectors
@@ -26,6 +26,40 @@ from topoloc.places.weights import Weights, describe, load_features
 NAME = "vlad-nn"
 # NetVLAD takes VGG's last convolution before its rectifier and pooling, as the public checkpoints do.
 DEPTHS: dict[BackboneName, int | None] = {"squeezenet1_1": 11, "vgg11": 19, "vgg16": 29, "compact": None}
+# The second nearest word's share in a feature, on average over the features that the words were learnt from.
+SECOND_SHARE = 0.01
+
+
+class NetVlad(nn.Module):
+    """Feature maps (n, c, h, w) -> unit vectors (n, k * c): residuals from each word, summed, each word's sum normalised.
+
+    VLAD with soft assignment (Arandjelovic et al. 2016). Parameters carry the names of the public PyTorch implementation, whose
+    checkpoints load as they are.
+    """
+
+    def __init__(self, num_clusters: int, num_channels: int) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(num_channels, num_clusters, 1, bias=False)
+        self.centroids = nn.Parameter(torch.zeros(num_clusters, num_channels))
+
+    def forward(self, maps: Tensor) -> Tensor:
+        maps = nn.functional.normalize(maps.float(), dim=1)
+        shares = torch.softmax(self.conv(maps.to(self.conv.weight.dtype)).float(), dim=1).flatten(2)
+        sums = torch.bmm(shares, maps.flatten(2).transpose(1, 2)) - shares.sum(dim=2, keepdim=True) * self.centroids.float()
+        return nn.functional.normalize(nn.functional.normalize(sums, dim=2).flatten(1))
+
+
+def learn_words(features: Float32[np.ndarray, "n c"], num_clusters: int, seed: int) -> tuple[Tensor, Tensor]:
+    """Centroids (k, c) and assignment weights (k, c, 1, 1) from unit features of the mapping images; fewer words where there are few.
+
+    Weights are the unit centroids, scaled so that the second nearest word gets one hundredth of the nearest one's share on average.
+    """
+    centroids = visual_words(features, num_clusters, seed)
+    directions = centroids / np.maximum(np.linalg.norm(centroids, axis=1, keepdims=True), 1e-6)
+    cosines = np.sort(features @ directions.T, axis=1)
+    lead = float(np.mean(cosines[:, -1] - cosines[:, -2])) if len(centroids) > 1 else 1.0
+    sharpness = -math.log(SECOND_SHARE) / max(lead, 1e-4)
+    return torch.from_numpy(centroids), torch.from_numpy(sharpness * directions).reshape(*directions.shape, 1, 1)
 
 
 class VladNetwork(nn.Module):
@@ -63,9 +97,8 @@ def train(
     network.pool.load_state_dict({"conv.weight": conv, "centroids": centroids})
     if config.tuning.num_epochs > 0:
         tune(network, pictures, training_set, config.tuning, progress)
-    fitted = fit_vectors(NAME, rounded_to_half(network), training_set, config.picture, config.dimension, progress)
-    facts = {"backbone": backbone, "weights": describe(weights), "config": asdict(config)}
-    return fitted.model(facts | {"num_clusters": len(centroids), "trained": config.tuning.num_epochs > 0})
+    facts = {"backbone": backbone, "weights": describe(weights), "num_clusters": len(centroids), "trained": config.tuning.num_epochs > 0}
+    return fit_vectors(NAME, rounded_to_half(network), training_set, config, facts, progress)
 
 
 def open_model(model: CoarseModel) -> VectorSearch:
