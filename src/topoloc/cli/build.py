@@ -118,11 +118,7 @@ class Command:
 
 
 def _with_slam(sequences: list[StereoSequence], config: SlamConfig, progress: Progress) -> list[StereoSequence]:
-    """The recordings with the poses that SLAM finds.
-
-    Raises:
-        RecordingError: one of them shares no place with the others.
-    """
+    """The recordings with the poses that SLAM finds. Raises RecordingError where one of them shares no place with the others."""
     result = run_slam(sequences, config, progress)
     for sequence, poses in zip(sequences, result.poses, strict=True):
         if not any(poses):

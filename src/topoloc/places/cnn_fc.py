@@ -96,11 +96,6 @@ def train(
     return CoarseModel(NAME, settings, to_arrays(network))
 
 
-def open_model(model: CoarseModel) -> CnnFc:
-    """The localizer of what `train` made."""
-    return CnnFc(model)
-
-
 class CnnFc:
     """The coarse localizer `cnn-fc`.
 
@@ -140,6 +135,9 @@ class CnnFc:
         outputs = self._predict(network_pictures(images, self._shape, self._picture)) / np.float32(self._temperature)
         powers = np.exp(outputs - outputs.max(axis=1, keepdims=True))
         return powers / powers.sum(axis=1, keepdims=True)
+
+
+open_model = CnnFc
 
 
 def soft_labels(training_set: TrainingSet, spread: float) -> Float32[np.ndarray, "n nodes"]:

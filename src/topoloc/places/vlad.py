@@ -93,9 +93,7 @@ class SurfVlad:
         return SurfVlad(words, mean, projection, vectors, model_array(model, "node_ids", "iu", (len(vectors),)), config)
 
 
-def open_model(model: CoarseModel) -> SurfVlad:
-    """The localizer of a stored model."""
-    return SurfVlad.from_model(model)
+open_model = SurfVlad.from_model
 
 
 def placed(features: Features, width: int, height: int, config: VladConfig) -> Float32[np.ndarray, "n d"]:
