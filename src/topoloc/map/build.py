@@ -32,6 +32,7 @@ from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.vlad import SurfVlad, learn_words, placed, vlad
 from topoloc.sequences.frame import Image, StereoSequence
 from topoloc.sequences.frame_view import FrameView, frame_view
+from topoloc.sequences.pictures import jpeg_of
 from topoloc.slam.metric_points import keypoint_sigmas, locate_points
 
 Progress = Callable[[str, int, int], None]
@@ -279,5 +280,4 @@ def _encode_jpeg(picture: Image, side_px: int, quality: int) -> bytes:
     scale = side_px / min(picture.shape[:2])
     if scale < 1.0:
         picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    bgr = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
-    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+    return jpeg_of(picture, quality)
