@@ -10,8 +10,8 @@ import io
 import json
 import os
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict
 from hashlib import blake2b
 from pathlib import Path
@@ -42,18 +42,9 @@ def save_map(topomap: TopoMetricMap, path: Path) -> None:
     """
     if os.path.isdir(path):  # Path.is_dir raises for names that are too long
         raise MapError(f"cannot write map {path}: it is a folder")
-    with _failing_as_map_error(path), replaced_file(path) as temporary:
-        database = sqlite3.connect(temporary, isolation_level=None)
-        try:
-            _Writer(database).write(topomap)
-        finally:
-            database.close()
-
-
-@contextmanager
-def _failing_as_map_error(path: Path) -> Iterator[None]:
     try:
-        yield
+        with replaced_file(path) as temporary, closing(sqlite3.connect(temporary, isolation_level=None)) as database:
+            _Writer(database).write(topomap)
     except (sqlite3.OperationalError, OSError, ValueError) as error:
         if isinstance(error, ValueError) and "null" not in str(error):  # of a file's name; any other is a bug
             raise
