@@ -28,7 +28,7 @@ from topoloc.features.surf import SurfConfig, extract_surf
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.rigid import Rigid3
-from topoloc.map.views import MappingView, mapping_view
+from topoloc.sequences.frame_view import FrameView, frame_view
 from topoloc.sequences.open import open_sequence
 from topoloc.slam.metric_points import MetricPointsConfig, locate_points
 
@@ -53,7 +53,7 @@ class Args:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    mapped: MappingView
+    mapped: FrameView
     queries: dict[str, np.ndarray]
     query_from_map: Rigid3
 
@@ -126,8 +126,8 @@ VARIANTS: dict[str, Extract] = {
 
 def make_pair(args: Args, number: int) -> Pair:
     map_path, map_idx, query_path, query_idx = PAIRS[number]
-    mapped = mapping_view(open_sequence(args.shared / "data" / map_path)[map_idx])
-    query = mapping_view(open_sequence(args.shared / "data" / query_path)[query_idx], with_depth=False)
+    mapped = frame_view(open_sequence(args.shared / "data" / map_path)[map_idx])
+    query = frame_view(open_sequence(args.shared / "data" / query_path)[query_idx], with_depth=False)
     config = FeatureConfig(kind="sift", normalization="none", max_features=3000)
     features_map, features_query = (extract_features(view.grey, config) for view in (mapped, query))
     points, points_img = matched(features_map, features_query, mapped)
@@ -143,7 +143,7 @@ def make_pair(args: Args, number: int) -> Pair:
     return Pair(mapped, queries, pose.cam_from_world)
 
 
-def matched(features_map: Features, features_query: Features, mapped: MappingView) -> tuple[np.ndarray, np.ndarray]:
+def matched(features_map: Features, features_query: Features, mapped: FrameView) -> tuple[np.ndarray, np.ndarray]:
     """Map points (metres, the map picture's camera frame) and the query's pixels that they are matched with."""
     located = locate_points(features_map, mapped, MetricPointsConfig())
     rows = np.flatnonzero(located.valid)

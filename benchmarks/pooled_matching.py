@@ -20,7 +20,7 @@ import tyro
 from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.matching import MatchingConfig, match_features, match_pooled
 from topoloc.geometry.absolute_pose import estimate_absolute_pose
-from topoloc.map.views import mapping_view
+from topoloc.sequences.frame_view import frame_view
 from topoloc.sequences.open import open_sequence
 from topoloc.slam.metric_points import MetricPointsConfig, locate_points
 
@@ -86,7 +86,7 @@ def main(args: Args) -> None:
     config = FeatureConfig()
     nodes = []
     for node_id in range(0, len(sequence), 10):
-        view = mapping_view(sequence[node_id])
+        view = frame_view(sequence[node_id])
         features = extract_features(view.grey, config)
         located = locate_points(features, view, MetricPointsConfig())
         rows = np.flatnonzero(located.valid)
@@ -95,7 +95,7 @@ def main(args: Args) -> None:
         nodes.append(Pool(features.descriptors[rows], points_world, sigmas, np.full(len(rows), node_id)))
     tallies: dict[tuple[str, float], list[tuple[int, int, int]]] = {}
     for query_idx in range(5, len(sequence), 20):
-        view = mapping_view(sequence[query_idx], with_depth=False)
+        view = frame_view(sequence[query_idx], with_depth=False)
         nearest = sorted(range(len(nodes)), key=lambda k, at=query_idx: abs(10 * k - at))[2:7]
         pool = Pool.concatenate([nodes[k] for k in nearest])
         features = extract_features(view.grey, config)

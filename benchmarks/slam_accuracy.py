@@ -20,9 +20,8 @@ from typing import Any
 import numpy as np
 
 from topoloc.errors import RecordingError
-from topoloc.geometry.alignment import align_trajectories
+from topoloc.geometry.alignment import absolute_trajectory_errors, align_trajectories, relative_drift
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.trajectory_error import absolute_trajectory_errors, relative_drift
 from topoloc.sequences.open import open_sequence
 from topoloc.slam.slam import run_slam
 

@@ -13,8 +13,7 @@ import topoloc
 from topoloc.demo.recordings import SHIPPED
 from topoloc.evaluation.experiments import answer_queries
 from topoloc.evaluation.metrics import summarize
-from topoloc.map.coarse_storage import store_coarse
-from topoloc.map.coarse_training import CoarseTrainingConfig, train_coarse
+from topoloc.map.coarse_training import CoarseTrainingConfig, store_coarse, train_coarse
 from topoloc.map.nodes import NodeConfig
 from topoloc.places.classifier_config import CnnFcConfig, PictureConfig, TrainingConfig
 

@@ -15,7 +15,7 @@ from topoloc.localization.localizer import Localizer
 from topoloc.map.build import BuildConfig, build_map
 from topoloc.map.nodes import NodeConfig
 from topoloc.sequences.open import open_sequence
-from topoloc.sequences.selection import sequence_subset
+from topoloc.sequences.recording import sequence_subset
 
 
 @pytest.fixture(scope="module")

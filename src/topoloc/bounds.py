@@ -1,20 +1,25 @@
-"""Bounds of settings: declared beside the field, `Annotated[float, Above(0)]`, and held by one function, `check_bounds`.
+"""Settings and their bounds, which are declared beside the field: `Annotated[float, Above(0)]`.
 
-Whatever its bounds, no number may be NaN or infinite, and none so large that it does not fit into 32 bits where it is whole.
+`check_bounds` holds what was made in Python, `settings_from` what was read from a TOML file, a map or a stored model. Whatever its bounds,
+no number may be NaN or infinite, and no whole number that has bounds so large that it does not fit into 32 bits.
 """
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, fields, is_dataclass
+import re
+from collections.abc import Collection, Iterator
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from difflib import get_close_matches
 from functools import cache
 from numbers import Integral, Real
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from topoloc.errors import ConfigError
+from topoloc.errors import ConfigError, TopolocError
 
+T = TypeVar("T")
 _LARGEST_WHOLE = 2**31 - 1
 
 
@@ -58,18 +63,7 @@ class Between:
         return f"from {self.least} to {self.most}"
 
 
-@dataclass(frozen=True)
-class Fitted:
-    """Fitted to data, hence no setting: files cannot set it, and any finite number will do."""
-
-    def holds(self, number: float | int) -> bool:
-        return True
-
-    def __str__(self) -> str:
-        return "fitted to data"
-
-
-Bound = Above | AtLeast | Between | Fitted
+Bound = Above | AtLeast | Between
 
 
 def check_bounds(config: Any, name: str | None = None) -> None:
@@ -88,6 +82,69 @@ def check_bounds(config: Any, name: str | None = None) -> None:
             raise ConfigError(f"{name}.{key}: {wrong}")
         if is_dataclass(value):
             check_bounds(value, f"{name}.{key}")
+
+
+def settings_from(
+    of: type[T], data: Any, key: str, default: T | None = None, known: Collection[str] | None = None, is_strict: bool = True
+) -> T:
+    """The dataclass `of` from the nested values of a TOML or JSON file, each of its type and within its bounds.
+
+    Args:
+        key: what `data` is called in errors.
+        default: what keeps its value where `data` has none; by default that of the class.
+        known: the keys that are proposed instead of one that there is not; by default those of `of`.
+        is_strict: such a key is an error; else it is left out.
+
+    Raises:
+        ConfigError: a key that there is not or that is missing, or a value that cannot be; names the key.
+    """
+    if not isinstance(data, dict):
+        raise ConfigError(f"{key}: a table is expected, [{key}]")
+    kinds, known = annotations_of(of), known or list(keys_of(of, key))
+    values = {name: getattr(default, name) for name in kinds} if default is not None else {}
+    for name, value in data.items():
+        its_key = f"{key}.{quoted(name)}"
+        if name in kinds:
+            values[name] = value_from(kinds[name], value, its_key, values.get(name), known, is_strict)
+        elif is_strict:
+            raise ConfigError(f"{its_key}: no such setting{did_you_mean(its_key, known)}")
+    required = (field.name for field in fields(of) if field.default is MISSING and field.default_factory is MISSING)  # pyright: ignore[reportArgumentType]
+    if missing := [name for name in required if name not in values]:
+        raise ConfigError(f"{key}.{missing[0]}: is missing")
+    try:
+        return of(**values)
+    except (ValueError, TopolocError) as error:  # values that do not go together
+        raise ConfigError(f"{key}: {error}") from None
+
+
+def value_from(kind: Any, value: Any, key: str, default: Any = None, known: Collection[str] | None = None, is_strict: bool = True) -> Any:
+    """One value as its annotation says; arguments and errors as of `settings_from`."""
+    plain, may_be_none = bare(kind)
+    if is_dataclass(plain) and not (value is None and may_be_none):
+        return settings_from(plain, value, key, default, known, is_strict)  # pyright: ignore[reportArgumentType]
+    value = _as_declared(value, plain)
+    if wrong := complaint(value, kind):
+        raise ConfigError(f"{key}: {wrong}")
+    return value
+
+
+def keys_of(kind: Any, key: str) -> Iterator[str]:
+    """The keys of a dataclass that is called `key`, and of those in it."""
+    for name, declared in annotations_of(kind).items():
+        yield f"{key}.{name}"
+        if is_dataclass(plain := bare(declared)[0]):
+            yield from keys_of(plain, f"{key}.{name}")
+
+
+def did_you_mean(name: str, names: Collection[str]) -> str:
+    """The end of an error about a name that there is not."""
+    near = get_close_matches(name[:100], names, n=1)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+def quoted(name: Any) -> str:
+    """A key as it can stand in a line."""
+    return name if re.fullmatch(r"[\w-]{1,60}", name) else json.dumps(name if len(name) <= 60 else name[:57] + "...")
 
 
 @cache
@@ -125,9 +182,18 @@ def complaint(value: Any, kind: Any) -> str | None:
         for bound in bounds_of(kind):
             if not bound.holds(number):
                 return f"must be {bound}, not {_shown(number)}"
-        if plain is int and number > _LARGEST_WHOLE:
+        if plain is int and bounds_of(kind) and number > _LARGEST_WHOLE:
             return f"must be at most {_LARGEST_WHOLE}, not {_shown(number)}"
     return None
+
+
+def _as_declared(value: Any, plain: Any) -> Any:
+    """What files know no type for: lists that are tuples, whole numbers where any will do."""
+    if get_origin(plain) is tuple and isinstance(value, list):
+        items = get_args(plain)
+        kinds = [items[0]] * len(value) if items[-1] is ... else [*items, *[None] * len(value)]
+        return tuple(map(_as_declared, value, kinds))
+    return float(value) if plain is float and type(value) is int and abs(value) < 2**53 else value
 
 
 def in_words(plain: Any) -> str:

@@ -69,12 +69,7 @@ def set_num_threads(number: int) -> None:
         sys.modules["torch"].set_num_threads(number)
 
 
-def num_threads() -> int:
-    """As `set_num_threads` said."""
-    return _chosen[0] if _chosen else _USUAL_THREADS
-
-
-def chosen_threads(usual: int) -> int:
+def num_threads(usual: int = _USUAL_THREADS) -> int:
     """As `set_num_threads` said, `usual` where it was not called."""
     return _chosen[0] if _chosen else usual
 

@@ -94,7 +94,7 @@ def test_bad_settings_are_one_line_before_the_work(
     assert "--lambda: must be " in complaint(*build, "--lambda", "-1", status=2)
     assert "--max-jump: must be " in complaint("localize", room_map, queries, "--max-jump", "nan", status=2)
     assert "localize.num_candidates: must be " in refused("[localize]\nnum_candidates = 0", "localize", room_map, queries)
-    assert "localize.num_candidate: no such setting; did you mean num_candidates?" in refused(
+    assert "localize.num_candidate: no such setting; did you mean localize.num_candidates?" in refused(
         "localize.num_candidate = 1", "evaluate", room_map, queries
     )
     assert "slam.odometry.window: a whole number" in refused("slam.odometry.window = 1.5", "slam", tiny_recording, tmp_path / "a.tum")

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from topoloc.cli import main
-from topoloc.map.coarse_storage import list_coarse
+from topoloc.map.coarse_training import list_coarse
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.backbones import Backbone
 

@@ -9,13 +9,15 @@ import pytest
 
 from built_room import built_room, unseen_views
 from tiny_world import CAMERA
-from topoloc.evaluation.match_pictures import MAX_LINES, NodeMatches, decoded, draw_pair, jpeg_of, match_with_node
+from topoloc.evaluation.match_pictures import MAX_LINES, NodeMatches, draw_pair, match_with_node
 from topoloc.evaluation.metrics import Answer
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.map.topomap import TopoMetricMap
+from topoloc.places.training_set import decode_picture
+from topoloc.sequences.pictures import jpeg_of
 
 
 @pytest.fixture(scope="module")
@@ -88,5 +90,5 @@ def test_many_matches_are_thinned_out():
 
 def test_an_encoded_picture_is_the_same_twice_and_nearly_the_original():
     picture = np.repeat(np.linspace(0, 255, 64).astype(np.uint8)[None, :, None], 48, axis=0).repeat(3, axis=2)
-    assert jpeg_of(picture) == jpeg_of(picture)
-    assert np.abs(decoded(jpeg_of(picture)).astype(int) - picture).max() < 12
+    assert jpeg_of(picture, 78) == jpeg_of(picture, 78)
+    assert np.abs(decode_picture(jpeg_of(picture, 78)).astype(int) - picture).max() < 12

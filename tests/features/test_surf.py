@@ -161,20 +161,6 @@ def test_place_and_size_of_a_blob() -> None:
     np.testing.assert_allclose(large.sizes_px / small.sizes_px, 3, rtol=0.15)
 
 
-def test_mask() -> None:
-    image = texture(240, 320)
-    mask = np.zeros_like(image)
-    mask[:, :160] = 1
-    everywhere, masked = extract_surf(image), extract_surf(image, mask=mask)
-    left = everywhere.points_img[:, 0] < 155
-    right = everywhere.points_img[:, 0] > 165
-    kept = {tuple(point) for point in masked.points_img}
-    assert all((tuple(p) in kept) == inside for p, inside in zip(everywhere.points_img[left | right], left[left | right], strict=True))
-    assert left.sum() > 20
-    assert len(extract_surf(image, mask=np.zeros_like(image))) == 0
-    assert_same(extract_surf(image, mask=np.full_like(image, 255)), everywhere)
-
-
 @pytest.mark.parametrize("shape", [(1, 1), (1, 300), (300, 1), (8, 8), (26, 26), (28, 28), (33, 70), (40, 500), (36, 66000)])
 def test_small_and_narrow_images(shape: tuple[int, int]) -> None:
     image = np.random.default_rng(0).integers(0, 256, shape, np.uint8)

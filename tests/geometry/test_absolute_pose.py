@@ -13,9 +13,8 @@ from topoloc.geometry.absolute_pose import (
 )
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.pose_covariance import covariance_of_inverse, position_covariance
-from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.stereo import covariances_from_depth
+from topoloc.geometry.rigid import Rigid3, covariance_of_inverse
+from topoloc.geometry.stereo import depth_sigmas, ray_covariances
 
 PINHOLE = CAMERAS["PINHOLE"]
 METHODS = ("poselib", "opencv")
@@ -199,9 +198,9 @@ def test_covariance_of_the_inverse_follows_its_perturbations():
     covariance = root @ root.T
     expected = by_xi @ covariance @ by_xi.T
     np.testing.assert_allclose(covariance_of_inverse(cam_from_world, covariance), expected, atol=1e-4 * expected.max())
-    np.testing.assert_allclose(
-        position_covariance(cam_from_world, covariance), by_position @ covariance @ by_position.T, rtol=1e-4, atol=1e-4
-    )
+    rotation = cam_from_world.rotation
+    of_position = rotation.T @ covariance[:3, :3] @ rotation  # as `covariance_of_inverse` says
+    np.testing.assert_allclose(of_position, by_position @ covariance @ by_position.T, rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(
         covariance_of_inverse(cam_from_world.inverse(), covariance_of_inverse(cam_from_world, covariance)), covariance
     )
@@ -212,7 +211,8 @@ def test_depth_sensor_covariances_fit_the_call():
     scene = make_scene(rng, PINHOLE, n=30)
     points_cam = scene.cam_from_world.apply(scene.points_world)
     rotation = scene.cam_from_world.rotation
-    covariances = rotation.T @ covariances_from_depth(points_cam, PINHOLE) @ rotation
+    of_points = ray_covariances(points_cam, depth_sigmas(points_cam[:, 2]), PINHOLE, np.full(len(points_cam), 0.7))
+    covariances = rotation.T @ of_points @ rotation
     pose = estimate_absolute_pose(scene.points_img, scene.points_world, PINHOLE, point_covariances=covariances)
     exact = estimate_absolute_pose(scene.points_img, scene.points_world, PINHOLE)
     assert pose is not None

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from topoloc.errors import TrajectoryError
+from topoloc.geometry.alignment import absolute_trajectory_errors, relative_drift
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.geometry.trajectory_error import absolute_trajectory_errors, relative_drift
 
 
 def circle(num: int, radius: float = 10.0, yaw_error: float = 0.0, scale: float = 1.0) -> list[Rigid3]:

@@ -18,6 +18,7 @@ from built_corridor import WalkAhead, built_corridor, corridor
 from tiny_world import render
 from topoloc.errors import MapError
 from topoloc.features.extraction import FeatureConfig
+from topoloc.features.kinds import KINDS, SURF
 from topoloc.features.side_views import SideViewConfig
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
@@ -25,8 +26,8 @@ from topoloc.map.build import BuildConfig, build_map
 from topoloc.map.nodes import NodeConfig, NodePoses, node_distances
 from topoloc.map.side_nodes import SideNodesConfig, describe_sides, gather_sides, nodes_with_sides
 from topoloc.map.topomap import NodeSummary, SideNodes, TopoMetricMap, TopoNode
-from topoloc.map.views import MappingView, mapping_view
 from topoloc.places.vlad import SurfVlad
+from topoloc.sequences.frame_view import FrameView, frame_view
 from topoloc.slam.metric_points import MetricPointsConfig
 
 SPACED = NodeConfig(d_thresh=0.3, lambda_rot=3.0)
@@ -39,8 +40,8 @@ def sides() -> SideNodes:
     return found
 
 
-def described(view: MappingView, config: SideNodesConfig | None = None) -> list[TopoNode]:
-    of_node = NodeSummary(-1, "walk", "a picture", 7, view.world_from_cam, 99)
+def described(view: FrameView, config: SideNodesConfig | None = None) -> list[TopoNode]:
+    of_node = NodeSummary(-1, "walk", "a picture", 7, Rigid3.identity(), 99)
     return describe_sides(of_node, view, FeatureConfig(), MetricPointsConfig(), config or SideNodesConfig())
 
 
@@ -114,7 +115,7 @@ def test_each_is_ranked_first_by_its_own_looks_and_its_centre_is_where_it_looks(
 
 
 def test_limits_on_points_are_kept():
-    view = mapping_view(WalkAhead(0)[4])
+    view = frame_view(WalkAhead(0)[4])
     few, all_of_them = described(view, SideNodesConfig(max_points=50)), described(view, SideNodesConfig(max_points=5000))
     assert [len(node.features) for node in few] == [50, 50]
     for node, whole in zip(few, all_of_them, strict=True):
@@ -125,7 +126,7 @@ def test_limits_on_points_are_kept():
 
 
 def test_pictures_that_show_no_walls_have_no_sides():
-    view = mapping_view(WalkAhead(0)[4])
+    view = frame_view(WalkAhead(0)[4])
     blank = np.full_like(view.grey, 90)
     assert described(replace(view, grey=blank, right_grey=blank)) == []
     assert described(view, SideNodesConfig(views=SideViewConfig(nearest=0.5))) == []
@@ -268,3 +269,8 @@ def test_damage_to_side_tables_is_a_map_error_of_one_line(saved_corridor: Path, 
     with pytest.raises(MapError, match=r"corridor\.topo is damaged") as caught:
         read_sides(saved_corridor)
     assert "\n" not in str(caught.value)
+
+
+def test_a_kind_that_walls_are_never_asked_for_has_no_sides(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(KINDS, "surf", replace(SURF, has_angle=False))
+    assert build_map([WalkAhead(0)], BuildConfig(nodes=SPACED)).sides is None

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from topoloc.errors import MapError, MapVersionError
+from topoloc.features.kinds import KINDS, SURF
 from topoloc.map import writing
-from topoloc.map.schema import DESCRIPTOR_SCALE, SCHEMA_VERSION
+from topoloc.map.schema import SCHEMA_VERSION
 from topoloc.map.topomap import TopoMetricMap
 
 
@@ -47,13 +49,20 @@ def test_everything_comes_back(tiny_map: TopoMetricMap, saved: Path):
 
 def test_descriptors_come_back_within_quantisation(tiny_map: TopoMetricMap, saved: Path):
     for one, other in zip(TopoMetricMap.load(saved).nodes, tiny_map.nodes, strict=True):
-        kept = np.abs(other.features.descriptors).max(axis=1) < 127 / DESCRIPTOR_SCALE
+        kept = np.abs(other.features.descriptors).max(axis=1) < 127 / SURF.descriptor_scale
         assert kept.mean() > 0.95
         error = np.abs(one.features.descriptors - other.features.descriptors)
-        assert error[kept].max() < 1.5 / (2 * DESCRIPTOR_SCALE) + 0.02 * np.abs(other.features.descriptors).max()
+        assert error[kept].max() < 1.5 / (2 * SURF.descriptor_scale) + 0.02 * np.abs(other.features.descriptors).max()
         cosines = np.sum(one.features.descriptors * other.features.descriptors, axis=1)
         assert cosines.min() > 0.95
         assert np.median(cosines) > 0.999
+
+
+def test_each_kind_has_its_own_quantisation(tiny_map: TopoMetricMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(KINDS, "surf", replace(SURF, descriptor_scale=100.0))
+    tiny_map.save(tmp_path / "coarser.topo")
+    for one, other in zip(TopoMetricMap.load(tmp_path / "coarser.topo").nodes, tiny_map.nodes, strict=True):
+        np.testing.assert_array_equal(one.stored_descriptors, np.rint(other.features.descriptors * 100.0))
 
 
 def test_covariances_come_back_positive_and_within_half_precision(tiny_map: TopoMetricMap, saved: Path):

@@ -18,8 +18,8 @@ from topoloc.features.features import Features
 from topoloc.places.classifier_config import CnnNnConfig, PictureConfig, TripletConfig, VladNnConfig
 from topoloc.places.coarse import CoarseLocalizer, CoarseModel, open_coarse
 from topoloc.places.training_set import TrainingSet, decode_picture
-from topoloc.places.triplets import tune
 from topoloc.places.vector_search import VectorSearch
+from topoloc.places.vlad_nn import tune
 from topoloc.places.weights import read_weights
 
 SMALL = PictureConfig(112, 84)

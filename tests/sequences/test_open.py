@@ -8,7 +8,7 @@ from tiny_recordings import assert_same_pose, picture, write
 from topoloc.errors import RecordingError, UnknownFormatError
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import FORMATS, open_sequence
-from topoloc.sequences.selection import parse_selection, sequence_subset
+from topoloc.sequences.recording import parse_selection, sequence_subset
 
 
 @pytest.mark.parametrize("name", ["kitti", "euroc", "tum", "seven_scenes"])

@@ -9,7 +9,7 @@ from tiny_recordings import assert_same_pose, kitti_row, pose, tum_line
 from topoloc.errors import TopolocError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.open import open_sequence
-from topoloc.sequences.trajectory import Trajectory, poses_at, read_trajectory, with_trajectory, write_kitti, write_tum
+from topoloc.sequences.trajectory import Trajectory, poses_at, read_trajectory, with_trajectory, write_tum
 
 SECOND = 1_000_000_000
 
@@ -46,7 +46,7 @@ def test_what_is_written_is_read_again(tmp_path_factory: pytest.TempPathFactory,
     folder = tmp_path_factory.mktemp("trip")
     poses = [Rigid3.exp(xi) for xi in np.random.default_rng(seed).normal(size=(len(times), 6))]
     write_tum(folder / "a.tum", Trajectory(poses, sorted(times)))
-    write_kitti(folder / "a.txt", Trajectory(poses))
+    np.savetxt(folder / "a.txt", [pose.matrix()[:3].ravel() for pose in poses], fmt="%.12e")
     assert read_trajectory(folder / "a.tum").t_ns == sorted(times)
     for name in ("a.tum", "a.txt"):
         for one, other in zip(read_trajectory(folder / name).world_from_cam, poses, strict=True):
@@ -63,7 +63,7 @@ def test_writing_replaces_the_file_or_leaves_it(tmp_path: Path):
     write_tum(path, Trajectory([pose(0)], [7]))
     assert read_trajectory(path).t_ns == [7]
     with pytest.raises(TopolocError, match="cannot write"):
-        write_kitti(tmp_path / "nowhere" / "a.txt", Trajectory([pose(0)]))
+        write_tum(tmp_path / "nowhere" / "a.tum", Trajectory([pose(0)], [7]))
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from topoloc.slam.epipolar_kernels import match_along_rows
+from topoloc.slam.epipolar_kernels import match_in_ranges
 from topoloc.slam.metric_points import MetricPointsConfig
 
 WIDTH, HEIGHT = 320, 200
@@ -32,7 +32,10 @@ def rendered_pair(offset: float, along: float, down: float, noise: float, seed: 
 
 
 def matched(left: np.ndarray, right: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return match_along_rows(left, right, points, 5, 80, 0.8, 0.97)
+    num = len(points)
+    disparities, sigmas = np.empty(num, np.float32), np.empty(num, np.float32)
+    match_in_ranges(left, right, points, np.zeros(num, np.int64), np.full(num, 81), 5, 0.8, 0.97, disparities, sigmas)
+    return disparities, sigmas
 
 
 def random_points(count: int, seed: int = 0) -> np.ndarray:
@@ -109,4 +112,4 @@ def test_points_at_and_beyond_the_border_are_left_out():
     left, right = rendered_pair(20.0, 0.0, 0.0, noise=1.0, seed=11)
     points = np.array([[2, 100], [WIDTH - 2, 100], [150, 2], [150, HEIGHT - 2], [-9, -9], [WIDTH + 9, HEIGHT + 9], [12, 100]], np.float32)
     assert np.isnan(matched(left, right, points)[0]).all()
-    assert np.isnan(match_along_rows(left, right, np.zeros((0, 2), np.float32), 5, 80, 0.8, 0.97)[0]).all()
+    assert np.isnan(matched(left, right, np.zeros((0, 2), np.float32))[0]).all()

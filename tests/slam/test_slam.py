@@ -12,9 +12,9 @@ from room_frames import FrameList, blackened, changed, depth_frame, stereo_frame
 import tiny_world
 import topoloc
 from topoloc.errors import CalibrationError, RecordingError
+from topoloc.geometry.alignment import absolute_trajectory_errors
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.trajectory_error import absolute_trajectory_errors
 from topoloc.sequences.frame import StereoSequence
 from topoloc.slam.slam import SlamResult, run_slam
 

@@ -11,7 +11,7 @@ from topoloc.evaluation.metrics import Answer, summarize
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import open_sequence
-from topoloc.sequences.selection import sequence_subset
+from topoloc.sequences.recording import sequence_subset
 from topoloc_paper.datasets import Dataset
 from topoloc_paper.known_nodes import KnownNodes
 from topoloc_paper.maps import MapKind, opened

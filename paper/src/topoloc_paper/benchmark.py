@@ -9,8 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from topoloc.cli.options import File, Flag
-from topoloc.cli.output import UsageError, check_outputs, interruptible, progress_bar, write_json
+from topoloc.cli.output import File, Flag, UsageError, check_outputs, interruptible, progress_bar, write_json
 from topoloc.errors import TopolocError
 from topoloc.sequences.atomic import write_text
 from topoloc_paper.datasets import RENDERED, at_hand, quick_datasets, real_datasets, render_missing, rendered_datasets

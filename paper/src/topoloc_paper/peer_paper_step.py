@@ -22,8 +22,8 @@ from topoloc.features.patch_normalization import PatchNormalizationConfig, patch
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.map.topomap import TopoMetricMap
-from topoloc.map.views import mapping_view
 from topoloc.sequences.frame import StereoFrame, StereoSequence
+from topoloc.sequences.frame_view import frame_view
 from topoloc.sequences.pictures import grey_image
 from topoloc.slam.metric_points import MetricPointsConfig, locate_points
 from topoloc_paper.peer_answers import PeerAnswer
@@ -61,11 +61,13 @@ class PaperStep:
         return answers
 
     def _node(self, sequence: StereoSequence, index: int) -> _Node:
-        view = mapping_view(sequence[index])
+        frame = sequence[index]
+        assert frame.world_from_cam is not None, "a mapping frame"
+        view = frame_view(frame)
         points_img, sizes, descriptors = self._features(view.grey)
         zeros = np.zeros(len(points_img), np.float32)
         located = locate_points(Features(points_img, sizes, zeros, zeros, descriptors), view, MetricPointsConfig())
-        return _Node(view.world_from_cam, located.points_cam[located.valid], descriptors[located.valid])
+        return _Node(frame.world_from_cam @ view.view_from_cam.inverse(), located.points_cam[located.valid], descriptors[located.valid])
 
     def _features(self, grey: UInt8[np.ndarray, "h w"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         normalized = patch_normalize(grey, PatchNormalizationConfig.paper())

@@ -16,13 +16,14 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
+from topoloc.bounds import settings_from
 from topoloc.errors import WeightsError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.map.coarse_training import training_set_of
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.augmentation import augment
 from topoloc.places.backbones import Backbone, normalize_pictures
-from topoloc.places.classifier_config import AugmentationConfig, BackboneName, PictureConfig, TrainingConfig, settings_of
+from topoloc.places.classifier_config import AugmentationConfig, BackboneName, PictureConfig, TrainingConfig
 from topoloc.places.coarse import Image
 from topoloc.places.inference import BATCH_SIZE, in_channels_last
 from topoloc.places.training import Task, Training, fit, hold_out
@@ -101,7 +102,7 @@ class PoseNet:
         """The inverse of `save`. Raises WeightsError."""
         try:
             content = torch.load(path, weights_only=True)
-            config = settings_of(PoseNetConfig, content["config"])
+            config = settings_from(PoseNetConfig, content["config"], "config", is_strict=False)
             network = PoseRegressor(content["backbone"], config.num_hidden)
             network.load_state_dict(content["network"])
             shape = PictureShape(*content["picture_shape"])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any
 
-from topoloc.evaluation.units import length_text
+from topoloc.evaluation.metrics import length_text
 
 Row = Mapping[str, Any]
 MISSING = "–"

@@ -9,8 +9,7 @@ from typing import Annotated
 import tyro
 
 from topoloc.cli.info import describe_map
-from topoloc.cli.options import File, Format
-from topoloc.cli.output import UsageError, check_outputs, progress_bar, write_json
+from topoloc.cli.output import File, Format, UsageError, check_outputs, progress_bar, write_json
 from topoloc.cli.settings_file import read_settings, with_option
 from topoloc.errors import RecordingError
 from topoloc.features.kinds import KINDS
@@ -119,11 +118,7 @@ class Command:
 
 
 def _with_slam(sequences: list[StereoSequence], config: SlamConfig, progress: Progress) -> list[StereoSequence]:
-    """The recordings with the poses that SLAM finds.
-
-    Raises:
-        RecordingError: one of them shares no place with the others.
-    """
+    """The recordings with the poses that SLAM finds. Raises RecordingError where one of them shares no place with the others."""
     result = run_slam(sequences, config, progress)
     for sequence, poses in zip(sequences, result.poses, strict=True):
         if not any(poses):

@@ -12,9 +12,7 @@ from typing import Annotated, Any
 import tyro
 
 from topoloc.cli.info import describe_map
-from topoloc.cli.options import File
-from topoloc.cli.output import UsageError, check_outputs, progress_bar, report_writer, write_json
-from topoloc.cli.recordings_table import print_recordings
+from topoloc.cli.output import File, UsageError, check_outputs, print_recordings, progress_bar, report_writer, write_json
 from topoloc.demo.recordings import ROLES, SHIPPED, Role, missing_recordings
 from topoloc.demo.words import PAPER_LAB, night_in_words, words_of
 from topoloc.errors import MissingExtraError, TopolocError

@@ -12,9 +12,17 @@ import numpy as np
 import tyro
 
 from topoloc.cli.info import describe_map
-from topoloc.cli.options import File, Format
-from topoloc.cli.output import UsageError, check_outputs, print_facts, progress_bar, report_writer, write_json
-from topoloc.cli.recordings_table import print_recordings
+from topoloc.cli.output import (
+    File,
+    Format,
+    UsageError,
+    check_outputs,
+    print_facts,
+    print_recordings,
+    progress_bar,
+    report_writer,
+    write_json,
+)
 from topoloc.cli.settings_file import read_settings, with_option
 from topoloc.errors import TrajectoryError
 from topoloc.evaluation.experiments import answer_elsewhere, answer_queries
@@ -24,6 +32,7 @@ from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import open_sequence
+from topoloc.sequences.text_rows import read_text
 
 
 @dataclass(frozen=True)
@@ -90,9 +99,7 @@ def _labels(paths: Sequence[str], sequences: Sequence[StereoSequence]) -> list[s
 def _read_rigid(path: Path) -> Rigid3:
     """A 4x4 matrix, alone or as the only matrix of a JSON object."""
     try:
-        data: Any = json.loads(path.read_text())
-    except OSError as error:
-        raise TrajectoryError(f"{path}: {error.strerror}") from None
+        data: Any = json.loads(read_text(path, TrajectoryError))
     except ValueError as error:
         raise TrajectoryError(f"{path}: not JSON ({error})") from None
     matrices = [value for value in data.values() if isinstance(value, list)] if isinstance(data, dict) else [data]

@@ -8,8 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from topoloc.cli.options import File, Flag
-from topoloc.cli.output import check_outputs, print_facts, write_json
+from topoloc.cli.output import File, Flag, check_outputs, print_facts, write_json
 from topoloc.errors import EmptyMapError, MapError
 
 MAX_DAMAGES = 20
@@ -60,7 +59,7 @@ def describe_map(topomap: Any, path: Path) -> dict[str, Any]:
     """
     import numpy as np
 
-    from topoloc.map.coarse_storage import list_coarse
+    from topoloc.map.coarse_training import list_coarse
 
     if len(topomap.summaries) == 0:
         raise EmptyMapError(f"map {path} has no nodes")

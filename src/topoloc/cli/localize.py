@@ -11,8 +11,7 @@ from typing import Annotated
 
 import tyro
 
-from topoloc.cli.options import File, Flag, Format
-from topoloc.cli.output import UsageError, check_outputs, interruptible, progress_bar, write_text
+from topoloc.cli.output import File, Flag, Format, UsageError, check_outputs, interruptible, progress_bar, write_text
 from topoloc.cli.query_answers import QueryAnswer, answer_line, exit_status, stream_summary, trajectory_of
 from topoloc.cli.settings_file import read_settings, with_option
 from topoloc.errors import CalibrationError, QueryError, TopolocError, UnreadableImageError

@@ -1,4 +1,4 @@
-"""What the commands share: output paths checked before the work, progress on a terminal, results written at once."""
+"""What the commands share: kinds of options, output paths checked before the work, progress on a terminal, tables, results written."""
 
 from __future__ import annotations
 
@@ -8,10 +8,20 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import tyro
 
 from topoloc.errors import MissingExtraError, TopolocError
 from topoloc.sequences.atomic import remove_leftovers, write_text
+
+# Given or not: no `--no-...`, and no "(default: False)" in the help.
+Flag = Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(help_behavior_hint="")]
+# A path that may be left out.
+File = Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
+# The format of the recordings.
+Format = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: recognised)")]
+_COLUMNS = ("recording", "localized", "median error", "in 5 cm, 5 deg", "in 25 cm, 2 deg", "false accepts", "ms")
 
 
 class UsageError(TopolocError):
@@ -112,6 +122,35 @@ def print_facts(facts: Sequence[tuple[str, str]]) -> None:
     width = max(len(name) for name, _ in facts)
     for name, value in facts:
         print(f"{name:<{width}}  {value}".rstrip())
+
+
+def print_recordings(evaluation: dict[str, Any], published: Sequence[tuple[str, float, float]] = ()) -> None:
+    """Print the rows of an evaluation (`summarize`), then what others published: (name, metres, degrees)."""
+    rows = [_COLUMNS, *(_row(recording) for recording in evaluation["recordings"])]
+    rows += [(name, "", _error(metres, degrees), "", "", "", "") for name, metres, degrees in published]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(_COLUMNS))]
+    for name, *cells in rows:
+        padded = [f"{cell:>{width}}" for cell, width in zip(cells, widths[1:], strict=True)]
+        print("  ".join([f"{name:<{widths[0]}}", *padded]).rstrip())
+
+
+def _row(recording: dict[str, Any]) -> tuple[str, ...]:
+    recall, num = recording["recall"], recording["num_queries"]
+    shares = [f"{100 * recall[key]:.0f} %" if num else "" for key in ("0.05m_5deg", "0.25m_2deg")]
+    median = _error(recording["median_translation_m"], recording["median_rotation_deg"]) if recording["num_localized"] else ""
+    total = recording["median_times_ms"].get("total")
+    return (
+        recording["name"],
+        f"{recording['num_localized']} of {num}" if num else "",
+        median,
+        *shares,
+        f"{recording['false_accepts']} of {num + recording['num_elsewhere']}",
+        "" if total is None else f"{total:.0f}",
+    )
+
+
+def _error(metres: float, degrees: float) -> str:
+    return f"{100 * metres:.2f} cm, {degrees:.2f} deg"
 
 
 def write_json(path: str | None, data: Any) -> None:

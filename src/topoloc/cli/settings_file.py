@@ -6,19 +6,17 @@ import ast
 import importlib
 import inspect
 import json
-import re
 import textwrap
 import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import is_dataclass, replace
-from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
-from topoloc.bounds import Fitted, annotations_of, bare, bounds_of, complaint
+from topoloc.bounds import annotations_of, bare, bounds_of, complaint, did_you_mean, quoted, settings_from
 from topoloc.cli.output import UsageError
-from topoloc.errors import ConfigError, TopolocError
+from topoloc.errors import ConfigError
 
 T = TypeVar("T")
 
@@ -57,8 +55,9 @@ def read_settings(path: str | None) -> Settings:
         configs = []
         for name, table in _parsed(path).items():
             if name not in TABLES:
-                raise ConfigError(f"{_key(name)}: no such table{_did_you_mean(name, TABLES)}")
-            configs.append(_configured(config_class(name)(), table, name))
+                raise ConfigError(f"{quoted(name)}: no such table{did_you_mean(name, TABLES)}")
+            kind = config_class(name)
+            configs.append(settings_from(kind, table, name, default=kind()))
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
     return Settings({type(config): config for config in configs})
@@ -93,7 +92,7 @@ def settings_text(tables: Sequence[str]) -> str:
 
 def _table_lines(config: Any, key: str, note: str = "") -> Iterator[str]:
     """A table and those in it."""
-    kinds, notes = _settable(type(config)), meanings_of(type(config))
+    kinds, notes = annotations_of(type(config)), meanings_of(type(config))
     nested = [name for name in kinds if is_dataclass(getattr(config, name))]
     yield from _comment(" ".join(filter(None, (_about(type(config)), note))))
     yield f"[{key}]"
@@ -144,11 +143,6 @@ def meanings_of(kind: type) -> dict[str, str]:
     return meanings
 
 
-def _settable(kind: type) -> dict[str, Any]:
-    """The fields that are settings."""
-    return {name: declared for name, declared in annotations_of(kind).items() if Fitted() not in bounds_of(declared)}
-
-
 def _parsed(path: str) -> dict[str, Any]:
     try:
         with Path(path).open("rb") as file:
@@ -161,57 +155,3 @@ def _parsed(path: str) -> dict[str, Any]:
         return tomllib.loads(content.decode())
     except (ValueError, RecursionError) as error:  # tomllib's own error is a ValueError, as are those of bad UTF-8 and of numbers too long
         raise ConfigError(f"not TOML ({error})") from None
-
-
-def _configured(config: T, table: Any, key: str) -> T:
-    """The configuration with what a table sets. Raises ConfigError, which names the key."""
-    if not isinstance(table, dict):
-        raise ConfigError(f"{key}: a table is expected, [{key}]")
-    kinds, changes = _settable(type(config)), {}
-    for name, value in table.items():
-        its_key = f"{key}.{_key(name)}"
-        if name not in kinds:
-            raise ConfigError(f"{its_key}: no such setting{_did_you_mean(name, kinds) or _elsewhere(name, key)}")
-        before = getattr(config, name)
-        if is_dataclass(before):
-            changes[name] = _configured(before, value, its_key)
-        else:
-            changes[name] = _as_declared(value, bare(kinds[name])[0])
-            if wrong := complaint(changes[name], kinds[name]):
-                raise ConfigError(f"{its_key}: {wrong}")
-    try:
-        return replace(config, **changes)  # pyright: ignore[reportArgumentType]
-    except (ValueError, TopolocError) as error:  # values that do not go together
-        raise ConfigError(f"{key}: {error}") from None
-
-
-def _as_declared(value: Any, plain: Any) -> Any:
-    """What TOML knows no type for: lists that are tuples, whole numbers where any will do."""
-    if get_origin(plain) is tuple and isinstance(value, list):
-        items = get_args(plain)
-        kinds = [items[0]] * len(value) if items[-1] is ... else [*items, *[None] * len(value)]
-        return tuple(map(_as_declared, value, kinds))
-    return float(value) if plain is float and type(value) is int and abs(value) < 2**53 else value
-
-
-def _key(name: str) -> str:
-    return name if re.fullmatch(r"[\w-]{1,60}", name) else json.dumps(name if len(name) <= 60 else name[:57] + "...")
-
-
-def _did_you_mean(name: str, names: Any) -> str:
-    near = get_close_matches(name[:100], names, n=1)
-    return f"; did you mean {near[0]}?" if near else ""
-
-
-def _elsewhere(name: str, key: str) -> str:
-    """The setting of this name in another place of the same table, where there is one."""
-    table = key.partition(".")[0]
-    found = [other for other in _keys(config_class(table)(), table) if other.rpartition(".")[2] == name]
-    return f"; did you mean {found[0]}?" if found else ""
-
-
-def _keys(config: Any, key: str) -> Iterator[str]:
-    for name in _settable(type(config)):
-        yield f"{key}.{name}"
-        if is_dataclass(value := getattr(config, name)):
-            yield from _keys(value, f"{key}.{name}")

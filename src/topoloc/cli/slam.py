@@ -11,11 +11,10 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from topoloc.cli.options import File, Format
-from topoloc.cli.output import check_outputs, print_facts, progress_bar, write_json
+from topoloc.cli.output import File, Format, check_outputs, print_facts, progress_bar, write_json
 from topoloc.cli.settings_file import read_settings
+from topoloc.geometry.alignment import absolute_trajectory_errors, relative_drift
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.trajectory_error import absolute_trajectory_errors, relative_drift
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import open_sequence
 from topoloc.sequences.trajectory import Trajectory, write_tum

@@ -10,11 +10,9 @@ from typing import Annotated, Literal
 
 import tyro
 
-from topoloc.cli.options import File, Flag
-from topoloc.cli.output import UsageError, check_outputs, progress_bar, write_json
+from topoloc.cli.output import File, Flag, UsageError, check_outputs, progress_bar, write_json
 from topoloc.cli.settings_file import read_settings
-from topoloc.map.coarse_storage import list_coarse, store_coarse
-from topoloc.map.coarse_training import CoarseTrainingConfig, train_coarse
+from topoloc.map.coarse_training import CoarseTrainingConfig, list_coarse, store_coarse, train_coarse
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.classifier_config import BackboneName
 from topoloc.places.coarse import CoarseModel

@@ -100,19 +100,6 @@ def draw_pair(
     return canvas
 
 
-def jpeg_of(image: Image, quality: int = JPEG_QUALITY) -> bytes:
-    """The picture encoded; the same picture gives the same bytes."""
-    bgr = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
-
-
-def decoded(jpeg: bytes) -> Image:
-    """A node's template, RGB."""
-    bgr = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
-    assert bgr is not None  # we encoded it
-    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
-
-
 def _reduced(image: Image, camera: Camera) -> tuple[Picture, Camera, float]:
     """The picture and its camera no wider than `MATCHED_WIDTH_PX`, and the scale."""
     height, width = image.shape[:2]

@@ -110,3 +110,10 @@ def _reasons(answers: list[Answer]) -> dict[str, int]:
 
 def _median(values: np.ndarray) -> float | None:
     return float(np.median(values)) if len(values) else None
+
+
+def length_text(metres: float, digits: int | None = None) -> str:
+    """Metres for people: in cm below one."""
+    if metres >= 1.0:
+        return f"{metres:.{2 if digits is None else digits}f} m"
+    return f"{100 * metres:.{(2 if metres < 0.1 else 1) if digits is None else digits}f} cm"

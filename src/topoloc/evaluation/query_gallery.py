@@ -9,12 +9,13 @@ from html import escape
 import numpy as np
 
 from topoloc.errors import UnreadableImageError
-from topoloc.evaluation.match_pictures import NodeMatches, decoded, draw_pair, jpeg_of, match_with_node
-from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION, Answer, by_recording
-from topoloc.evaluation.units import length_text
+from topoloc.evaluation.match_pictures import JPEG_QUALITY, NodeMatches, draw_pair, match_with_node
+from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION, Answer, by_recording, length_text
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.map.topomap import TopoMetricMap, TopoNode
+from topoloc.places.training_set import decode_picture
 from topoloc.sequences.frame import Image
+from topoloc.sequences.pictures import jpeg_of
 
 NUM_WORST = 6
 
@@ -96,9 +97,10 @@ def _pictures(answer: Answer, node: TopoNode | None, topomap: TopoMetricMap) -> 
     if image is None:
         shown, caption = node.template_jpeg if node else None, "the query's picture cannot be read any more"
     elif node is None:
-        shown, caption = jpeg_of(draw_pair(image, None)), "query; no node to compare it with"
+        shown, caption = jpeg_of(draw_pair(image, None), JPEG_QUALITY), "query; no node to compare it with"
     else:
-        shown = jpeg_of(draw_pair(image, decoded(node.template_jpeg), _matches(answer, image, node, topomap), node.camera))
+        pair = draw_pair(image, decode_picture(node.template_jpeg), _matches(answer, image, node, topomap), node.camera)
+        shown = jpeg_of(pair, JPEG_QUALITY)
         caption = f"left the query, right node {node.summary.node_id}"
     return f"<figure>{_img(shown, caption)}<figcaption>{caption}</figcaption></figure>"
 

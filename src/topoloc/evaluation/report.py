@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from html import escape
 from importlib import resources
 from pathlib import Path
@@ -15,6 +16,20 @@ from topoloc.evaluation.query_gallery import gallery, typical_queries, worst_que
 from topoloc.evaluation.report_tables import ReportWords, cards, numbers_tables, recordings_table, what_counts
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.atomic import write_text
+
+_MAP = "Seen from above. A tick at a node shows where its camera looked; lines lead from true to estimated positions."
+_CURVES = "The height of a curve is the share of all queries whose error is at most that much; it ends where no more queries have a pose."
+_TYPICAL = (
+    "Of each recording the query with the median error, and the node of the map that its pose comes from. Lines join what was "
+    "matched: green what the pose explains, red what it does not."
+)
+_WORST = (
+    "False accepts first, then queries without a pose, then the largest errors; each recording has its share of the places. Where "
+    "there is no pose, lines show what looks alike: green what is right by the truth, red what is wrong."
+)
+_NO_WORST = "There are none: no image from elsewhere was given a pose."
+_ALONG = "Every query in the order of its recording; errors on a logarithmic scale."
+_TIMES = "Bars are medians; the line ends where 95 % of the queries are done. The total includes what lies between the stages."
 
 
 def write_report(
@@ -36,81 +51,36 @@ def _page(evaluation: dict[str, Any], answers: list[Answer], topomap: TopoMetric
     title = escape(words.title or f"Localization in {Path(evaluation['map']['path']).name}")
     recordings = ", ".join(row["name"] for row in evaluation["recordings"] if row["name"]) or "no recordings"
     subtitle = escape(words.subtitle or f"Asked about: {recordings}")
-    several = len(evaluation["recordings"]) > 1
-    sections = [_lead(evaluation, words)]
-    sections.append(_map_section(answers, topomap))
-    if evaluation["num_queries"]:
-        sections += [_curves_section(evaluation, answers)]
-    if several:
-        sections.append(_typical_section(answers, topomap))
-    sections.append(_worst_section(answers, topomap))
-    if evaluation["num_queries"]:
-        sections.append(_along_section(answers))
-    if evaluation["median_times_ms"]:
-        sections.append(_times_section(answers))
-    sections += [_section("All the numbers", "", numbers_tables(evaluation)), _config_section(evaluation)]
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
     header = f'<header><div class="page"><h1>{title}</h1><p>{subtitle}</p></div></header>'
-    body = "\n".join([cards(evaluation), *sections, "<footer>Written by topoloc.</footer>"])
+    body = "\n".join([cards(evaluation), *_sections(evaluation, answers, topomap, words), "<footer>Written by topoloc.</footer>"])
     return (
         f'<!DOCTYPE html>\n<html lang="en"><head>{head}\n<title>{title}</title>\n<style>\n{style}</style></head><body>\n'
         f'{header}\n<div class="page">{body}</div></body></html>\n'
     )
 
 
+def _sections(evaluation: dict[str, Any], answers: list[Answer], topomap: TopoMetricMap, words: ReportWords) -> Iterator[str]:
+    paragraphs = "".join(f'<p class="lead">{escape(paragraph)}</p>' for paragraph in words.paragraphs)
+    yield _section("Results", what_counts(evaluation), recordings_table(evaluation, words) + paragraphs)
+    yield _section("The map from above", _MAP, _wide(draw_map(answers, topomap)))
+    if evaluation["num_localized"]:
+        yield _section("How large are the errors?", _CURVES, f'<div class="halves">{"".join(draw_error_curves(answers))}</div>')
+    if len(evaluation["recordings"]) > 1:
+        yield _section("What the queries look like", _TYPICAL, gallery(typical_queries(answers), topomap))
+    worst = worst_queries(answers)
+    yield _section("The worst queries", _WORST if worst else _NO_WORST, gallery(worst, topomap) if worst else "")
+    if evaluation["num_queries"]:
+        yield _section("Where do errors occur?", _ALONG, _wide(draw_errors_along(answers)))
+    if evaluation["median_times_ms"]:
+        yield _section("Where does the time go?", _TIMES, _wide(draw_stage_times(answers)))
+    yield _section("All the numbers", "", numbers_tables(evaluation))
+    config = escape(json.dumps(evaluation["map"]["config"], indent=1, sort_keys=True))
+    yield f"<section><details><summary>The configuration that the map was built with</summary><pre>{config}</pre></details></section>"
+
+
 def _section(title: str, explanation: str, content: str) -> str:
     return f"<section><h2>{title}</h2>" + (f"<p>{explanation}</p>" if explanation else "") + f"{content}</section>"
-
-
-def _lead(evaluation: dict[str, Any], words: ReportWords) -> str:
-    paragraphs = "".join(f'<p class="lead">{escape(paragraph)}</p>' for paragraph in words.paragraphs)
-    return _section("Results", what_counts(evaluation), recordings_table(evaluation, words) + paragraphs)
-
-
-def _map_section(answers: list[Answer], topomap: TopoMetricMap) -> str:
-    text = "Seen from above. A tick at a node shows where its camera looked; lines lead from true to estimated positions."
-    return _section("The map from above", text, _wide(draw_map(answers, topomap)))
-
-
-def _curves_section(evaluation: dict[str, Any], answers: list[Answer]) -> str:
-    if not evaluation["num_localized"]:
-        return ""
-    text = "The height of a curve is the share of all queries whose error is at most that much; it ends where no more queries have a pose."
-    return _section("How large are the errors?", text, f'<div class="halves">{"".join(draw_error_curves(answers))}</div>')
-
-
-def _typical_section(answers: list[Answer], topomap: TopoMetricMap) -> str:
-    text = (
-        "Of each recording the query with the median error, and the node of the map that its pose comes from. Lines join what was "
-        "matched: green what the pose explains, red what it does not."
-    )
-    return _section("What the queries look like", text, gallery(typical_queries(answers), topomap))
-
-
-def _worst_section(answers: list[Answer], topomap: TopoMetricMap) -> str:
-    worst = worst_queries(answers)
-    if not worst:
-        return _section("The worst queries", "There are none: no image from elsewhere was given a pose.", "")
-    text = (
-        "False accepts first, then queries without a pose, then the largest errors; each recording has its share of the places. Where "
-        "there is no pose, lines show what looks alike: green what is right by the truth, red what is wrong."
-    )
-    return _section("The worst queries", text, gallery(worst, topomap))
-
-
-def _along_section(answers: list[Answer]) -> str:
-    text = "Every query in the order of its recording; errors on a logarithmic scale."
-    return _section("Where do errors occur?", text, _wide(draw_errors_along(answers)))
-
-
-def _times_section(answers: list[Answer]) -> str:
-    text = "Bars are medians; the line ends where 95 % of the queries are done. The total includes what lies between the stages."
-    return _section("Where does the time go?", text, _wide(draw_stage_times(answers)))
-
-
-def _config_section(evaluation: dict[str, Any]) -> str:
-    text = escape(json.dumps(evaluation["map"]["config"], indent=1, sort_keys=True))
-    return f"<section><details><summary>The configuration that the map was built with</summary><pre>{text}</pre></details></section>"
 
 
 def _wide(figure: str) -> str:

@@ -8,8 +8,7 @@ from html import escape
 from typing import Any
 
 from topoloc.evaluation.figure_style import recording_colours
-from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION
-from topoloc.evaluation.units import length_text
+from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION, length_text
 
 
 @dataclass(frozen=True)

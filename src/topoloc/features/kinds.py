@@ -63,7 +63,7 @@ class FeatureKind:
     extract: gives the features of a grey uint8 picture, strongest first, with these settings on so many threads. Descriptors must have
     unit length: they are compared by their scalar product.
     normalization: what is done to the picture first, unless the settings say otherwise.
-    descriptor_scale: a map file keeps a descriptor's numbers times this as signed bytes; what exceeds 127 is clipped.
+    descriptor_scale: a map file keeps a descriptor's numbers times this as signed bytes; what exceeds 127 (at 200: 0.63) is clipped.
     has_scale, has_angle: do `Features.sizes_px` and `angles` follow the picture? Where they do not, all are the same, and matching
     does not look at them.
     sigma_px: standard deviation (pixels) of a matched key point along x and along y.

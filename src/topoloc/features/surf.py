@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int32, Int64, UInt8
+from jaxtyping import Float32, Int32, Int64, UInt8
 
 from topoloc.bounds import AtLeast, Between
 from topoloc.compiled import num_threads
@@ -63,21 +63,14 @@ class SurfConfig:
             raise ValueError(f"SURF: filters beyond {LARGEST_FILTER_PX} px, fewer octaves or layers are needed: {self}")
 
 
-def extract_surf(
-    image: UInt8[np.ndarray, "h w"], config: SurfConfig = SurfConfig(), mask: UInt8[np.ndarray, "h w"] | None = None
-) -> Features:
+def extract_surf(image: UInt8[np.ndarray, "h w"], config: SurfConfig = SurfConfig()) -> Features:
     """The strongest SURF key points of a grey image, strongest first, with descriptors (n, 64) of unit length.
 
-    Where `mask` is 0 nothing is found: at least half of the filter of a key point must lie on non-zero mask. Upright
-    key points have angle 0; their windows are read as OpenCV's are, turned by 270 degrees. The result is the same for any
-    number of threads. Raises ValueError if the mask is of another size than the image.
+    Upright key points have angle 0; their windows are read as OpenCV's are, turned by 270 degrees. The result is the same for any
+    number of threads.
     """
-    if mask is not None and mask.shape != image.shape:
-        raise ValueError(f"SURF: mask of {mask.shape} for an image of {image.shape}")
     integral = integral_image(np.ascontiguousarray(image))
     found = _detect(integral, config)
-    if mask is not None:
-        found = found[_on_mask(mask, found)]
     found = found[np.argsort(-found[:, 3], kind="stable")[: config.max_features]]
     if len(found) == 0:
         return Features.empty(DESCRIPTOR_LENGTH)
@@ -142,17 +135,6 @@ def _borders(num_rows: int, part: int, num_parts: int) -> tuple[int, int]:
 def _part_of(rows: Int64[np.ndarray, " n"], part: int, num_parts: int) -> Int64[np.ndarray, " m"]:
     first, last = _borders(len(rows), part, num_parts)
     return rows[first:last]
-
-
-def _on_mask(mask: UInt8[np.ndarray, "h w"], found: Float32[np.ndarray, "m 4"]) -> Bool[np.ndarray, " m"]:
-    """Which filters lie with at least half of their area on the mask."""
-    counts = integral_image((mask > 0).astype(np.uint8))
-    half = found[:, 2:3] / 2
-    low = np.clip(np.rint(found[:, :2] + 0.5 - half).astype(int), 0, None)
-    high = np.minimum(np.rint(found[:, :2] + 0.5 + half).astype(int), mask.shape[::-1])
-    (left, top), (right, bottom) = low.T, high.T
-    covered = counts[bottom, right] - counts[top, right] - counts[bottom, left] + counts[top, left]
-    return 2 * covered >= (right - left) * (bottom - top)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Bringing two coordinate frames together, and the distance between two poses.
+"""Bringing two coordinate frames together; how far two poses, and two trajectories, are apart: absolute error, and drift as KITTI has it.
 
 A trajectory here is a list of ``world_from_cam`` poses; two of them, of the same moments in worlds a and b, give
 ``a_from_b`` of the worlds.
@@ -7,6 +7,7 @@ A trajectory here is a list of ``world_from_cam`` poses; two of them, of the sam
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +18,9 @@ from topoloc.geometry.rigid import Rigid3
 # A spread below this share of the longest one, or of a micrometre, is rounding: the points are on a line.
 _MIN_RELATIVE_SPREAD = 1e-6
 _MIN_SPREAD = 1e-6
+KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+SHORT_LENGTHS = (10.0, 20.0, 30.0, 40.0, 50.0)
+_SHORTEST_FOR_KITTI = 200.0
 
 
 def align_points(points_a: Float[np.ndarray, "n 3"], points_b: Float[np.ndarray, "n 3"]) -> Rigid3:
@@ -27,20 +31,17 @@ def align_points(points_a: Float[np.ndarray, "n 3"], points_b: Float[np.ndarray,
     Raises:
         TrajectoryError: fewer than three points, all on a line, or not finite: no single rotation fits best.
     """
-    rotation, _ = _umeyama_rotation(points_a, points_b)
-    return Rigid3(rotation, points_a.mean(axis=0) - rotation @ points_b.mean(axis=0))
-
-
-def align_points_with_scale(points_a: Float[np.ndarray, "n 3"], points_b: Float[np.ndarray, "n 3"]) -> tuple[Rigid3, float]:
-    """(a_from_b, scale) with ``points_a ~ a_from_b.apply(scale * points_b)``, for a b without metric scale (Umeyama 1991, Eq. 40-42).
-
-    Raises:
-        TrajectoryError: as `align_points`.
-    """
-    rotation, trace = _umeyama_rotation(points_a, points_b)
+    if len(points_a) != len(points_b):
+        raise TrajectoryError(f"point sets to align have {len(points_a)} and {len(points_b)} points")
+    if not (np.isfinite(points_a).all() and np.isfinite(points_b).all()):
+        raise TrajectoryError("points to align hold values that are not finite")
+    for points in (points_a, points_b):
+        spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) if len(points) >= 3 else np.zeros(3)
+        if spread[1] <= max(_MIN_SPREAD, _MIN_RELATIVE_SPREAD * spread[0]):
+            raise TrajectoryError(f"{len(points)} points on one line (or fewer than three) fix no rotation")
     centre_a, centre_b = points_a.mean(axis=0), points_b.mean(axis=0)
-    scale = float(trace / np.sum((points_b - centre_b) ** 2))
-    return Rigid3(rotation, centre_a - scale * rotation @ centre_b), scale
+    rotation = _nearest_rotation((points_a - centre_a).T @ (points_b - centre_b))
+    return Rigid3(rotation, centre_a - rotation @ centre_b)
 
 
 def align_trajectories(world_a_from_cams: Sequence[Rigid3], world_b_from_cams: Sequence[Rigid3]) -> Rigid3:
@@ -79,7 +80,7 @@ def align_poses(
         correlation += a.rotation @ b.rotation.T / (2.0 * sigma_rotation**2)
     if not np.isfinite(correlation).all():
         raise TrajectoryError("trajectories to align hold poses that are not finite")
-    rotation, _ = _nearest_rotation(correlation)
+    rotation = _nearest_rotation(correlation)
     return Rigid3(rotation, centre_a - rotation @ centre_b)
 
 
@@ -93,24 +94,64 @@ def rotation_error(a_from_b: Rigid3, estimated_a_from_b: Rigid3) -> float:
     return Rigid3(a_from_b.rotation.T @ estimated_a_from_b.rotation, np.zeros(3)).angle()
 
 
-def _umeyama_rotation(points_a: Float[np.ndarray, "n 3"], points_b: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3 3"], float]:
-    """The best rotation and the trace of the signed singular values (Umeyama's tr(D S), times n)."""
-    if len(points_a) != len(points_b):
-        raise TrajectoryError(f"point sets to align have {len(points_a)} and {len(points_b)} points")
-    if not (np.isfinite(points_a).all() and np.isfinite(points_b).all()):
-        raise TrajectoryError("points to align hold values that are not finite")
-    for points in (points_a, points_b):
-        spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) if len(points) >= 3 else np.zeros(3)
-        if spread[1] <= max(_MIN_SPREAD, _MIN_RELATIVE_SPREAD * spread[0]):
-            raise TrajectoryError(f"{len(points)} points on one line (or fewer than three) fix no rotation")
-    return _nearest_rotation((points_a - points_a.mean(axis=0)).T @ (points_b - points_b.mean(axis=0)))
+@dataclass(frozen=True)
+class Drift:
+    """Mean error of relative poses: a share of the way (0.01 is 1 %), and radians a metre."""
+
+    translation: float
+    rotation: float
 
 
-def _nearest_rotation(correlation: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarray, "3 3"], float]:
-    """The rotation R of the largest tr(R' C), and that trace."""
-    u, singular, vt = np.linalg.svd(correlation)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    return u * signs @ vt, float(singular @ signs)
+def absolute_trajectory_errors(true_world_from_cams: Sequence[Rigid3], world_from_cams: Sequence[Rigid3]) -> Float[np.ndarray, " n"]:
+    """Distance (m) of each position from the true one, once the trajectory is aligned with the truth by a rigid transform.
+
+    Sturm et al., *A benchmark for the evaluation of RGB-D SLAM systems*, IROS 2012; their ATE is the root of the mean square. Where
+    positions alone fix no alignment (a straight way, a standing camera) orientations help.
+
+    Raises:
+        TrajectoryError: different lengths, no pose, or values that are not finite.
+    """
+    try:
+        true_from_estimated = align_trajectories(true_world_from_cams, world_from_cams)
+    except TrajectoryError:
+        true_from_estimated = align_poses(true_world_from_cams, world_from_cams)
+    positions = true_from_estimated.apply(np.array([pose.translation for pose in world_from_cams]))
+    return np.linalg.norm(positions - np.array([pose.translation for pose in true_world_from_cams]), axis=1)
+
+
+def relative_drift(
+    true_world_from_cams: Sequence[Rigid3], world_from_cams: Sequence[Rigid3], lengths: Sequence[float] | None = None
+) -> Drift | None:
+    """Mean error over all pieces of these lengths (metres of the true way), from every frame on; None where no piece fits.
+
+    Geiger et al., *Are we ready for autonomous driving?*, CVPR 2012: 100 m to 800 m. Ways below 200 m are measured over 10 m to 50 m.
+
+    Raises:
+        TrajectoryError: different lengths.
+    """
+    if len(true_world_from_cams) != len(world_from_cams):
+        raise TrajectoryError(f"trajectories to compare have {len(true_world_from_cams)} and {len(world_from_cams)} poses")
+    positions = np.array([pose.translation for pose in true_world_from_cams]).reshape(-1, 3)
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
+    if lengths is None:
+        lengths = KITTI_LENGTHS if way[-1] >= _SHORTEST_FOR_KITTI else SHORT_LENGTHS
+    translations, rotations = [], []
+    for length in lengths:
+        for first, last in enumerate(np.searchsorted(way, way + length).tolist()):
+            if last >= len(way):
+                break
+            true_motion = true_world_from_cams[first].inverse() @ true_world_from_cams[last]
+            motion = world_from_cams[first].inverse() @ world_from_cams[last]
+            error = motion.inverse() @ true_motion
+            translations.append(float(np.linalg.norm(error.translation)) / length)
+            rotations.append(error.angle() / length)
+    return Drift(float(np.mean(translations)), float(np.mean(rotations))) if translations else None
+
+
+def _nearest_rotation(correlation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation R of the largest tr(R' C)."""
+    u, _, vt = np.linalg.svd(correlation)
+    return u * np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
 
 
 def _positions(world_from_cams: Sequence[Rigid3]) -> Float[np.ndarray, "n 3"]:

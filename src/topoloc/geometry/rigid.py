@@ -172,6 +172,16 @@ class Rigid3:
         return Rigid3(exp_so3(fraction * omega) @ self.rotation, translation)
 
 
+def covariance_of_inverse(a_from_b: Rigid3, covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
+    """Covariance of the left perturbation of ``b_from_a = a_from_b.inverse()``, from that of `a_from_b`.
+
+    As ``(exp(xi) @ a_from_b).inverse() == exp(-Ad @ xi) @ b_from_a`` with Ad the adjoint of b_from_a. The result's translation part is of
+    the frame b at its origin; the camera's own position, ``-R' t``, has the covariance ``R' C R``, C the upper left 3x3 of `covariance`.
+    """
+    adjoint = a_from_b.inverse().adjoint()
+    return adjoint @ covariance @ adjoint.T
+
+
 def _left_jacobian_so3(omega: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     angle = float(np.linalg.norm(omega))
     k = skew(omega)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from topoloc.geometry.pose_covariance import covariance_of_inverse
+from topoloc.geometry.rigid import covariance_of_inverse
 from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.belief import MIN_LEAD, Hypothesis, lead
 from topoloc.localization.evidence import is_only_imprecise, precision_of

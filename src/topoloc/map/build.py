@@ -18,6 +18,7 @@ from topoloc.bounds import check_bounds
 from topoloc.errors import EmptyMapError, TrajectoryError
 from topoloc.features.extraction import extract_features
 from topoloc.features.features import Features
+from topoloc.features.kinds import find_kind
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.map.config import MapConfig
@@ -28,9 +29,10 @@ from topoloc.map.schema import SCHEMA_VERSION
 from topoloc.map.sessions import Edit, Light, Session, light_of, mean_light, path_of, poses_source_of, today
 from topoloc.map.side_nodes import describe_sides, gather_sides, nodes_with_sides
 from topoloc.map.topomap import TopoMetricMap
-from topoloc.map.views import MappingView, mapping_view
 from topoloc.places.vlad import SurfVlad, learn_words, placed, vlad
 from topoloc.sequences.frame import Image, StereoSequence
+from topoloc.sequences.frame_view import FrameView, frame_view
+from topoloc.sequences.pictures import jpeg_of
 from topoloc.slam.metric_points import keypoint_sigmas, locate_points
 
 Progress = Callable[[str, int, int], None]
@@ -51,8 +53,8 @@ class _MappingFrame:
     t_ns: int
     world_from_cam: Rigid3
 
-    def view(self, with_depth: bool = True) -> MappingView:
-        return mapping_view(self.sequence[self.index], with_depth)
+    def view(self, with_depth: bool = True) -> FrameView:
+        return frame_view(self.sequence[self.index], with_depth)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +173,9 @@ def _resolve_node_config(frames: list[_MappingFrame], config: BuildConfig) -> No
 def _draft_nodes(frames: list[_MappingFrame], node_config: NodeConfig, config: BuildConfig, progress: Progress) -> list[_NodeDraft]:
     """The trajectory discretised by Eq. 1; a picture with too few points (dark, blurred, blank) becomes no node."""
     frame_idx = place_nodes([frame.world_from_cam for frame in frames], node_config)
-    with_sides = nodes_with_sides([frames[i].world_from_cam for i in frame_idx], node_config, config.sides)
+    kind = find_kind(config.features.kind)
+    has_sides = kind.has_scale and kind.has_angle  # without them nobody asks for the walls
+    with_sides = nodes_with_sides([frames[i].world_from_cam for i in frame_idx], node_config, config.sides) if has_sides else set()
     drafts: list[_NodeDraft] = []
     for done, i in enumerate(frame_idx):
         draft = _draft_node(frames[i], done in with_sides, config)
@@ -185,7 +189,7 @@ def _draft_nodes(frames: list[_MappingFrame], node_config: NodeConfig, config: B
 
 def _draft_node(frame: _MappingFrame, with_sides: bool, config: BuildConfig) -> _NodeDraft:
     view = frame.view()
-    image = _mapping_image(view, config)
+    image = _mapping_image(frame, view, config)
     located = locate_points(image.features, view, config.points)
     rows = np.flatnonzero(located.valid)
     template_jpeg = _encode_jpeg(view.picture, config.template_side_px, quality=75)
@@ -194,9 +198,10 @@ def _draft_node(frame: _MappingFrame, with_sides: bool, config: BuildConfig) -> 
     return _NodeDraft(frame, image, template_jpeg, rows, located.points_cam[rows], located.covariances[rows], [], sides)
 
 
-def _mapping_image(view: MappingView, config: BuildConfig) -> _MappingImage:
+def _mapping_image(frame: _MappingFrame, view: FrameView, config: BuildConfig) -> _MappingImage:
     jpeg = _encode_jpeg(view.picture, config.place_side_px, quality=60)
-    return _MappingImage(view.camera, view.world_from_cam, extract_features(view.grey, config.features), jpeg, light_of(view.picture))
+    world_from_view = frame.world_from_cam @ view.view_from_cam.inverse()
+    return _MappingImage(view.camera, world_from_view, extract_features(view.grey, config.features), jpeg, light_of(view.picture))
 
 
 def _visit_all_images(
@@ -211,7 +216,7 @@ def _visit_all_images(
     images: list[PlaceImage] = []
     vlads, lights = [], []
     for done, frame in enumerate(frames):
-        image = drafted.get(frame) or _mapping_image(frame.view(with_depth=False), config)
+        image = drafted.get(frame) or _mapping_image(frame, frame.view(with_depth=False), config)
         nearest = np.argsort(node_distances(image.world_from_cam, node_poses, node_config.lambda_rot), kind="stable")
         for node_id in nearest[: config.landmarks.nodes_per_image]:
             if drafts[node_id].frame is not frame:
@@ -275,5 +280,4 @@ def _encode_jpeg(picture: Image, side_px: int, quality: int) -> bytes:
     scale = side_px / min(picture.shape[:2])
     if scale < 1.0:
         picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    bgr = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
-    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+    return jpeg_of(picture, quality)

@@ -3,29 +3,21 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import asdict, dataclass, field
 from typing import Annotated, Any
 
-from topoloc.bounds import Between, check_bounds
+from topoloc.bounds import Between, settings_from
 from topoloc.errors import ConfigError
-from topoloc.features.kinds import KINDS, FeatureConfig
+from topoloc.features.kinds import FeatureConfig
 from topoloc.map.landmarks import LandmarkConfig
 from topoloc.map.nodes import NodeConfig
 from topoloc.map.side_nodes import SideNodesConfig
-from topoloc.places.stored_settings import SettingsError, bounded_settings_from, json_of
+from topoloc.map.validation import json_of
 from topoloc.places.vlad import VladConfig
 from topoloc.slam.metric_points import MetricPointsConfig
 
 CONFIG_VERSION = 1
 """Of the JSON in the map file; one more whenever a key comes to mean something else."""
-
-
-def descriptor_size_of(kind: str) -> int:
-    """Numbers in a descriptor of this kind of features. Raises SettingsError where the kind is not known."""
-    if kind not in KINDS:
-        raise SettingsError(f"the feature kind {kind[:40]!r} is not known (known: {', '.join(KINDS)})")
-    return KINDS[kind].descriptor_size
 
 
 @dataclass(frozen=True)
@@ -68,25 +60,13 @@ def config_to_text(config: MapConfig) -> str:
     return json.dumps(config.to_json(), sort_keys=True)
 
 
-def config_from_text(text: str) -> MapConfig:
-    """The inverse of `config_to_text`. Raises SettingsError, which names the key."""
+def config_from_text(text: str, version: int | None) -> MapConfig:
+    """The inverse of `config_to_text`; files of schema 1 named no version. Raises ConfigError, which names the key."""
     data = json_of(text)
-    if not isinstance(data, dict) or "version" not in data:
-        raise SettingsError("config: key 'version' is missing")
-    if data["version"] != CONFIG_VERSION:
-        raise SettingsError(f"config: version {str(data['version'])[:20]!r} is not known (known: {CONFIG_VERSION})")
-    return resolved_config({key: value for key, value in data.items() if key != "version"})
-
-
-def resolved_config(data: Any) -> MapConfig:
-    """The configuration of a map that was built, from its nested values. Raises SettingsError, which names the key."""
-    config = bounded_settings_from(MapConfig, data, "config")
+    if version is not None and isinstance(data, dict) and data.pop("version", None) != version:
+        raise ConfigError(f"config: of another version than {version}, which is known")
+    config = settings_from(MapConfig, data, "config")
     for name in ("d_thresh", "lambda_rot"):
-        value = getattr(config.nodes, name)
-        if value is None or not 0.0 <= value < math.inf:
-            raise SettingsError(f"config.nodes.{name}: a number that is not negative is expected")
-    try:
-        check_bounds(config, "config")
-    except ConfigError as error:
-        raise SettingsError(str(error)) from error
+        if getattr(config.nodes, name) is None:
+            raise ConfigError(f"config.nodes.{name}: is missing")
     return config

@@ -17,11 +17,20 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
-from topoloc.errors import CalibrationError, MapError, MapVersionError
-from topoloc.map.migration import SHOW_AS_SCHEMA_2
-from topoloc.map.schema import APPLICATION_ID, ORDER, SCHEMA_1, SCHEMA_VERSION, SIDE, TABLES, Columns, checksum_of, creation_of
+from topoloc.errors import CalibrationError, ConfigError, FeatureKindError, MapError, MapVersionError
+from topoloc.map.schema import (
+    APPLICATION_ID,
+    ORDER,
+    SCHEMA_1,
+    SCHEMA_VERSION,
+    SHOW_AS_SCHEMA_2,
+    SIDE,
+    TABLES,
+    Columns,
+    checksum_of,
+    creation_of,
+)
 from topoloc.map.validation import Damage, counts_from
-from topoloc.places.stored_settings import SettingsError
 
 MAX_SECONDS = 5.0
 """What one reading may take: the slowest honest one, all node summaries of a large map, takes a tenth of a second."""
@@ -105,7 +114,7 @@ class MapFile:
                 yield
         except (sqlite3.ProgrammingError, sqlite3.InterfaceError):  # a call of ours that is wrong
             raise
-        except (sqlite3.Error, zlib.error, Damage, SettingsError, CalibrationError) as error:
+        except (sqlite3.Error, zlib.error, Damage, ConfigError, FeatureKindError, CalibrationError) as error:
             raise MapError(f"map {self.path} is damaged: {' '.join(str(error).split())[:300]}") from error
 
     def rows(self, table: str, columns: Sequence[str] | None = None) -> list[dict[str, Any]]:

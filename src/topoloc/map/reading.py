@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
+from topoloc.bounds import settings_from, value_from
 from topoloc.errors import MapError
 from topoloc.features.features import Features
+from topoloc.features.kinds import find_kind
 from topoloc.geometry.camera import Camera
-from topoloc.map.config import MapConfig, config_from_text, descriptor_size_of, resolved_config
+from topoloc.map.config import CONFIG_VERSION, MapConfig, config_from_text
 from topoloc.map.entries import Edge, NodeSummary, PlaceImage, SharedErrors, SideNodes, TopoNode
 from topoloc.map.file import MapFile
 from topoloc.map.schema import SIDE
-from topoloc.map.sessions import Edit, Light, Session
+from topoloc.map.sessions import Edit, Session
 from topoloc.map.sums import LandmarkSums, sums_from
 from topoloc.map.topomap import NextIds, TopoMetricMap
-from topoloc.map.validation import MAX_POINTS, Damage, array_from, arrays_from, camera_from, count_within, pose_from
+from topoloc.map.validation import MAX_POINTS, Damage, array_from, arrays_from, camera_from, count_within, json_of, pose_from
 from topoloc.places.coarse import CoarseModel
-from topoloc.places.stored_settings import json_of, settings_from, value_from
 
 T = TypeVar("T")
 MAX_ID = 2**53
@@ -55,16 +58,16 @@ def _map_of(file: MapFile) -> TopoMetricMap:
     missing = [key for key in ("config", "length_m") if key not in facts]
     if missing:
         raise Damage(f"key {missing[0]!r} of table map is missing")
-    config = config_from_text(facts["config"]) if file.version > 1 else _config_of_schema_1(facts["config"])
+    config = config_from_text(facts["config"], CONFIG_VERSION if file.version > 1 else None)
     kinds = _kinds_of(facts, config)
     sides = None
     if file.count(f"{SIDE}nodes") > 0:
-        sides = SideNodes(_StoredSummaries(file, SIDE), StoredNodes(file, config.features.kind, SIDE), _StoredModels(file, SIDE))
+        sides = SideNodes(_stored_summaries(file, SIDE), _stored_nodes(file, config.features.kind, SIDE), _StoredModels(file, SIDE))
     return TopoMetricMap(
-        summaries=_StoredSummaries(file),
-        nodes=StoredNodes(file, config.features.kind),
+        summaries=_stored_summaries(file),
+        nodes=_stored_nodes(file, config.features.kind),
         edges=[Edge(row["source_id"], row["target_id"]) for row in file.rows("edges")],
-        place_images=_StoredImages(file),
+        place_images=_Stored(partial(file.count, "place_images"), partial(_image_at, file)),
         coarse_models=_StoredModels(file),
         config=config,
         length_m=value_from(float, json_of(facts["length_m"]), "length_m"),
@@ -74,12 +77,8 @@ def _map_of(file: MapFile) -> TopoMetricMap:
         sessions=list(_sessions_of(file).values()),
         edits=[Edit(*row.values()) for row in file.rows("edits")],
         next_ids=settings_from(NextIds, json_of(facts.get("next_ids", "{}")), "next_ids"),
-        other_kinds={kind: StoredNodes(file, kind, is_default=False) for kind in kinds if kind != config.features.kind},
+        other_kinds={kind: _stored_nodes(file, kind, is_default=False) for kind in kinds if kind != config.features.kind},
     )
-
-
-def _config_of_schema_1(text: str) -> MapConfig:
-    return resolved_config(json_of(text))
 
 
 def _kinds_of(facts: Mapping[str, str], config: MapConfig) -> list[str]:
@@ -90,7 +89,7 @@ def _kinds_of(facts: Mapping[str, str], config: MapConfig) -> list[str]:
     if kinds[:1] != [config.features.kind]:
         raise Damage(f"kinds: {kinds} do not begin with that of the configuration")
     for kind in kinds:
-        descriptor_size_of(kind)
+        find_kind(kind)
     return kinds
 
 
@@ -110,32 +109,30 @@ def _sessions_of(file: MapFile) -> dict[int, Session]:
     return file.kept("sessions", read)
 
 
+def _session_of(file: MapFile, session_id: int) -> Session:
+    sessions = _sessions_of(file)
+    if session_id not in sessions:
+        raise Damage(f"session {session_id} is missing")
+    return sessions[session_id]
+
+
 def _session(row: Mapping[str, Any]) -> Session:
     facts = json_of(row["json"])
     if not isinstance(facts, dict):
         raise Damage("a session that says nothing of itself")
-    camera, light = facts.pop("camera", None), facts.pop("light", None)
-    known = settings_from(Session, facts | {"session_id": row["session_id"], "name": row["name"]}, "session")
-    return Session(
-        known.session_id,
-        known.name,
-        known.recording,
-        known.poses_from,
-        known.start_ns,
-        known.end_ns,
-        None if camera is None else Camera.from_json(camera),
-        None if light is None else settings_from(Light, light, "session.light"),
-    )
+    camera = facts.pop("camera", None)
+    session = settings_from(Session, facts | {"session_id": row["session_id"], "name": row["name"]}, "session")
+    return session if camera is None else replace(session, camera=Camera.from_json(camera))
 
 
 class _Stored(Sequence[T]):
     """Rows of the map, numbered from 0, each read when asked for."""
 
-    def __init__(self, file: MapFile, prefix: str = "") -> None:
-        self._file, self._prefix = file, prefix
+    def __init__(self, length: Callable[[], int], read: Callable[[int], T]) -> None:
+        self._length, self._read = length, read
 
-    def _read(self, row: int) -> T:
-        raise NotImplementedError
+    def __len__(self) -> int:
+        return self._length()
 
     def __getitem__(self, index):  # type: ignore[override]
         if isinstance(index, slice):
@@ -146,14 +143,19 @@ class _Stored(Sequence[T]):
         return self._read(int(position))
 
 
-class _StoredSummaries(_Stored[NodeSummary]):
+# No return types: to hold them, at run time, an entry would be read.
+def _stored_summaries(file: MapFile, prefix: str = ""):
     """The summaries of all nodes, read together at the first question: a few dozen bytes a node."""
+    return _Stored(partial(file.count, f"{prefix}nodes"), partial(_summary_at, file, prefix))
 
-    def __len__(self) -> int:
-        return len(_summaries(self._file, self._prefix))
 
-    def _read(self, row: int) -> NodeSummary:
-        return _summaries(self._file, self._prefix)[row]
+def _stored_nodes(file: MapFile, kind: str, prefix: str = "", is_default: bool = True):
+    """Nodes with their points of one kind; of that which answers first, summaries tell the number."""
+    return _Stored(partial(file.count, f"{prefix}nodes"), partial(_node_at, file, kind, prefix, is_default))
+
+
+def _summary_at(file: MapFile, prefix: str, row: int) -> NodeSummary:
+    return _summaries(file, prefix)[row]
 
 
 def _summaries(file: MapFile, prefix: str) -> list[NodeSummary]:
@@ -173,37 +175,20 @@ def _summary(row: Mapping[str, Any], file: MapFile, nodes: Mapping[int, NodeSumm
     if nodes is not None and row["of_node"] not in nodes:
         raise Damage(f"side node {node_id} is of node {row['of_node']}, which is missing")
     session_id = row["session_id"] if nodes is None else nodes[row["of_node"]].session_id
-    if session_id not in _sessions_of(file):
-        raise Damage(f"session {session_id} is missing")
-    recording, pose = _sessions_of(file)[session_id].name, pose_from(row["world_from_cam"])
+    recording, pose = _session_of(file, session_id).name, pose_from(row["world_from_cam"])
     return NodeSummary(node_id, recording, row["name"], row["t_ns"], pose, num_points, session_id, row.get("of_node"))
 
 
-class StoredNodes(_Stored[TopoNode]):
-    """Nodes with their points of one kind."""
-
-    def __init__(self, file: MapFile, kind: str, prefix: str = "", is_default: bool = True) -> None:
-        super().__init__(file, prefix)
-        self._kind, self._is_default = kind, is_default
-
-    def __len__(self) -> int:
-        return self._file.count(f"{self._prefix}nodes")
-
-    def _read(self, row: int) -> TopoNode:
-        node = read_node(self._file, row, self._kind, self._prefix)
-        if self._is_default and node.summary.num_points != len(node.features):
-            raise MapError(f"map {self._file.path} is damaged: node {node.summary.node_id} has {len(node.features)} points")
-        return node
-
-
-def read_node(file: MapFile, row: int, kind: str, prefix: str = "") -> TopoNode:
+def _node_at(file: MapFile, kind: str, prefix: str, is_default: bool, row: int) -> TopoNode:
     """The node of a row with its points of a kind; with the prefix `SIDE` a side node, which has no template. Raises MapError."""
     with file.reading():
         summary = _summaries(file, prefix)[row]
         node_id, what = summary.node_id, f"{prefix}node {summary.node_id}"
         points = _found(file.row(f"{prefix}node_points", node_id=node_id, kind=kind), f"the points of {what}")
         template = b"" if prefix else _found(file.row("node_templates", node_id=node_id), f"the template of {what}")["jpeg"]
-        n, size = count_within(points["num_points"], 0, MAX_POINTS, f"the points of {what}"), descriptor_size_of(kind)
+        n, size = count_within(points["num_points"], 0, MAX_POINTS, f"the points of {what}"), find_kind(kind).descriptor_size
+        if is_default and summary.num_points != n:
+            raise Damage(f"node {node_id} has {n} points")
         if points["descriptor_size"] != size:
             raise Damage(f"the points of {what} are not described as {kind} is")
         stored = array_from(points["descriptors"], "i1", (n, size), what)
@@ -262,25 +247,16 @@ class _StoredSums:
         return sums_from(session_id, row["sums"], count_within(row["num_rows"], 0, self._num_points, what), self._num_points)
 
 
-class _StoredImages(_Stored[PlaceImage]):
-    def _ids(self) -> list[int]:
-        def read() -> list[int]:
-            return [row["image_id"] for row in self._file.rows("place_images", ("image_id",))]
+def _image_at(file: MapFile, row: int) -> PlaceImage:
+    def read_ids() -> list[int]:
+        return [row["image_id"] for row in file.rows("place_images", ("image_id",))]
 
-        return self._file.kept("image_ids", read)
-
-    def __len__(self) -> int:
-        return self._file.count("place_images")
-
-    def _read(self, row: int) -> PlaceImage:
-        with self._file.reading():
-            image_id = self._ids()[row]
-            found = _found(self._file.row("place_images", image_id=image_id), f"place image {image_id}")
-            session_id, sessions = found["session_id"], _sessions_of(self._file)
-            if session_id not in sessions:
-                raise Damage(f"session {session_id} is missing")
-            pose = pose_from(found["world_from_cam"])
-            return PlaceImage(sessions[session_id].name, found["name"], found["node_id"], pose, found["jpeg"], session_id, image_id)
+    with file.reading():
+        image_id = file.kept("image_ids", read_ids)[row]
+        found = _found(file.row("place_images", image_id=image_id), f"place image {image_id}")
+        session = _session_of(file, found["session_id"])
+        pose = pose_from(found["world_from_cam"])
+        return PlaceImage(session.name, found["name"], found["node_id"], pose, found["jpeg"], session.session_id, image_id)
 
 
 class _StoredModels(Mapping[str, CoarseModel]):

@@ -20,8 +20,8 @@ from topoloc.features.side_views import SideView, SideViewConfig, side_views
 from topoloc.geometry.rigid import Rigid3
 from topoloc.map.entries import NodeSummary, SideNodes, TopoNode
 from topoloc.map.nodes import NodeConfig, place_nodes
-from topoloc.map.views import MappingView
 from topoloc.places.vlad import SurfVlad, VladConfig, learn_words, placed, vlad
+from topoloc.sequences.frame_view import FrameView
 from topoloc.slam.metric_points import MetricPointsConfig, locate_points
 
 
@@ -61,7 +61,7 @@ def nodes_with_sides(world_from_nodes: list[Rigid3], node_config: NodeConfig, co
 
 
 def describe_sides(
-    of_node: NodeSummary, view: MappingView, features: FeatureConfig, points: MetricPointsConfig, config: SideNodesConfig
+    of_node: NodeSummary, view: FrameView, features: FeatureConfig, points: MetricPointsConfig, config: SideNodesConfig
 ) -> list[TopoNode]:
     """The side nodes of a node's picture, none to two of them, not numbered yet."""
     sides = (_side_node(of_node, view, side, features, points, config) for side in side_views(view.camera, config.views))
@@ -80,7 +80,7 @@ def gather_sides(described: list[TopoNode], config: SideNodesConfig) -> SideNode
 
 def _side_node(
     of_node: NodeSummary,
-    view: MappingView,
+    view: FrameView,
     side: SideView,
     feature_config: FeatureConfig,
     points: MetricPointsConfig,
@@ -98,7 +98,7 @@ def _side_node(
     turn = side_from_cam.rotation
     roots = np.linalg.cholesky(turn @ located.covariances[rows] @ turn.T)
     return TopoNode(
-        replace(of_node, world_from_cam=view.world_from_cam @ side.cam_from_side, num_points=len(rows)),
+        replace(of_node, world_from_cam=of_node.world_from_cam @ side.cam_from_side, num_points=len(rows)),
         side.camera,
         features.select(rows),
         points_side[rows].astype(np.float32),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import math
 import zipfile
 import zlib
@@ -14,7 +15,6 @@ import numpy as np
 from topoloc.errors import CalibrationError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.places.stored_settings import json_of
 
 MAX_POINTS = 100_000
 MAX_SIDE_PX = 32_768
@@ -45,11 +45,19 @@ def pose_from(data: bytes) -> Rigid3:
 
 
 def camera_from(text: str) -> Camera:
-    """A camera of a size that pictures have. Raises SettingsError, CalibrationError, Damage."""
+    """A camera of a size that pictures have. Raises CalibrationError, Damage."""
     camera = Camera.from_json(json_of(text))
     if max(camera.width, camera.height) > MAX_SIDE_PX or max(map(abs, camera.params)) > _FAR or min(camera.fx, camera.fy) < 1.0:
         raise CalibrationError(f"a camera of {camera.width}x{camera.height} pixels, f = {camera.fx:g}, is none")
     return camera
+
+
+def json_of(text: str) -> Any:
+    """The value of a JSON text."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise Damage(f"no JSON that can be read ({' '.join(str(error).split())[:100]})") from error
 
 
 def count_within(value: int, least: int, most: int, what: str) -> int:

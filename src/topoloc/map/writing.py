@@ -10,8 +10,8 @@ import io
 import json
 import os
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict
 from hashlib import blake2b
 from pathlib import Path
@@ -21,11 +21,12 @@ import numpy as np
 from jaxtyping import Int8
 
 from topoloc.errors import MapError
+from topoloc.features.kinds import find_kind
 from topoloc.geometry.rigid import Rigid3
 from topoloc.map.config import config_to_text
 from topoloc.map.entries import TopoNode
 from topoloc.map.reading import unit_descriptors
-from topoloc.map.schema import APPLICATION_ID, DESCRIPTOR_SCALE, ORDER, SCHEMA_VERSION, SIDE, TABLES, checksum_of, creation_of
+from topoloc.map.schema import APPLICATION_ID, ORDER, SCHEMA_VERSION, SIDE, TABLES, checksum_of, creation_of
 from topoloc.map.sessions import Session, sessions_named
 from topoloc.map.sums import sums_bytes
 from topoloc.map.topomap import NextIds, TopoMetricMap
@@ -41,18 +42,9 @@ def save_map(topomap: TopoMetricMap, path: Path) -> None:
     """
     if os.path.isdir(path):  # Path.is_dir raises for names that are too long
         raise MapError(f"cannot write map {path}: it is a folder")
-    with _failing_as_map_error(path), replaced_file(path) as temporary:
-        database = sqlite3.connect(temporary, isolation_level=None)
-        try:
-            _Writer(database).write(topomap)
-        finally:
-            database.close()
-
-
-@contextmanager
-def _failing_as_map_error(path: Path) -> Iterator[None]:
     try:
-        yield
+        with replaced_file(path) as temporary, closing(sqlite3.connect(temporary, isolation_level=None)) as database:
+            _Writer(database).write(topomap)
     except (sqlite3.OperationalError, OSError, ValueError) as error:
         if isinstance(error, ValueError) and "null" not in str(error):  # of a file's name; any other is a bug
             raise
@@ -148,7 +140,8 @@ class _Writer:
     def _insert_points(self, node: TopoNode, kind: str, prefix: str = "") -> None:
         f, node_id = node.features, node.summary.node_id
         shapes = np.stack([f.sizes_px, f.angles, f.responses], axis=1).astype("<f4")
-        blobs = (f.points_img.astype("<f4"), shapes, _quantised(node), node.points_cam.astype("<f4"), node.point_sqrt_covs.astype("<f2"))
+        descriptors = _quantised(node, find_kind(kind).descriptor_scale)
+        blobs = (f.points_img.astype("<f4"), shapes, descriptors, node.points_cam.astype("<f4"), node.point_sqrt_covs.astype("<f2"))
         self._insert(f"{prefix}node_points", node_id, kind, len(f), f.descriptors.shape[1], *(blob.tobytes() for blob in blobs))
         if not prefix:
             for sums in node.sums:
@@ -172,12 +165,12 @@ def digest_of(checksums: Mapping[str, Sequence[bytes]]) -> str:
     return digest.hexdigest()
 
 
-def _quantised(node: TopoNode) -> Int8[np.ndarray, "n d"]:
+def _quantised(node: TopoNode, scale: float) -> Int8[np.ndarray, "n d"]:
     """The descriptors as signed bytes; of a node that was read from a file, those that it was read from."""
     descriptors, stored = node.features.descriptors, node.stored_descriptors
     if stored is not None and stored.shape == descriptors.shape and np.array_equal(unit_descriptors(stored), descriptors):
         return stored
-    return np.clip(np.rint(descriptors * DESCRIPTOR_SCALE), -127, 127).astype(np.int8)
+    return np.clip(np.rint(descriptors * scale), -127, 127).astype(np.int8)
 
 
 def _session_text(session: Session) -> str:

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from dataclasses import dataclass, field
+from typing import Annotated, Literal, get_args
 
 from topoloc.bounds import Above, AtLeast, Between
-from topoloc.places.stored_settings import bounded_settings_from
-
-T = TypeVar("T")
 
 BackboneName = Literal["squeezenet1_1", "vgg11", "vgg16", "compact"]
 BACKBONES: tuple[BackboneName, ...] = get_args(BackboneName)
@@ -138,19 +134,3 @@ class VladNnConfig:
     tuning: TripletConfig = field(default_factory=TripletConfig)
     seed: Annotated[int, Between(0, 1_000_000_000)] = 0
     """Of the vocabulary."""
-
-
-_NESTED = {"picture": PictureConfig, "training": TrainingConfig, "augmentation": AugmentationConfig, "tuning": TripletConfig}
-
-
-def settings_of(kind: type[T], stored: Mapping[str, Any]) -> T:
-    """A configuration from the JSON that a map keeps of it. Raises SettingsError."""
-    return bounded_settings_from(kind, _known_of(kind, stored))
-
-
-def _known_of(kind: type[Any], stored: Any) -> Any:
-    """Without the keys of other versions."""
-    if not isinstance(stored, Mapping):
-        return stored
-    known = {item.name for item in fields(kind)}
-    return {name: _known_of(_NESTED[name], value) if name in _NESTED else value for name, value in stored.items() if name in known}

@@ -19,7 +19,7 @@ from topoloc.errors import MapError, TrainingError
 from topoloc.features.features import Features
 from topoloc.places.augmentation import augment
 from topoloc.places.backbones import Backbone, has_wide_classifier, normalize_pictures
-from topoloc.places.classifier_config import BackboneName, CnnFcConfig, PictureConfig, settings_of
+from topoloc.places.classifier_config import BackboneName, CnnFcConfig, PictureConfig
 from topoloc.places.coarse import CoarseModel, Image, NodeScore, model_array, setting
 from topoloc.places.inference import BATCH_SIZE, Predictor, from_arrays, in_channels_last, rounded_to_half, to_arrays
 from topoloc.places.training import Task, fit, hold_out
@@ -96,11 +96,6 @@ def train(
     return CoarseModel(NAME, settings, to_arrays(network))
 
 
-def open_model(model: CoarseModel) -> CnnFc:
-    """The localizer of what `train` made."""
-    return CnnFc(model)
-
-
 class CnnFc:
     """The coarse localizer `cnn-fc`.
 
@@ -109,7 +104,7 @@ class CnnFc:
     """
 
     def __init__(self, model: CoarseModel) -> None:
-        self._picture: PictureConfig = settings_of(CnnFcConfig, setting(model, "config", dict)).picture
+        self._picture: PictureConfig = setting(model, "config", CnnFcConfig).picture
         self._shape = PictureShape(*setting(model, "picture_shape", tuple[int, int]))
         self._temperature, num_outputs = setting(model, "temperature", float), setting(model, "num_nodes", int)
         if not 0 < num_outputs <= MAX_OUTPUTS or self._temperature <= 0.0:
@@ -140,6 +135,9 @@ class CnnFc:
         outputs = self._predict(network_pictures(images, self._shape, self._picture)) / np.float32(self._temperature)
         powers = np.exp(outputs - outputs.max(axis=1, keepdims=True))
         return powers / powers.sum(axis=1, keepdims=True)
+
+
+open_model = CnnFc
 
 
 def soft_labels(training_set: TrainingSet, spread: float) -> Float32[np.ndarray, "n nodes"]:

@@ -6,12 +6,10 @@ few cells instead of one: neighbouring nodes see the same things, at other place
 
 from __future__ import annotations
 
-from dataclasses import asdict
-
 from torch import Tensor, nn
 
 from topoloc.places.backbones import Backbone
-from topoloc.places.classifier_config import BackboneName, CnnNnConfig, settings_of
+from topoloc.places.classifier_config import BackboneName, CnnNnConfig
 from topoloc.places.coarse import CoarseModel, setting
 from topoloc.places.training_set import Progress, TrainingSet
 from topoloc.places.vector_search import VectorSearch, fit_vectors
@@ -49,14 +47,12 @@ def train(
     network = _network(backbone, config)
     if weights is not None:
         load_features(network.backbone, weights)
-    return fit_vectors(NAME, network, training_set, config.picture, config.dimension, progress).model(
-        {"backbone": backbone, "weights": describe(weights), "config": asdict(config)}
-    )
+    return fit_vectors(NAME, network, training_set, config, {"backbone": backbone, "weights": describe(weights)}, progress)
 
 
 def open_model(model: CoarseModel) -> VectorSearch:
     """The localizer of what `train` made."""
-    config = settings_of(CnnNnConfig, setting(model, "config", dict))
+    config = setting(model, "config", CnnNnConfig)
     return VectorSearch(model, _network(setting(model, "backbone", BackboneName), config), config.picture)
 
 

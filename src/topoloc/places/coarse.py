@@ -14,9 +14,9 @@ from typing import Any, Literal, Protocol, get_args, runtime_checkable
 import numpy as np
 from jaxtyping import UInt8
 
-from topoloc.errors import MapError, MissingExtraError
+from topoloc.bounds import value_from
+from topoloc.errors import ConfigError, MapError, MissingExtraError
 from topoloc.features.features import Features
-from topoloc.places.stored_settings import SettingsError, value_from
 
 CoarseName = Literal["surf-vlad", "cnn-fc", "cnn-nn", "vlad-nn"]
 COARSE_NAMES: tuple[CoarseName, ...] = get_args(CoarseName)
@@ -83,13 +83,13 @@ def open_coarse(model: CoarseModel) -> CoarseLocalizer:
         raise MapError(f"the map's coarse localizer {model.name!r} is not known to this version (known: {', '.join(COARSE_NAMES)})")
     try:
         return module_of(model.name).open_model(model)
-    except SettingsError as error:
+    except ConfigError as error:
         raise MapError(f"the map's coarse localizer {model.name!r} is damaged: {error}") from error
 
 
 def setting(model: CoarseModel, name: str, of: Any) -> Any:
-    """A setting of a stored model, of this type. Raises SettingsError."""
-    return value_from(of, model.settings.get(name), name)
+    """A setting of a stored model, of this type, without the keys of other versions. Raises ConfigError."""
+    return value_from(of, model.settings.get(name), name, is_strict=False)
 
 
 def module_of(name: str) -> Any:

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor, nn
 
-from topoloc.compiled import chosen_threads
+from topoloc.compiled import num_threads
 from topoloc.places.backbones import normalize_pictures
 from topoloc.places.training_set import RgbPictures
 
@@ -57,7 +57,7 @@ class Predictor:
         """One picture through the frozen network, which is made at the first call: in small networks calls cost as much as arithmetic."""
         shape = tuple(image.shape)
         # By default one: the last digits follow from the number, and on a busy machine several wait for one another many times as long.
-        with threads(chosen_threads(1)):
+        with threads(num_threads(1)):
             with self._freezing:
                 if shape not in self._frozen:
                     self._frozen[shape] = _freeze(self._network, image)

@@ -1,8 +1,9 @@
-"""Nearest neighbours among place vectors, and the nodes they vote for."""
+"""Place vectors: whitened (PCA, Jegou & Chum 2012), their nearest neighbours, and the nodes that these vote for."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import faiss
@@ -16,6 +17,8 @@ from topoloc.places.place_kernels import multiply_rows
 MAX_EXACT_VECTORS = 8_000
 # Of an inverted file: cells that a query looks into, images that its cells are learnt from, of each.
 NUM_PROBES, IMAGES_PER_CELL = 24, 48
+# The axes of this many images are those of all; beyond it only the time grows.
+MAX_LEARNING_IMAGES = 2000
 
 
 class PlaceIndex:
@@ -73,3 +76,47 @@ def _inverted_file(vectors: Float32[np.ndarray, "n d"]) -> Any:
     index.add(vectors)  # pyright: ignore[reportCallIssue]
     index.nprobe = NUM_PROBES
     return index
+
+
+@dataclass(frozen=True, eq=False)
+class Whitening:
+    """``projection @ (vector - mean)``, then brought to unit length."""
+
+    mean: Float32[np.ndarray, " d"]
+    projection: Float32[np.ndarray, "p d"]
+
+    def apply(self, raw: Float32[np.ndarray, "n d"]) -> Float32[np.ndarray, "n p"]:
+        """Unit vectors."""
+        projected = (raw - self.mean) @ self.projection.T
+        return np.ascontiguousarray(projected / np.maximum(np.linalg.norm(projected, axis=1, keepdims=True), 1e-6), np.float32)
+
+
+def learn_whitening(raw: Float32[np.ndarray, "n d"], dimension: int) -> Whitening:
+    """Mean and projection to at most `dimension` whitened components, from unit vectors of images.
+
+    The variances are softened by the mean one, since the trailing components of few images are noise, which plain
+    whitening would blow up.
+    """
+    raw = raw[np.unique(np.linspace(0, len(raw) - 1, MAX_LEARNING_IMAGES).astype(int))]
+    mean = raw.mean(axis=0)
+    centred = raw - mean
+    by_image = len(raw) < raw.shape[1]  # whichever is smaller: the products of images, or those of dimensions
+    eigenvalues, vectors = np.linalg.eigh(centred @ centred.T if by_image else centred.T @ centred)
+    order = np.argsort(-eigenvalues, kind="stable")[:dimension]
+    # Vectors are of unit length: below a millionth of that is rounding.
+    keep = order[eigenvalues[order] > 1e-6 * max(float(eigenvalues.max()), len(raw) * 1e-6)]
+    if len(keep) == 0:  # one image, or all alike
+        direction = mean / max(float(np.linalg.norm(mean)), 1e-6)
+        return Whitening(np.zeros_like(mean), direction[None].astype(np.float32))
+    axes = centred.T @ vectors[:, keep] / np.sqrt(eigenvalues[keep]) if by_image else vectors[:, keep]
+    softened = np.sqrt(eigenvalues[keep] + eigenvalues[keep].mean())
+    return Whitening(mean.astype(np.float32), np.ascontiguousarray((axes / softened).T, np.float32))
+
+
+def visual_words(descriptors: Float32[np.ndarray, "n d"], num_words: int, seed: int) -> Float32[np.ndarray, "k d"]:
+    """The k-means centres of descriptors, fewer where there are few of them."""
+    num_words = max(1, min(num_words, len(descriptors) // 40))
+    kmeans = faiss.Kmeans(descriptors.shape[1], num_words, niter=20, seed=seed + 1, min_points_per_centroid=1)
+    kmeans.train(np.ascontiguousarray(descriptors))
+    assert kmeans.centroids is not None
+    return np.asarray(kmeans.centroids, np.float32).reshape(num_words, -1)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 import hashlib
 import math
-import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -25,6 +24,7 @@ from topoloc.errors import TrainingError
 from topoloc.places.classifier_config import TrainingConfig
 from topoloc.places.inference import has_bfloat16, threads
 from topoloc.places.training_set import Progress
+from topoloc.sequences.atomic import replaced_file
 
 BatchLoss = Callable[[Tensor, Generator], Tensor]
 """The mean loss of these rows of the training set, a scalar with gradient; randomness from the generator."""
@@ -139,14 +139,11 @@ class _State:
         names = ("epoch", "best_epoch", "losses", "scores", "best")
         content = {name: getattr(self, name) for name in names} | {"fingerprint": self._fingerprint()}
         content |= {"network": self.task.network.state_dict(), "optimizer": self.optimizer.state_dict()}
-        part = path.with_name(f".{path.name}.{os.getpid()}.part")
         try:
-            torch.save(content, part)
-            os.replace(part, path)
+            with replaced_file(path) as part:
+                torch.save(content, part)
         except (OSError, RuntimeError) as error:
             raise TrainingError(f"cannot write checkpoint {path}: {' '.join(str(error).split())[:200]}") from error
-        finally:
-            part.unlink(missing_ok=True)
 
     def load(self, path: Path) -> None:
         try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -12,33 +12,26 @@ from torch import nn
 
 from topoloc.errors import MapError
 from topoloc.features.features import Features
-from topoloc.places.classifier_config import PictureConfig
+from topoloc.places.classifier_config import CnnNnConfig, PictureConfig, VladNnConfig
 from topoloc.places.coarse import CoarseModel, Image, NodeScore, model_array, setting
 from topoloc.places.inference import Predictor, from_arrays, rounded_to_half, to_arrays
-from topoloc.places.neighbours import PlaceIndex
+from topoloc.places.neighbours import PlaceIndex, Whitening, learn_whitening
 from topoloc.places.training_set import PictureShape, Progress, TrainingSet, decode_pictures, network_pictures
-from topoloc.places.whitening import Whitening, learn_whitening
 
 _CHUNK = 64
 
 
-@dataclass(frozen=True, eq=False)
-class FittedVectors:
-    """The arrays of a model whose vectors were learnt; `model` adds the settings."""
-
-    name: str
-    picture_shape: PictureShape
-    arrays: Mapping[str, np.ndarray]
-
-    def model(self, settings: Mapping[str, Any]) -> CoarseModel:
-        shape = [self.picture_shape.width, self.picture_shape.height]
-        return CoarseModel(self.name, {**settings, "picture_shape": shape}, self.arrays)
-
-
 def fit_vectors(
-    name: str, network: nn.Module, training_set: TrainingSet, picture: PictureConfig, dimension: int, progress: Progress
-) -> FittedVectors:
-    """Vectors of all mapping images and their whitening. The network's weights are rounded to half floats, as the map keeps them.
+    name: str,
+    network: nn.Module,
+    training_set: TrainingSet,
+    config: CnnNnConfig | VladNnConfig,
+    facts: Mapping[str, Any],
+    progress: Progress,
+) -> CoarseModel:
+    """The model of a network: vectors of all mapping images and their whitening; `facts` go with its settings.
+
+    The network's weights are rounded to half floats, as the map keeps them.
 
     Raises:
         MapError: a mapping image is damaged.
@@ -47,14 +40,15 @@ def fit_vectors(
     predict = Predictor(rounded_to_half(network))
     raw = []
     for start in range(0, len(pictures), _CHUNK):
-        raw.append(predict(network_pictures(pictures[start : start + _CHUNK], shape, picture)))
+        raw.append(predict(network_pictures(pictures[start : start + _CHUNK], shape, config.picture)))
         progress(f"{name}: vectors", min(start + _CHUNK, len(pictures)), len(pictures))
     vectors = np.concatenate(raw)
-    whitening = learn_whitening(vectors, dimension)
+    whitening = learn_whitening(vectors, config.dimension)
     whitening = Whitening(whitening.mean, whitening.projection.astype(np.float16).astype(np.float32))
     arrays = to_arrays(network) | {"mean": whitening.mean, "projection": whitening.projection.astype(np.float16)}
     arrays |= {"vectors": whitening.apply(vectors).astype(np.float16), "node_ids": training_set.node_ids.astype(np.int32)}
-    return FittedVectors(name, shape, arrays)
+    settings = {**facts, "config": asdict(config), "picture_shape": [shape.width, shape.height]}
+    return CoarseModel(name, settings, arrays)
 
 
 class VectorSearch:

@@ -12,18 +12,15 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Annotated
 
-import faiss
 import numpy as np
 from jaxtyping import Float32, Int
 
-from topoloc.bounds import AtLeast, Between
+from topoloc.bounds import AtLeast, Between, settings_from
 from topoloc.errors import MapError
 from topoloc.features.features import Features
 from topoloc.places.coarse import CoarseModel, Image, NodeScore, model_array
-from topoloc.places.neighbours import PlaceIndex
+from topoloc.places.neighbours import PlaceIndex, learn_whitening, visual_words
 from topoloc.places.place_kernels import add_residuals, multiply_rows
-from topoloc.places.stored_settings import bounded_settings_from
-from topoloc.places.whitening import learn_whitening
 
 
 @dataclass(frozen=True)
@@ -87,8 +84,8 @@ class SurfVlad:
 
     @staticmethod
     def from_model(model: CoarseModel) -> SurfVlad:
-        """The inverse of `to_model`. Raises MapError where the arrays do not belong together, for kernels trust them, and SettingsError."""
-        config = bounded_settings_from(VladConfig, {"position_weight": 0.0, **model.settings})
+        """The inverse of `to_model`. Raises MapError where the arrays do not belong together, for kernels trust them, and ConfigError."""
+        config = settings_from(VladConfig, {"position_weight": 0.0, **model.settings}, "settings")
         words = model_array(model, "words", "f", (None, None)).astype(np.float32, copy=False)
         projection = model_array(model, "projection", "f", (None, words.size)).astype(np.float32)
         mean = model_array(model, "mean", "f", (words.size,)).astype(np.float32, copy=False)
@@ -96,9 +93,7 @@ class SurfVlad:
         return SurfVlad(words, mean, projection, vectors, model_array(model, "node_ids", "iu", (len(vectors),)), config)
 
 
-def open_model(model: CoarseModel) -> SurfVlad:
-    """The localizer of a stored model."""
-    return SurfVlad.from_model(model)
+open_model = SurfVlad.from_model
 
 
 def placed(features: Features, width: int, height: int, config: VladConfig) -> Float32[np.ndarray, "n d"]:
@@ -124,8 +119,4 @@ def learn_words(descriptors: Float32[np.ndarray, "n d"], config: VladConfig) -> 
     rng = np.random.default_rng(config.seed)
     if len(descriptors) > config.max_training_descriptors:
         descriptors = descriptors[np.sort(rng.choice(len(descriptors), config.max_training_descriptors, replace=False))]
-    num_words = max(1, min(config.num_words, len(descriptors) // 40))
-    kmeans = faiss.Kmeans(descriptors.shape[1], num_words, niter=20, seed=config.seed + 1, min_points_per_centroid=1)
-    kmeans.train(np.ascontiguousarray(descriptors))
-    assert kmeans.centroids is not None
-    return np.asarray(kmeans.centroids, np.float32).reshape(num_words, -1)
+    return visual_words(descriptors, config.num_words, config.seed)

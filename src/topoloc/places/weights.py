@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import os
 import pickle
+import shutil
 import urllib.error
 import urllib.request
 import zipfile
@@ -22,6 +23,7 @@ from torch import Tensor
 from topoloc.errors import WeightsError
 from topoloc.places.backbones import NUM_CHANNELS, Backbone
 from topoloc.places.classifier_config import BACKBONES, BackboneName
+from topoloc.sequences.atomic import replaced_file
 
 SCRATCH = "scratch"
 """In place of a file: start from random weights."""
@@ -76,9 +78,7 @@ def read_weights(path: Path, backbone: BackboneName) -> Weights:
     if any(name.startswith("encoder.") for name in tensors):
         tensors, netvlad = _split_netvlad(tensors)
     _check(path, tensors, netvlad, backbone)
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return Weights(backbone, tensors, path.name, digest, netvlad)
+    return Weights(backbone, tensors, path.name, _sha256(path), netvlad)
 
 
 def load_features(network: Backbone, weights: Weights) -> None:
@@ -105,23 +105,23 @@ def _published_file(backbone: BackboneName) -> Path:
     if path.is_file():
         return path
     advice = f"fetch it on another machine and put it at {path}, or give --weights FILE (--weights {SCRATCH}: none)"
-    part = path.with_name(f".{name}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with urllib.request.urlopen(_URL + name, timeout=_TIMEOUT_SECONDS) as answer, part.open("wb") as file:
-            while block := answer.read(1 << 20):
-                file.write(block)
-        with part.open("rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
-        if not digest.startswith(name.rpartition("-")[2].removesuffix(".pth")):
-            raise WeightsError(f"{_URL}{name} came with SHA-256 {digest[:8]}..., not as published; {advice}")
-        os.replace(part, path)
+        with replaced_file(path) as part, urllib.request.urlopen(_URL + name, timeout=_TIMEOUT_SECONDS) as answer:
+            with part.open("wb") as file:
+                shutil.copyfileobj(answer, file)
+            digest = _sha256(part)
+            if not digest.startswith(name.rpartition("-")[2].removesuffix(".pth")):
+                raise WeightsError(f"{_URL}{name} came with SHA-256 {digest[:8]}..., not as published; {advice}")
     except (urllib.error.URLError, OSError) as error:
         reason = getattr(error, "reason", None) or error
         raise WeightsError(f"no weights of {backbone}: {_URL}{name} cannot be fetched ({reason}); {advice}") from error
-    finally:
-        part.unlink(missing_ok=True)
     return path
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _read_tensors(path: Path) -> dict[str, Tensor]:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from topoloc.errors import CalibrationError
 from topoloc.geometry.camera import Camera
+from topoloc.sequences.text_rows import read_text
 
 FILE_NAME = "camera.json"
 
@@ -29,10 +30,8 @@ def read_camera_json(path: Path) -> CameraFile:
         CalibrationError: missing, not JSON, a key is missing or out of range; names the file.
     """
     try:
-        data = json.loads(path.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError:
-        raise CalibrationError(f"{path}: no such camera file") from None
-    except (OSError, ValueError) as error:
+        data = json.loads(read_text(path, CalibrationError, "no such camera file"))
+    except ValueError as error:
         raise CalibrationError(f"{path}: not a JSON file ({error})") from None
     if not isinstance(data, dict):
         raise CalibrationError(f"{path}: not a JSON object")

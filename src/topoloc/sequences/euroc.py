@@ -17,7 +17,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.recording import Recording, RightPictures
-from topoloc.sequences.text_rows import read_file_list
+from topoloc.sequences.text_rows import read_file_list, read_text
 from topoloc.sequences.trajectory import poses_at, read_asl_poses
 
 LOOKS_FOR = "mav0/ with cam0/data.csv, or cam0/data.csv"
@@ -82,12 +82,7 @@ def read_sensor(path: Path) -> Sensor:
     Raises:
         CalibrationError: missing, a key or number is missing, or a model that is not known.
     """
-    try:
-        text = re.sub(r"#.*", "", path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise CalibrationError(f"{path}: no calibration here") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"{path}: cannot be read ({error.__class__.__name__})") from None
+    text = re.sub(r"#.*", "", read_text(path, CalibrationError, "no calibration here"))
     distortion = _word(text, "distortion_model", "none")
     if _word(text, "camera_model", "pinhole") != "pinhole" or distortion not in _DISTORTIONS:
         known = ", ".join(_DISTORTIONS)

@@ -15,7 +15,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.camera_json import FILE_NAME, CameraFile, read_camera_json
 from topoloc.sequences.pictures import PICTURE_SUFFIXES
 from topoloc.sequences.recording import DepthPictures, Recording, RightPictures, check_pairs, list_pictures
-from topoloc.sequences.truth import read_times, read_truth
+from topoloc.sequences.trajectory import read_times, read_truth
 
 LOOKS_FOR = "pictures, or left/ and right/, or rgb/ and depth/ with camera.json"
 _STEREO = (("left", "right"), ("image_0", "image_1"))

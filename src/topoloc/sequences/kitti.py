@@ -17,7 +17,8 @@ from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.pictures import image_size
 from topoloc.sequences.recording import Recording, RightPictures, check_pairs, list_pictures
-from topoloc.sequences.truth import read_times, read_truth
+from topoloc.sequences.text_rows import read_text
+from topoloc.sequences.trajectory import read_times, read_truth
 
 LOOKS_FOR = "image_0/ and image_1/ (or image_2/ and image_3/) with calib.txt"
 _PAIRS = ((0, 1), (2, 3))
@@ -62,12 +63,7 @@ def read_calib(path: Path) -> dict[str, Float[np.ndarray, "3 4"]]:
     Raises:
         CalibrationError: missing, or a P line is not 12 finite numbers.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError:
-        raise CalibrationError(f"{path}: no calibration here; a camera.json with a baseline beside it would do as well") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"{path}: cannot be read ({error.__class__.__name__})") from None
+    lines = read_text(path, CalibrationError, "no calibration here; a camera.json with a baseline beside it would do as well").splitlines()
     projections = {}
     for number, line in enumerate(lines, start=1):
         key, _, values = line.partition(":")

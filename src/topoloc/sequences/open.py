@@ -9,7 +9,7 @@ from pathlib import Path
 from topoloc.errors import RecordingError, UnknownFormatError
 from topoloc.sequences import euroc, folder, kitti, seven_scenes, tum, video
 from topoloc.sequences.frame import StereoSequence
-from topoloc.sequences.selection import parse_selection, sequence_subset
+from topoloc.sequences.recording import parse_selection, sequence_subset
 
 
 @dataclass(frozen=True)

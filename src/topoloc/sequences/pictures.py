@@ -65,6 +65,12 @@ def read_depth(path: Path, units_per_metre: float) -> Float32[np.ndarray, "h w"]
     return depth
 
 
+def jpeg_of(image: Image, quality: int) -> bytes:
+    """The picture encoded; the same picture gives the same bytes."""
+    bgr = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+
+
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height in pixels, from the header where the file type allows it, else by decoding.
 

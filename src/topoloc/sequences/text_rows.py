@@ -13,21 +13,26 @@ NANOSECONDS = 1_000_000_000
 _MAX_SECONDS = 10**12
 
 
+def read_text(path: Path, error: type[TopolocError], missing: str = "no such file") -> str:
+    """The text of a file. Raises `error`, which names it."""
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise error(f"{path}: {missing}") from None
+    except UnicodeDecodeError:
+        raise error(f"{path}: not a text file") from None
+    except OSError as failure:
+        raise error(f"{path}: {failure.strerror}") from None
+
+
 def read_rows(path: Path, error: type[TopolocError]) -> list[tuple[int, list[str]]]:
     """Line number and columns (split at spaces and commas) of each line; blank lines and comments (``#``) are left out.
 
     Raises:
         error: the file is missing, no text, or holds no row; names it.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise error(f"{path}: no such file") from None
-    except UnicodeDecodeError:
-        raise error(f"{path}: not a text file") from None
-    except OSError as failure:
-        raise error(f"{path}: {failure.strerror}") from None
-    numbered = ((number, line.partition("#")[0].replace(",", " ").split()) for number, line in enumerate(text.splitlines(), start=1))
+    lines = enumerate(read_text(path, error).splitlines(), start=1)
+    numbered = ((number, line.partition("#")[0].replace(",", " ").split()) for number, line in lines)
     rows = [(number, columns) for number, columns in numbered if columns]
     if not rows:
         raise error(f"{path}: nothing in this file")

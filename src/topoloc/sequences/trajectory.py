@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from topoloc.errors import TrajectoryError
+from topoloc.errors import RecordingError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.atomic import write_text
 from topoloc.sequences.frame import StereoSequence
-from topoloc.sequences.recording import SequenceView
+from topoloc.sequences.recording import SequenceView, times_by_rate
 from topoloc.sequences.text_rows import NANOSECONDS, parse_times, read_rows
 
 # Times written with few decimals still mean the frame they were made from.
@@ -88,16 +88,6 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
     write_text(path, "\n".join(lines) + "\n")
 
 
-def write_kitti(path: Path, trajectory: Trajectory) -> None:
-    """Write KITTI rows, atomically.
-
-    Raises:
-        TopolocError: the file cannot be written.
-    """
-    rows = (pose.matrix()[:3].ravel() for pose in trajectory.world_from_cam)
-    write_text(path, "\n".join([" ".join(f"{value:.12e}" for value in row) for row in rows]) + "\n")
-
-
 def poses_at(trajectory: Trajectory, t_ns: Sequence[int], max_gap: float = 0.2) -> list[Rigid3 | None]:
     """The pose at each time: interpolated where its neighbours are at most `max_gap` seconds apart, else the pose within 1 ms, else None.
 
@@ -139,6 +129,32 @@ def with_trajectory(sequence: StereoSequence, path: Path) -> StereoSequence:
         rows = frame_poses(trajectory, sequence.base.t_ns, path)
         return SequenceView(sequence.base, sequence.indices, [rows[index] for index in sequence.indices])
     return SequenceView(sequence, list(range(len(sequence))), frame_poses(trajectory, sequence.t_ns, path))
+
+
+def read_truth(tum: Path, kitti_rows: list[Path], t_ns: list[int]) -> list[Rigid3 | None]:
+    """The pose of each frame from the first of these files that is there: TUM by time, KITTI rows one a frame.
+
+    Raises:
+        TrajectoryError: the file is malformed, or fits no frame.
+    """
+    for path in (tum, *kitti_rows):
+        if path.is_file():
+            return frame_poses(read_trajectory(path), t_ns, path)
+    return [None] * len(t_ns)
+
+
+def read_times(path: Path, num_frames: int) -> list[int]:
+    """Times in nanoseconds from a file of one time in seconds a line; 10 Hz where there is no file.
+
+    Raises:
+        RecordingError: malformed, not increasing, or their number is not that of the frames.
+    """
+    if not path.is_file():
+        return times_by_rate(num_frames)
+    t_ns = parse_times(read_rows(path, RecordingError), path, RecordingError)
+    if len(t_ns) != num_frames:
+        raise RecordingError(f"{path}: {len(t_ns)} times for {num_frames} pictures")
+    return t_ns
 
 
 def _pose_at(times: list[int], poses: list[Rigid3], time: int, max_gap_ns: int) -> Rigid3 | None:

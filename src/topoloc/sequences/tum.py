@@ -17,7 +17,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.camera_json import FILE_NAME, CameraFile, read_camera_json
 from topoloc.sequences.recording import DepthPictures, Recording
 from topoloc.sequences.text_rows import read_file_list
-from topoloc.sequences.truth import read_truth
+from topoloc.sequences.trajectory import read_truth
 
 LOOKS_FOR = "rgb.txt and depth.txt"
 DEPTH_FACTOR = 5000.0

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import cv2
 
@@ -20,7 +20,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.camera_json import FILE_NAME, read_camera_json
 from topoloc.sequences.frame import Image, StereoFrame
 from topoloc.sequences.pictures import opencv_silent
-from topoloc.sequences.truth import read_truth
+from topoloc.sequences.trajectory import read_truth
 
 # FFmpeg prints its own lines about broken files on stderr, beside the error that says it; read once a process, at its first use.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
@@ -34,20 +34,11 @@ def recognises(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
 
 
-@runtime_checkable
-class _Capture(Protocol):
-    """What is asked of an open video."""
-
-    def grab(self) -> bool: ...
-
-    def retrieve(self) -> tuple[bool, Any]: ...
-
-
 @dataclass(eq=False)
 class _Reader:
     """An open video and the number of the frame that it gives next."""
 
-    capture: _Capture
+    capture: Any
     next_idx: int = 0
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Float, Float32
 
 from topoloc.bounds import Above, Between
 from topoloc.features.bands import run_in_bands
-from topoloc.geometry.stereo import DepthNoise, depth_sigmas
+from topoloc.geometry.stereo import depth_sigmas
 from topoloc.sequences.frame import StereoFrame
 from topoloc.sequences.frame_view import FrameView, frame_view
 from topoloc.slam.epipolar_kernels import match_in_ranges
@@ -112,5 +112,5 @@ def _from_depth(
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     assert measured.view.depth is not None
     depth = smooth_depth(measured.view.depth, points_img, config.max_depth_step)
-    sigmas = measured.stereo.bf / depth**2 * depth_sigmas(depth, DepthNoise())
+    sigmas = measured.stereo.bf / depth**2 * depth_sigmas(depth)
     return measured.stereo.bf / depth, np.maximum(sigmas, _MIN_SIGMA_OF_DEPTH_PX)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from topoloc.compiled import kernel
-from topoloc.slam.sampling_kernels import sample_bilinear
+from topoloc.slam.tracking_kernels import sample_bilinear
 
 _OPTIONS = {"error_model": "numpy", "fastmath": {"reassoc", "contract", "arcp"}}
 
@@ -132,7 +132,7 @@ def _refine_disparity(patch, half, right, x, y, disparity, num_iterations):
 
 @kernel(**_OPTIONS)
 def _match_point(left, right, x, y, half, low, num_disparities, min_score, max_ratio, patch, back, strip, sums, scores):
-    """(disparity, sigma) of one point, sought among low .. low + num_disparities - 1; NaN as `match_along_rows` says."""
+    """(disparity, sigma) of one point, sought among low .. low + num_disparities - 1; NaN as `match_in_ranges` says."""
     height, width = left.shape
     side = 2 * half + 1
     nothing = np.float32(np.nan), np.float32(np.nan)
@@ -163,22 +163,13 @@ def _match_point(left, right, x, y, half, low, num_disparities, min_score, max_r
 
 
 @kernel(**_OPTIONS)
-def match_along_rows(left, right, points, half, max_disparity, min_score, max_ratio):
-    """Disparity of each point (x, y) of `left` in `right` (float32 pictures of one size) with its standard deviation.
-
-    NaN where the point is too near the border, without texture, not distinct along the row (the best score elsewhere
-    reaches `max_ratio` of the best), below `min_score`, or not found back from the right picture within a pixel.
-    """
-    num = len(points)
-    disparities, sigmas = np.empty(num, np.float32), np.empty(num, np.float32)
-    lows, nums = np.zeros(num, np.int64), np.full(num, max_disparity + 1)
-    match_in_ranges(left, right, points, lows, nums, half, min_score, max_ratio, disparities, sigmas)
-    return disparities, sigmas
-
-
-@kernel(**_OPTIONS)
 def match_in_ranges(left, right, points, lows, nums, half, min_score, max_ratio, disparities, sigmas):
-    """As `match_along_rows`, the disparity of point n sought among lows[n] .. lows[n] + nums[n] - 1 only; fills the last two."""
+    """Disparity of each point (x, y) of `left` in `right` (float32 pictures of one size) with its standard deviation; fills the last two.
+
+    That of point n is sought among lows[n] .. lows[n] + nums[n] - 1. NaN where the point is too near the border, without texture, not
+    distinct along the row (the best score elsewhere reaches `max_ratio` of the best), below `min_score`, or not found back from the right
+    picture within a pixel.
+    """
     side = 2 * half + 1
     most = 1
     for n in range(len(points)):

@@ -112,3 +112,17 @@ class KeyFrame:
     bias: DisparityBias
     motion: Motion | None = None
     place: PlaceView | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class FramePose:
+    """Where a frame is: relative to a key frame, so that it moves with it."""
+
+    frame_idx: int
+    keyframe: KeyFrame
+    cam_from_keyframe: Rigid3
+    view_from_cam: Rigid3
+
+    def world_from_cam(self) -> Rigid3:
+        """The pose of the frame's own camera, which rectification may have turned."""
+        return (self.cam_from_keyframe @ self.keyframe.cam_from_world).inverse() @ self.view_from_cam

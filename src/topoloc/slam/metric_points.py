@@ -20,7 +20,6 @@ from topoloc.bounds import Above, Between
 from topoloc.errors import RecordingError
 from topoloc.features.features import Features
 from topoloc.geometry.stereo import (
-    DepthNoise,
     depth_sigmas,
     depth_sigmas_of_disparity,
     points_from_depth,
@@ -28,7 +27,7 @@ from topoloc.geometry.stereo import (
     ray_covariances,
 )
 from topoloc.sequences.frame_view import FrameView
-from topoloc.slam.epipolar_kernels import match_along_rows
+from topoloc.slam.epipolar_kernels import match_in_ranges
 
 # SURF and SIFT describe a neighbourhood of 20 s and 12 sigma; both report sizes of about 7.5 scales across.
 SCALES_PER_SIZE = 1.2 / 9.0
@@ -90,16 +89,13 @@ def _from_stereo(
     assert view.right_grey is not None
     assert view.rig is not None
     # Nearer than a quarter of the picture's width in disparity nothing is seen well by both cameras.
-    max_disparity = max(16, view.camera.width // 4)
-    disparity, sigma = match_along_rows(
-        view.grey.astype(np.float32),
-        view.right_grey.astype(np.float32),
-        features.points_img,
-        config.correlation_half_px,
-        max_disparity,
-        config.min_correlation,
-        config.max_second_correlation,
-    )
+    max_disparity, num = max(16, view.camera.width // 4), len(features)
+    disparity, sigma = np.empty(num, np.float32), np.empty(num, np.float32)
+    match_in_ranges(
+        view.grey.astype(np.float32), view.right_grey.astype(np.float32), features.points_img, np.zeros(num, np.int64),
+        np.full(num, max_disparity + 1), config.correlation_half_px, config.min_correlation, config.max_second_correlation,
+        disparity, sigma,
+    )  # fmt: skip
     sigma = np.hypot(sigma.astype(np.float64), config.min_sigma_disparity_px)
     points_cam = points_from_disparity(features.points_img.astype(np.float64), disparity.astype(np.float64), view.rig)
     return points_cam, depth_sigmas_of_disparity(points_cam[:, 2], sigma, view.rig)
@@ -111,7 +107,7 @@ def _from_depth(
     assert view.depth is not None
     depth = smooth_depth(view.depth, features.points_img, config.max_depth_step)
     points_cam = points_from_depth(features.points_img.astype(np.float64), depth, view.camera)
-    return points_cam, depth_sigmas(points_cam[:, 2], DepthNoise())
+    return points_cam, depth_sigmas(points_cam[:, 2])
 
 
 def smooth_depth(depth: np.ndarray, points_img: np.ndarray, max_step: float) -> Float[np.ndarray, " n"]:

@@ -14,13 +14,11 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.frame import StereoFrame
 from topoloc.slam.bundle import adjust_bundle
 from topoloc.slam.disparity import MeasuredView, measure_disparities, measured_view
-from topoloc.slam.frame_state import FramePose, LastFrame, Tracks
 from topoloc.slam.input_checks import InputChecks
-from topoloc.slam.keyframes import DisparityBias, KeyFrame, Landmarks, Motion, Observations
+from topoloc.slam.keyframes import DisparityBias, FramePose, KeyFrame, Landmarks, Motion, Observations
 from topoloc.slam.motion_prediction import MotionHistory, expected_one
-from topoloc.slam.odometry_config import OdometryConfig
 from topoloc.slam.place_matching import match_places, place_view
-from topoloc.slam.steps import Step, StepSeeker
+from topoloc.slam.steps import LastFrame, OdometryConfig, Step, StepSeeker, Tracks
 from topoloc.slam.tracking import find_corners
 
 

@@ -18,13 +18,12 @@ from topoloc.bounds import check_bounds
 from topoloc.errors import RecordingError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.frame import StereoFrame, StereoSequence
-from topoloc.slam.frame_state import FramePose
 from topoloc.slam.global_map import GlobalMapConfig, adjust_all, close_loops, join_submaps
 from topoloc.slam.input_checks import InputCheckConfig, InputChecks
-from topoloc.slam.keyframes import KeyFrame, Landmarks
+from topoloc.slam.keyframes import FramePose, KeyFrame, Landmarks
 from topoloc.slam.loop_closure import LoopConfig, find_links
 from topoloc.slam.odometry import Odometry
-from topoloc.slam.odometry_config import OdometryConfig
+from topoloc.slam.steps import OdometryConfig
 
 Progress = Callable[[str, int, int], None]
 """Called with a stage's name, steps done and steps in all."""

@@ -6,20 +6,100 @@ found: it is seen by seeking from other places too.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from topoloc.geometry.absolute_pose import AbsolutePose, estimate_absolute_pose
+from topoloc.bounds import Above, AtLeast, Between
+from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.stereo import ray_covariances
-from topoloc.slam.disparity import MeasuredView
-from topoloc.slam.frame_state import LastFrame, Tracks
+from topoloc.slam.bundle import BundleConfig
+from topoloc.slam.disparity import DisparityConfig, MeasuredView
 from topoloc.slam.keyframes import KeyFrame, Landmarks, StereoCamera
-from topoloc.slam.motion_prediction import Prediction
-from topoloc.slam.odometry_config import OdometryConfig
-from topoloc.slam.tracking import align_with_reference, follow
+from topoloc.slam.motion_prediction import Prediction, PredictionConfig
+from topoloc.slam.place_matching import PlaceMatchingConfig
+from topoloc.slam.tracking import TrackingConfig, align_with_reference, follow
+
+
+@dataclass(frozen=True)
+class OdometryConfig:
+    """When a frame is tracked, and when it becomes a key frame."""
+
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    prediction: PredictionConfig = field(default_factory=PredictionConfig)
+    disparity: DisparityConfig = field(default_factory=DisparityConfig)
+    pose: AbsolutePoseConfig = field(
+        default_factory=lambda: AbsolutePoseConfig(max_reprojection_error_px=2.0, sigma_px=0.5, max_iterations=300, min_iterations=20)
+    )
+    bundle: BundleConfig = field(default_factory=BundleConfig)
+    places: PlaceMatchingConfig = field(default_factory=PlaceMatchingConfig)
+    sigma_px: Annotated[float, Above(0)] = 0.3
+    """Standard deviation of a tracked point."""
+    sigma_bias_px: Annotated[float, Above(0)] = 1.0
+    """How wrong all disparities together may be before the recording has shown by how much."""
+    min_disparity_px: Annotated[float, Above(0)] = 0.5
+    """What seems further away than this becomes no landmark."""
+    sigma_landmark_px: Annotated[float, Above(0)] = 0.25
+    """Uncertainty of a landmark's depth, as a disparity."""
+    window: Annotated[int, Between(1, 1000)] = 8
+    """Key frames that are adjusted together."""
+    held: Annotated[int, Between(0, 1000)] = 5
+    """Key frames before these that hold them in place."""
+    min_tracked: Annotated[int, AtLeast(4)] = 25
+    """Points that agree on a pose; a frame with fewer is lost."""
+    min_tracked_share: Annotated[float, Between(0, 1)] = 0.35
+    """Share of the points followed that must agree; a frame with fewer is lost."""
+    keyframe_share: Annotated[float, Between(0, 1)] = 0.7
+    """A key frame is due when so few of the last one's points are left."""
+    keyframe_motion: Annotated[float, Above(0)] = 0.03
+    """... or when they have moved in the picture by this share of its width (median)."""
+    min_gap_share: Annotated[float, Between(0, 1)] = 0.5
+    """After a gap, a step that the motion does not let expect is believed where this share of the points is found again."""
+    start_spacing_px: Annotated[float, Above(0)] = 25.0
+    """Whether the last picture looks alike from elsewhere is tried from places this far apart (median over the points) ..."""
+    max_starts: Annotated[int, Between(0, 1000)] = 16
+    """... so many to either side along the motion at most, ..."""
+    repeat_depth: Annotated[float, AtLeast(0)] = 1.0
+    """... and as far as this share of the median depth, as the way since the last frame, or as the prediction is uncertain."""
+    repeat_share: Annotated[float, Between(0, 1)] = 0.3
+    """It does where this share of the points that should be in the picture agree."""
+    max_repeats: Annotated[int, Between(0, 1000)] = 8
+    """A step may then be off by so many of these repeats."""
+    same_step: Annotated[float, Above(0)] = 0.04
+    """Steps that differ by less than this share of the median depth, and radians, are the same."""
+    max_lost_tracked: Annotated[int, AtLeast(0)] = 3
+    """The points of the last frame that was tracked are sought in so many more."""
+    max_lost_frames: Annotated[int, AtLeast(0)] = 10
+    """A camera that is lost for longer starts a new sub-map."""
+    places_asked: Annotated[int, Between(0, 1000)] = 6
+    """The last places in which a camera that is lost is sought."""
+    place_distance: Annotated[float, AtLeast(0)] = 0.1
+    """A key frame keeps what it looks like (for loops) when it is this share of the median depth from the last that did ..."""
+    place_angle_deg: Annotated[float, AtLeast(0)] = 8.0
+    """... or turned by this angle."""
+
+
+@dataclass(eq=False)
+class Tracks:
+    """The points being followed: where they are in the last frame, where in the last key frame, and their landmarks."""
+
+    landmark_ids: Int[np.ndarray, " n"]
+    points_img: Float32[np.ndarray, "n 2"]
+    points_ref: Float32[np.ndarray, "n 2"]
+
+    def select(self, rows: np.ndarray) -> Tracks:
+        return Tracks(self.landmark_ids[rows], self.points_img[rows], self.points_ref[rows])
+
+
+@dataclass(eq=False)
+class LastFrame:
+    """The frame before."""
+
+    measured: MeasuredView
+    cam_from_world: Rigid3
 
 
 @dataclass(frozen=True, eq=False)

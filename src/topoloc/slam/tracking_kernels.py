@@ -8,9 +8,18 @@ from __future__ import annotations
 import numpy as np
 
 from topoloc.compiled import kernel
-from topoloc.slam.sampling_kernels import sample_bilinear
 
 _OPTIONS = {"error_model": "numpy", "fastmath": {"reassoc", "contract", "arcp"}}
+
+
+@kernel(error_model="numpy", inline="always")  # inlined, it obeys the caller's rules of arithmetic
+def sample_bilinear(image, x, y):
+    """Bilinear; the caller keeps (x, y) inside."""
+    ix, iy = int(x), int(y)
+    fx, fy = np.float32(x - ix), np.float32(y - iy)
+    top = image[iy, ix] * (1 - fx) + image[iy, ix + 1] * fx
+    bottom = image[iy + 1, ix] * (1 - fx) + image[iy + 1, ix + 1] * fx
+    return top * (1 - fy) + bottom * fy
 
 
 @kernel(**_OPTIONS)

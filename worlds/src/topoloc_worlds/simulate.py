@@ -10,8 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from topoloc.cli.options import File, Flag
-from topoloc.cli.output import UsageError, check_outputs, interruptible, progress_bar, write_json
+from topoloc.cli.output import File, Flag, UsageError, check_outputs, interruptible, progress_bar, write_json
 from topoloc.errors import CalibrationError, TopolocError
 from topoloc.geometry.camera import Camera
 from topoloc.sequences.camera_json import read_camera_json

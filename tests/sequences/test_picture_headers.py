@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from topoloc.sequences.exif import exif_focal_length
+from topoloc.sequences.picture_headers import exif_focal_length
 from topoloc.sequences.pictures import read_image
 
 SHORT, LONG, RATIONAL = 3, 4, 5

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from topoloc.places.netvlad import SECOND_SHARE, NetVlad, learn_words
+from topoloc.places.vlad_nn import SECOND_SHARE, NetVlad, learn_words
 
 
 def unit(array: np.ndarray) -> np.ndarray:
