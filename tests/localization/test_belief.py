@@ -178,7 +178,6 @@ def test_a_pose_that_is_not_clear_must_lead_by_its_odds_too(log_odds: float, oth
     assert isinstance(_answered(best, wrong), Localization) is is_answered
 
 
-
 # the walls along the way
 
 

@@ -13,12 +13,15 @@ from tiny_world import CAMERA
 from topoloc.features.features import Features
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization import open_map
+from topoloc.localization.building import with_repetitions
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.open_map import OpenMap
 from topoloc.localization.repetition import copies, folded, shifts_of
 from topoloc.localization.result import Localization, NotLocalized
+from topoloc.map.checking import damages
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.coarse import Image, NodeScore
 
@@ -104,6 +107,29 @@ def test_a_room_that_stands_twice_in_the_map_is_moved_onto_its_copy_and_back(roo
 def test_a_room_that_stands_once_in_the_map_has_no_copy(room: TopoMetricMap):
     opened = OpenMap(room)
     assert not any(_turned(opened, row) for row in range(len(room.nodes)))
+
+
+def test_what_the_build_found_is_kept_in_the_file_and_not_sought_again(
+    room: TopoMetricMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    built = with_repetitions(twice(room))
+    built.save(tmp_path / "twice.topo")
+    sought = []
+    monkeypatch.setattr(open_map, "shifts_of", lambda *given: sought.append(given))
+    with TopoMetricMap.load(tmp_path / "twice.topo") as topomap:
+        opened = OpenMap(topomap)
+        for row, node_id in enumerate(opened.node_ids):
+            assert built.repetitions is not None
+            np.testing.assert_array_equal(opened.moves(row), built.repetitions.moves.get(node_id, np.zeros((0, 4, 4))))
+        assert damages(tmp_path / "twice.topo") == []
+    assert sought == []
+
+
+def test_what_was_found_of_other_nodes_is_found_anew(room: TopoMetricMap):
+    assert room.repetitions is not None
+    doubled = twice(room)
+    assert doubled.repetitions is room.repetitions
+    assert any(_turned(OpenMap(doubled), row) for row in range(len(doubled.nodes)))
 
 
 class _OnlyTheFirstRoom:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from topoloc.features.kinds import find_kind
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.correlated_errors import with_correlated_errors
 from topoloc.localization.fitted_weights import weights_of
+from topoloc.localization.open_map import OpenMap
+from topoloc.localization.repetition import digest_of
 from topoloc.map import build
-from topoloc.map.topomap import TopoMetricMap
+from topoloc.map.topomap import Repetitions, TopoMetricMap
 from topoloc.sequences.frame import StereoSequence
 
 
@@ -34,4 +37,13 @@ def build_map(
     config = config or build.BuildConfig()
     kind = find_kind(config.features.kind)
     topomap, asked = build.build_map(sequences, config, progress, poses_from), LocalizerConfig().for_kind(kind)
-    return with_correlated_errors(topomap, asked.guided, asked.pose, asked.correlated_errors, weights_of(kind.name).shared_errors)
+    topomap = with_correlated_errors(topomap, asked.guided, asked.pose, asked.correlated_errors, weights_of(kind.name).shared_errors)
+    return with_repetitions(topomap)
+
+
+def with_repetitions(topomap: TopoMetricMap) -> TopoMetricMap:
+    """The map, told by which moves its nodes are found elsewhere in it."""
+    opened = OpenMap(topomap)
+    found = {node_id: opened.moves(row) for row, node_id in enumerate(opened.node_ids)}
+    moves = {node_id: moves for node_id, moves in found.items() if len(moves)}
+    return replace(topomap, repetitions=Repetitions(digest_of(topomap.summaries), moves))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -14,7 +14,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.guided import expected_key_points
 from topoloc.localization.local_map import LocalMap
-from topoloc.localization.repetition import LEAST_SHIFT, NUM_NEIGHBOURS, copy_of, may_repeat, shifts_of
+from topoloc.localization.repetition import LEAST_SHIFT, NUM_NEIGHBOURS, copy_of, digest_of, may_repeat, shifts_of
 from topoloc.localization.viewing import viewing_distances
 from topoloc.localization.wall_index import WallIndex
 from topoloc.map.memory import RememberedNodes
@@ -23,6 +23,7 @@ from topoloc.map.topomap import TopoMetricMap, TopoNode, open_coarse_of
 from topoloc.places.coarse import CoarseLocalizer, NodeScore
 from topoloc.places.vlad import SurfVlad
 
+_NO_MOVES = np.zeros((0, 4, 4))
 _LEAST_REACH = 2.5  # metres: how far shifts are looked for, at least
 _NUM_ALIKE, _NUM_PARTS, _PART_REACH = 64, 6, 5.0  # nodes that look alike; parts of the map that they make up; a part, in D_thresh (Eq. 1)
 
@@ -50,7 +51,6 @@ class OpenMap:
         self.node_poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
         self.lambda_rot, self.d_thresh = topomap.config.lambda_rot, topomap.config.d_thresh
         self._local_map = RememberedNodes(lambda row: LocalMap.of_node(topomap.nodes[row]))
-        self._repeats = RememberedNodes(self._find_repeats)
         self._moves = RememberedNodes(self._find_moves)
         self._expected: tuple[Camera, RememberedNodes[Float32[np.ndarray, "n 5"]]] | None = None
 
@@ -88,16 +88,25 @@ class OpenMap:
         return kept[1](row)
 
     def repeats(self, row: int) -> Float[np.ndarray, "k 3"]:
-        """The shifts (metres, world) by which what a node shows repeats itself, see `repetition.py`."""
-        return self._repeats(row)
+        """The shifts (metres, world) by which what a node shows repeats itself, see `repetition.py`: of its moves those without a turn."""
+        moves = self.moves(row)
+        return moves[(moves[:, :3, :3] == np.eye(3)).all(axis=(1, 2)), :3, 3]
 
     def moves(self, row: int) -> Float[np.ndarray, "k 4 4"]:
-        """The moves (world) by which what a node shows is found elsewhere in the map, those shifts among them."""
+        """The moves (world) by which what a node shows is found elsewhere in the map; as the map tells them, or found now."""
+        known = self._known_repetitions
+        if known is not None:
+            return known.get(self.node_ids[row], _NO_MOVES)
         return self._moves(row)
+
+    @cached_property
+    def _known_repetitions(self) -> Mapping[int, Float[np.ndarray, "k 4 4"]] | None:
+        known = self.topomap.repetitions
+        return dict(known.moves) if known is not None and known.digest == digest_of(self.topomap.summaries) else None
 
     def _find_moves(self, row: int) -> Float[np.ndarray, "k 4 4"]:
         node = self.topomap.nodes[row]
-        found = [Rigid3(np.eye(3), shift) for shift in self.repeats(row)]
+        found = [Rigid3(np.eye(3), shift) for shift in self._shifts(row)]
         found += [move for part in self._alike(node) if (move := copy_of(node, self.local_map(part))) is not None]
         return np.array([move.matrix() for move in found]).reshape(-1, 4, 4)
 
@@ -120,7 +129,7 @@ class OpenMap:
         """What ranks nodes by features alone, where the map has it."""
         return open_coarse_of(self.topomap, SurfVlad.name) if SurfVlad.name in self.topomap.coarse_models else None
 
-    def _find_repeats(self, row: int) -> Float[np.ndarray, "k 3"]:
+    def _shifts(self, row: int) -> Float[np.ndarray, "k 3"]:
         node, poses = self._local_map(row), self.node_poses
         if not may_repeat(node):
             return np.zeros((0, 3))

@@ -13,6 +13,9 @@ all of them (`refine.py`). What tells them apart is what does not repeat itself,
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 
@@ -20,7 +23,7 @@ from topoloc.features.matching import MatchingConfig, match_features
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.local_map import LocalMap
-from topoloc.map.entries import TopoNode
+from topoloc.map.entries import NodeSummary, TopoNode
 
 NUM_NEIGHBOURS = 9
 LEAST_SHIFT = 0.3
@@ -33,7 +36,16 @@ _MAX_SHIFTS = 6
 _MIN_COPIED, _MIN_COPIED_SHARE = 20, 0.3
 _NEAREST = MatchingConfig(ratio=0.0, mutual=False)
 _POSE = AbsolutePoseConfig(max_reprojection_error_px=6.0, max_iterations=500)
+_METHOD = 1  # part of the digest: one more whenever the same nodes come to have other repetitions
 _HALF = 1000  # cells to either side: more than any shift is long
+
+
+def digest_of(summaries: Sequence[NodeSummary]) -> str:
+    """A short name for what repetitions follow from: the nodes, by their poses and numbers of points."""
+    digest = hashlib.sha256(bytes([_METHOD]))
+    for summary in summaries:
+        digest.update(summary.world_from_cam.matrix().astype("<f8").tobytes() + summary.num_points.to_bytes(4, "little"))
+    return digest.hexdigest()[:16]
 
 
 def may_repeat(node: LocalMap) -> bool:

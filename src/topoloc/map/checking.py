@@ -47,6 +47,10 @@ def _of_entries(topomap: TopoMetricMap) -> Iterator[str]:
     for nodes in topomap.other_kinds.values():
         yield from _each(nodes, _with_sums)
     yield from _each(topomap.place_images, lambda image: topomap.row_of(image.node_id))
+    if topomap.repetitions is not None:
+        moves = topomap.repetitions.moves
+        for node_id in moves:
+            yield from _tried(lambda node_id=node_id: (moves[node_id], topomap.row_of(node_id)))[1]
     known = {summary.node_id for summary in topomap.summaries}
     for edge in topomap.edges:
         if not {edge.source_id, edge.target_id} <= known:

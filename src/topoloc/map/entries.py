@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Float32, Int8
+from jaxtyping import Float, Float32, Int8
 
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
@@ -93,6 +93,16 @@ class Edge:
 
     source_id: int
     target_id: int
+
+
+@dataclass(frozen=True, eq=False)
+class Repetitions:
+    """By node id, the moves (4x4 matrices, world) by which what a node shows is found elsewhere in the map, of nodes that have any, as
+    `localization/repetition.py` found them. `digest` stands for the nodes that were looked at: of others it says nothing.
+    """
+
+    digest: str
+    moves: Mapping[int, Float[np.ndarray, "k 4 4"]]
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ from topoloc.features.features import Features
 from topoloc.features.kinds import find_kind
 from topoloc.geometry.camera import Camera
 from topoloc.map.config import CONFIG_VERSION, MapConfig, config_from_text
-from topoloc.map.entries import Edge, NodeSummary, PlaceImage, SharedErrors, SideNodes, TopoNode
+from topoloc.map.entries import Edge, NodeSummary, PlaceImage, Repetitions, SharedErrors, SideNodes, TopoNode
 from topoloc.map.file import MapFile
-from topoloc.map.schema import SIDE
+from topoloc.map.schema import ORDER, SIDE
 from topoloc.map.sessions import Edit, Session
 from topoloc.map.sums import LandmarkSums, sums_from
 from topoloc.map.topomap import NextIds, TopoMetricMap
@@ -27,7 +27,10 @@ from topoloc.map.validation import MAX_POINTS, Damage, array_from, arrays_from, 
 from topoloc.places.coarse import CoarseModel
 
 T = TypeVar("T")
+K = TypeVar("K", int, str)
+V = TypeVar("V")
 MAX_ID = 2**53
+_MAX_MOVES = 1000
 
 
 def open_map(path: Path, digest: str | None = None) -> TopoMetricMap:
@@ -62,17 +65,18 @@ def _map_of(file: MapFile) -> TopoMetricMap:
     kinds = _kinds_of(facts, config)
     sides = None
     if file.count(f"{SIDE}nodes") > 0:
-        sides = SideNodes(_stored_summaries(file, SIDE), _stored_nodes(file, config.features.kind, SIDE), _StoredModels(file, SIDE))
+        sides = SideNodes(_stored_summaries(file, SIDE), _stored_nodes(file, config.features.kind, SIDE), _stored_models(file, SIDE))
     return TopoMetricMap(
         summaries=_stored_summaries(file),
         nodes=_stored_nodes(file, config.features.kind),
         edges=[Edge(row["source_id"], row["target_id"]) for row in file.rows("edges")],
         place_images=_Stored(partial(file.count, "place_images"), partial(_image_at, file)),
-        coarse_models=_StoredModels(file),
+        coarse_models=_stored_models(file),
         config=config,
         length_m=value_from(float, json_of(facts["length_m"]), "length_m"),
         default_coarse=value_from(str, json_of(facts.get("default_coarse", '"surf-vlad"')), "default_coarse"),
         shared_errors=_shared_errors_of(facts.get("shared_errors")),
+        repetitions=_repetitions_of(file, facts.get("repetitions")),
         sides=sides,
         sessions=list(_sessions_of(file).values()),
         edits=[Edit(*row.values()) for row in file.rows("edits")],
@@ -259,31 +263,47 @@ def _image_at(file: MapFile, row: int) -> PlaceImage:
         return PlaceImage(session.name, found["name"], found["node_id"], pose, found["jpeg"], session.session_id, image_id)
 
 
-class _StoredModels(Mapping[str, CoarseModel]):
-    def __init__(self, file: MapFile, prefix: str = "") -> None:
-        self._file, self._table = file, f"{prefix}coarse_models"
+class _Keyed(Mapping[K, V]):
+    """Rows of a table by their key, each read when asked for."""
 
-    def _names(self) -> list[str]:
-        def read() -> list[str]:
-            return [row["name"] for row in self._file.rows(self._table, ("name",))]
+    def __init__(self, file: MapFile, table: str, read: Callable[[dict[str, Any]], V]) -> None:
+        self._file, self._table, self._read = file, table, read
+        self._key = ORDER[table]
 
-        return self._file.kept(self._table, read)
+    def _keys(self) -> list[K]:
+        return self._file.kept(self._table, lambda: [row[self._key] for row in self._file.rows(self._table, (self._key,))])
 
     def __len__(self) -> int:
-        return len(self._names())
+        return len(self._keys())
 
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._names())
+    def __iter__(self) -> Iterator[K]:
+        return iter(self._keys())
 
-    def __getitem__(self, name: str) -> CoarseModel:
-        if name not in self._names():
-            raise KeyError(name)
+    def __getitem__(self, key: K) -> V:
+        if key not in self._keys():
+            raise KeyError(key)
         with self._file.reading():
-            row = _found(self._file.row(self._table, name=name), f"coarse localizer {name}")
-            settings = json_of(row["settings"])
-            if not isinstance(settings, dict):
-                raise Damage(f"the settings of coarse localizer {name} are none")
-            return CoarseModel(name, settings, arrays_from(row["arrays"], f"coarse localizer {name}"))
+            return self._read(_found(self._file.row(self._table, **{self._key: key}), f"{self._table} {key}"))
+
+
+def _stored_models(file: MapFile, prefix: str = "") -> Mapping[str, CoarseModel]:
+    def read(row: dict[str, Any]) -> CoarseModel:
+        name, settings = row["name"], json_of(row["settings"])
+        if not isinstance(settings, dict):
+            raise Damage(f"the settings of coarse localizer {name} are none")
+        return CoarseModel(name, settings, arrays_from(row["arrays"], f"coarse localizer {name}"))
+
+    return _Keyed(file, f"{prefix}coarse_models", read)
+
+
+def _repetitions_of(file: MapFile, digest: str | None) -> Repetitions | None:
+    def read(row: dict[str, Any]) -> np.ndarray:
+        num_moves = count_within(row["num_moves"], 1, _MAX_MOVES, f"the repetitions of node {row['node_id']}")
+        size = len(row["moves"]) // num_moves
+        moves = [pose_from(row["moves"][k * size : (k + 1) * size]).matrix() for k in range(num_moves)]
+        return np.array(moves)
+
+    return None if digest is None else Repetitions(value_from(str, digest, "repetitions"), _Keyed(file, "repetitions", read))
 
 
 def _found(row: dict[str, Any] | None, what: str) -> dict[str, Any]:

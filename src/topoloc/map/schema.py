@@ -48,6 +48,7 @@ TABLES: dict[str, Columns] = {
         "sums": "BLOB NOT NULL",
     },
     "node_templates": {"node_id": "INTEGER PRIMARY KEY REFERENCES nodes", "jpeg": "BLOB NOT NULL"},
+    "repetitions": {"node_id": "INTEGER PRIMARY KEY REFERENCES nodes", "num_moves": "INTEGER NOT NULL", "moves": "BLOB NOT NULL"},
     "edges": {"source_id": "INTEGER NOT NULL REFERENCES nodes", "target_id": "INTEGER NOT NULL REFERENCES nodes"},
     "place_images": {
         "image_id": "INTEGER PRIMARY KEY",
@@ -136,6 +137,7 @@ CREATE TEMP VIEW edges AS SELECT source_id, target_id, NULL AS checksum FROM mai
 CREATE TEMP VIEW place_images AS SELECT image_id, session_id, i.name AS name, node_id, world_from_cam, jpeg, NULL AS checksum
     FROM main.place_images AS i LEFT JOIN sessions AS s ON s.name = i.recording;
 CREATE TEMP VIEW landmark_sums AS SELECT 0 AS node_id, '' AS kind, 0 AS session_id, 0 AS num_rows, x'' AS sums, NULL AS checksum WHERE 0;
+CREATE TEMP VIEW repetitions AS SELECT 0 AS node_id, 0 AS num_moves, x'' AS moves, NULL AS checksum WHERE 0;
 """
 # Of nodes and of side nodes. Every map of schema 1 has one kind of features, named in its configuration.
 _POINTS_OF = """

@@ -19,7 +19,7 @@ import numpy as np
 
 from topoloc.errors import MapError
 from topoloc.map.config import MapConfig
-from topoloc.map.entries import Edge, NodeSummary, PlaceImage, SharedErrors, SideNodes, TopoNode
+from topoloc.map.entries import Edge, NodeSummary, PlaceImage, Repetitions, SharedErrors, SideNodes, TopoNode
 from topoloc.map.file import MapFile
 from topoloc.map.sessions import Edit, Session
 from topoloc.places.coarse import CoarseLocalizer, CoarseModel, open_coarse
@@ -29,6 +29,7 @@ __all__ = [
     "Edit",
     "NodeSummary",
     "PlaceImage",
+    "Repetitions",
     "Session",
     "SharedErrors",
     "SideNodes",
@@ -56,8 +57,8 @@ class TopoMetricMap:
 
     `summaries[i]` describes `nodes[i]`; their ids are in increasing order. `config` is the effective configuration it
     was built with, `length_m` the metres of trajectory that were mapped. `default_coarse` names the coarse localizer that answers
-    where the user names none. `shared_errors` is None where nobody has measured them,
-    `sides` where no mapping picture is wide enough to show the walls along the way. `edits` begins with the build.
+    where the user names none. `shared_errors` and `repetitions` are None where nobody has measured
+    them, `sides` where no mapping picture is wide enough to show the walls along the way. `edits` begins with the build.
     `other_kinds` are the same nodes with points of further kinds of features, by the kind's name.
 
     A map that was loaded holds its file open; ``with TopoMetricMap.load(path) as topomap`` or `close` let go of it. It is pickled as
@@ -73,6 +74,7 @@ class TopoMetricMap:
     length_m: float = 0.0
     default_coarse: str = "surf-vlad"
     shared_errors: SharedErrors | None = None
+    repetitions: Repetitions | None = None
     sides: SideNodes | None = None
     sessions: Sequence[Session] = ()
     edits: Sequence[Edit] = ()

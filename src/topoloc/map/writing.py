@@ -84,6 +84,9 @@ class _Writer:
                 self._insert_node(node, topomap.kind, {}, SIDE)
             for model in topomap.sides.coarse_models.values():
                 self._insert_model(model, SIDE)
+        if topomap.repetitions is not None:
+            for node_id, moves in sorted(topomap.repetitions.moves.items()):
+                self._insert("repetitions", node_id, len(moves), moves[:, :3].astype("<f8").tobytes())
         self._write_facts(topomap, sessions, next_image)
         self._database.execute("COMMIT")
 
@@ -122,6 +125,8 @@ class _Writer:
         }
         if topomap.shared_errors is not None:
             facts["shared_errors"] = json.dumps(asdict(topomap.shared_errors))
+        if topomap.repetitions is not None:
+            facts["repetitions"] = topomap.repetitions.digest
         for key, value in sorted(facts.items()):
             self._insert("map", key, value)
         self._insert("map", "digest", digest_of({table: [c for _, c in sorted(rows)] for table, rows in self._checksums.items()}))
