@@ -52,6 +52,6 @@ def _insert(database: sqlite3.Connection, node: TopoNode, prefix: str) -> None:
     row = (s.node_id, s.recording, s.name, s.t_ns, camera_id, _pose_bytes(s.world_from_cam), len(f))
     database.execute(f"INSERT INTO {prefix}nodes VALUES (?, ?, ?, ?, ?, ?, ?)", row)
     shapes = np.stack([f.sizes_px, f.angles, f.responses], axis=1).astype("<f4")
-    blobs = (f.points_img, shapes, _quantised(node), node.points_cam, node.point_sqrt_covs.astype("<f2"))
+    blobs = (f.points_img, shapes, _quantised(node, 200.0), node.points_cam, node.point_sqrt_covs.astype("<f2"))
     row = (s.node_id, f.descriptors.shape[1], *(blob.tobytes() for blob in blobs))
     database.execute(f"INSERT INTO {prefix}node_points VALUES (?, ?, ?, ?, ?, ?, ?)", row)
