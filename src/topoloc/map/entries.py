@@ -95,6 +95,7 @@ class Edge:
     target_id: int
 
 
+@no_type_check  # as of a side node's
 @dataclass(frozen=True, eq=False)
 class Repetitions:
     """By node id, the moves (4x4 matrices, world) by which what a node shows is found elsewhere in the map, of nodes that have any, as

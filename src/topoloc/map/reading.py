@@ -65,18 +65,20 @@ def _map_of(file: MapFile) -> TopoMetricMap:
     kinds = _kinds_of(facts, config)
     sides = None
     if file.count(f"{SIDE}nodes") > 0:
-        sides = SideNodes(_stored_summaries(file, SIDE), _stored_nodes(file, config.features.kind, SIDE), _stored_models(file, SIDE))
+        sides = SideNodes(
+            _stored_summaries(file, SIDE), _stored_nodes(file, config.features.kind, SIDE), _Keyed(file, f"{SIDE}coarse_models", _model_of)
+        )
     return TopoMetricMap(
         summaries=_stored_summaries(file),
         nodes=_stored_nodes(file, config.features.kind),
         edges=[Edge(row["source_id"], row["target_id"]) for row in file.rows("edges")],
         place_images=_Stored(partial(file.count, "place_images"), partial(_image_at, file)),
-        coarse_models=_stored_models(file),
+        coarse_models=_Keyed(file, "coarse_models", _model_of),
         config=config,
         length_m=value_from(float, json_of(facts["length_m"]), "length_m"),
         default_coarse=value_from(str, json_of(facts.get("default_coarse", '"surf-vlad"')), "default_coarse"),
         shared_errors=_shared_errors_of(facts.get("shared_errors")),
-        repetitions=_repetitions_of(file, facts.get("repetitions")),
+        repetitions=Repetitions(facts["repetitions"], _Keyed(file, "repetitions", _moves_of)) if "repetitions" in facts else None,
         sides=sides,
         sessions=list(_sessions_of(file).values()),
         edits=[Edit(*row.values()) for row in file.rows("edits")],
@@ -286,24 +288,17 @@ class _Keyed(Mapping[K, V]):
             return self._read(_found(self._file.row(self._table, **{self._key: key}), f"{self._table} {key}"))
 
 
-def _stored_models(file: MapFile, prefix: str = "") -> Mapping[str, CoarseModel]:
-    def read(row: dict[str, Any]) -> CoarseModel:
-        name, settings = row["name"], json_of(row["settings"])
-        if not isinstance(settings, dict):
-            raise Damage(f"the settings of coarse localizer {name} are none")
-        return CoarseModel(name, settings, arrays_from(row["arrays"], f"coarse localizer {name}"))
-
-    return _Keyed(file, f"{prefix}coarse_models", read)
+def _model_of(row: dict[str, Any]) -> CoarseModel:
+    name, settings = row["name"], json_of(row["settings"])
+    if not isinstance(settings, dict):
+        raise Damage(f"the settings of coarse localizer {name} are none")
+    return CoarseModel(name, settings, arrays_from(row["arrays"], f"coarse localizer {name}"))
 
 
-def _repetitions_of(file: MapFile, digest: str | None) -> Repetitions | None:
-    def read(row: dict[str, Any]) -> np.ndarray:
-        num_moves = count_within(row["num_moves"], 1, _MAX_MOVES, f"the repetitions of node {row['node_id']}")
-        size = len(row["moves"]) // num_moves
-        moves = [pose_from(row["moves"][k * size : (k + 1) * size]).matrix() for k in range(num_moves)]
-        return np.array(moves)
-
-    return None if digest is None else Repetitions(value_from(str, digest, "repetitions"), _Keyed(file, "repetitions", read))
+def _moves_of(row: dict[str, Any]) -> np.ndarray:
+    num_moves = count_within(row["num_moves"], 1, _MAX_MOVES, f"the repetitions of node {row['node_id']}")
+    size = len(row["moves"]) // num_moves
+    return np.array([pose_from(row["moves"][k * size : (k + 1) * size]).matrix() for k in range(num_moves)])
 
 
 def _found(row: dict[str, Any] | None, what: str) -> dict[str, Any]:
