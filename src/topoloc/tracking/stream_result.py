@@ -11,7 +11,7 @@ from jaxtyping import Float
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization, NotLocalized
 
-State = Literal["localized", "tracked", "predicted", "lost"]
+State = Literal["localized", "tracked", "predicted", "ambiguous", "lost"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from topoloc.tracking.motion_gate import GateConfig, MotionGate
 
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3
-from topoloc.tracking.motion_gate import GateConfig, MotionGate
 
 SIGMA = np.diag(np.full(6, 1e-4))
 SECOND = 1_000_000_000
