@@ -45,8 +45,6 @@ class HypothesesConfig:
     """The heaviest hypotheses are kept, so many ..."""
     min_weight: Annotated[float, Between(0, 0.1)] = 0.002
     """... of at least this share of all weight."""
-    alternative_sigma: Annotated[float, Above(0)] = 0.03
-    """Of an alternative's pose, whose errors are not told; metres and radians."""
     max_predicted: Annotated[float, AtLeast(0)] = 1.0
     """Seconds without a measured pose after which a hypothesis is given up ..."""
     max_predicted_with_odometry: Annotated[float, AtLeast(0)] = 20.0
@@ -126,7 +124,7 @@ class PoseHypotheses:
         found: list[Alternative] = []
         for one in self._alive:
             pose = one.now.world_from_cam
-            known = next((k for k, other in enumerate(found) if _is_same_place(other.world_from_cam, pose)), None)
+            known = next((k for k, other in enumerate(found) if is_same_place(other.world_from_cam, pose)), None)
             if known is None:
                 found.append(Alternative(pose, one.weight, one.node_id))
             else:
@@ -235,7 +233,7 @@ def _is_same_motion(a: MotionState, b: MotionState) -> bool:
     return float(error @ np.linalg.solve(a.covariance + b.covariance, error)) < 6.0
 
 
-def _is_same_place(a: Rigid3, b: Rigid3) -> bool:
+def is_same_place(a: Rigid3, b: Rigid3) -> bool:
     """As near as two right answers can be (`Localization.probability`)."""
     return translation_error(a, b) < 0.25 and (a.inverse() @ b).angle() < math.radians(5.0)
 

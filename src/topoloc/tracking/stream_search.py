@@ -2,27 +2,43 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.geometry.pose_covariance import covariance_of_inverse
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.result import Alternative, Localization, NotLocalized
 from topoloc.localization.seen_points import SeenPoints
+from topoloc.localization.trace import Trace
 from topoloc.tracking.pose_errors import PoseErrors, errors_of
-from topoloc.tracking.pose_hypotheses import Candidate, PoseHypotheses
+from topoloc.tracking.pose_hypotheses import Candidate, PoseHypotheses, is_same_place
 from topoloc.tracking.tracker_state import StreamPicture
 
 
 @dataclass(frozen=True, eq=False)
+class Expected:
+    """About where the picture was taken. `doubt`: what that is wrong by beside what the filter knows of (covariance, left, of cam_from_world).
+
+    Who asks around there alone finds only what is there: `is_enough` where the motion tells that well enough from what is not.
+    """
+
+    world_from_cam: Rigid3
+    doubt: Float[np.ndarray, "6 6"]
+    is_followed: bool
+    is_enough: bool
+
+
+@dataclass(frozen=True, eq=False)
 class Found:
-    """A picture localized as the heaviest hypothesis has it."""
+    """A pose that the picture may have, with its probability, the points that it stands on, and what it is wrong by."""
 
     result: Localization
     seen: SeenPoints
     errors: PoseErrors
+    probability: float
 
 
 class StreamSearch:
@@ -31,43 +47,70 @@ class StreamSearch:
     def __init__(self, localizer: Localizer, hypotheses: PoseHypotheses, floor_share: float) -> None:
         self._localizer, self._hypotheses, self._floor_share = localizer, hypotheses, floor_share
 
-    def find(self, picture: StreamPicture, near: Rigid3 | None, doubt: Float[np.ndarray, "6 6"], is_followed: bool) -> Found | NotLocalized:
-        """What is believed of this picture, or why nothing is.
+    def find(self, picture: StreamPicture, expected: Expected | None) -> Found | NotLocalized:
+        """What is believed of this picture, or why nothing is: around what is expected, then in all of the map."""
+        doubt = np.zeros((6, 6)) if expected is None else expected.doubt
+        around: list[Found] | None = None
+        if expected is not None and expected.is_enough:
+            refusal, around = self._ask(picture, expected.world_from_cam)
+            if expected.is_followed and not around:
+                return refusal or NotLocalized("not_in_map")
+        if around is not None and len(around) == 1 and self._follows(around[0], doubt):
+            refusal, found = None, around
+        else:
+            refusal, found = self._ask(picture, None)
+            if len(found) != 1 and expected is not None:
+                found = _with(found, around if around is not None else self._ask(picture, expected.world_from_cam)[1])
+        candidates = [Candidate(one.result.world_from_cam, one.errors.whole + doubt, one.probability, one.result.node_id) for one in found]
+        self._hypotheses.weigh(picture.t_ns, candidates, picture.odom_from_cam)
+        if self._hypotheses.taken is not None:
+            return found[self._hypotheses.taken]
+        return refusal or refused(found[0].result)
 
-        Around `near` alone a pose that follows is enough. Where it does not, all that the map has is asked: who knows where to look finds only
-        what is there. `doubt` is the covariance of the prediction beside that of the filter; with followed points a failure costs no more time.
-        """
-        found = self._ask(picture, near)
-        if near is not None and not (isinstance(found, NotLocalized) and is_followed) and not self._follows(found, doubt):
-            found = self._ask(picture, None)
-        self._hypotheses.weigh(picture.t_ns, self._candidates(found, doubt), picture.odom_from_cam)
-        if self._hypotheses.taken is None:
-            return refused(found.result) if isinstance(found, Found) else found
-        if isinstance(found, Found):
-            return found
-        around = self._ask(picture, self._hypotheses.best.world_from_cam)
-        return around if self._follows(around, np.zeros((6, 6))) else found
-
-    def _ask(self, picture: StreamPicture, near: Rigid3 | None) -> Found | NotLocalized:
-        result, seen = self._localizer.localize_near(picture.image, picture.camera, near)
-        if isinstance(result, NotLocalized):
-            return result
-        assert seen is not None, "points are seen where a pose was found"
-        depth = float(np.median(result.world_from_cam.inverse().apply(seen.points_world)[:, 2]))
-        return Found(result, seen, errors_of(result, depth, self._floor_share))
-
-    def _follows(self, found: Found | NotLocalized, doubt: Float[np.ndarray, "6 6"]) -> bool:
-        if isinstance(found, NotLocalized) or not self._hypotheses.is_alive:
-            return False
+    def _follows(self, found: Found, doubt: Float[np.ndarray, "6 6"]) -> bool:
         return self._hypotheses.follows(self._hypotheses.best, found.result.world_from_cam, found.errors.whole + doubt)
 
-    def _candidates(self, found: Found | NotLocalized, doubt: Float[np.ndarray, "6 6"]) -> list[Candidate]:
-        """A localization stands alone: its probability is also that of being precise, which is none of other places."""
-        config = self._hypotheses.config
-        if isinstance(found, Found):
-            return [Candidate(found.result.world_from_cam, found.errors.whole + doubt, 1.0 - config.miss, found.result.node_id)]
-        covariance = config.alternative_sigma**2 * np.eye(6) + doubt
-        return [Candidate(one.world_from_cam, covariance, one.probability, one.node_id) for one in found.alternatives]
+    def _ask(self, picture: StreamPicture, near: Rigid3 | None) -> tuple[NotLocalized | None, list[Found]]:
+        """The poses that the picture may have: one, the alternatives of an ambiguous one, or none and why."""
+        trace = Trace()
+        result, seen = self._localizer.localize_near(picture.image, picture.camera, near, trace=trace)
+        if isinstance(result, NotLocalized):
+            return result, [self._alternative(picture, result, one, trace) for one in result.alternatives]
+        assert seen is not None, "points are seen where a pose was found"
+        # its probability is also that of being precise, which says nothing of other places
+        return None, [self._found(result, seen, 1.0 - self._hypotheses.config.miss)]
+
+    def _alternative(self, picture: StreamPicture, asked: NotLocalized, one: Alternative, trace: Trace) -> Found:
+        pose = one.world_from_cam.matrix()
+        hypotheses = [tried.hypothesis for tried in trace.tried if tried.hypothesis is not None]
+        hypothesis = next(other for other in hypotheses if np.array_equal(other.world_from_cam.matrix(), pose))
+        seen = hypothesis.fit.seen_points(picture.camera.width / hypothesis.fit.camera.width)
+        assert seen is not None, "an alternative has a pose"
+        result = Localization(
+            one.world_from_cam,
+            covariance_of_inverse(one.world_from_cam.inverse(), hypothesis.covariance),
+            one.probability,
+            one.node_id,
+            asked.candidates,
+            len(hypothesis.fit.matches),
+            hypothesis.fit.num_inliers,
+            asked.times_ms,
+            noise_share=hypothesis.noise_share,
+        )
+        return self._found(result, seen, one.probability)
+
+    def _found(self, result: Localization, seen: SeenPoints, probability: float) -> Found:
+        depth = float(np.median(result.world_from_cam.inverse().apply(seen.points_world)[:, 2]))
+        return Found(result, seen, errors_of(result, depth, self._floor_share), probability)
+
+
+def _with(found: list[Found], around: list[Found]) -> list[Found]:
+    """Alternatives and what the search missed, which is as likely as they are in the mean."""
+    poses = [one.result.world_from_cam for one in found]
+    missed = [one for one in around if not any(is_same_place(one.result.world_from_cam, pose) for pose in poses)]
+    whole = len(found) + len(missed)
+    shares = [one.probability * len(found) / whole for one in found] + [1.0 / whole] * len(missed)
+    return [replace(one, probability=share) for one, share in zip([*found, *missed], shares, strict=True)]
 
 
 def refused(found: Localization) -> NotLocalized:

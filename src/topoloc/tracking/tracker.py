@@ -35,7 +35,7 @@ from topoloc.tracking.pose_errors import lasting_change, noise_floor
 from topoloc.tracking.pose_hypotheses import HypothesesConfig, PoseHypotheses
 from topoloc.tracking.pose_window import PoseWindow, PoseWindowConfig
 from topoloc.tracking.stream_result import StreamedPose
-from topoloc.tracking.stream_search import Found, StreamSearch, refused
+from topoloc.tracking.stream_search import Expected, Found, StreamSearch, refused
 from topoloc.tracking.tracker_state import Reference, StreamPicture, doubt_of, reduced
 
 
@@ -160,7 +160,7 @@ class Tracker:
             self._hypotheses.move(self._blended(followed, picture.t_ns).inverse(), followed.covariance, picture.odom_from_cam)
         if followed is None or self._is_due(followed, picture):
             self._attempt_ns = picture.t_ns
-            found = self._search.find(picture, self._expected(predicted, followed), self._doubt(followed), followed is not None)
+            found = self._search.find(picture, self._expected(predicted, followed))
             if isinstance(found, Found):
                 return self._decided(self._believe(picture, found, predicted, followed, seconds))
             if followed is None or not self._hypotheses.continues:
@@ -197,21 +197,18 @@ class Tracker:
         is_old = picture.t_ns - reference.t_ns >= config.localize_every * 1e9
         return is_old or followed.share_left < config.min_share_left or followed.shift_px > config.max_shift * picture.grey_camera.width
 
-    def _expected(self, predicted: MotionState | None, followed: Followed | None) -> Rigid3 | None:
-        """About where the picture was taken, where that is known well enough to ask around it alone."""
-        reference = self._reference
-        if reference is None or predicted is None or self._hypotheses.has_rivals:
+    def _expected(self, predicted: MotionState | None, followed: Followed | None) -> Expected | None:
+        """About where the picture was taken; a followed pose is wrong by its reference's errors and by wrong depths, too."""
+        reference, is_alone = self._reference, not self._hypotheses.has_rivals
+        if reference is None or predicted is None:
             return None
-        if followed is not None:
-            return (followed.cam_from_ref @ reference.cam_from_world).inverse()
-        return predicted.world_from_cam if doubt_of(predicted, reference.errors.depth) <= self.config.max_doubt else None
-
-    def _doubt(self, followed: Followed | None) -> Float[np.ndarray, "6 6"]:
-        """What a followed pose is wrong by beside what the points say: the reference's errors, and wrong depths."""
-        if followed is None or self._reference is None:
-            return np.zeros((6, 6))
+        if followed is None:
+            is_known = doubt_of(predicted, reference.errors.depth) <= self.config.max_doubt
+            return Expected(predicted.world_from_cam, np.zeros((6, 6)), is_followed=False, is_enough=is_known and is_alone)
         motion, scale = followed.cam_from_ref.adjoint(), self.config.hypotheses.prediction_scale
-        return motion @ self._reference.errors.whole @ motion.T + scale**2 * self._followed_covariance(followed)
+        doubt = motion @ reference.errors.whole @ motion.T + scale**2 * self._followed_covariance(followed)
+        near = (followed.cam_from_ref @ reference.cam_from_world).inverse()
+        return Expected(near, doubt, is_followed=True, is_enough=is_alone)
 
     def _believe(
         self, picture: StreamPicture, found: Found, predicted: MotionState | None, followed: Followed | None, seconds: float
