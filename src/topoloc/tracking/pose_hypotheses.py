@@ -35,16 +35,20 @@ class HypothesesConfig:
     """Squared Mahalanobis distance from the prediction (chi^2 with 6 degrees of freedom: 1 in 100,000) beyond which a pose does not follow."""
     prediction_scale: Annotated[float, Above(0)] = 2.5
     """By how much the prediction may be more wrong than its sigma says: hands jerk, wheels meet kerbs."""
-    min_probability: Annotated[float, Between(0.5, 1)] = 0.9
+    min_probability: Annotated[float, Between(0.5, 1)] = 0.95
     """A hypothesis that has so much of all weight is the pose; while none has, the answer is `ambiguous`."""
     miss: Annotated[float, Between(1e-6, 0.5)] = 0.02
-    """Probability that a picture's answer misses the true pose, at least."""
+    """Probability that a localization is wrong ..."""
+    miss_ambiguous: Annotated[float, Between(1e-6, 0.5)] = 0.1
+    """... and that the true pose is not among alternatives, at least."""
     elsewhere: Annotated[float, Between(1e-9, 0.5)] = 0.001
     """Probability that the camera is at none of the hypotheses, at least: it was carried, or all of them are wrong."""
     max_number: Annotated[int, Between(1, 1000)] = 24
     """The heaviest hypotheses are kept, so many ..."""
     min_weight: Annotated[float, Between(0, 0.1)] = 0.002
     """... of at least this share of all weight."""
+    max_asked: Annotated[int, AtLeast(0)] = 8
+    """Around so many of them, the heaviest, a picture is sought where the answer leaves them out."""
     max_predicted: Annotated[float, AtLeast(0)] = 1.0
     """Seconds without a measured pose after which a hypothesis is given up ..."""
     max_predicted_with_odometry: Annotated[float, AtLeast(0)] = 20.0
@@ -162,7 +166,8 @@ class PoseHypotheses:
         if not candidates:
             self.continues = self.is_alive
             return
-        none = max(self.config.miss, 1.0 - sum(one.probability for one in candidates))
+        miss = self.config.miss if len(candidates) == 1 else self.config.miss_ambiguous
+        none = max(miss, 1.0 - sum(one.probability for one in candidates))
         new: list[_Hypothesis] = []
         for one in self._alive:
             children = [self._taking(one, number, candidate, odom_from_cam) for number, candidate in enumerate(candidates)]

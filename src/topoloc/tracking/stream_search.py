@@ -50,22 +50,34 @@ class StreamSearch:
     def find(self, picture: StreamPicture, expected: Expected | None) -> Found | NotLocalized:
         """What is believed of this picture, or why nothing is: around what is expected, then in all of the map."""
         doubt = np.zeros((6, 6)) if expected is None else expected.doubt
-        around: list[Found] | None = None
+        refusal, found = None, list[Found]()
         if expected is not None and expected.is_enough:
-            refusal, around = self._ask(picture, expected.world_from_cam)
-            if expected.is_followed and not around:
-                return refusal or NotLocalized("not_in_map")
-        if around is not None and len(around) == 1 and self._follows(around[0], doubt):
-            refusal, found = None, around
-        else:
-            refusal, found = self._ask(picture, None)
-            if len(found) != 1 and expected is not None:
-                found = _with(found, around if around is not None else self._ask(picture, expected.world_from_cam)[1])
+            refusal, found = self._ask(picture, expected.world_from_cam)
+            if refusal is not None and expected.is_followed:
+                return refusal
+        if len(found) != 1 or not self._follows(found[0], doubt):
+            refusal, found = self._everywhere(picture)
         candidates = [Candidate(one.result.world_from_cam, one.errors.whole + doubt, one.probability, one.result.node_id) for one in found]
         self._hypotheses.weigh(picture.t_ns, candidates, picture.odom_from_cam)
         if self._hypotheses.taken is not None:
             return found[self._hypotheses.taken]
         return refusal or refused(found[0].result)
+
+    def _everywhere(self, picture: StreamPicture) -> tuple[NotLocalized | None, list[Found]]:
+        """As `_ask` in all of the map. Where that does not settle it, also around each hypothesis that the answer leaves out: of many
+        poses that look alike a search finds some. What it left out is as likely as the others are in the mean.
+        """
+        refusal, found = self._ask(picture, None)
+        if refusal is None:
+            return refusal, found
+        missed: list[Found] = []
+        for hypothesis in self._hypotheses.alternatives()[: self._hypotheses.config.max_asked]:
+            if not _is_among(hypothesis.world_from_cam, [*found, *missed]):
+                around = self._ask(picture, hypothesis.world_from_cam)[1]
+                missed += [one for one in around if not _is_among(one.result.world_from_cam, [*found, *missed])]
+        whole = len(found) + len(missed)
+        found = [replace(one, probability=one.probability * len(found) / whole) for one in found]
+        return refusal, found + [replace(one, probability=1.0 / whole) for one in missed]
 
     def _follows(self, found: Found, doubt: Float[np.ndarray, "6 6"]) -> bool:
         return self._hypotheses.follows(self._hypotheses.best, found.result.world_from_cam, found.errors.whole + doubt)
@@ -104,13 +116,8 @@ class StreamSearch:
         return Found(result, seen, errors_of(result, depth, self._floor_share), probability)
 
 
-def _with(found: list[Found], around: list[Found]) -> list[Found]:
-    """Alternatives and what the search missed, which is as likely as they are in the mean."""
-    poses = [one.result.world_from_cam for one in found]
-    missed = [one for one in around if not any(is_same_place(one.result.world_from_cam, pose) for pose in poses)]
-    whole = len(found) + len(missed)
-    shares = [one.probability * len(found) / whole for one in found] + [1.0 / whole] * len(missed)
-    return [replace(one, probability=share) for one, share in zip([*found, *missed], shares, strict=True)]
+def _is_among(world_from_cam: Rigid3, found: list[Found]) -> bool:
+    return any(is_same_place(one.result.world_from_cam, world_from_cam) for one in found)
 
 
 def refused(found: Localization) -> NotLocalized:
