@@ -124,8 +124,8 @@ def test_callers_from_python_are_told_too(tiny_recording: Path):
         topoloc.build_map([], topoloc.BuildConfig(nodes=nodes))
     with pytest.raises(ConfigError, match=r"^LocalizerConfig\.num_candidates: must be from 1"):
         topoloc.Localizer(topomap, topoloc.LocalizerConfig(num_candidates=0))
-    gate = HypothesesConfig(max_surprise=math.nan)
-    with pytest.raises(ConfigError, match=r"^TrackerConfig\.gate\.max_surprise: must be a finite number"):
-        topoloc.Tracker(topoloc.Localizer(topomap), topoloc.TrackerConfig(hypotheses=gate))
+    gating = HypothesesConfig(max_surprise=math.nan)
+    with pytest.raises(ConfigError, match=r"^TrackerConfig\.hypotheses\.max_surprise: must be a finite number"):
+        topoloc.Tracker(topoloc.Localizer(topomap), topoloc.TrackerConfig(hypotheses=gating))
     with pytest.raises(ConfigError, match=r"^SlamConfig\.odometry\.window: must be from 1"):
         run_slam([], SlamConfig(odometry=OdometryConfig(window=0)))

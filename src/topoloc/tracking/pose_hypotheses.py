@@ -1,12 +1,11 @@
 """What is believed of where a stream's camera is: several hypotheses, each with its motion and its weight.
 
-One picture of a place that repeats itself may have been taken at any of several poses, and now and then a picture is placed wrongly. So what
-follows from a picture's answer is not one pose but a set (a multi-hypothesis filter: Reid, *An algorithm for tracking multiple
-targets*, 1979). Each hypothesis predicts the next pose. It gains where the next picture's answer has a pose that follows from it, by the probability of
-that pose and by how little it surprises; where the answer has none, it keeps the small weight of an answer that misses the
-true pose. Poses that follow from nothing begin hypotheses of their own, at the weight of "elsewhere". A camera that was carried elsewhere, a
-stream that was placed wrongly to begin with, and walls of equal panels are all decided so. The motion that followed points show is the
-same for all hypotheses: it moves them together.
+A picture of a place that repeats itself may have been taken at any of several poses, and now and then a picture is placed wrongly. So a
+stream believes not one pose but a set of them (a multi-hypothesis filter: Reid, *An algorithm for tracking multiple targets*, 1979). Each
+hypothesis predicts the next pose. Where the next picture's answer has a pose that follows, it gains by the probability of that pose
+and by how little this surprises; where it has none, the probability of an answer that misses the true pose is left. Poses that follow from
+nothing begin hypotheses at the weight of "elsewhere". So a camera that was carried, a stream that was placed wrongly to begin with, and
+walls of equal panels are decided alike. What followed points show of the motion is true of all hypotheses, and moves them together.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ class HypothesesConfig:
 
     motion: MotionConfig = field(default_factory=MotionConfig)
     max_surprise: Annotated[float, Above(0)] = 33.0
-    """Squared Mahalanobis distance from the prediction (chi^2 with 6 degrees of freedom: 1 in 100,000) beyond which a pose does not follow."""
+    """Squared Mahalanobis distance from the prediction (chi^2 with 6 degrees of freedom: 1 in 100,000), beyond which no pose follows."""
     prediction_scale: Annotated[float, Above(0)] = 2.5
     """By how much the prediction may be more wrong than its sigma says: hands jerk, wheels meet kerbs."""
     min_probability: Annotated[float, Between(0.5, 1)] = 0.95
@@ -69,8 +68,8 @@ class Candidate:
 class _Hypothesis:
     """`state` is of the pose measured last, `odom_from_cam` of that moment, `now` the state at the picture at hand.
 
-    `from_best` takes poses of the best hypothesis into those of this one: where the motion is known, it does not change.
-    `taken` is the number of the candidate that it took last, None where it took none of those.
+    `from_best` takes poses of the best hypothesis into those of this one, whatever the motion since they were compared.
+    `taken` is the number of the candidate that it took of this picture's, None where none.
     """
 
     state: MotionState
@@ -85,7 +84,7 @@ class _Hypothesis:
 class PoseHypotheses:
     """The hypotheses, the heaviest first, and the weight of "elsewhere"; all weights sum to one.
 
-    `continues`: after what was weighed last, the heaviest one is where the one before lets expect.
+    `continues`: the heaviest one is the one that was so before this picture, or follows from it.
     """
 
     def __init__(self, config: HypothesesConfig) -> None:
@@ -95,27 +94,16 @@ class PoseHypotheses:
     def forget(self) -> None:
         """Nothing is known."""
         self._alive: list[_Hypothesis] = []
-        self._elsewhere = 1.0
-        self.continues = False
+        self._elsewhere, self.continues = 1.0, False
 
     @property
-    def is_alive(self) -> bool:
-        """Whether anything is believed."""
-        return bool(self._alive)
-
-    @property
-    def has_rivals(self) -> bool:
-        """Whether there is more than one place."""
-        return len(self.alternatives()) > 1
-
-    @property
-    def best(self) -> MotionState:
-        """The heaviest hypothesis at the picture at hand."""
-        return self._alive[0].now
+    def best(self) -> MotionState | None:
+        """The heaviest hypothesis at the picture at hand; None where the camera is lost."""
+        return self._alive[0].now if self._alive else None
 
     @property
     def taken(self) -> int | None:
-        """Which of the candidates weighed last is that of the heaviest hypothesis."""
+        """The number of the candidate that the heaviest hypothesis took."""
         return self._alive[0].taken if self._alive else None
 
     @property
@@ -140,15 +128,16 @@ class PoseHypotheses:
         return (t_ns - self._alive[0].state.t_ns) / 1e9 if self._alive else float("inf")
 
     def predict(self, t_ns: int, odom_from_cam: Rigid3 | None = None) -> MotionState | None:
-        """Where the best hypothesis has the camera at this time; None where it is lost."""
-        config, alive = self.config, list[_Hypothesis]()
-        for one in self._alive:
+        """Where the best hypothesis has the camera at this time; those not measured for too long are given up."""
+        config, before, alive = self.config, self._alive, list[_Hypothesis]()
+        for one in before:
             before_from_cam = _since(one.odom_from_cam, odom_from_cam)
             limit = config.max_predicted if before_from_cam is None else config.max_predicted_with_odometry
             if t_ns - one.state.t_ns <= limit * 1e9:
                 alive.append(replace(one, now=predict_motion(one.state, t_ns, config.motion, before_from_cam), taken=None))
-        self._keep(alive, self._elsewhere if alive else 1.0)
-        return self._alive[0].now if self._alive else None
+        self.continues = bool(alive) and alive[0].state is before[0].state
+        self._keep(alive, self._elsewhere)
+        return self.best
 
     def follows(self, predicted: MotionState, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"]) -> bool:
         """Whether this pose can follow from a prediction."""
@@ -162,31 +151,28 @@ class PoseHypotheses:
             self._alive[k] = replace(one, state=now, now=now, odom_from_cam=odom_from_cam)
 
     def weigh(self, t_ns: int, candidates: Sequence[Candidate], odom_from_cam: Rigid3 | None = None) -> None:
-        """What the picture's answer makes of the hypotheses. Both exclude each other; where there are no candidates, nothing is learnt."""
+        """What the picture's answer makes of the hypotheses. The candidates exclude each other; where there are none, nothing is learnt."""
         if not candidates:
-            self.continues = self.is_alive
             return
-        miss = self.config.miss if len(candidates) == 1 else self.config.miss_ambiguous
+        before, miss = self.best, self.config.miss if len(candidates) == 1 else self.config.miss_ambiguous
         none = max(miss, 1.0 - sum(one.probability for one in candidates))
         new: list[_Hypothesis] = []
         for one in self._alive:
-            children = [self._taking(one, number, candidate, odom_from_cam) for number, candidate in enumerate(candidates)]
-            children = [child for child in children if child is not None]
-            new += children
-            if len(candidates) > 1 or not children:
-                new.append(replace(one, weight=one.weight * none))
+            taking = [self._taking(one, number, candidate, odom_from_cam) for number, candidate in enumerate(candidates)]
+            children = [child for child in taking if child is not None]
+            is_settled = len(candidates) == 1 and len(children) == 1
+            new += children if is_settled else [*children, replace(one, weight=one.weight * none)]
         for number, candidate in enumerate(candidates):
             weight = self._elsewhere * candidate.probability
-            of_it = [k for k, one in enumerate(new) if one.taken == number]
-            if of_it:
-                heaviest = max(of_it, key=lambda k: new[k].weight)
-                new[heaviest] = replace(new[heaviest], weight=new[heaviest].weight + weight)
+            heaviest = max((one for one in new if one.taken == number), key=lambda one: one.weight, default=None)
+            if heaviest is not None:
+                new[new.index(heaviest)] = replace(heaviest, weight=heaviest.weight + weight)
             else:
                 state = start_motion(t_ns, candidate.world_from_cam, candidate.covariance, self.config.motion)
                 new.append(_Hypothesis(state, odom_from_cam, state, weight, candidate.node_id, Rigid3.identity(), number))
-        before = self._alive[0].now if self._alive else None
         self._keep(_merged(new), self._elsewhere * none)
-        self.continues = before is not None and self.follows(before, self.best.world_from_cam, self.best.pose_covariance)
+        best = self._alive[0].now
+        self.continues = before is not None and self.follows(before, best.world_from_cam, best.pose_covariance)
         self._compare()
 
     def correct(self, state: MotionState, odom_from_cam: Rigid3 | None) -> None:
@@ -208,16 +194,15 @@ class PoseHypotheses:
         config = self.config
         whole = sum(one.weight for one in hypotheses) + elsewhere
         heaviest = sorted(hypotheses, key=lambda one: -one.weight)[: config.max_number]
-        kept = [one for one in heaviest if one.weight >= config.min_weight * whole]
+        kept = [one for one in heaviest if one.weight >= config.min_weight * whole] or heaviest[:1]
         self._elsewhere = max(elsewhere / whole, config.elsewhere) if kept else 1.0
         share = (1.0 - self._elsewhere) / max(sum(one.weight for one in kept), 1e-300)
         self._alive = [replace(one, weight=share * one.weight) for one in kept]
 
     def _compare(self) -> None:
         """From where the best hypothesis is to where each is."""
-        if self._alive:
-            best_from_world = self.best.world_from_cam.inverse()
-            self._alive = [replace(one, from_best=one.now.world_from_cam @ best_from_world) for one in self._alive]
+        best_from_world = self._alive[0].now.world_from_cam.inverse()
+        self._alive = [replace(one, from_best=one.now.world_from_cam @ best_from_world) for one in self._alive]
 
 
 def _merged(hypotheses: list[_Hypothesis]) -> list[_Hypothesis]:

@@ -20,9 +20,9 @@ from topoloc.tracking.tracker_state import StreamPicture
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """About where the picture was taken. `doubt`: what that is wrong by beside what the filter knows of (covariance, left, of cam_from_world).
+    """About where the picture was taken, and what that is wrong by beside what the filter knows of (covariance, left, of cam_from_world).
 
-    Who asks around there alone finds only what is there: `is_enough` where the motion tells that well enough from what is not.
+    Who asks around there alone finds only what is there; `is_enough` where nothing else is likely.
     """
 
     world_from_cam: Rigid3
@@ -80,7 +80,8 @@ class StreamSearch:
         return refusal, found + [replace(one, probability=1.0 / whole) for one in missed]
 
     def _follows(self, found: Found, doubt: Float[np.ndarray, "6 6"]) -> bool:
-        return self._hypotheses.follows(self._hypotheses.best, found.result.world_from_cam, found.errors.whole + doubt)
+        best = self._hypotheses.best
+        return best is not None and self._hypotheses.follows(best, found.result.world_from_cam, found.errors.whole + doubt)
 
     def _ask(self, picture: StreamPicture, near: Rigid3 | None) -> tuple[NotLocalized | None, list[Found]]:
         """The poses that the picture may have: one, the alternatives of an ambiguous one, or none and why."""

@@ -36,7 +36,7 @@ from topoloc.tracking.pose_hypotheses import HypothesesConfig, PoseHypotheses
 from topoloc.tracking.pose_window import PoseWindow, PoseWindowConfig
 from topoloc.tracking.stream_result import StreamedPose
 from topoloc.tracking.stream_search import Expected, Found, StreamSearch, refused
-from topoloc.tracking.tracker_state import Reference, StreamPicture, doubt_of, reduced
+from topoloc.tracking.tracker_state import Reference, StreamPicture, doubt_of, reduced, smoothed_covariance
 
 
 @dataclass(frozen=True)
@@ -128,6 +128,7 @@ class Tracker:
         if self.config.mode == "paper":
             return self._copied(result, t_ns)
         self._hypotheses.predict(t_ns, odom_from_cam)
+        self._keep_reference()
         return self._decided(self._without_pose(result, t_ns))
 
     def _advance(self, t_ns: int, may_stand_still: bool = False) -> None:
@@ -154,6 +155,7 @@ class Tracker:
         clock = StageClock()
         seconds = self._hypotheses.seconds_since(picture.t_ns)
         predicted = self._hypotheses.predict(picture.t_ns, picture.odom_from_cam)
+        self._keep_reference()
         with clock.stage("tracking"):
             followed = self._follow(picture, predicted)
         if followed is not None:
@@ -161,19 +163,25 @@ class Tracker:
         if followed is None or self._is_due(followed, picture):
             self._attempt_ns = picture.t_ns
             found = self._search.find(picture, self._expected(predicted, followed))
+            self._keep_reference()
             if isinstance(found, Found):
                 return self._decided(self._believe(picture, found, predicted, followed, seconds))
-            if followed is None or not self._hypotheses.continues:
+            if followed is None or self._reference is None:
                 return self._decided(self._without_pose(found, picture.t_ns))
         return self._decided(self._tracked(picture, followed, clock))
+
+    def _keep_reference(self) -> None:
+        """Only while its hypothesis is the heaviest."""
+        if not self._hypotheses.continues:
+            self._reference = None
+            self._window.clear()
 
     def _decided(self, answer: StreamedPose) -> StreamedPose:
         """The answer where one hypothesis leads; else that it may be any of them."""
         if self._hypotheses.is_decided:
             return answer
-        old, detail = answer.result, "the pictures so far leave open which of these"
-        alternatives = self._hypotheses.alternatives()
-        result = NotLocalized("ambiguous", old.candidates, old.num_matches, old.num_inliers, old.times_ms, detail, alternatives)
+        detail, alternatives = "the pictures so far leave open which of these", self._hypotheses.alternatives()
+        result = NotLocalized("ambiguous", times_ms=answer.result.times_ms, detail=detail, alternatives=alternatives)
         return StreamedPose(answer.t_ns, "ambiguous", result)
 
     def _follow(self, picture: StreamPicture, predicted: MotionState | None) -> Followed | None:
@@ -199,7 +207,7 @@ class Tracker:
 
     def _expected(self, predicted: MotionState | None, followed: Followed | None) -> Expected | None:
         """About where the picture was taken; a followed pose is wrong by its reference's errors and by wrong depths, too."""
-        reference, is_alone = self._reference, not self._hypotheses.has_rivals
+        reference, is_alone = self._reference, len(self._hypotheses.alternatives()) == 1
         if reference is None or predicted is None:
             return None
         if followed is None:
@@ -216,8 +224,7 @@ class Tracker:
         """The answer that a full localization gives, `seconds` after the pose measured before."""
         cam_from_world, errors = found.result.world_from_cam.inverse(), found.errors
         t_ns, offset = picture.t_ns, Rigid3.identity()
-        if predicted is None or self._reference is None or not self._hypotheses.continues:
-            self._window.clear()
+        if predicted is None or self._reference is None:
             smoothed, doubt = self._window.add(cam_from_world, errors.noise, Rigid3.identity(), errors.noise)
         else:
             motion, motion_covariance = self._motion(predicted, followed)
@@ -226,14 +233,16 @@ class Tracker:
             if followed is None and np.trace(motion_covariance) >= np.trace(errors.noise):
                 self._window.clear()  # a guess from the poses before says nothing new of this one
             smoothed, doubt = self._window.add(cam_from_world, errors.noise, motion, motion_covariance)
-            offset = offset if before is None else self._faded(before @ smoothed.inverse(), seconds)
+            if before is not None:
+                offset = self._faded(before @ smoothed.inverse(), seconds)
             measured = errors.noise if followed is None else followed.covariance
             self._hypotheses.correct(update_motion(predicted, (offset @ smoothed).inverse(), measured), picture.odom_from_cam)
         points = found.seen.in_image(picture.grey_camera.width / picture.camera.width)
         follower = PointFollower(picture.grey, points, cam_from_world, picture.grey_camera, self.config.following)
         self._reference = Reference(t_ns, found.result, cam_from_world, errors, smoothed, doubt + errors.lasting, offset, follower)
-        state = self._hypotheses.best
-        return StreamedPose(t_ns, "localized", found.result, state.world_from_cam, self._covariance(self._reference))
+        best = self._hypotheses.best
+        assert best is not None
+        return StreamedPose(t_ns, "localized", found.result, best.world_from_cam, smoothed_covariance(self._reference))
 
     def _blended(self, followed: Followed, t_ns: int) -> Rigid3:
         """The smoothed cam_from_world of a followed picture."""
@@ -254,6 +263,7 @@ class Tracker:
     def _tracked(self, picture: StreamPicture, followed: Followed, clock: StageClock) -> StreamedPose:
         reference, state = self._reference, self._hypotheses.best
         assert reference is not None
+        assert state is not None
         world_from_cam = (followed.cam_from_ref @ reference.cam_from_world).inverse()
         adjoint, motion = world_from_cam.adjoint(), followed.cam_from_ref.adjoint()
         covariance = adjoint @ (motion @ reference.errors.whole @ motion.T + followed.covariance) @ adjoint.T
@@ -268,26 +278,14 @@ class Tracker:
             num_inliers=followed.num_agreeing,
             times_ms=clock.times_ms(),
         )
-        return StreamedPose(picture.t_ns, "tracked", result, state.world_from_cam, self._covariance(reference, state))
+        return StreamedPose(picture.t_ns, "tracked", result, state.world_from_cam, smoothed_covariance(reference, state))
 
     def _without_pose(self, result: NotLocalized, t_ns: int) -> StreamedPose:
         """Predicted for a while, then lost."""
-        if not self._hypotheses.is_alive:
-            self._reference = None
-            return StreamedPose(t_ns, "lost", result)
         predicted = self._hypotheses.best
-        return StreamedPose(t_ns, "predicted", result, predicted.world_from_cam, self._covariance(self._reference, predicted))
-
-    def _covariance(self, reference: Reference | None, since: MotionState | None = None) -> Float[np.ndarray, "6 6"]:
-        """Of the left perturbation of world_from_cam: what the picture localized last is wrong by, and the motion since."""
-        covariance = np.zeros((6, 6))
-        if reference is not None:
-            adjoint = reference.smoothed.inverse().adjoint()
-            covariance = adjoint @ reference.covariance @ adjoint.T
-        if since is None:
-            return covariance
-        adjoint = since.world_from_cam.adjoint()
-        return covariance + adjoint @ since.pose_covariance @ adjoint.T
+        if predicted is None:
+            return StreamedPose(t_ns, "lost", result)
+        return StreamedPose(t_ns, "predicted", result, predicted.world_from_cam, smoothed_covariance(self._reference, predicted))
 
     def _followed_covariance(self, followed: Followed) -> Float[np.ndarray, "6 6"]:
         """Of a followed motion: what the points say, and what wrong depths make of it, in proportion to the motion."""
