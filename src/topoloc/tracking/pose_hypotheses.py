@@ -4,8 +4,9 @@ A picture of a place that repeats itself may have been taken at any of several p
 stream believes not one pose but a set of them (a multi-hypothesis filter: Reid, *An algorithm for tracking multiple targets*, 1979). Each
 hypothesis predicts the next pose. Where the next picture's answer has a pose that follows, it gains by the probability of that pose
 and by how little this surprises; where it has none, the probability of an answer that misses the true pose is left. Poses that follow from
-nothing begin hypotheses at the weight of "elsewhere". So a camera that was carried, a stream that was placed wrongly to begin with, and
-walls of equal panels are decided alike. What followed points show of the motion is true of all hypotheses, and moves them together.
+nothing begin hypotheses at the weight of "elsewhere". Alternatives of two pictures taken close together err alike: what they say counts by
+the share of it that is new. So a camera that was carried, a stream that was placed wrongly to begin with, and walls of equal panels are
+decided alike. What followed points show of the motion is true of all hypotheses, and moves them together.
 """
 
 from __future__ import annotations
@@ -40,6 +41,8 @@ class HypothesesConfig:
     """Probability that a localization is wrong ..."""
     miss_ambiguous: Annotated[float, Between(1e-6, 0.5)] = 0.1
     """... and that the true pose is not among alternatives, at least."""
+    renewal: Annotated[float, Above(0)] = 0.5
+    """Motion (way in depths of the points, plus radians) after which what alternatives say is new (but for 1/e)."""
     elsewhere: Annotated[float, Between(1e-9, 0.5)] = 0.001
     """Probability that the camera is at none of the hypotheses, at least: it was carried, or all of them are wrong."""
     max_number: Annotated[int, Between(1, 1000)] = 24
@@ -150,8 +153,11 @@ class PoseHypotheses:
             now = update_motion(one.now, one.from_best @ world_from_cam, covariance)
             self._alive[k] = replace(one, state=now, now=now, odom_from_cam=odom_from_cam)
 
-    def weigh(self, t_ns: int, candidates: Sequence[Candidate], odom_from_cam: Rigid3 | None = None) -> None:
-        """What the picture's answer makes of the hypotheses. The candidates exclude each other; where there are none, nothing is learnt."""
+    def weigh(self, t_ns: int, candidates: Sequence[Candidate], odom_from_cam: Rigid3 | None = None, share_new: float = 1.0) -> None:
+        """What the picture's answer makes of the hypotheses, if this share of what it says is new.
+
+        The candidates exclude each other; where there are none, nothing is learnt.
+        """
         if not candidates:
             return
         before, miss = self.best, self.config.miss if len(candidates) == 1 else self.config.miss_ambiguous
@@ -160,17 +166,19 @@ class PoseHypotheses:
         for one in self._alive:
             taking = [self._taking(one, number, candidate, odom_from_cam) for number, candidate in enumerate(candidates)]
             children = [child for child in taking if child is not None]
-            is_settled = len(candidates) == 1 and len(children) == 1
-            new += children if is_settled else [*children, replace(one, weight=one.weight * none)]
+            if len(candidates) > 1 or not children:
+                children.append(replace(one, weight=one.weight * none))
+            gain = sum(child.weight for child in children) / one.weight
+            new += [replace(child, weight=child.weight * gain ** (share_new - 1.0)) for child in children]
         for number, candidate in enumerate(candidates):
-            weight = self._elsewhere * candidate.probability
+            weight = self._elsewhere * candidate.probability * share_new
             heaviest = max((one for one in new if one.taken == number), key=lambda one: one.weight, default=None)
             if heaviest is not None:
                 new[new.index(heaviest)] = replace(heaviest, weight=heaviest.weight + weight)
             else:
                 state = start_motion(t_ns, candidate.world_from_cam, candidate.covariance, self.config.motion)
                 new.append(_Hypothesis(state, odom_from_cam, state, weight, candidate.node_id, Rigid3.identity(), number))
-        self._keep(_merged(new), self._elsewhere * none)
+        self._keep(_merged(new), self._elsewhere * none**share_new)
         best = self._alive[0].now
         self.continues = before is not None and self.follows(before, best.world_from_cam, best.pose_covariance)
         self._compare()
@@ -186,7 +194,7 @@ class PoseHypotheses:
         if not self.follows(one.now, pose, covariance):
             return None
         state = update_motion(one.now, pose, covariance)
-        weight = one.weight * candidate.probability * math.exp(-0.5 * surprise(one.now, pose, covariance))
+        weight = one.weight * candidate.probability * max(math.exp(-0.5 * surprise(one.now, pose, covariance)), 1e-100)
         return _Hypothesis(state, odom_from_cam, state, weight, candidate.node_id, one.from_best, number)
 
     def _keep(self, hypotheses: list[_Hypothesis], elsewhere: float) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -46,6 +47,7 @@ class StreamSearch:
 
     def __init__(self, localizer: Localizer, hypotheses: PoseHypotheses, floor_share: float) -> None:
         self._localizer, self._hypotheses, self._floor_share = localizer, hypotheses, floor_share
+        self._asked_at: Rigid3 | None = None  # where the last ambiguous picture was taken
 
     def find(self, picture: StreamPicture, expected: Expected | None) -> Found | NotLocalized:
         """What is believed of this picture, or why nothing is: around what is expected, then in all of the map."""
@@ -58,10 +60,22 @@ class StreamSearch:
         if len(found) != 1 or not self._follows(found[0], doubt):
             refusal, found = self._everywhere(picture)
         candidates = [Candidate(one.result.world_from_cam, one.errors.whole + doubt, one.probability, one.result.node_id) for one in found]
-        self._hypotheses.weigh(picture.t_ns, candidates, picture.odom_from_cam)
+        self._hypotheses.weigh(picture.t_ns, candidates, picture.odom_from_cam, self._share_new(found))
         if self._hypotheses.taken is not None:
             return found[self._hypotheses.taken]
         return refusal or refused(found[0].result)
+
+    def _share_new(self, found: list[Found]) -> float:
+        """How much of what an ambiguous picture says is new since the one before."""
+        best, before = self._hypotheses.best, self._asked_at
+        if len(found) > 1 and best is not None:
+            self._asked_at = best.world_from_cam
+            if before is not None and self._hypotheses.continues:
+                moved = before.inverse() @ best.world_from_cam
+                depth = float(np.median([one.errors.depth for one in found]))
+                way = float(np.linalg.norm(moved.translation)) / depth + moved.angle()
+                return 1.0 - math.exp(-way / self._hypotheses.config.renewal)
+        return 1.0
 
     def _everywhere(self, picture: StreamPicture) -> tuple[NotLocalized | None, list[Found]]:
         """As `_ask` in all of the map. Where that does not settle it, also around each hypothesis that the answer leaves out: of many
