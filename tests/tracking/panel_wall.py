@@ -6,6 +6,7 @@ import numpy as np
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.belief import Hypothesis
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import PoseFit
@@ -35,7 +36,7 @@ class PanelWall(Localizer):
         self.num_asked = 0
 
     def localize_near(
-        self, image: np.ndarray, camera: Camera, prior: Rigid3 | None, max_ms: float | None = None, trace: Trace | None = None
+        self, image: np.ndarray, camera: Camera | RoughCamera, prior: Rigid3 | None, max_ms: float | None = None, trace: Trace | None = None
     ) -> tuple[Localization | NotLocalized, SeenPoints | None]:
         self.num_asked += 1
         xs = self.xs
@@ -45,7 +46,7 @@ class PanelWall(Localizer):
             return NotLocalized("not_in_map"), None
         if len(xs) == 1:
             return Localization(at(xs[0]), _SIGMA, 0.99, int(xs[0]), [], 40, 40), _points(xs[0])
-        shares = 0.5 ** np.arange(1, len(xs) + 1)
+        shares = [0.9 * (len(xs) - number) / sum(range(len(xs) + 1)) for number in range(len(xs))]
         if trace is not None:
             trace.tried += [Tried("retrieval", _Fit(x), None, _Hypothesis(x), 0.0) for x in xs]
         return NotLocalized("ambiguous", alternatives=tuple(Alternative(at(x), p, int(x)) for x, p in zip(xs, shares, strict=True))), None
@@ -75,9 +76,9 @@ class _Hypothesis(Hypothesis):
 
 
 def _points(x: float) -> SeenPoints:
-    points_cam = np.array([[0.0, 0.0, 2.0], [0.1, 0.0, 2.0], [0.0, 0.1, 2.0], [0.1, 0.1, 2.0]])
+    points_cam = np.array([[0.0, 0.0, 0.5], [0.1, 0.0, 0.5], [0.0, 0.1, 0.5], [0.1, 0.1, 0.5]])
     covariances = np.tile(1e-6 * np.eye(3), (4, 1, 1))
-    return SeenPoints(CAMERA.img_from_cam(points_cam).astype(np.float32), points_cam + [x, 0.0, 0.0], covariances)
+    return SeenPoints(CAMERA.img_from_cam(points_cam).astype(np.float32), points_cam + np.array([x, 0.0, 0.0]), covariances)
 
 
 class Walk:

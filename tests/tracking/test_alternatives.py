@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from panel_wall import STEP, Walk
 
@@ -40,24 +41,22 @@ def test_before_it_no_pose_is_claimed_and_all_are_named():
         assert "world_from_cam" not in line
         probabilities = [one["probability"] for one in line["alternatives"]]
         assert probabilities == sorted(probabilities, reverse=True)
-        assert 0.5 < sum(probabilities) <= 1.0
+        assert 0.8 < sum(probabilities) <= 1.0
         offsets = [one["world_from_cam"]["translation"][0] - walk.x for one in line["alternatives"]]
         assert min(map(abs, offsets)) < 0.02, "the true one is among them"
-    answer = walk.see(0.0)
-    assert answer.state == "localized"
-    assert is_right(answer, walk)
+    for _ in range(2):
+        answer = walk.see(0.0)
+        assert answer.state == "localized"
+        assert is_right(answer, walk)
     for _ in range(4):
         assert is_right(walk.see(*PANELS), walk)
 
 
 def test_the_motion_decides_where_only_one_alternative_moves_as_the_camera_does():
-    walk, states = Walk(), []
-    for others in ((3.4, -7.2), (9.1, -2.3), (-4.6, 5.7), (8.2, -9.5)):
-        answer = walk.see(*others, 0.0)
-        states.append(answer.state)
-    assert states[0] == "ambiguous"
-    assert states[-1] == "localized"
-    assert is_right(answer, walk)
+    walk, rng = Walk(), np.random.default_rng(1)
+    answers = [walk.see(*rng.uniform(-9.0, 9.0, 2), 0.0) for _ in range(10)]
+    assert [answer.state for answer in answers[:2]] == ["ambiguous"] * 2
+    assert is_right(answers[-1], walk)
 
 
 @pytest.mark.parametrize("num_wrong", [1, 2])
@@ -78,8 +77,7 @@ def test_a_sure_answer_one_panel_off_is_not_believed(num_wrong: int):
 def test_a_stream_that_began_one_panel_off_is_overruled():
     walk = Walk()
     assert not is_right(walk.see(1.0), walk)
-    states = [walk.see(0.0).state for _ in range(2)]
-    assert states == ["predicted", "ambiguous"]
+    assert walk.see(0.0).state == "ambiguous"
     for _ in range(3):
         answer = walk.see(0.0)
         assert answer.state == "localized"

@@ -95,8 +95,8 @@ def test_one_wild_pose_is_forgotten():
 
 def test_the_motion_decides_between_alternatives_however_improbable_the_right_one():
     hypotheses = walked_a_second()
-    shares = {-1.0: 0.5, 0.0: 0.05, 1.0: 0.4}
-    for k in range(1, 8):
+    shares = {-1.0: 0.5, 0.0: 0.15, 1.0: 0.3}
+    for k in range(1, 5):
         x = 1.0 + 0.1 * k
         hypotheses.predict(SECOND + k * STEP_NS)
         hypotheses.weigh(SECOND + k * STEP_NS, [Candidate(at(x + off), SIGMA, share, 0) for off, share in shares.items()])
@@ -119,7 +119,8 @@ def test_equal_panels_stay_ambiguous_until_something_unique_is_seen():
         seen(hypotheses, k * STEP_NS, *(at(0.1 * k + panel) for panel in range(4)), odom_from_cam=at(0.1 * k))
         assert not hypotheses.is_decided
         alternatives = hypotheses.alternatives()
-        assert sorted(round(float(one.world_from_cam.translation[0] - 0.1 * k), 2) for one in alternatives[:4]) == [0.0, 1.0, 2.0, 3.0]
+        assert len(alternatives) == 4
+        assert sorted(round(float(one.world_from_cam.translation[0] - 0.1 * k), 2) for one in alternatives) == [0.0, 1.0, 2.0, 3.0]
         assert 0.9 < sum(one.probability for one in alternatives) <= 1.0
     seen(hypotheses, 8 * STEP_NS, at(2.8), odom_from_cam=at(0.8))
     assert hypotheses.is_decided
@@ -133,8 +134,8 @@ def test_the_motion_decides_between_alternatives_of_which_only_one_moves_as_the_
         wrong = [at(x, z=20.0) for x in rng.uniform(-30, 30, 3)]
         seen(hypotheses, k * STEP_NS, *wrong, at(0.1 * k), odom_from_cam=at(0.1 * k))
         decided.append(hypotheses.is_decided)
-    assert not decided[0]
-    assert decided[2:] == [True] * 4
+    assert not any(decided[:2])
+    assert decided[-1]
     assert best_x(hypotheses) == pytest.approx(0.5, abs=0.02)
 
 

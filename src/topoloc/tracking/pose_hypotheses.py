@@ -35,15 +35,15 @@ class HypothesesConfig:
     """Squared Mahalanobis distance from the prediction (chi^2 with 6 degrees of freedom: 1 in 100,000), beyond which no pose follows."""
     prediction_scale: Annotated[float, Above(0)] = 2.5
     """By how much the prediction may be more wrong than its sigma says: hands jerk, wheels meet kerbs."""
-    min_probability: Annotated[float, Between(0.5, 1)] = 0.95
+    min_probability: Annotated[float, Between(0.5, 1)] = 0.9
     """A hypothesis that has so much of all weight is the pose; while none has, the answer is `ambiguous`."""
-    miss: Annotated[float, Between(1e-6, 0.5)] = 0.02
+    miss: Annotated[float, Between(1e-6, 0.5)] = 0.01
     """Probability that a localization is wrong ..."""
     miss_ambiguous: Annotated[float, Between(1e-6, 0.5)] = 0.1
     """... and that the true pose is not among alternatives, at least."""
-    renewal: Annotated[float, Above(0)] = 0.5
+    renewal: Annotated[float, Above(0)] = 1.0
     """Motion (way in depths of the points, plus radians) after which what alternatives say is new (but for 1/e)."""
-    elsewhere: Annotated[float, Between(1e-9, 0.5)] = 0.001
+    elsewhere: Annotated[float, Between(1e-9, 0.5)] = 0.0005
     """Probability that the camera is at none of the hypotheses, at least: it was carried, or all of them are wrong."""
     max_number: Annotated[int, Between(1, 1000)] = 24
     """The heaviest hypotheses are kept, so many ..."""
@@ -144,8 +144,11 @@ class PoseHypotheses:
 
     def follows(self, predicted: MotionState, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"]) -> bool:
         """Whether this pose can follow from a prediction."""
+        return self._slack_surprise(predicted, world_from_cam, covariance) <= self.config.max_surprise
+
+    def _slack_surprise(self, predicted: MotionState, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"]) -> float:
         slack = (self.config.prediction_scale**2 - 1.0) * predicted.pose_covariance
-        return surprise(predicted, world_from_cam, covariance + slack) <= self.config.max_surprise
+        return surprise(predicted, world_from_cam, covariance + slack)
 
     def move(self, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"], odom_from_cam: Rigid3 | None) -> None:
         """Followed points show the best hypothesis at this pose, and so each other one where the same motion takes it."""
@@ -166,8 +169,11 @@ class PoseHypotheses:
         for one in self._alive:
             taking = [self._taking(one, number, candidate, odom_from_cam) for number, candidate in enumerate(candidates)]
             children = [child for child in taking if child is not None]
-            if len(candidates) > 1 or not children:
-                children.append(replace(one, weight=one.weight * none))
+            if len(candidates) == 1 and children:  # it follows, and there is nothing else that could
+                sure = self._slack_surprise(one.now, candidates[0].world_from_cam, candidates[0].covariance)
+                new.append(replace(children[0], weight=one.weight * candidates[0].probability * math.exp(-0.5 * sure)))
+                continue
+            children.append(replace(one, weight=one.weight * none))
             gain = sum(child.weight for child in children) / one.weight
             new += [replace(child, weight=child.weight * gain ** (share_new - 1.0)) for child in children]
         for number, candidate in enumerate(candidates):
@@ -189,13 +195,15 @@ class PoseHypotheses:
         self._compare()
 
     def _taking(self, one: _Hypothesis, number: int, candidate: Candidate, odom_from_cam: Rigid3 | None) -> _Hypothesis | None:
-        """The hypothesis that the picture was taken there; None where that does not follow."""
+        """The hypothesis that the picture was taken there, less likely the more that surprises; None where it does not follow."""
         pose, covariance = candidate.world_from_cam, candidate.covariance
         if not self.follows(one.now, pose, covariance):
             return None
         state = update_motion(one.now, pose, covariance)
-        weight = one.weight * candidate.probability * max(math.exp(-0.5 * surprise(one.now, pose, covariance)), 1e-100)
-        return _Hypothesis(state, odom_from_cam, state, weight, candidate.node_id, one.from_best, number)
+        likelihood = max(math.exp(-0.5 * surprise(one.now, pose, covariance)), 1e-100)
+        return _Hypothesis(
+            state, odom_from_cam, state, one.weight * candidate.probability * likelihood, candidate.node_id, one.from_best, number
+        )
 
     def _keep(self, hypotheses: list[_Hypothesis], elsewhere: float) -> None:
         """The heaviest of these."""
@@ -216,7 +224,8 @@ class PoseHypotheses:
 def _merged(hypotheses: list[_Hypothesis]) -> list[_Hypothesis]:
     """Those that agree in pose and velocity become one, of what was measured now where there is a choice."""
     kept: list[_Hypothesis] = []
-    for one in sorted(hypotheses, key=lambda one: (one.taken is None, -one.weight)):
+    least = 1e-4 * max(one.weight for one in hypotheses)
+    for one in sorted((one for one in hypotheses if one.weight > least), key=lambda one: (one.taken is None, -one.weight)):
         same = next((k for k, other in enumerate(kept) if _is_same_motion(one.now, other.now)), None)
         if same is None:
             kept.append(one)

@@ -200,6 +200,8 @@ class Tracker:
         """Whether it is time to localize in full."""
         config, reference = self.config, self._reference
         assert reference is not None
+        if not self._hypotheses.is_decided:
+            return True
         if picture.t_ns - self._attempt_ns < config.retry_after * 1e9:
             return False
         is_old = picture.t_ns - reference.t_ns >= config.localize_every * 1e9
