@@ -139,7 +139,10 @@ class PoseHypotheses:
             if t_ns - one.state.t_ns <= limit * 1e9:
                 alive.append(replace(one, now=predict_motion(one.state, t_ns, config.motion, before_from_cam), taken=None))
         self.continues = bool(alive) and alive[0].state is before[0].state
-        self._keep(alive, self._elsewhere)
+        left = sum(one.weight for one in alive)
+        self._keep(
+            alive if self.continues or left > 0.5 else [], 1.0 - left
+        )  # who was given up is elsewhere: what is left beside it is no belief
         return self.best
 
     def follows(self, predicted: MotionState, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"]) -> bool:
@@ -165,21 +168,19 @@ class PoseHypotheses:
             return
         before, miss = self.best, self.config.miss if len(candidates) == 1 else self.config.miss_ambiguous
         none = max(miss, 1.0 - sum(one.probability for one in candidates))
-        new: list[_Hypothesis] = []
+        new = self._agreed(candidates[0], odom_from_cam) if len(candidates) == 1 else []
         for one in self._alive:
+            if new and self.follows(one.now, candidates[0].world_from_cam, candidates[0].covariance):
+                continue  # it is that one
             taking = [self._taking(one, number, candidate, odom_from_cam) for number, candidate in enumerate(candidates)]
             children = [child for child in taking if child is not None]
-            if len(candidates) == 1 and children:  # it follows, and there is nothing else that could
-                sure = self._slack_surprise(one.now, candidates[0].world_from_cam, candidates[0].covariance)
-                new.append(replace(children[0], weight=one.weight * candidates[0].probability * math.exp(-0.5 * sure)))
-                continue
             children.append(replace(one, weight=one.weight * none))
             gain = sum(child.weight for child in children) / one.weight
             new += [replace(child, weight=child.weight * gain ** (share_new - 1.0)) for child in children]
         for number, candidate in enumerate(candidates):
             weight = self._elsewhere * candidate.probability * share_new
             heaviest = max((one for one in new if one.taken == number), key=lambda one: one.weight, default=None)
-            if heaviest is not None:
+            if heaviest is not None and heaviest.weight >= weight:
                 new[new.index(heaviest)] = replace(heaviest, weight=heaviest.weight + weight)
             else:
                 state = start_motion(t_ns, candidate.world_from_cam, candidate.covariance, self.config.motion)
@@ -193,6 +194,18 @@ class PoseHypotheses:
         """The heaviest hypothesis is in this state: its pose is known better than from the candidate that it took."""
         self._alive[0] = replace(self._alive[0], state=state, now=state, odom_from_cam=odom_from_cam)
         self._compare()
+
+    def _agreed(self, candidate: Candidate, odom_from_cam: Rigid3 | None) -> list[_Hypothesis]:
+        """The hypotheses that a sure pose follows from, as one: there they all are. The motion is that of the likeliest of them."""
+        pose, covariance = candidate.world_from_cam, candidate.covariance
+        weight, likeliest = 0.0, (-math.inf, None)
+        for one in self._alive:
+            if (taking := self._taking(one, 0, candidate, odom_from_cam)) is not None:
+                weight += one.weight * candidate.probability * math.exp(-0.5 * self._slack_surprise(one.now, pose, covariance))
+                spread = float(np.linalg.slogdet(one.now.pose_covariance + covariance)[1])
+                density = math.log(one.weight) - 0.5 * (surprise(one.now, pose, covariance) + spread)
+                likeliest = max(likeliest, (density, taking), key=lambda pair: pair[0])
+        return [] if likeliest[1] is None else [replace(likeliest[1], weight=weight)]
 
     def _taking(self, one: _Hypothesis, number: int, candidate: Candidate, odom_from_cam: Rigid3 | None) -> _Hypothesis | None:
         """The hypothesis that the picture was taken there, less likely the more that surprises; None where it does not follow."""
