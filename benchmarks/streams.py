@@ -102,7 +102,7 @@ def judge(pair: Pair) -> None:
         smoothed = [a.smoothed for a in answers]
         report_poses(f"{name}, smoothed", smoothed, truths)
     states = Counter(answer.state for answer in answers)
-    print("  states: " + ", ".join(f"{states[state]} {state}" for state in ("localized", "tracked", "predicted", "lost")))
+    print("  states: " + ", ".join(f"{states[state]} {state}" for state in ("localized", "tracked", "predicted", "ambiguous", "lost")))
     measured = [answer.state in ("localized", "tracked") for answer in answers]
     tracked = [ms for ms, answer in zip(cpu_ms, answers, strict=True) if answer.state == "tracked"]
     errors = [translation_error(pose, truth) for pose, truth in zip(smoothed, truths, strict=True) if pose is not None]

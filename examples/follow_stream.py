@@ -16,7 +16,7 @@ import topoloc
 from topoloc.demo.recordings import SHIPPED
 from topoloc.geometry.alignment import translation_error
 from topoloc.tracking.motion import MotionConfig
-from topoloc.tracking.motion_gate import GateConfig
+from topoloc.tracking.pose_hypotheses import HypothesesConfig
 
 COVERED, MISPLACED = range(8, 10), 20
 
@@ -28,8 +28,8 @@ def main(map_file: Path | None, recording: str | None) -> None:
         topomap = topoloc.TopoMetricMap.load(map_file)
     walk = topoloc.open_sequence(recording or SHIPPED / "day")
     # A cart at walking pace, two pictures a second: what a hand could do within half a second, it cannot.
-    slow = GateConfig(motion=MotionConfig(sigma_acceleration=0.5, sigma_angular_acceleration=1.5))
-    tracker = topoloc.Tracker(topoloc.Localizer(topomap), topoloc.TrackerConfig(gate=slow))
+    slow = HypothesesConfig(motion=MotionConfig(sigma_acceleration=0.5, sigma_angular_acceleration=1.5))
+    tracker = topoloc.Tracker(topoloc.Localizer(topomap), topoloc.TrackerConfig(hypotheses=slow))
     states: Counter[str] = Counter()
     errors_cm = []
     for i in range(len(walk)):

@@ -21,7 +21,7 @@ from topoloc.errors import ConfigError
 from topoloc.map.nodes import NodeConfig
 from topoloc.slam.odometry import OdometryConfig
 from topoloc.slam.slam import SlamConfig, run_slam
-from topoloc.tracking.motion_gate import GateConfig
+from topoloc.tracking.pose_hypotheses import HypothesesConfig
 
 
 @dataclass(frozen=True)
@@ -122,9 +122,9 @@ def test_callers_from_python_are_told_too(tiny_recording: Path):
         topoloc.build_map([], topoloc.BuildConfig(nodes=nodes))
     with pytest.raises(ConfigError, match=r"^LocalizerConfig\.num_candidates: must be from 1"):
         topoloc.Localizer(topomap, topoloc.LocalizerConfig(num_candidates=0))
-    gate = GateConfig(max_surprise=math.nan)
-    with pytest.raises(ConfigError, match=r"^TrackerConfig\.gate\.max_surprise: must be a finite number"):
-        topoloc.Tracker(topoloc.Localizer(topomap), topoloc.TrackerConfig(gate=gate))
+    gating = HypothesesConfig(max_surprise=math.nan)
+    with pytest.raises(ConfigError, match=r"^TrackerConfig\.hypotheses\.max_surprise: must be a finite number"):
+        topoloc.Tracker(topoloc.Localizer(topomap), topoloc.TrackerConfig(hypotheses=gating))
     with pytest.raises(ConfigError, match=r"^SlamConfig\.odometry\.window: must be from 1"):
         run_slam([], SlamConfig(odometry=OdometryConfig(window=0)))
 

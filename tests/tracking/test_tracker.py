@@ -145,8 +145,8 @@ def test_a_jump_is_refused_until_others_agree_with_it(localizer: Localizer):
     tracker = Tracker(localizer)
     last = _stream(tracker, 0, 10)[-1]
     jumped = [tracker.process(picture, CAMERA, last.t_ns + (k + 1) * INTERVAL_NS) for k, (picture, _) in enumerate(far_away())]
-    assert [answer.state for answer in jumped[:3]] == ["predicted", "predicted", "localized"]
-    assert [answer.to_json("")["reason"] for answer in jumped[:2]] == ["jump", "jump"]
+    assert [answer.state for answer in jumped[:3]] == ["predicted", "ambiguous", "localized"]
+    assert [answer.to_json("")["reason"] for answer in jumped[:2]] == ["jump", "ambiguous"]
     for answer, (_, truth) in zip(jumped[2:], far_away()[2:], strict=True):
         assert translation_error(_smoothed(answer), truth) < 0.03
 

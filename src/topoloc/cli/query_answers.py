@@ -61,7 +61,9 @@ def answer_line(answer: QueryAnswer) -> str:
     result, state = answer.result, f"{answer.streamed.state}  " if answer.streamed is not None else ""
     ms = f"  {result.times_ms['total']:.0f} ms" if result.times_ms else ""
     if isinstance(result, NotLocalized):
-        evidence = "" if result.reason == "unreadable" else f"  ({result.num_inliers} of {result.num_matches} matches)"
+        evidence = f"  ({result.num_inliers} of {result.num_matches} matches)"
+        if result.reason == "unreadable" or (answer.streamed is not None and answer.streamed.state == "ambiguous"):
+            evidence = f"  ({len(result.alternatives)} alternatives)" if result.alternatives else ""
         return f"{answer.query}  {state}not localized: {result.reason}{evidence}{ms}"
     focal = "" if result.focal_length_px is None else f"  f {result.focal_length_px:.0f} px (found)"
     x, y, z = result.world_from_cam.translation
@@ -75,5 +77,5 @@ def answer_line(answer: QueryAnswer) -> str:
 def stream_summary(answers: list[QueryAnswer], seconds: float) -> str:
     """How often each state, and frames a second."""
     states = Counter(answer.streamed.state for answer in answers if answer.streamed is not None)
-    counts = ", ".join(f"{states[state]} {state}" for state in ("localized", "tracked", "predicted", "lost"))
+    counts = ", ".join(f"{states[state]} {state}" for state in ("localized", "tracked", "predicted", "ambiguous", "lost"))
     return f"{states.total()} frames: {counts}; {len(answers) / seconds:.1f} frames a second"

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization, NotLocalized
 
-State = Literal["localized", "tracked", "predicted", "lost"]
+State = Literal["localized", "tracked", "predicted", "ambiguous", "lost"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,9 +20,10 @@ class StreamedPose:
 
     `state` says what stands behind it: "localized", the picture was matched with the map; "tracked", points of the map were
     followed into it from the picture before; "predicted", neither, and `smoothed` is what the motion so far lets expect (by the
-    paper's rule: a copy of the pose before); "lost", no pose at all. In the first two states alone `result` is a `Localization`, the
-    raw pose, and else it says why there is none. `smoothed` is world_from_cam as the whole stream up to this picture shows
-    it; `smoothed_covariance` (6, 6) is of its left perturbation, order (translation, rotation), metres and radians.
+    paper's rule: a copy of the pose before); "ambiguous", the pictures so far leave open which of several poses it is, and
+    `result.alternatives` names them; "lost", no pose at all. In the first two states alone `result` is a `Localization`, the raw pose, and
+    else it says why there is none. `smoothed` is world_from_cam as the whole stream up to this picture shows it;
+    `smoothed_covariance` (6, 6) is of its left perturbation, order (translation, rotation), metres and radians.
     `is_repeated`: the same picture as the one before, whose answer this is.
     """
 

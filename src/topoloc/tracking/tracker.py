@@ -2,9 +2,11 @@
 
 Where a picture was taken is predicted from the motion so far, or from external odometry. Points of the map that the last
 localized picture showed are followed into it; that alone gives its pose, in a few milliseconds. Every so often, and whenever too
-few points are left, it is localized in full, around the predicted pose instead of by the coarse search. A pose that the motion
-does not allow for is refused (reason `jump`), until several in a row agree that the camera is elsewhere indeed. Localized
-pictures are adjusted together in a sliding window; what comes out of it is the smoothed pose.
+few points are left, it is localized in full, around the predicted pose instead of by the coarse search. What that answers is weighed
+against what is believed so far (`pose_hypotheses.py`): a pose that the motion does not allow for is refused (reason `jump`), until
+several agree that the camera is elsewhere indeed, and between the alternatives of ambiguous pictures the motion decides. While
+several are left, the answer is `ambiguous`. Localized pictures are adjusted together in a sliding window; what comes out of it is the
+smoothed pose.
 
 `mode="paper"` is the rule of section III-B instead: each picture is localized alone, and where its pose lies further than
 `max_jump` from the one before, that one is copied. Here the copy is said to be one.
@@ -24,17 +26,17 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.localization.seen_points import SeenPoints
 from topoloc.localization.stages import StageClock
 from topoloc.places.coarse import Image
 from topoloc.sequences.pictures import grey_image
 from topoloc.tracking.following import Followed, FollowingConfig, PointFollower
-from topoloc.tracking.motion import MotionState
-from topoloc.tracking.motion_gate import GateConfig, MotionGate
-from topoloc.tracking.pose_errors import errors_of, lasting_change, noise_floor
+from topoloc.tracking.motion import MotionState, update_motion
+from topoloc.tracking.pose_errors import lasting_change, noise_floor
+from topoloc.tracking.pose_hypotheses import HypothesesConfig, PoseHypotheses
 from topoloc.tracking.pose_window import PoseWindow, PoseWindowConfig
 from topoloc.tracking.stream_result import StreamedPose
-from topoloc.tracking.tracker_state import Reference, StreamPicture, doubt_of, reduced
+from topoloc.tracking.stream_search import Expected, Found, StreamSearch, refused
+from topoloc.tracking.tracker_state import Reference, StreamPicture, doubt_of, reduced, smoothed_covariance
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ class TrackerConfig:
     """`paper`: each picture is localized alone, and a pose too far from the one before is refused, which is copied."""
     max_jump: Annotated[float, Above(0)] = 1.0
     """mode "paper": metres from one pose to the next beyond which the new one is refused (the paper: 1 to 5, by the size of the place)."""
-    gate: GateConfig = field(default_factory=GateConfig)
+    hypotheses: HypothesesConfig = field(default_factory=HypothesesConfig)
     following: FollowingConfig = field(default_factory=FollowingConfig)
     window: PoseWindowConfig = field(default_factory=PoseWindowConfig)
     max_side_px: Annotated[int, Between(64, 16_384)] = 800
@@ -76,7 +78,8 @@ class Tracker:
     def __init__(self, localizer: Localizer, config: TrackerConfig | None = None) -> None:
         self.localizer, self.config = localizer, config or TrackerConfig()
         check_bounds(self.config)
-        self._gate, self._window = MotionGate(self.config.gate), PoseWindow(self.config.window)
+        self._hypotheses, self._window = PoseHypotheses(self.config.hypotheses), PoseWindow(self.config.window)
+        self._search = StreamSearch(localizer, self._hypotheses, self.config.floor_share)
         self.reset()
 
     def reset(self) -> None:
@@ -86,7 +89,7 @@ class Tracker:
         self._answer: StreamedPose | None = None
         self._reference: Reference | None = None
         self._attempt_ns = 0
-        self._gate.forget()
+        self._hypotheses.forget()
         self._window.clear()
 
     def process(self, image: Image, camera: Camera, t_ns: int, odom_from_cam: Rigid3 | None = None) -> StreamedPose:
@@ -124,7 +127,9 @@ class Tracker:
         self._image = None
         if self.config.mode == "paper":
             return self._copied(result, t_ns)
-        return self._without_pose(result, self._gate.predict(t_ns, odom_from_cam), t_ns)
+        self._hypotheses.predict(t_ns, odom_from_cam)
+        self._keep_reference()
+        return self._decided(self._without_pose(result, t_ns))
 
     def _advance(self, t_ns: int, may_stand_still: bool = False) -> None:
         if self._t_ns is not None and (t_ns < self._t_ns or (t_ns == self._t_ns and not may_stand_still)):
@@ -139,7 +144,7 @@ class Tracker:
             return self._copied(result, t_ns)
         previous = self._answer.smoothed if self._answer is not None else None
         if previous is not None and np.linalg.norm(result.world_from_cam.translation - previous.translation) > self.config.max_jump:
-            return self._copied(_refused(result), t_ns)
+            return self._copied(refused(result), t_ns)
         return StreamedPose(t_ns, "localized", result, result.world_from_cam, result.covariance)
 
     def _copied(self, result: NotLocalized, t_ns: int) -> StreamedPose:
@@ -148,17 +153,36 @@ class Tracker:
 
     def _by_motion(self, picture: StreamPicture) -> StreamedPose:
         clock = StageClock()
-        predicted = self._gate.predict(picture.t_ns, picture.odom_from_cam)
+        seconds = self._hypotheses.seconds_since(picture.t_ns)
+        predicted = self._hypotheses.predict(picture.t_ns, picture.odom_from_cam)
+        self._keep_reference()
         with clock.stage("tracking"):
             followed = self._follow(picture, predicted)
+        if followed is not None:
+            self._hypotheses.move(self._blended(followed, picture.t_ns).inverse(), followed.covariance, picture.odom_from_cam)
         if followed is None or self._is_due(followed, picture):
-            result, seen = self._localize(picture, predicted, followed)
-            if seen is not None and (answer := self._believe(picture, result, seen, predicted, followed)) is not None:
-                return answer
-            if followed is None:
-                return self._without_pose(_refused(result) if isinstance(result, Localization) else result, predicted, picture.t_ns)
-        assert predicted is not None, "points are followed where the motion is known"
-        return self._tracked(picture, followed, predicted, clock)
+            self._attempt_ns = picture.t_ns
+            found = self._search.find(picture, self._expected(predicted, followed))
+            self._keep_reference()
+            if isinstance(found, Found):
+                return self._decided(self._believe(picture, found, predicted, followed, seconds))
+            if followed is None or self._reference is None:
+                return self._decided(self._without_pose(found, picture.t_ns))
+        return self._decided(self._tracked(picture, followed, clock))
+
+    def _keep_reference(self) -> None:
+        """Only while its hypothesis is the heaviest."""
+        if not self._hypotheses.continues:
+            self._reference = None
+            self._window.clear()
+
+    def _decided(self, answer: StreamedPose) -> StreamedPose:
+        """The answer where one hypothesis leads; else that it may be any of them."""
+        if self._hypotheses.is_decided:
+            return answer
+        detail, alternatives = "the pictures so far leave open which of these", self._hypotheses.alternatives()
+        result = NotLocalized("ambiguous", times_ms=answer.result.times_ms, detail=detail, alternatives=alternatives)
+        return StreamedPose(answer.t_ns, "ambiguous", result)
 
     def _follow(self, picture: StreamPicture, predicted: MotionState | None) -> Followed | None:
         """The points followed into this picture; None where they are lost or lead where the camera cannot be."""
@@ -170,53 +194,40 @@ class Tracker:
             return None
         world_from_cam = self._blended(followed, picture.t_ns).inverse()
         floor = noise_floor(reference.errors.depth, self.config.floor_share)
-        return followed if self._gate.follows(predicted, world_from_cam, followed.covariance + floor) else None
+        return followed if self._hypotheses.follows(predicted, world_from_cam, followed.covariance + floor) else None
 
     def _is_due(self, followed: Followed, picture: StreamPicture) -> bool:
         """Whether it is time to localize in full."""
         config, reference = self.config, self._reference
         assert reference is not None
+        if not self._hypotheses.is_decided:
+            return True
         if picture.t_ns - self._attempt_ns < config.retry_after * 1e9:
             return False
         is_old = picture.t_ns - reference.t_ns >= config.localize_every * 1e9
         return is_old or followed.share_left < config.min_share_left or followed.shift_px > config.max_shift * picture.grey_camera.width
 
-    def _localize(
-        self, picture: StreamPicture, predicted: MotionState | None, followed: Followed | None
-    ) -> tuple[Localization | NotLocalized, SeenPoints | None]:
-        """In full: around the pose that is expected where that is known well enough, else, and where that fails, by the coarse search."""
-        self._attempt_ns = picture.t_ns
-        reference = self._reference
-        if reference is not None and followed is not None:
-            near = (followed.cam_from_ref @ reference.cam_from_world).inverse()
-            return self.localizer.localize_near(picture.image, picture.camera, near)
-        if reference is not None and predicted is not None and doubt_of(predicted, reference.errors.depth) <= self.config.max_doubt:
-            found, seen = self.localizer.localize_near(picture.image, picture.camera, predicted.world_from_cam)
-            if isinstance(found, Localization):
-                return found, seen
-        return self.localizer.localize_near(picture.image, picture.camera, None)
+    def _expected(self, predicted: MotionState | None, followed: Followed | None) -> Expected | None:
+        """About where the picture was taken; a followed pose is wrong by its reference's errors and by wrong depths, too."""
+        reference, is_alone = self._reference, len(self._hypotheses.alternatives()) == 1
+        if reference is None or predicted is None:
+            return None
+        if followed is None:
+            is_known = doubt_of(predicted, reference.errors.depth) <= self.config.max_doubt
+            return Expected(predicted.world_from_cam, np.zeros((6, 6)), is_followed=False, is_enough=is_known and is_alone)
+        motion, scale = followed.cam_from_ref.adjoint(), self.config.hypotheses.prediction_scale
+        doubt = motion @ reference.errors.whole @ motion.T + scale**2 * self._followed_covariance(followed)
+        near = (followed.cam_from_ref @ reference.cam_from_world).inverse()
+        return Expected(near, doubt, is_followed=True, is_enough=is_alone)
 
     def _believe(
-        self,
-        picture: StreamPicture,
-        found: Localization | NotLocalized,
-        seen: SeenPoints,
-        predicted: MotionState | None,
-        followed: Followed | None,
-    ) -> StreamedPose | None:
-        """The answer that a full localization gives; None where the motion does not allow for it."""
-        assert isinstance(found, Localization), "points are seen where a pose was found"
-        cam_from_world = found.world_from_cam.inverse()
-        depth = float(np.median(cam_from_world.apply(seen.points_world)[:, 2]))
-        errors = errors_of(found, depth, self.config.floor_share)
-        t_ns, odom_from_cam = picture.t_ns, picture.odom_from_cam
-        if predicted is None or not self._gate.follows(predicted, found.world_from_cam, errors.whole):
-            if predicted is not None and not self._gate.is_overruled(t_ns, found.world_from_cam, errors.whole, odom_from_cam):
-                return None
-            self._window.clear()
+        self, picture: StreamPicture, found: Found, predicted: MotionState | None, followed: Followed | None, seconds: float
+    ) -> StreamedPose:
+        """The answer that a full localization gives, `seconds` after the pose measured before."""
+        cam_from_world, errors = found.result.world_from_cam.inverse(), found.errors
+        t_ns, offset = picture.t_ns, Rigid3.identity()
+        if predicted is None or self._reference is None:
             smoothed, doubt = self._window.add(cam_from_world, errors.noise, Rigid3.identity(), errors.noise)
-            offset = Rigid3.identity()
-            state = self._gate.begin(t_ns, found.world_from_cam, errors.noise, odom_from_cam)
         else:
             motion, motion_covariance = self._motion(predicted, followed)
             motion_covariance = motion_covariance + lasting_change(errors, motion, self.config.reach)
@@ -224,14 +235,16 @@ class Tracker:
             if followed is None and np.trace(motion_covariance) >= np.trace(errors.noise):
                 self._window.clear()  # a guess from the poses before says nothing new of this one
             smoothed, doubt = self._window.add(cam_from_world, errors.noise, motion, motion_covariance)
-            offset = Rigid3.identity() if before is None else self._faded(before @ smoothed.inverse(), self._gate.seconds_since(t_ns))
+            if before is not None:
+                offset = self._faded(before @ smoothed.inverse(), seconds)
             measured = errors.noise if followed is None else followed.covariance
-            state = self._gate.correct(predicted, (offset @ smoothed).inverse(), measured, odom_from_cam)
-            self._gate.drop_rival()
-        points = seen.in_image(picture.grey_camera.width / picture.camera.width)
+            self._hypotheses.correct(update_motion(predicted, (offset @ smoothed).inverse(), measured), picture.odom_from_cam)
+        points = found.seen.in_image(picture.grey_camera.width / picture.camera.width)
         follower = PointFollower(picture.grey, points, cam_from_world, picture.grey_camera, self.config.following)
-        self._reference = Reference(t_ns, found, cam_from_world, errors, smoothed, doubt + errors.lasting, offset, follower)
-        return StreamedPose(t_ns, "localized", found, state.world_from_cam, self._covariance(self._reference))
+        self._reference = Reference(t_ns, found.result, cam_from_world, errors, smoothed, doubt + errors.lasting, offset, follower)
+        best = self._hypotheses.best
+        assert best is not None
+        return StreamedPose(t_ns, "localized", found.result, best.world_from_cam, smoothed_covariance(self._reference))
 
     def _blended(self, followed: Followed, t_ns: int) -> Rigid3:
         """The smoothed cam_from_world of a followed picture."""
@@ -249,11 +262,10 @@ class Tracker:
             return followed.cam_from_ref, self._followed_covariance(followed)
         return predicted.world_from_cam.inverse() @ self._reference.smoothed.inverse(), predicted.pose_covariance
 
-    def _tracked(self, picture: StreamPicture, followed: Followed, predicted: MotionState, clock: StageClock) -> StreamedPose:
-        reference = self._reference
+    def _tracked(self, picture: StreamPicture, followed: Followed, clock: StageClock) -> StreamedPose:
+        reference, state = self._reference, self._hypotheses.best
         assert reference is not None
-        smoothed = self._blended(followed, picture.t_ns).inverse()
-        state = self._gate.correct(predicted, smoothed, followed.covariance, picture.odom_from_cam)
+        assert state is not None
         world_from_cam = (followed.cam_from_ref @ reference.cam_from_world).inverse()
         adjoint, motion = world_from_cam.adjoint(), followed.cam_from_ref.adjoint()
         covariance = adjoint @ (motion @ reference.errors.whole @ motion.T + followed.covariance) @ adjoint.T
@@ -268,32 +280,17 @@ class Tracker:
             num_inliers=followed.num_agreeing,
             times_ms=clock.times_ms(),
         )
-        return StreamedPose(picture.t_ns, "tracked", result, state.world_from_cam, self._covariance(reference, state))
+        return StreamedPose(picture.t_ns, "tracked", result, state.world_from_cam, smoothed_covariance(reference, state))
 
-    def _without_pose(self, result: NotLocalized, predicted: MotionState | None, t_ns: int) -> StreamedPose:
+    def _without_pose(self, result: NotLocalized, t_ns: int) -> StreamedPose:
         """Predicted for a while, then lost."""
+        predicted = self._hypotheses.best
         if predicted is None:
-            self._reference = None
-            self._gate.forget()
             return StreamedPose(t_ns, "lost", result)
-        assert self._reference is not None
-        return StreamedPose(t_ns, "predicted", result, predicted.world_from_cam, self._covariance(self._reference, predicted))
-
-    def _covariance(self, reference: Reference, since: MotionState | None = None) -> Float[np.ndarray, "6 6"]:
-        """Of the left perturbation of world_from_cam: what the picture localized last is wrong by, and the motion since."""
-        adjoint = reference.smoothed.inverse().adjoint()
-        covariance = adjoint @ reference.covariance @ adjoint.T
-        if since is None:
-            return covariance
-        adjoint = since.world_from_cam.adjoint()
-        return covariance + adjoint @ since.pose_covariance @ adjoint.T
+        return StreamedPose(t_ns, "predicted", result, predicted.world_from_cam, smoothed_covariance(self._reference, predicted))
 
     def _followed_covariance(self, followed: Followed) -> Float[np.ndarray, "6 6"]:
         """Of a followed motion: what the points say, and what wrong depths make of it, in proportion to the motion."""
         way, turn = float(np.linalg.norm(followed.cam_from_ref.translation)), followed.cam_from_ref.angle()
         share = np.diag(np.repeat([way**2, turn**2], 3)) * self.config.followed_share**2
         return followed.covariance + share
-
-
-def _refused(found: Localization) -> NotLocalized:
-    return NotLocalized("jump", found.candidates, found.num_matches, found.num_inliers, found.times_ms)

@@ -53,6 +53,18 @@ def doubt_of(predicted: MotionState, depth: float) -> float:
     return 3.0 * float(np.hypot(sigmas[:3].max() / depth, sigmas[3:].max()))
 
 
+def smoothed_covariance(reference: Reference | None, since: MotionState | None = None) -> Float[np.ndarray, "6 6"]:
+    """Of the left perturbation of world_from_cam: what the picture localized last is wrong by, and the motion since."""
+    covariance = np.zeros((6, 6))
+    if reference is not None:
+        adjoint = reference.smoothed.inverse().adjoint()
+        covariance = adjoint @ reference.covariance @ adjoint.T
+    if since is None:
+        return covariance
+    adjoint = since.world_from_cam.adjoint()
+    return covariance + adjoint @ since.pose_covariance @ adjoint.T
+
+
 def reduced(grey: UInt8[np.ndarray, "h w"], camera: Camera, max_side_px: int) -> tuple[UInt8[np.ndarray, "a b"], Camera]:
     """The picture with its camera, smaller where a side is longer than `max_side_px`."""
     scale = max_side_px / max(grey.shape)

@@ -1,0 +1,103 @@
+"""A localizer of a wall of equal panels, a metre apart, without pictures or a map: what it answers is told to it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.rough_camera import RoughCamera
+from topoloc.localization.belief import Hypothesis
+from topoloc.localization.localizer import Localizer
+from topoloc.localization.pose_fit import PoseFit
+from topoloc.localization.result import Alternative, Localization, NotLocalized
+from topoloc.localization.seen_points import SeenPoints
+from topoloc.localization.trace import Trace, Tried
+from topoloc.tracking.stream_result import StreamedPose
+from topoloc.tracking.tracker import Tracker
+
+CAMERA = Camera.pinhole(96, 72, 80.0, 80.0, 48.0, 36.0)
+INTERVAL_NS = 375_000_000
+STEP = 0.45
+"""Metres from picture to picture."""
+_SIGMA = np.diag(np.full(6, 1e-6))
+
+
+def at(x: float) -> Rigid3:
+    return Rigid3(np.eye(3), np.array([x, 0.0, 0.0]))
+
+
+class PanelWall(Localizer):
+    """`xs` are where the next picture may have been taken, the likeliest first; who looks near a pose finds one within
+    half a panel."""
+
+    def __init__(self) -> None:
+        self.xs: list[float] = []
+        self.num_asked = 0
+
+    def localize_near(
+        self, image: np.ndarray, camera: Camera | RoughCamera, prior: Rigid3 | None, max_ms: float | None = None, trace: Trace | None = None
+    ) -> tuple[Localization | NotLocalized, SeenPoints | None]:
+        self.num_asked += 1
+        xs = self.xs
+        if prior is not None:
+            xs = sorted((x for x in xs if abs(x - prior.translation[0]) < 0.5), key=lambda x: abs(x - prior.translation[0]))[:1]
+        if not xs:
+            return NotLocalized("not_in_map"), None
+        if len(xs) == 1:
+            return Localization(at(xs[0]), _SIGMA, 0.99, int(xs[0]), [], 40, 40), _points(xs[0])
+        shares = [0.9 * (len(xs) - number) / sum(range(len(xs) + 1)) for number in range(len(xs))]
+        if trace is not None:
+            trace.tried += [Tried("retrieval", _Fit(x), None, _Hypothesis(x), 0.0) for x in xs]
+        return NotLocalized("ambiguous", alternatives=tuple(Alternative(at(x), p, int(x)) for x, p in zip(xs, shares, strict=True))), None
+
+
+class _Fit(PoseFit):
+    """Of the pose at x, with points too few to be followed."""
+
+    def __init__(self, x: float) -> None:
+        vars(self).update(x=x, camera=CAMERA, matches=range(40))
+
+    @property
+    def num_inliers(self) -> int:
+        return 40
+
+    def seen_points(self, scale: float) -> SeenPoints:
+        return _points(vars(self)["x"])
+
+
+class _Hypothesis(Hypothesis):
+    def __init__(self, x: float) -> None:
+        vars(self).update(x=x, fit=_Fit(x), covariance=_SIGMA, noise_share=1.0)
+
+    @property
+    def world_from_cam(self) -> Rigid3:
+        return at(vars(self)["x"])
+
+
+def _points(x: float) -> SeenPoints:
+    points_cam = np.array([[0.0, 0.0, 0.5], [0.1, 0.0, 0.5], [0.0, 0.1, 0.5], [0.1, 0.1, 0.5]])
+    covariances = np.tile(1e-6 * np.eye(3), (4, 1, 1))
+    return SeenPoints(CAMERA.img_from_cam(points_cam).astype(np.float32), points_cam + np.array([x, 0.0, 0.0]), covariances)
+
+
+class Walk:
+    """A camera that goes along the wall, at x = 0.45 k in picture k; the odometry drifts by a hundredth."""
+
+    def __init__(self, has_odometry: bool = True) -> None:
+        self.wall, self._has_odometry, self._number = PanelWall(), has_odometry, 0
+        self.tracker = Tracker(self.wall)
+        self._rng = np.random.default_rng(0)
+
+    @property
+    def x(self) -> float:
+        """Where the picture seen last was taken."""
+        return STEP * (self._number - 1)
+
+    def see(self, *offsets: float) -> StreamedPose:
+        """The next picture, which may have been taken so far off the truth, the likeliest first."""
+        number, self._number = self._number, self._number + 1
+        self.wall.xs = [STEP * number + offset for offset in offsets]
+        image = self._rng.integers(0, 255, (CAMERA.height, CAMERA.width), dtype=np.uint8)
+        odom_from_cam = at(1.01 * STEP * number) if self._has_odometry else None
+        return self.tracker.process(image, CAMERA, number * INTERVAL_NS, odom_from_cam)

@@ -1,0 +1,159 @@
+"""What follows, which of several poses is believed, and when a belief is overruled."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from topoloc.geometry.alignment import translation_error
+from topoloc.geometry.rigid import Rigid3
+from topoloc.tracking.pose_hypotheses import Candidate, HypothesesConfig, PoseHypotheses
+
+SIGMA = np.diag(np.full(6, 1e-4))
+SECOND = 1_000_000_000
+STEP_NS = SECOND // 10
+
+
+def at(x: float, z: float = 0.0) -> Rigid3:
+    return Rigid3(np.eye(3), np.array([x, 0.0, z]))
+
+
+def one_of(*poses: Rigid3, sum_: float = 0.98) -> list[Candidate]:
+    """Candidates that are equally probable."""
+    return [Candidate(pose, SIGMA, sum_ / len(poses), node_id) for node_id, pose in enumerate(poses)]
+
+
+def seen(hypotheses: PoseHypotheses, t_ns: int, *poses: Rigid3, odom_from_cam: Rigid3 | None = None) -> None:
+    """A picture that may have been taken at any of these poses."""
+    hypotheses.predict(t_ns, odom_from_cam)
+    hypotheses.weigh(t_ns, one_of(*poses), odom_from_cam)
+
+
+def walked_a_second() -> PoseHypotheses:
+    """A camera that has been going along x at 1 m/s for a second."""
+    hypotheses = PoseHypotheses(HypothesesConfig())
+    for tenth in range(11):
+        seen(hypotheses, tenth * STEP_NS, at(tenth / 10))
+    return hypotheses
+
+
+def best_x(hypotheses: PoseHypotheses) -> float:
+    assert hypotheses.best is not None
+    return float(hypotheses.best.world_from_cam.translation[0])
+
+
+def test_nothing_is_predicted_before_the_first_pose_nor_long_after_the_last():
+    hypotheses = PoseHypotheses(HypothesesConfig())
+    assert hypotheses.predict(SECOND) is None
+    assert hypotheses.is_decided
+    hypotheses = walked_a_second()
+    soon = hypotheses.predict(SECOND * 3 // 2)
+    assert soon is not None
+    assert hypotheses.continues
+    assert translation_error(soon.world_from_cam, at(1.5)) < 0.05
+    assert hypotheses.predict(SECOND * 21 // 10) is None
+    assert not hypotheses.continues
+
+
+def test_odometry_carries_further():
+    hypotheses = PoseHypotheses(HypothesesConfig())
+    seen(hypotheses, 0, at(5.0), odom_from_cam=at(100.0))
+    late = hypotheses.predict(10 * SECOND, at(103.0))
+    assert late is not None
+    assert translation_error(late.world_from_cam, at(8.0)) < 1e-9
+    assert hypotheses.predict(10 * SECOND) is None, "odometry that stops is none"
+
+
+def test_a_jump_is_believed_when_the_next_poses_agree_with_it():
+    hypotheses, decided, followed = walked_a_second(), [], []
+    for k in range(1, 4):
+        seen(hypotheses, SECOND + k * STEP_NS, at(1.0 + 0.1 * k, z=6.0))
+        decided.append(hypotheses.is_decided)
+        followed.append(hypotheses.continues)
+    assert decided == [True, False, True], "in between it may be either"
+    assert followed == [True, False, True]
+    assert hypotheses.best is not None
+    assert translation_error(hypotheses.best.world_from_cam, at(1.3, z=6.0)) < 0.02
+    assert abs(hypotheses.best.velocity[0] - 1.0) < 0.3, "what the rival has learnt of the velocity is kept"
+
+
+def test_wild_poses_that_do_not_agree_are_never_believed():
+    hypotheses, rng = walked_a_second(), np.random.default_rng(0)
+    for k in range(1, 9):
+        seen(hypotheses, SECOND + k * STEP_NS, Rigid3(np.eye(3), rng.uniform(-40, 40, 3)))
+        assert best_x(hypotheses) == pytest.approx(1.0 + 0.1 * k, abs=0.05)
+
+
+def test_one_wild_pose_is_forgotten():
+    hypotheses = walked_a_second()
+    seen(hypotheses, SECOND + STEP_NS, at(7.0))
+    assert len(hypotheses.alternatives()) == 2
+    for k in (2, 3):
+        seen(hypotheses, SECOND + k * STEP_NS, at(1.0 + 0.1 * k))
+    assert len(hypotheses.alternatives()) == 1
+
+
+def test_the_motion_decides_between_alternatives_however_improbable_the_right_one():
+    hypotheses = walked_a_second()
+    shares = {-1.0: 0.5, 0.0: 0.15, 1.0: 0.3}
+    for k in range(1, 5):
+        x = 1.0 + 0.1 * k
+        hypotheses.predict(SECOND + k * STEP_NS)
+        hypotheses.weigh(SECOND + k * STEP_NS, [Candidate(at(x + off), SIGMA, share, 0) for off, share in shares.items()])
+        assert hypotheses.is_decided
+        assert hypotheses.taken == 1
+        assert best_x(hypotheses) == pytest.approx(x, abs=0.02)
+
+
+def test_answers_that_miss_the_true_pose_begin_a_doubt_and_no_more():
+    hypotheses = walked_a_second()
+    seen(hypotheses, SECOND + STEP_NS, at(5.1), at(6.1), at(7.1))
+    assert hypotheses.is_decided
+    assert hypotheses.taken is None
+    assert best_x(hypotheses) == pytest.approx(1.1, abs=0.02)
+
+
+def test_equal_panels_stay_ambiguous_until_something_unique_is_seen():
+    hypotheses = PoseHypotheses(HypothesesConfig())
+    for k in range(8):
+        seen(hypotheses, k * STEP_NS, *(at(0.1 * k + panel) for panel in range(4)), odom_from_cam=at(0.1 * k))
+        assert not hypotheses.is_decided
+        alternatives = hypotheses.alternatives()
+        assert len(alternatives) == 4
+        assert sorted(round(float(one.world_from_cam.translation[0] - 0.1 * k), 2) for one in alternatives) == [0.0, 1.0, 2.0, 3.0]
+        assert 0.9 < sum(one.probability for one in alternatives) <= 1.0
+    seen(hypotheses, 8 * STEP_NS, at(2.8), odom_from_cam=at(0.8))
+    assert hypotheses.is_decided
+    assert best_x(hypotheses) == pytest.approx(2.8, abs=0.01)
+
+
+def test_the_motion_decides_between_alternatives_of_which_only_one_moves_as_the_camera_does():
+    hypotheses, rng = PoseHypotheses(HypothesesConfig()), np.random.default_rng(2)
+    decided = []
+    for k in range(6):
+        wrong = [at(x, z=20.0) for x in rng.uniform(-30, 30, 3)]
+        seen(hypotheses, k * STEP_NS, *wrong, at(0.1 * k), odom_from_cam=at(0.1 * k))
+        decided.append(hypotheses.is_decided)
+    assert not any(decided[:2])
+    assert decided[-1]
+    assert best_x(hypotheses) == pytest.approx(0.5, abs=0.02)
+
+
+def test_followed_points_move_all_hypotheses():
+    hypotheses = PoseHypotheses(HypothesesConfig())
+    seen(hypotheses, 0, at(0.0), at(5.0))
+    hypotheses.predict(STEP_NS)
+    assert hypotheses.best is not None
+    x = best_x(hypotheses)
+    hypotheses.move(at(x + 0.3), SIGMA, None)
+    assert sorted(float(one.world_from_cam.translation[0]) for one in hypotheses.alternatives()) == pytest.approx([0.3, 5.3], abs=1e-3)
+    seen(hypotheses, 2 * STEP_NS, at(0.6), at(5.9))
+    assert best_x(hypotheses) == pytest.approx(0.6, abs=0.02), "the other one would have to go twice as fast"
+
+
+def test_the_number_is_bounded():
+    hypotheses = PoseHypotheses(HypothesesConfig(max_number=5))
+    seen(hypotheses, 0, *(at(float(x)) for x in range(20)))
+    assert len(hypotheses.alternatives()) == 5
+    seen(hypotheses, STEP_NS, *(at(float(x)) for x in range(20)))
+    assert len(hypotheses.alternatives()) <= 5
