@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.geometry.pose_covariance import covariance_of_inverse
-from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.rigid import Rigid3, covariance_of_inverse
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Alternative, Localization, NotLocalized
 from topoloc.localization.seen_points import SeenPoints
