@@ -11,7 +11,7 @@ leads that, it is right with the probability 1 / (1 + 1/o + sum of e^-d).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -109,22 +109,18 @@ class Belief:
 
     hypotheses: tuple[Hypothesis, ...] = ()
     weighed: tuple[Hypothesis, ...] = ()
-    _compared: dict[tuple[int, int], bool] = field(default_factory=dict)
-    """Which pairs of these say the same: what was found out before need not be again."""
+    _like: tuple[frozenset[int], ...] = ()
+    """Of each of these, which of those before it say the same, by their place among them."""
 
     def given(self, hypothesis: Hypothesis, config: EvidenceConfig, weights: RivalWeights) -> Belief:
         """With one more hypothesis."""
-        weighed, kept = (*self.weighed, hypothesis), list[Hypothesis]()
-        for one in _ranked(weighed, weights):
-            if not any(self._say_the_same(one, other, config) for other in kept):
-                kept.append(one)
-        return Belief(tuple(kept), weighed, self._compared)
-
-    def _say_the_same(self, one: Hypothesis, other: Hypothesis, config: EvidenceConfig) -> bool:
-        pair = (min(id(one), id(other)), max(id(one), id(other)))
-        if pair not in self._compared:
-            self._compared[pair] = _say_the_same(one, other, config)
-        return self._compared[pair]
+        like_it = frozenset(k for k, other in enumerate(self.weighed) if _say_the_same(hypothesis, other, config))
+        weighed, like = (*self.weighed, hypothesis), (*self._like, like_it)
+        places, kept = {id(one): k for k, one in enumerate(weighed)}, list[int]()
+        for k in (places[id(one)] for one in _ranked(weighed, weights)):
+            if not any(min(k, other) in like[max(k, other)] for other in kept):
+                kept.append(k)
+        return Belief(tuple(weighed[k] for k in kept), weighed, like)
 
     def ranked(self, weights: RivalWeights) -> list[Hypothesis]:
         """The hypotheses, the one that leads all others first."""

@@ -54,10 +54,8 @@ class ViewpointsConfig:
 class WallsConfig:
     """How the walls along the way are asked."""
 
-    num_ranked: Annotated[int, Between(0, 10_000)] = 32
-    """Side nodes that are compared with each view; 0 asks none."""
-    num_first: Annotated[int, Between(1, 10_000)] = 8
-    """So many are compared first; the others only where one of these is recognised."""
+    num_ranked: Annotated[int, Between(0, 10_000)] = 8
+    """Side nodes that are compared with each view; 0 asks none. More of them add more wrong poses than right ones."""
     min_agreeing: Annotated[int, AtLeast(3)] = 8
     """Matches of a view with a side node that must agree on one pose, for it to be recognised: from elsewhere there are 5 to 7."""
     num_hypotheses: Annotated[int, Between(1, 1000)] = 6

@@ -95,9 +95,7 @@ class OpenMap:
     def moves(self, row: int) -> Float[np.ndarray, "k 4 4"]:
         """The moves (world) by which what a node shows is found elsewhere in the map; as the map tells them, or found now."""
         known = self._known_repetitions
-        if known is not None:
-            return known.get(self.node_ids[row], _NO_MOVES)
-        return self._moves(row)
+        return self._moves(row) if known is None else known.get(self.node_ids[row], _NO_MOVES)
 
     @cached_property
     def _known_repetitions(self) -> Mapping[int, Float[np.ndarray, "k 4 4"]] | None:

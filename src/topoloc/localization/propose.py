@@ -148,7 +148,7 @@ def _repetitions(search: Search) -> Iterator[Proposal]:
             continue
         tried.append(hypothesis.world_from_cam)
         for move in search.map.moves(search.map.topomap.row_of(hypothesis.fit.node_id)):
-            world_from_cam = Rigid3.from_matrix(move) @ hypothesis.world_from_cam
+            world_from_cam = Rigid3(move[:3, :3], move[:3, 3]) @ hypothesis.world_from_cam
             if _is_beside(world_from_cam, [*tried, *(other.world_from_cam for other in search.belief.hypotheses)]):
                 continue
             if num_asked == config.max_repetitions:

@@ -84,16 +84,14 @@ def propose_walls(search: Search) -> Iterator[Proposal]:
         return
     with search.query.clock.stage("walls"):
         walls = SeenWalls.of(search, index)
-        found = _compared_with(walls, slice(0, config.num_first))
-        if found:
-            found += _compared_with(walls, slice(config.num_first, None))
+        found = _compared_with_ranked(walls)
         chosen = [proposal for view in range(len(walls.seen)) for proposal in _best([one for one in found if one.view == view])]
     yield from chosen
 
 
-def _compared_with(walls: SeenWalls, ranks: slice) -> list[WallProposal]:
-    """What each view has in common with the side nodes of these ranks."""
-    pairs = [(view, row) for view, rows in enumerate(walls.ranked) for row in rows[ranks]]
+def _compared_with_ranked(walls: SeenWalls) -> list[WallProposal]:
+    """What each view has in common with the side nodes that look most like it."""
+    pairs = [(view, row) for view, rows in enumerate(walls.ranked) for row in rows]
     return [proposal for view, row in pairs if (proposal := _compared(walls, view, row)) is not None]
 
 
