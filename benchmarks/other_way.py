@@ -23,9 +23,9 @@ from topoloc.errors import MapError
 from topoloc.features.side_views import SideViewConfig, side_views
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.building import build_map
 from topoloc.localization.config import WallsConfig
 from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.map_facts.building import build_map
 from topoloc.localization.result import Localization
 from topoloc.sequences.frame import StereoFrame
 from topoloc.sequences.open import open_sequence

@@ -15,7 +15,7 @@ from tiny_world import BASELINE, LEVEL_FROM_CAM, Panel, render, right_pose, smoo
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization.building import build_map
+from topoloc.localization.map_facts.building import build_map
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.frame import StereoFrame
 

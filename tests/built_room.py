@@ -11,7 +11,7 @@ import numpy as np
 
 from tiny_world import CAMERA, path_pose, render, room, tum_line
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.building import build_map
+from topoloc.localization.map_facts.building import build_map
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.open import open_sequence
 

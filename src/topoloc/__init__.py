@@ -13,10 +13,10 @@ if TYPE_CHECKING:
     from topoloc.errors import TopolocError
     from topoloc.geometry.camera import Camera
     from topoloc.geometry.rigid import Rigid3
-    from topoloc.localization.building import build_map
     from topoloc.localization.localizer import Localizer, LocalizerConfig
+    from topoloc.localization.map_facts.building import build_map
     from topoloc.localization.result import Alternative, Localization, NotLocalized
-    from topoloc.localization.trace import Trace
+    from topoloc.localization.search import Trace
     from topoloc.localization.warm_up import warm_up
     from topoloc.map.build import BuildConfig
     from topoloc.map.topomap import TopoMetricMap
@@ -60,10 +60,10 @@ _MODULES = {
     "StreamedPose": "topoloc.tracking.stream_result",
     "TopoMetricMap": "topoloc.map.topomap",
     "TopolocError": "topoloc.errors",
-    "Trace": "topoloc.localization.trace",
+    "Trace": "topoloc.localization.search",
     "Tracker": "topoloc.tracking.tracker",
     "TrackerConfig": "topoloc.tracking.tracker",
-    "build_map": "topoloc.localization.building",
+    "build_map": "topoloc.localization.map_facts.building",
     "open_sequence": "topoloc.sequences.open",
     "set_num_threads": "topoloc.compiled",
     "warm_up": "topoloc.localization.warm_up",

@@ -17,7 +17,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.localization.belief import Belief
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.localization.trace import Trace
+from topoloc.localization.search import Trace
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.coarse import NodeScore
 

@@ -19,7 +19,7 @@ from topoloc.localization.fitted_weights import weights_of
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import PoseFit
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.localization.trace import Trace
+from topoloc.localization.search import Trace
 from topoloc.map.topomap import TopoMetricMap
 
 LIGHTS = (0.055, 0.05, 0.045)

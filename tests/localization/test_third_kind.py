@@ -15,9 +15,9 @@ from tiny_world import CAMERA
 from topoloc.errors import FeatureKindError
 from topoloc.features.kinds import KINDS, FeatureConfig
 from topoloc.geometry.alignment import rotation_error, translation_error
-from topoloc.localization.building import build_map
 from topoloc.localization.fitted_weights import weights_of
 from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.map_facts.building import build_map
 from topoloc.localization.result import Localization
 from topoloc.map.build import BuildConfig
 from topoloc.map.topomap import TopoMetricMap

@@ -15,8 +15,8 @@ import numpy as np
 
 from topoloc.errors import TopolocError
 from topoloc.geometry.camera import Camera
-from topoloc.localization.contradictions import contradictions
 from topoloc.localization.localizer import Localizer
+from topoloc.localization.map_facts.contradictions import contradictions
 from topoloc.map.checking import damages
 from topoloc.map.topomap import TopoMetricMap
 

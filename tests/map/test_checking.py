@@ -12,7 +12,7 @@ from built_room import built_room
 from topoloc.cli import main
 from topoloc.errors import MapError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.contradictions import contradictions
+from topoloc.localization.map_facts.contradictions import contradictions
 from topoloc.map.checking import damages
 from topoloc.map.topomap import TopoMetricMap
 

@@ -14,8 +14,8 @@ from built_corridor import WIDE, WalkAhead, built_corridor, seen_ahead, seen_on_
 from topoloc.errors import MapError
 from topoloc.evaluation.experiments import neighbours_of
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.building import build_map
 from topoloc.localization.localizer import Localizer
+from topoloc.localization.map_facts.building import build_map
 from topoloc.localization.result import Localization
 from topoloc.map.entries import Edge, SideNodes
 from topoloc.map.nodes import NodePoses, node_distances

@@ -9,10 +9,9 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.belief import Hypothesis
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.pose_fit import PoseFit
+from topoloc.localization.pose_fit import PoseFit, SeenPoints
 from topoloc.localization.result import Alternative, Localization, NotLocalized
-from topoloc.localization.seen_points import SeenPoints
-from topoloc.localization.trace import Trace, Tried
+from topoloc.localization.search import Trace, Tried
 from topoloc.tracking.stream_result import StreamedPose
 from topoloc.tracking.tracker import Tracker
 

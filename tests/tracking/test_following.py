@@ -8,7 +8,7 @@ import pytest
 import tiny_world
 from room_stream import room_stream
 from topoloc.geometry.alignment import rotation_error, translation_error
-from topoloc.localization.seen_points import SeenPoints
+from topoloc.localization.pose_fit import SeenPoints
 from topoloc.slam.tracking import TrackingConfig, find_corners
 from topoloc.tracking.following import FollowingConfig, PointFollower
 

@@ -13,7 +13,7 @@ from topoloc.cli.output import File, Format, UsageError, check_outputs, progress
 from topoloc.cli.settings_file import read_settings, with_option
 from topoloc.errors import RecordingError
 from topoloc.features.kinds import KINDS
-from topoloc.localization.building import build_map
+from topoloc.localization.map_facts.building import build_map
 from topoloc.map.build import BuildConfig, Progress
 from topoloc.map.coarse_training import CoarseTrainingConfig, train_coarse
 from topoloc.places.classifier_config import BackboneName

@@ -18,8 +18,8 @@ from topoloc.demo.words import PAPER_LAB, night_in_words, words_of
 from topoloc.errors import MissingExtraError, TopolocError
 from topoloc.evaluation.experiments import answer_elsewhere, answer_queries
 from topoloc.evaluation.metrics import Answer, by_recording, summarize
-from topoloc.localization.building import build_map
 from topoloc.localization.localizer import Localizer
+from topoloc.localization.map_facts.building import build_map
 from topoloc.localization.result import Localization
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.atomic import write_text

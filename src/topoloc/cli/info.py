@@ -44,7 +44,7 @@ class Command:
 
 def _damages(topomap: Any, path: Path) -> list[str]:
     """What is wrong with the bytes of the file, or, where nothing is, with what they say."""
-    from topoloc.localization.contradictions import contradictions
+    from topoloc.localization.map_facts.contradictions import contradictions
     from topoloc.map.checking import damages
 
     found = damages(path)

@@ -10,9 +10,9 @@ from topoloc.geometry.rigid import covariance_of_inverse
 from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.belief import MIN_LEAD, Hypothesis, lead
 from topoloc.localization.evidence import is_only_imprecise, precision_of
+from topoloc.localization.pose_fit import SeenPoints
 from topoloc.localization.result import Alternative, Localization, NotLocalized, Reason
 from topoloc.localization.search import Search
-from topoloc.localization.seen_points import SeenPoints
 
 _MIN_ALTERNATIVE = 0.01  # ones that are less probable beside the best one are not named
 

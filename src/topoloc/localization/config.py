@@ -9,9 +9,9 @@ from topoloc.bounds import Above, AtLeast, Between
 from topoloc.features.kinds import FeatureKind
 from topoloc.features.matching import MatchingConfig
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
-from topoloc.localization.correlated_errors import CorrelatedErrorsConfig
 from topoloc.localization.evidence import EvidenceConfig
 from topoloc.localization.guided import GuidedConfig
+from topoloc.localization.map_facts.correlated_errors import CorrelatedErrorsConfig
 
 
 @dataclass(frozen=True)

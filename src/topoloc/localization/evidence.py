@@ -9,7 +9,7 @@ precision: its own covariance, beside what is tolerated, says so.
 
 The weights are those of a logistic regression on poses tried, right and wrong ones; each kind of features has its own
 (`fitted_weights.py`). That of the doubt is set by hand: wrong places in a corridor of many doors come with precise
-poses, and a free weight would follow them to zero. Walls that are seen from the other side (`walls.py`) repeat themselves more than a
+poses, and a free weight would follow them to zero. Walls that are seen from the other side (`walls/`) repeat themselves more than a
 room does, and less of them is recognised at a slant: the same evidence has weights of its own there, and it also counts how many
 of the key points found look more like the map's point here than like any elsewhere.
 """

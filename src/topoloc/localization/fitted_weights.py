@@ -56,7 +56,7 @@ class RivalWeights:
 
 @dataclass(frozen=True)
 class WallWeights:
-    """Of the evidence for a pose that the walls let expect (`walls.py`), in logarithms of odds.
+    """Of the evidence for a pose that the walls let expect (`walls/`), in logarithms of odds.
 
     sigma_px: standard deviation of a key point found at such a slant; least_shared_errors: rho (`correlated_errors.py`) is at least this,
     for what is wrong with a wall seen at a slant is wrong with all points on it.

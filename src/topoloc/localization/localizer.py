@@ -20,16 +20,15 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.answer import answer
 from topoloc.localization.config import LocalizerConfig
-from topoloc.localization.correlated_errors import correlated_errors_of
 from topoloc.localization.fitted_weights import FittedWeights, weights_of
+from topoloc.localization.map_facts.correlated_errors import correlated_errors_of
 from topoloc.localization.open_map import OpenMap
+from topoloc.localization.pose_fit import SeenPoints
 from topoloc.localization.propose import propose
 from topoloc.localization.query import Query, check_size, reduced_image
 from topoloc.localization.refine import hypothesis_of
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.localization.search import Search
-from topoloc.localization.seen_points import SeenPoints
-from topoloc.localization.trace import Trace
+from topoloc.localization.search import Search, Trace
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.coarse import CoarseLocalizer, Image
 

@@ -14,11 +14,10 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.guided import expected_key_points
 from topoloc.localization.local_map import LocalMap
-from topoloc.localization.repetition import LEAST_SHIFT, NUM_NEIGHBOURS, copy_of, digest_of, may_repeat, shifts_of
-from topoloc.localization.viewing import viewing_distances
-from topoloc.localization.wall_index import WallIndex
+from topoloc.localization.map_facts.repetition import LEAST_SHIFT, NUM_NEIGHBOURS, copy_of, digest_of, may_repeat, shifts_of
+from topoloc.localization.walls.wall_index import WallIndex
 from topoloc.map.memory import RememberedNodes
-from topoloc.map.nodes import NodePoses
+from topoloc.map.nodes import NodePoses, node_distances
 from topoloc.map.topomap import TopoMetricMap, TopoNode, open_coarse_of
 from topoloc.places.coarse import CoarseLocalizer, NodeScore
 from topoloc.places.vlad import SurfVlad
@@ -146,3 +145,16 @@ class OpenMap:
     def nearest(self, world_from_cam: Rigid3, num_nodes: int) -> Int[np.ndarray, " n"]:
         """The rows of the nodes nearest to a camera, the nearest first."""
         return np.argsort(self.distances(world_from_cam), kind="stable")[:num_nodes]
+
+
+QUARTER = Rigid3(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
+"""A quarter turn about the optical axis."""
+
+
+def viewing_distances(world_from_cam: Rigid3, nodes: NodePoses, lambda_rot: float) -> Float[np.ndarray, " nodes"]:
+    """D_total of Eq. 1 (metres) between a camera and each node, whichever side of the camera is up: the least of four quarter turns."""
+    distances = node_distances(world_from_cam, nodes, lambda_rot)
+    for _ in range(3):
+        world_from_cam = world_from_cam @ QUARTER
+        distances = np.minimum(distances, node_distances(world_from_cam, nodes, lambda_rot))
+    return distances

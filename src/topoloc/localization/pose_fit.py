@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from topoloc.features.features import Features, Matches
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
@@ -15,7 +15,27 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera, usual_camera
 from topoloc.localization.local_map import LocalMap
-from topoloc.localization.seen_points import SeenPoints
+
+
+@dataclass(frozen=True, eq=False)
+class SeenPoints:
+    """Row k: the pixel at which a map point was found, its world position (metres) and the covariance of that (m^2)."""
+
+    points_img: Float32[np.ndarray, "n 2"]
+    points_world: Float[np.ndarray, "n 3"]
+    covariances: Float[np.ndarray, "n 3 3"]
+
+    def __len__(self) -> int:
+        return len(self.points_img)
+
+    def select(self, rows: np.ndarray) -> SeenPoints:
+        return SeenPoints(self.points_img[rows], self.points_world[rows], self.covariances[rows])
+
+    def in_image(self, scale: float) -> SeenPoints:
+        """The same in a picture that is `scale` times as wide."""
+        points_img = ((self.points_img + np.float32(0.5)) * np.float32(scale) - np.float32(0.5)).astype(np.float32)
+        return SeenPoints(points_img, self.points_world, self.covariances)
+
 
 _MIN_MATCHES = 4
 

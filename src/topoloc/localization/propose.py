@@ -11,7 +11,7 @@
   matches that are displaced anyhow, the right one matches that are displaced alike: only nodes whose displacements agree are followed up.
 
 - **repetition**: where a place repeats itself (`repetition.py`), a hypothesis is one of many: the poses shifted so are proposed, too.
-- **walls**: what is seen of the walls along the way, from the other side (`walls.py`).
+- **walls**: what is seen of the walls along the way, from the other side (`walls/`).
 
 Each proposer looks at what is believed so far and proposes nothing where that is settled.
 """
@@ -27,10 +27,10 @@ from topoloc.features.matching import match_pooled
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.belief import Hypothesis, is_same_pose
 from topoloc.localization.guided import largest_shift, match_expected, match_guided
+from topoloc.localization.map_facts.repetition import LEAST_SHIFT
 from topoloc.localization.pose_fit import PoseFit, fit_pose
-from topoloc.localization.repetition import LEAST_SHIFT
 from topoloc.localization.search import Proposal, Search, Source
-from topoloc.localization.walls import propose_walls
+from topoloc.localization.walls.propose_walls import propose_walls
 from topoloc.map.nodes import node_distances
 from topoloc.places.coarse import NodeScore
 

@@ -8,6 +8,8 @@ picture is reduced until its pixels see as much as the map's did; a coarser one 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -20,9 +22,27 @@ from topoloc.features.extraction import FeatureConfig, extract_normalized, norma
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rough_camera import RoughCamera, usual_camera
-from topoloc.localization.stages import StageClock
 from topoloc.places.coarse import Image
 from topoloc.sequences.pictures import grey_image
+
+
+class StageClock:
+    """Adds up the time spent in named stages; `total` is the time since it was made."""
+
+    def __init__(self) -> None:
+        self._start = time.perf_counter()
+        self._times_ms: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._times_ms[name] = self._times_ms.get(name, 0.0) + (time.perf_counter() - start) * 1e3
+
+    def times_ms(self) -> dict[str, float]:
+        return self._times_ms | {"total": (time.perf_counter() - self._start) * 1e3}
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,14 +16,13 @@ from topoloc.features.matching import match_pooled
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.belief import Hypothesis
-from topoloc.localization.correlated_errors import inflation
 from topoloc.localization.evidence import Evidence, doubt_of, even_share_of, log_odds_of, spread_of
 from topoloc.localization.guided import count_by_chance, match_guided, visible_pixels
+from topoloc.localization.map_facts.correlated_errors import inflation
+from topoloc.localization.map_facts.repetition import copies, folded
 from topoloc.localization.pose_fit import PoseFit, fit_pose
-from topoloc.localization.repetition import copies, folded
-from topoloc.localization.search import Proposal, Search
-from topoloc.localization.trace import Tried
-from topoloc.localization.walls import WallProposal, refine_wall, weigh_wall
+from topoloc.localization.search import Proposal, Search, Tried
+from topoloc.localization.walls.propose_walls import WallProposal, refine_wall, weigh_wall
 
 _HOPELESS = -3.0  # odds, in logarithms, that nothing can mend
 

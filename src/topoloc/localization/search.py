@@ -12,8 +12,30 @@ from topoloc.localization.fitted_weights import FittedWeights
 from topoloc.localization.open_map import OpenMap
 from topoloc.localization.pose_fit import PoseFit
 from topoloc.localization.query import Query
-from topoloc.localization.trace import Trace
 from topoloc.places.coarse import NodeScore
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """A first pose and what became of it.
+
+    `refined` is the pose found around the first one (None: the first was not followed up), `hypothesis` that with its evidence (None:
+    too little was found for any), `milliseconds` the time since the query began.
+    """
+
+    source: str
+    first: PoseFit
+    refined: PoseFit | None
+    hypothesis: Hypothesis | None
+    milliseconds: float
+
+
+@dataclass(eq=False)
+class Trace:
+    """All first poses that were tried, in order."""
+
+    tried: list[Tried] = field(default_factory=list)
+
 
 Source = Literal["prior", "retrieval", "look-alikes", "viewpoints", "repetition", "walls"]
 

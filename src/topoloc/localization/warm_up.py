@@ -17,8 +17,8 @@ from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.matching import MatchingConfig, match_features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.building import build_map
 from topoloc.localization.localizer import Localizer
+from topoloc.localization.map_facts.building import build_map
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.frame import DepthImage, StereoFrame
 

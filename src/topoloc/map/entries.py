@@ -99,7 +99,7 @@ class Edge:
 @dataclass(frozen=True, eq=False)
 class Repetitions:
     """By node id, the moves (4x4 matrices, world) by which what a node shows is found elsewhere in the map, of nodes that have any, as
-    `localization/repetition.py` found them. `digest` stands for the nodes that were looked at: of others it says nothing.
+    `map_facts/repetition.py` found them. `digest` stands for the nodes that were looked at: of others it says nothing.
     """
 
     digest: str
@@ -108,7 +108,7 @@ class Repetitions:
 
 @dataclass(frozen=True)
 class SharedErrors:
-    """rho, the share of a match's variance that the map's points have in common, as `localization/correlated_errors.py` measured it.
+    """rho, the share of a match's variance that the map's points have in common, as `map_facts/correlated_errors.py` measured it.
 
     `digest` stands for the nodes and the settings that it was measured of and with: of others it says nothing.
     """

@@ -3,7 +3,7 @@
 A node's points are known from where the mapping camera looked, and found again from there. Its picture also holds the walls to the
 left and to the right, slanted; `features/side_views.py` shows them as from before them. Some of the nodes are therefore described once more
 as two cameras in the same place that look to the sides, with features and points of their own. They are no nodes of Eq. 1: the
-localizer asks them only where nothing else gave a pose (`localization/walls.py`).
+localizer asks them only where nothing else gave a pose (`localization/walls/`).
 """
 
 from __future__ import annotations

@@ -10,9 +10,9 @@ from jaxtyping import Float
 
 from topoloc.geometry.rigid import Rigid3, covariance_of_inverse
 from topoloc.localization.localizer import Localizer
+from topoloc.localization.pose_fit import SeenPoints
 from topoloc.localization.result import Alternative, Localization, NotLocalized
-from topoloc.localization.seen_points import SeenPoints
-from topoloc.localization.trace import Trace
+from topoloc.localization.search import Trace
 from topoloc.tracking.pose_errors import PoseErrors, errors_of
 from topoloc.tracking.pose_hypotheses import Candidate, PoseHypotheses, is_same_place
 from topoloc.tracking.tracker_state import StreamPicture

@@ -25,8 +25,8 @@ from topoloc.errors import QueryError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
+from topoloc.localization.query import StageClock
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.localization.stages import StageClock
 from topoloc.places.coarse import Image
 from topoloc.sequences.pictures import grey_image
 from topoloc.tracking.following import Followed, FollowingConfig, PointFollower

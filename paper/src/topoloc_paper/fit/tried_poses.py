@@ -15,10 +15,10 @@ import numpy as np
 from topoloc.features.kinds import FeatureConfig
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.building import build_map
 from topoloc.localization.evidence import Evidence, EvidenceConfig, tolerated_translation
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.trace import Trace
+from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.search import Trace
 from topoloc.map.build import BuildConfig
 from topoloc.map.side_nodes import SideNodesConfig
 from topoloc.map.topomap import TopoMetricMap

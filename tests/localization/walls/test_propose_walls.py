@@ -26,7 +26,7 @@ from topoloc.localization.query import Query
 from topoloc.localization.refine import hypothesis_of
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Search
-from topoloc.localization.walls import propose_walls
+from topoloc.localization.walls.propose_walls import propose_walls
 from topoloc.map.topomap import SideNodes, TopoMetricMap
 
 NO_WALLS = LocalizerConfig(walls=WallsConfig(num_ranked=0))

@@ -13,11 +13,11 @@ import topoloc
 from built_room import built_room
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization import correlated_errors
-from topoloc.localization.correlated_errors import CorrelatedErrorsConfig, inflation
 from topoloc.localization.fitted_weights import weights_of
 from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.map_facts import correlated_errors
+from topoloc.localization.map_facts.correlated_errors import CorrelatedErrorsConfig, inflation
 from topoloc.map.topomap import TopoMetricMap
 
 CONFIG, WEIGHTS = CorrelatedErrorsConfig(min_nodes=3), weights_of("surf").shared_errors

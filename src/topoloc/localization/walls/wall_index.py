@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from topoloc.errors import MapError
 from topoloc.localization.local_map import LocalMap
-from topoloc.localization.wall_matching import of_picture
+from topoloc.localization.walls.wall_matching import of_picture
 from topoloc.map.memory import RememberedNodes
 from topoloc.map.topomap import SideNodes, TopoMetricMap, TopoNode, in_rows
 from topoloc.places.vlad import SurfVlad

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from topoloc.features.features import Features, Matches
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization.wall_poses import agreeing_pose
+from topoloc.localization.walls.wall_poses import agreeing_pose
 from topoloc.map.topomap import NodeSummary, TopoNode
 
 NODE_CAMERA = Camera.pinhole(480, 430, 240.0, 240.0, -240.0, 216.0)

@@ -14,12 +14,12 @@ from topoloc.features.features import Features
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization import open_map
-from topoloc.localization.building import with_repetitions
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.localizer import Localizer
+from topoloc.localization.map_facts.building import with_repetitions
+from topoloc.localization.map_facts.repetition import copies, folded, shifts_of
 from topoloc.localization.open_map import OpenMap
-from topoloc.localization.repetition import copies, folded, shifts_of
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.map.checking import damages
 from topoloc.map.topomap import TopoMetricMap

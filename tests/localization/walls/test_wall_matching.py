@@ -17,7 +17,7 @@ from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.local_map import LocalMap
-from topoloc.localization.wall_matching import SeenSide, estimate_pose, match_sides, nearest_sides, of_picture
+from topoloc.localization.walls.wall_matching import SeenSide, estimate_pose, match_sides, nearest_sides, of_picture
 from topoloc.map.topomap import SideNodes
 
 PICTURE, TRUTH = seen_on_the_way_back()[2]

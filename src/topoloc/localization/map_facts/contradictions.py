@@ -14,9 +14,9 @@ import numpy as np
 
 from topoloc.features.matching import MatchingConfig, match_features
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
-from topoloc.localization.correlated_errors import inflation
 from topoloc.localization.fitted_weights import weights_of
 from topoloc.localization.local_map import LocalMap
+from topoloc.localization.map_facts.correlated_errors import inflation
 from topoloc.map.entries import TopoNode
 from topoloc.map.nodes import NodePoses, node_distances
 from topoloc.map.topomap import TopoMetricMap

@@ -23,15 +23,15 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.belief import Hypothesis
-from topoloc.localization.correlated_errors import inflation
 from topoloc.localization.evidence import Evidence, doubt_of, even_share_of, log_odds_of, spread_of
 from topoloc.localization.guided import visible_pixels
 from topoloc.localization.local_map import LocalMap
+from topoloc.localization.map_facts.correlated_errors import inflation
 from topoloc.localization.pose_fit import PoseFit
 from topoloc.localization.search import Proposal, Search
-from topoloc.localization.wall_index import WallIndex
-from topoloc.localization.wall_matching import SeenSide, SideMatches, estimate_pose, match_sides, nearest_sides
-from topoloc.localization.wall_poses import agreeing_pose
+from topoloc.localization.walls.wall_index import WallIndex
+from topoloc.localization.walls.wall_matching import SeenSide, SideMatches, estimate_pose, match_sides, nearest_sides
+from topoloc.localization.walls.wall_poses import agreeing_pose
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

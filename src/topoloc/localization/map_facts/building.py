@@ -7,10 +7,10 @@ from dataclasses import replace
 
 from topoloc.features.kinds import find_kind
 from topoloc.localization.config import LocalizerConfig
-from topoloc.localization.correlated_errors import with_correlated_errors
 from topoloc.localization.fitted_weights import weights_of
+from topoloc.localization.map_facts.correlated_errors import with_correlated_errors
+from topoloc.localization.map_facts.repetition import digest_of
 from topoloc.localization.open_map import OpenMap
-from topoloc.localization.repetition import digest_of
 from topoloc.map import build
 from topoloc.map.topomap import Repetitions, TopoMetricMap
 from topoloc.sequences.frame import StereoSequence
