@@ -210,14 +210,15 @@ def test_a_loaded_map_keeps_its_sides_when_it_is_saved_again(sides: SideNodes, s
 
 QUERIES_OF_OPENING = """
 import sqlite3, sys
-from topoloc.map import file, reading
+from topoloc.map import file
+from topoloc.map.topomap import TopoMetricMap
 connect, asked = sqlite3.connect, []
 def traced(*args, **kwargs):
     database = connect(*args, **kwargs)
     database.set_trace_callback(asked.append)
     return database
 file.sqlite3.connect = traced
-topomap = reading.open_map(reading.Path(sys.argv[1]))
+topomap = TopoMetricMap.load(sys.argv[1])
 print(asked)
 topomap.sides.nodes[1]
 print(asked)

@@ -17,12 +17,12 @@ from topoloc.features.features import Features
 from topoloc.features.kinds import find_kind
 from topoloc.geometry.camera import Camera
 from topoloc.map.config import CONFIG_VERSION, MapConfig, config_from_text
+from topoloc.map.contents import MapContents, NextIds
 from topoloc.map.entries import Edge, NodeSummary, PlaceImage, Repetitions, SharedErrors, SideNodes, TopoNode
 from topoloc.map.file import MapFile
 from topoloc.map.schema import ORDER, SIDE
 from topoloc.map.sessions import Edit, Session
 from topoloc.map.sums import LandmarkSums, sums_from
-from topoloc.map.topomap import NextIds, TopoMetricMap
 from topoloc.map.validation import MAX_POINTS, Damage, array_from, arrays_from, camera_from, count_within, json_of, pose_from
 from topoloc.places.coarse import CoarseModel
 
@@ -33,8 +33,8 @@ MAX_ID = 2**53
 _MAX_MOVES = 1000
 
 
-def open_map(path: Path, digest: str | None = None) -> TopoMetricMap:
-    """Open a map file without reading its nodes.
+def open_map(path: Path, digest: str | None = None) -> tuple[MapContents, MapFile]:
+    """Open a map file without reading its nodes; it stays open.
 
     Args:
         digest: of the map that is expected; another one is an error.
@@ -48,15 +48,13 @@ def open_map(path: Path, digest: str | None = None) -> TopoMetricMap:
         if digest is not None and file.digest != digest:
             raise MapError(f"map {path} is not the one that was pickled: it was replaced since")
         with file.reading():
-            topomap = _map_of(file)
+            return _contents_of(file), file
     except BaseException:
         file.close()
         raise
-    topomap.__dict__["_opened"] = file  # no field: a changed copy is not that of the file
-    return topomap
 
 
-def _map_of(file: MapFile) -> TopoMetricMap:
+def _contents_of(file: MapFile) -> MapContents:
     facts = file.facts
     missing = [key for key in ("config", "length_m") if key not in facts]
     if missing:
@@ -68,7 +66,7 @@ def _map_of(file: MapFile) -> TopoMetricMap:
         sides = SideNodes(
             _stored_summaries(file, SIDE), _stored_nodes(file, config.features.kind, SIDE), _Keyed(file, f"{SIDE}coarse_models", _model_of)
         )
-    return TopoMetricMap(
+    return MapContents(
         summaries=_stored_summaries(file),
         nodes=_stored_nodes(file, config.features.kind),
         edges=[Edge(row["source_id"], row["target_id"]) for row in file.rows("edges")],

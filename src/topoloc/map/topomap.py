@@ -1,6 +1,6 @@
 """The topo-metric map of the paper (section III-A): nodes with features and their 3-D positions, edges, place images.
 
-Data only: `build.py` makes it, `writing.py` writes and `reading.py` reads it, `localization` asks it.
+`build.py` makes it, `writing.py` writes and `reading.py` reads it, `localization` asks it.
 
 Everything in a map has an id that never changes and is never used again. Whoever computes works on rows, which the open map derives: row
 i is `summaries[i]` and `nodes[i]`, and `row_of` leads there from an id.
@@ -8,8 +8,8 @@ i is `summaries[i]` and `nodes[i]`, and `row_of` leads there from an id.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -18,10 +18,12 @@ from typing import Any, no_type_check
 import numpy as np
 
 from topoloc.errors import MapError
-from topoloc.map.config import MapConfig
+from topoloc.map.contents import MapContents
 from topoloc.map.entries import Edge, NodeSummary, PlaceImage, Repetitions, SharedErrors, SideNodes, TopoNode
 from topoloc.map.file import MapFile
+from topoloc.map.reading import open_map
 from topoloc.map.sessions import Edit, Session
+from topoloc.map.writing import save_map
 from topoloc.places.coarse import CoarseLocalizer, CoarseModel, open_coarse
 
 __all__ = [
@@ -39,56 +41,19 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True)
-class NextIds:
-    """The ids that new entries of a map get: more than any that was ever used in it."""
-
-    session: int = 0
-    node: int = 0
-    place_image: int = 1
-    side_node: int = 0
-    edit: int = 1
-
-
-@no_type_check  # at run time: it would read from the file to look at entries' types
+@no_type_check  # as of its contents
 @dataclass(frozen=True, eq=False)
-class TopoMetricMap:
-    """The map. In a map that was loaded, every sequence and mapping reads the file only when an entry is asked for.
-
-    `summaries[i]` describes `nodes[i]`; their ids are in increasing order. `config` is the effective configuration it
-    was built with, `length_m` the metres of trajectory that were mapped. `default_coarse` names the coarse localizer that answers
-    where the user names none. `shared_errors` and `repetitions` are None where nobody has measured
-    them, `sides` where no mapping picture is wide enough to show the walls along the way. `edits` begins with the build.
-    `other_kinds` are the same nodes with points of further kinds of features, by the kind's name.
+class TopoMetricMap(MapContents):
+    """The map, see `MapContents` for what it holds. In one that was loaded, every sequence and mapping reads the file only when an entry
+    is asked for.
 
     A map that was loaded holds its file open; ``with TopoMetricMap.load(path) as topomap`` or `close` let go of it. It is pickled as
     its path, and several threads may read it.
     """
 
-    summaries: Sequence[NodeSummary]
-    nodes: Sequence[TopoNode]
-    edges: Sequence[Edge]
-    place_images: Sequence[PlaceImage]
-    coarse_models: Mapping[str, CoarseModel]
-    config: MapConfig = field(default_factory=MapConfig)
-    length_m: float = 0.0
-    default_coarse: str = "surf-vlad"
-    shared_errors: SharedErrors | None = None
-    repetitions: Repetitions | None = None
-    sides: SideNodes | None = None
-    sessions: Sequence[Session] = ()
-    edits: Sequence[Edit] = ()
-    next_ids: NextIds = NextIds()
-    other_kinds: Mapping[str, Sequence[TopoNode]] = field(default_factory=dict)
-
     def row_of(self, node_id: int) -> int:
         """The row of a node. Raises KeyError where the map has no node of this id."""
         return self._rows[node_id]
-
-    @property
-    def kind(self) -> str:
-        """The kind of features that the nodes' points are described with, and queries must be."""
-        return self.config.features.kind
 
     @cached_property
     def _rows(self) -> dict[int, int]:
@@ -96,16 +61,12 @@ class TopoMetricMap:
 
     def save(self, path: str | Path) -> None:
         """Write the map file at once or not at all. Raises MapError."""
-        from topoloc.map.writing import save_map
-
         save_map(self, Path(path))
 
     @staticmethod
     def load(path: str | Path) -> TopoMetricMap:
         """Open a map file; nodes are read when asked for. Raises MapError, MapVersionError."""
-        from topoloc.map.reading import open_map
-
-        return open_map(Path(path))
+        return _opened(open_map(Path(path)))
 
     def close(self) -> None:
         """Let go of the file, where the map was loaded; what is asked of it afterwards is a MapError."""
@@ -131,9 +92,14 @@ class TopoMetricMap:
 
 def _load_same(path: str, digest: str) -> TopoMetricMap:
     """The map that was pickled. Raises MapError where another one is in its place by now."""
-    from topoloc.map.reading import open_map
+    return _opened(open_map(Path(path), digest))
 
-    return open_map(Path(path), digest)
+
+def _opened(read: tuple[MapContents, MapFile]) -> TopoMetricMap:
+    contents, file = read
+    topomap = TopoMetricMap(**vars(contents))
+    topomap.__dict__["_opened"] = file  # no field: a changed copy is not that of the file
+    return topomap
 
 
 def open_coarse_of(topomap: TopoMetricMap, name: str) -> CoarseLocalizer:

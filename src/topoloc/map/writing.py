@@ -24,17 +24,17 @@ from topoloc.errors import MapError
 from topoloc.features.kinds import find_kind
 from topoloc.geometry.rigid import Rigid3
 from topoloc.map.config import config_to_text
+from topoloc.map.contents import MapContents, NextIds
 from topoloc.map.entries import TopoNode
 from topoloc.map.reading import unit_descriptors
 from topoloc.map.schema import APPLICATION_ID, ORDER, SCHEMA_VERSION, SIDE, TABLES, checksum_of, creation_of
 from topoloc.map.sessions import Session, sessions_named
 from topoloc.map.sums import sums_bytes
-from topoloc.map.topomap import NextIds, TopoMetricMap
 from topoloc.places.coarse import CoarseModel
 from topoloc.sequences.atomic import replaced_file
 
 
-def save_map(topomap: TopoMetricMap, path: Path) -> None:
+def save_map(topomap: MapContents, path: Path) -> None:
     """Write the map to `path`: beside it first, then renamed over it, so that a reader sees the old map or the new one.
 
     Raises:
@@ -59,7 +59,7 @@ class _Writer:
         self._checksums: dict[str, list[tuple[tuple[Any, ...], bytes]]] = {table: [] for table in TABLES}
         self._camera_ids: dict[str, int] = {}
 
-    def write(self, topomap: TopoMetricMap) -> None:
+    def write(self, topomap: MapContents) -> None:
         # the file is nobody's until it is renamed: no journal is needed to undo what is half done
         for pragma in ("page_size = 4096", "journal_mode = OFF", "synchronous = OFF", f"application_id = {APPLICATION_ID}"):
             self._database.execute(f"PRAGMA {pragma}")
@@ -90,14 +90,14 @@ class _Writer:
         self._write_facts(topomap, sessions, next_image)
         self._database.execute("COMMIT")
 
-    def _write_nodes(self, topomap: TopoMetricMap, session_ids: Mapping[str, int]) -> None:
+    def _write_nodes(self, topomap: MapContents, session_ids: Mapping[str, int]) -> None:
         for row, node in enumerate(topomap.nodes):
             self._insert_node(node, topomap.kind, session_ids)
             self._insert("node_templates", node.summary.node_id, node.template_jpeg)
             for kind, nodes in sorted(topomap.other_kinds.items()):
                 self._insert_points(nodes[row], kind)
 
-    def _write_images(self, topomap: TopoMetricMap, session_ids: Mapping[str, int]) -> int:
+    def _write_images(self, topomap: MapContents, session_ids: Mapping[str, int]) -> int:
         """Images without an id get the next ones; returns the one after them."""
         next_id = max(topomap.next_ids.place_image, 1)
         for image in topomap.place_images:
@@ -107,7 +107,7 @@ class _Writer:
             next_id = max(next_id, image_id + 1)
         return next_id
 
-    def _write_facts(self, topomap: TopoMetricMap, sessions: Sequence[Session], next_image: int) -> None:
+    def _write_facts(self, topomap: MapContents, sessions: Sequence[Session], next_image: int) -> None:
         used = NextIds(
             session=max((session.session_id + 1 for session in sessions), default=0),
             node=max((summary.node_id + 1 for summary in topomap.summaries), default=0),

@@ -1,0 +1,55 @@
+"""What a map holds, as `reading.py` finds it in a file and `writing.py` writes it. Data only; `topomap.py` makes a map of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import no_type_check
+
+from topoloc.map.config import MapConfig
+from topoloc.map.entries import Edge, NodeSummary, PlaceImage, Repetitions, SharedErrors, SideNodes, TopoNode
+from topoloc.map.sessions import Edit, Session
+from topoloc.places.coarse import CoarseModel
+
+
+@dataclass(frozen=True)
+class NextIds:
+    """The ids that new entries of a map get: more than any that was ever used in it."""
+
+    session: int = 0
+    node: int = 0
+    place_image: int = 1
+    side_node: int = 0
+    edit: int = 1
+
+
+@no_type_check  # at run time: it would read from the file to look at entries' types
+@dataclass(frozen=True, eq=False)
+class MapContents:
+    """All of a map. `summaries[i]` describes `nodes[i]`; their ids are in increasing order. `config` is the effective configuration it
+    was built with, `length_m` the metres of trajectory that were mapped. `default_coarse` names the coarse localizer that answers
+    where the user names none. `shared_errors` and `repetitions` are None where nobody has measured
+    them, `sides` where no mapping picture is wide enough to show the walls along the way. `edits` begins with the build.
+    `other_kinds` are the same nodes with points of further kinds of features, by the kind's name.
+    """
+
+    summaries: Sequence[NodeSummary]
+    nodes: Sequence[TopoNode]
+    edges: Sequence[Edge]
+    place_images: Sequence[PlaceImage]
+    coarse_models: Mapping[str, CoarseModel]
+    config: MapConfig = field(default_factory=MapConfig)
+    length_m: float = 0.0
+    default_coarse: str = "surf-vlad"
+    shared_errors: SharedErrors | None = None
+    repetitions: Repetitions | None = None
+    sides: SideNodes | None = None
+    sessions: Sequence[Session] = ()
+    edits: Sequence[Edit] = ()
+    next_ids: NextIds = NextIds()
+    other_kinds: Mapping[str, Sequence[TopoNode]] = field(default_factory=dict)
+
+    @property
+    def kind(self) -> str:
+        """The kind of features that the nodes' points are described with, and queries must be."""
+        return self.config.features.kind
