@@ -14,7 +14,7 @@ import numpy as np
 import topoloc
 from topoloc.demo.recordings import SHIPPED
 from topoloc.geometry.alignment import rotation_error, translation_error
-from topoloc.geometry.pose_covariance import covariance_of_inverse, position_covariance
+from topoloc.geometry.rigid import covariance_of_inverse, position_covariance
 
 
 def main(map_from: str, ask: str, out: Path) -> None:
