@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from doubled_room import ELSEWHERE, twice
 
 from built_room import built_room, unseen_views
+from doubled_room import ELSEWHERE, twice
 from tiny_world import CAMERA
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3

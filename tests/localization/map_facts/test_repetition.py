@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from doubled_room import ELSEWHERE, twice
 
 from built_room import built_room, unseen_views
+from doubled_room import ELSEWHERE, twice
 from tiny_world import CAMERA
 from topoloc.features.features import Features
 from topoloc.geometry.alignment import translation_error
