@@ -25,8 +25,9 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.evidence import EvidenceConfig, tolerated_translation
 from topoloc.localization.localizer import Localizer
+from topoloc.localization.map_facts.building import build_map
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.map.build import BuildConfig, build_map
+from topoloc.map.build import BuildConfig
 from topoloc.map.nodes import NodeConfig
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.open import open_sequence

@@ -20,7 +20,8 @@ from topoloc.features.matching import MatchingConfig
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.map.build import BuildConfig, build_map
+from topoloc.localization.map_facts.building import build_map
+from topoloc.map.build import BuildConfig
 from topoloc.map.nodes import NodeConfig
 from topoloc.sequences.open import open_sequence
 

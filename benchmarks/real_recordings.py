@@ -24,7 +24,8 @@ import numpy as np
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
-from topoloc.map.build import BuildConfig, build_map
+from topoloc.localization.map_facts.building import build_map
+from topoloc.map.build import BuildConfig
 from topoloc.map.nodes import NodeConfig
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.frame import StereoFrame

@@ -38,8 +38,8 @@ import numpy as np
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
+from topoloc.localization.map_facts.building import build_map
 from topoloc.localization.result import Localization
-from topoloc.map.build import build_map
 from topoloc.sequences.frame import StereoFrame
 from topoloc.sequences.open import open_sequence
 from topoloc.sequences.recording import single_pictures

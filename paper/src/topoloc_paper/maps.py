@@ -12,7 +12,8 @@ import numpy as np
 
 from topoloc.errors import MissingExtraError
 from topoloc.features.extraction import FeatureConfig
-from topoloc.map.build import BuildConfig, build_map
+from topoloc.localization.map_facts.building import build_map
+from topoloc.map.build import BuildConfig
 from topoloc.map.coarse_training import CoarseTrainingConfig, train_coarse
 from topoloc.map.nodes import NodeConfig
 from topoloc.map.topomap import TopoMetricMap
