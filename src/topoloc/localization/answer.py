@@ -14,6 +14,7 @@ from topoloc.localization.pose_fit import SeenPoints
 from topoloc.localization.result import Alternative, Localization, NotLocalized, Reason
 from topoloc.localization.search import Search
 
+_ELSEWHERE_DEG = 10.0
 _MIN_ALTERNATIVE = 0.01  # ones that are less probable beside the best one are not named
 
 
@@ -32,11 +33,13 @@ def answer(search: Search) -> tuple[Localization | NotLocalized, SeenPoints | No
 
 
 def _lead(search: Search, best: Hypothesis, other: Hypothesis) -> float:
-    """By how much the best hypothesis leads. One that is not clear must do so by its odds, too: where a wrong place of the map has nearly
-    as much for it, a place that is not in the map may as well."""
+    """By how much the best hypothesis leads. One that is not clear must lead those elsewhere by its odds, too: where a wrong place of the
+    map has nearly as much for it, a place that is not in the map may as well."""
     by_all = lead(best, other, search.weights.rivals)
     is_clear = best.log_odds > search.weights.evidence.clear_log_odds
-    return by_all if is_clear else min(by_all, best.log_odds - other.log_odds)
+    apart, config = best.world_from_cam.inverse() @ other.world_from_cam, search.config.evidence
+    is_elsewhere = np.linalg.norm(apart.translation) > 2.0 * config.max_translation or apart.angle() > math.radians(_ELSEWHERE_DEG)
+    return min(by_all, best.log_odds - other.log_odds) if is_elsewhere and not is_clear else by_all
 
 
 def _localization(search: Search, best: Hypothesis, probability: float) -> Localization:
