@@ -85,7 +85,8 @@ def main() -> None:
     places += [Place(f"lab, {light}", str(SHIPPED / "map_lap1"), str(SHIPPED / light)) for light in ("day", "night")]
     if arguments.rendered:
         folder = arguments.rendered.resolve()
-        places += [Place(f"corridor, {light}", f"{folder}/corridor_map", f"{folder}/corridor_{light}") for light in ("day", "night")]
+        rendered = [Place(f"corridor, {light}", f"{folder}/corridor_map", f"{folder}/corridor_{light}") for light in ("day", "night")]
+        places += [place for place in rendered if Path(place.queries).is_dir() or print(f"left out: {place.queries}, which is not there")]
     groups: dict[str, Asked] = {}
     topomap, mapped = None, ""
     for place in places:
