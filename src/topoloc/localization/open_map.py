@@ -14,7 +14,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.guided import expected_key_points
 from topoloc.localization.local_map import LocalMap
-from topoloc.localization.map_facts.repetition import LEAST_SHIFT, NUM_NEIGHBOURS, copy_of, digest_of, may_repeat, shifts_of
+from topoloc.localization.map_facts.repetition import NUM_NEIGHBOURS, copy_of, digest_of, may_repeat, shifts_of
 from topoloc.localization.walls.wall_index import WallIndex
 from topoloc.map.memory import RememberedNodes
 from topoloc.map.nodes import NodePoses, node_distances
@@ -136,7 +136,7 @@ class OpenMap:
         near = np.flatnonzero(looks_alike & (away < max(_LEAST_REACH, 1.5 * float(np.median(depths)))))
         near = near[np.argsort(away[near], kind="stable")]
         spread = np.unique(np.linspace(0, len(near) - 1, NUM_NEIGHBOURS).round().astype(int))
-        return shifts_of(node, self.local_map(near[spread]), LEAST_SHIFT)
+        return shifts_of(node, self.local_map(near[spread]))
 
     def distances(self, world_from_cam: Rigid3) -> Float[np.ndarray, " nodes"]:
         """D_total of Eq. 1 (metres) between a camera and each node, whichever side of the camera is up."""

@@ -35,7 +35,7 @@ from topoloc.map.nodes import node_distances
 from topoloc.places.coarse import NodeScore
 
 _BESIDE = 0.25  # radians
-_MIN_COPIED_SHARE = 0.2  # of what is found at a pose, that must be found at one that is as likely
+_LEAST_FOUND_SHARE = 0.2  # of what is found at a pose, that must be found at one that is as likely
 
 
 def propose(search: Search, prior: Rigid3 | None) -> Iterator[Proposal]:
@@ -172,7 +172,7 @@ def _is_beside(world_from_cam: Rigid3, others: list[Rigid3]) -> bool:
 def _moved(search: Search, world_from_cam: Rigid3, hypothesis: Hypothesis) -> PoseFit | None:
     """What is found around a pose that is known to a few centimetres; None where it is far less than at the one that it repeats."""
     query, config, start = search.query, search.config, (world_from_cam.inverse(), hypothesis.fit.camera)
-    least = _MIN_COPIED_SHARE * hypothesis.evidence.num_found
+    least = _LEAST_FOUND_SHARE * hypothesis.evidence.num_found
     with query.clock.stage("matching"):
         local_map = search.map.local_map(search.map.nearest(world_from_cam, config.guided.num_nodes))
         matches = match_guided(query.features, local_map, *start, replace(config.guided, radius_px=2.0 * config.guided.radius_px))

@@ -270,8 +270,8 @@ class _Keyed(Mapping[K, V]):
         self._file, self._table, self._read = file, table, read
         self._key = ORDER[table]
 
-    def _keys(self) -> list[K]:
-        return self._file.kept(self._table, lambda: [row[self._key] for row in self._file.rows(self._table, (self._key,))])
+    def _keys(self) -> dict[K, None]:
+        return self._file.kept(self._table, lambda: {row[self._key]: None for row in self._file.rows(self._table, (self._key,))})
 
     def __len__(self) -> int:
         return len(self._keys())

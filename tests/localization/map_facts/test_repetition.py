@@ -53,7 +53,7 @@ def _wall(num_panels: int, noise: float = 0.0) -> LocalMap:
 @pytest.mark.parametrize("noise", [0.0, 0.2])
 def test_a_wall_of_equal_panels_repeats_itself_by_whole_panels(noise: float):
     wall = _wall(4, noise)
-    shifts = shifts_of(wall, wall, 0.3)
+    shifts = shifts_of(wall, wall)
     along = shifts[:, 0] / PERIOD[0]
     np.testing.assert_allclose(shifts[:, 1:], 0.0, atol=0.01)
     np.testing.assert_allclose(along, np.round(along), atol=0.02)
@@ -61,7 +61,7 @@ def test_a_wall_of_equal_panels_repeats_itself_by_whole_panels(noise: float):
 
 
 def test_what_is_there_once_does_not_repeat_itself():
-    assert len(shifts_of(_wall(1), _wall(1), 0.3)) == 0
+    assert len(shifts_of(_wall(1), _wall(1))) == 0
 
 
 def test_parts_of_a_panel_that_resemble_each_other_are_no_repetition_beside_the_panels():
@@ -72,7 +72,7 @@ def test_parts_of_a_panel_that_resemble_each_other_are_no_repetition_beside_the_
         wall.descriptors[few], wall.points_world[few] + [0.0, 0.0, 0.5], wall.covariances[few], wall.radii[few],
         wall.node_ids[few], wall.sizes[few], wall.directions[few],
     )  # fmt: skip
-    np.testing.assert_allclose(shifts_of(wall, LocalMap.pooled([wall, above]), 0.3)[:, 2], 0.0, atol=0.01)
+    np.testing.assert_allclose(shifts_of(wall, LocalMap.pooled([wall, above]))[:, 2], 0.0, atol=0.01)
 
 
 def test_folded_points_of_all_panels_are_those_of_one():

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+from jaxtyping import Float
+
 from topoloc.features.kinds import find_kind
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.fitted_weights import weights_of
@@ -38,12 +41,15 @@ def build_map(
     kind = find_kind(config.features.kind)
     topomap, asked = build.build_map(sequences, config, progress, poses_from), LocalizerConfig().for_kind(kind)
     topomap = with_correlated_errors(topomap, asked.guided, asked.pose, asked.correlated_errors, weights_of(kind.name).shared_errors)
-    return with_repetitions(topomap)
+    return with_repetitions(topomap, progress)
 
 
-def with_repetitions(topomap: TopoMetricMap) -> TopoMetricMap:
+def with_repetitions(topomap: TopoMetricMap, progress: build.Progress | None = None) -> TopoMetricMap:
     """The map, told by which moves its nodes are found elsewhere in it."""
-    opened = OpenMap(topomap)
-    found = {node_id: opened.moves(row) for row, node_id in enumerate(opened.node_ids)}
-    moves = {node_id: moves for node_id, moves in found.items() if len(moves)}
+    opened, moves = OpenMap(topomap), dict[int, Float[np.ndarray, "k 4 4"]]()
+    for row, node_id in enumerate(opened.node_ids):
+        if len(found := opened.moves(row)):
+            moves[node_id] = found
+        if progress is not None:
+            progress("repetitions", row + 1, len(opened.node_ids))
     return replace(topomap, repetitions=Repetitions(digest_of(topomap.summaries), moves))

@@ -30,7 +30,7 @@ LEAST_SHIFT = 0.3
 """Metres: from there on a copy is another place."""
 _NUM_POINTS = 128
 _MIN_SIMILARITY = 0.9
-_CELL = 0.1  # metres; and a share of the shift's own length
+_CELL = 0.1  # metres
 _MIN_VOTES, _LEAST_WITHIN = 12, 0.15
 _MAX_SHIFTS = 6
 _MIN_COPIED, _MIN_COPIED_SHARE = 20, 0.3
@@ -50,21 +50,21 @@ def digest_of(summaries: Sequence[NodeSummary]) -> str:
 
 def may_repeat(node: LocalMap) -> bool:
     """Is there anything in what a node shows that its own picture shows twice? What repeats itself mostly does."""
-    return len(shifts_of(node, node, LEAST_SHIFT, _LEAST_WITHIN)) > 0
+    return len(shifts_of(node, node, _LEAST_WITHIN)) > 0
 
 
-def shifts_of(node: LocalMap, around: LocalMap, min_shift: float, min_share: float = 0.5) -> Float[np.ndarray, "k 3"]:
+def shifts_of(node: LocalMap, around: LocalMap, min_share: float = 0.5) -> Float[np.ndarray, "k 3"]:
     """The shifts (metres, world) by which what a node shows is there once more, those with most votes first; none in most places.
 
     Args:
-        around: the points of the nodes nearby that look the same way. min_shift: metres; a smaller shift is no other place.
+        around: the points of the nodes nearby that look the same way.
         min_share: of the node's points must find a copy by the first shift, half as many by each other one: parts of a panel may
             resemble each other, too, and smooth surfaces any part of themselves.
     """
     points, descriptors = node.points_world[:_NUM_POINTS], node.descriptors[:_NUM_POINTS]
     rows, columns = np.nonzero(descriptors @ around.descriptors.T >= _MIN_SIMILARITY)
     shifts = around.points_world[columns] - points[rows]
-    far = np.linalg.norm(shifts, axis=1) > min_shift
+    far = np.linalg.norm(shifts, axis=1) > LEAST_SHIFT
     rows, shifts = rows[far], shifts[far]
     found: list[Float[np.ndarray, " 3"]] = []
     least = max(_MIN_VOTES, min_share * len(points))
@@ -74,9 +74,10 @@ def shifts_of(node: LocalMap, around: LocalMap, min_shift: float, min_share: flo
         votes = len(np.unique(rows[near]))
         if votes < least:
             break
-        least = max(_MIN_VOTES, 0.5 * max(votes, least)) if not found else least
+        if not found:
+            least = max(_MIN_VOTES, 0.5 * votes)
         found.append(np.median(shifts[near], axis=0))
-        kept = np.linalg.norm(shifts - found[-1], axis=1) > max(0.5 * min_shift, 3.0 * _CELL)
+        kept = np.linalg.norm(shifts - found[-1], axis=1) > 3.0 * _CELL
         rows, shifts = rows[kept], shifts[kept]
     return np.array(found).reshape(-1, 3)
 
