@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Annotated
 
 import numpy as np
@@ -70,12 +70,12 @@ def correlated_errors_of(
     return measure_correlated_errors(topomap, guided, pose, config, weights)
 
 
-def with_correlated_errors(
+def correlated_errors_to_keep(
     topomap: TopoMetricMap, guided: GuidedConfig, pose: AbsolutePoseConfig, config: CorrelatedErrorsConfig, weights: SharedErrorWeights
-) -> TopoMetricMap:
-    """The map, rho measured, so that who opens its file need not."""
+) -> SharedErrors:
+    """rho measured, for the map to keep."""
     rho = measure_correlated_errors(topomap, guided, pose, config, weights)
-    return replace(topomap, shared_errors=SharedErrors(rho, _digest(topomap, guided, pose, config, weights)))
+    return SharedErrors(rho, _digest(topomap, guided, pose, config, weights))
 
 
 def measure_correlated_errors(
