@@ -21,11 +21,12 @@ COMMANDS = {
     "localize": ("topoloc.cli.localize", "where were these images taken? 6-DoF poses of images, folders, recordings"),
     "evaluate": ("topoloc.cli.evaluate", "localize a recording with known truth and judge the poses"),
     "info": ("topoloc.cli.info", "what a map file holds"),
+    "weights": ("topoloc.cli.weights", "networks of local features: which are known and here, and how to get others"),
     "config": ("topoloc.cli.config", "all other settings as a TOML file, with defaults and meanings"),
 }
 _BROUGHT = {"simulate": "topoloc-worlds", "benchmark": "topoloc-paper"}
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
-_IN_HELP = ("demo", "simulate", "slam", "build", "train", "localize", "evaluate", "benchmark", "info", "config")
+_IN_HELP = ("demo", "simulate", "slam", "build", "train", "localize", "evaluate", "benchmark", "info", "weights", "config")
 
 
 LEAST_ADDRESS_SPACE = 1_600_000_000

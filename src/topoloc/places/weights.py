@@ -6,7 +6,6 @@ Files are read without running code from them (`weights_only`). A file of anothe
 from __future__ import annotations
 
 import hashlib
-import os
 import pickle
 import shutil
 import urllib.error
@@ -21,6 +20,7 @@ import torch
 from torch import Tensor
 
 from topoloc.errors import WeightsError
+from topoloc.features.network_files import cache_folder
 from topoloc.places.backbones import NUM_CHANNELS, Backbone
 from topoloc.places.classifier_config import BACKBONES, BackboneName
 from topoloc.sequences.atomic import replaced_file
@@ -89,13 +89,6 @@ def load_features(network: Backbone, weights: Weights) -> None:
 def describe(weights: Weights | None) -> dict[str, str] | None:
     """What a map keeps of where its network comes from: the file's name and hash, None for random weights."""
     return None if weights is None else {"file": weights.file_name, "sha256": weights.sha256}
-
-
-def cache_folder() -> Path:
-    """Where published weights are kept: $TOPOLOC_CACHE, else `topoloc` in the user's cache folder."""
-    if "TOPOLOC_CACHE" in os.environ:
-        return Path(os.environ["TOPOLOC_CACHE"])
-    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "topoloc"
 
 
 def _published_file(backbone: BackboneName) -> Path:
