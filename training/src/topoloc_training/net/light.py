@@ -123,7 +123,7 @@ def _exposed(picture: Grey, generator: Generator, strength: float) -> Grey:
     light = np.maximum(picture, 0) ** 2.2
     wanted = np.exp(generator.normal(-1.9, 0.2 + 0.5 * strength))
     light = light * np.clip(wanted / (light.mean() + 1e-6), 0.05, 20)
-    electrons = np.exp(generator.uniform(np.log(4000), np.log(4000 / (1 + 60 * strength))))
+    electrons = np.exp(generator.uniform(np.log(4000 / (1 + 60 * strength)), np.log(4000)))
     read = generator.uniform(1, 4) / electrons
     noise = generator.standard_normal(light.shape, dtype=np.float32)
     light = light + noise * np.sqrt(np.minimum(light, 1) / electrons + read**2)

@@ -6,7 +6,7 @@ Input `image` (1, 1, h, w) float32, grey in [0, 1], h and w multiples of 32. Out
 
 from __future__ import annotations
 
-import hashlib
+import io
 import warnings
 from pathlib import Path
 
@@ -61,7 +61,11 @@ def export(network: nn.Module, path: Path, properties: dict[str, str]) -> None:
         onnx.save(model, part)
 
 
-def source_properties(kind: str, source: Path, origin: str, licence: str) -> dict[str, str]:
-    """What a file says of where it comes from."""
-    digest = hashlib.sha256(source.read_bytes()).hexdigest()
-    return {"topoloc_network": kind, "source_sha256": digest, "licence": licence, "source": origin}
+def convert(kind: str, weights: bytes, target: Path, properties: dict[str, str]) -> None:
+    """Published weights (the bytes of their file) to ONNX. Called by `topoloc weights` through an entry point.
+
+    Raises:
+        ValueError: as `build_network`.
+    """
+    tensors = torch.load(io.BytesIO(weights), map_location="cpu", weights_only=True)
+    export(build_network(kind, tensors), target, properties)

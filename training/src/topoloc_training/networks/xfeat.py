@@ -11,6 +11,8 @@ from torch.nn import functional
 STRIDE = 8
 """Pixels from one descriptor of the map to the next; also the side of a cell of the key point head."""
 
+_LARGEST_LOGIT = 80.0
+
 UNUSED = ("fine_matcher.",)
 """Keys of the published file that this network leaves out: the matcher of coarse matches."""
 
@@ -18,6 +20,13 @@ UNUSED = ("fine_matcher.",)
 def _chain(*layers: tuple[int, int, int, int]) -> nn.Sequential:
     """Layers of (inputs, outputs, kernel, stride)."""
     return nn.Sequential(*(ConvNormReLU(i, o, kernel, stride, kernel // 2, affine=False) for i, o, kernel, stride in layers))
+
+
+def _bilinear_weights() -> Float[Tensor, "64 1 3 3"]:
+    """What each pixel of a cell takes from its own and the eight cells around, enlarging bilinearly with centres at half numbers."""
+    offset = (torch.arange(STRIDE) + 0.5) / STRIDE - 0.5
+    along = torch.stack([(-offset).clamp(min=0), 1 - offset.abs(), offset.clamp(min=0)], dim=1)
+    return torch.einsum("yi,xj->yxij", along, along).reshape(STRIDE * STRIDE, 1, 3, 3)
 
 
 class XFeat(nn.Module):
@@ -37,6 +46,7 @@ class XFeat(nn.Module):
         self.block_fusion = nn.Sequential(*_chain((64, 64, 3, 1), (64, 64, 3, 1)), nn.Conv2d(64, 64, 1))
         self.heatmap_head = nn.Sequential(*_chain((64, 64, 1, 1), (64, 64, 1, 1)), nn.Conv2d(64, 1, 1), nn.Sigmoid())
         self.keypoint_head = nn.Sequential(*_chain((64, 64, 1, 1), (64, 64, 1, 1), (64, 64, 1, 1)), nn.Conv2d(64, 65, 1))
+        self.register_buffer("bilinear", _bilinear_weights(), persistent=False)
 
     def maps(
         self, image: Float[Tensor, "b 1 h w"]
@@ -47,9 +57,18 @@ class XFeat(nn.Module):
         sixteenth = self.block4(eighth)
         coarse = self.block5(sixteenth)
         features = self.block_fusion(eighth + enlarged(sixteenth, 2) + enlarged(coarse, 4))
-        return features, self.keypoint_head(functional.pixel_unshuffle(grey, STRIDE)), self.heatmap_head(features)
+        # The head's first 1x1 convolution sees the 64 pixels of a cell as channels: one of 8x8 pixels and stride 8.
+        convolution, *first = self.keypoint_head[0].layer
+        cells = functional.conv2d(grey, convolution.weight.view(64, 1, STRIDE, STRIDE), stride=STRIDE)
+        logits = self.keypoint_head[1:](nn.Sequential(*first)(cells))
+        return features, logits, self.heatmap_head(features)
 
     def forward(self, image: Float[Tensor, "b 1 h w"]) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 64 h8 w8"]]:
         features, logits, reliability = self.maps(image)
-        cells = torch.softmax(logits, dim=1)[:, :64]
-        return functional.pixel_shuffle(cells, STRIDE) * enlarged(reliability, STRIDE), features
+        # Softmax over the channels, written out: ONNX Runtime's own turns the whole map round twice, at four times the cost.
+        # The logits of a trained network are far from float32's limit (e^88); the bound keeps an odd picture finite.
+        shares = torch.exp(logits.clamp(max=_LARGEST_LOGIT))
+        # Reliability is enlarged cell by cell, as channels: the same bilinear weights, without a map of one channel at full size.
+        around = functional.pad(reliability, (1, 1, 1, 1), mode="replicate")
+        cells = shares[:, :64] * (functional.conv2d(around, self.bilinear) / shares.sum(dim=1, keepdim=True))
+        return functional.pixel_shuffle(cells, STRIDE), features
