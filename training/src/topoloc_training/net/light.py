@@ -120,12 +120,12 @@ def _blurred(picture: Grey, generator: Generator) -> Grey:
 
 def _exposed(picture: Grey, generator: Generator, strength: float) -> Grey:
     """A camera's exposure, photon and read noise, curve, clipping and eight bits."""
-    light = np.maximum(picture, 0) ** 2.2
+    light = cv2.pow(np.maximum(picture, 0).astype(np.float32), 2.2)
     wanted = np.exp(generator.normal(-1.9, 0.2 + 0.5 * strength))
     light = light * np.clip(wanted / (light.mean() + 1e-6), 0.05, 20)
     electrons = np.exp(generator.uniform(np.log(4000 / (1 + 60 * strength)), np.log(4000)))
     read = generator.uniform(1, 4) / electrons
     noise = generator.standard_normal(light.shape, dtype=np.float32)
     light = light + noise * np.sqrt(np.minimum(light, 1) / electrons + read**2)
-    curve = np.clip(light, 0, 1) ** (1 / generator.uniform(2.2 - 0.6 * strength, 2.2 + 0.6 * strength))
-    return (np.round(np.clip(curve, 0, 1) * 255) / 255).astype(np.float32)
+    curve = cv2.pow(np.clip(light, 0, 1), 1 / generator.uniform(2.2 - 0.6 * strength, 2.2 + 0.6 * strength))
+    return (np.round(curve * 255) / 255).astype(np.float32)
