@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import shutil
+import tempfile
 import urllib.error
 import urllib.request
 import zipfile
@@ -84,22 +85,16 @@ def fetch_network(name: str) -> Path:
     network = known_network(name)
     if not network.url:
         return find_network(name)
-    download = cache_folder() / network.url.rpartition("/")[2]
     by_hand = f"fetch it on another machine and give it to `topoloc weights convert`: {network.url}"
     try:
-        download.parent.mkdir(parents=True, exist_ok=True)
-        with (
-            replaced_file(download) as part,
-            urllib.request.urlopen(network.url, timeout=_TIMEOUT_SECONDS) as answer,
-            part.open("wb") as file,
-        ):
-            shutil.copyfileobj(answer, file)
+        with urllib.request.urlopen(network.url, timeout=_TIMEOUT_SECONDS) as answer:
+            data = answer.read()
     except (urllib.error.URLError, OSError) as error:
         raise WeightsError(f"network {name} cannot be fetched ({getattr(error, 'reason', None) or error}); {by_hand}") from error
-    try:
+    with tempfile.TemporaryDirectory() as folder:
+        download = Path(folder) / network.url.rpartition("/")[2]
+        download.write_bytes(data)
         return keep_network(download)[1]
-    finally:
-        download.unlink(missing_ok=True)
 
 
 def _by_hash(path: Path, data: bytes) -> KnownNetwork:
