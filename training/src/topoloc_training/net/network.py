@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import torch
 from jaxtyping import Float
-from topoloc_training.networks.layers import ConvNormReLU, Residual, enlarged
 from torch import Tensor, nn
 from torch.nn import functional
+
+from topoloc_training.networks.layers import ConvNormReLU, Residual, enlarged
 
 KIND = "topoloc-net"
 DIMENSION = 64

@@ -16,13 +16,14 @@ from typing import Annotated
 import numpy as np
 import torch
 import tyro
+from torch import Tensor, nn
+
 from topoloc_training.net.losses import likeness, peaks, sampled, told_apart
 from topoloc_training.net.network import KIND, STRIDE, TopolocNet
 from topoloc_training.net.pairs import Pair, find_pairs
 from topoloc_training.net.teacher import HEIGHT, learn
 from topoloc_training.net.views import Sample, draw_sample
 from topoloc_training.networks.export import export
-from torch import Tensor, nn
 
 _LOG_EVERY = 100
 _SAVE_EVERY = 250

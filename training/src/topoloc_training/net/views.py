@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 from numpy.random import Generator
+
 from topoloc_training.net.light import changed
 from topoloc_training.net.pairs import Pair
 from topoloc_training.net.teacher import HEIGHT, WIDTH, Lessons

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
-from topoloc_training.networks.layers import ConvNormReLU, Residual, enlarged
 from torch import Tensor, nn
 from torch.nn import functional
+
+from topoloc_training.networks.layers import ConvNormReLU, Residual, enlarged
 
 STRIDE = 4
 """Pixels from one descriptor of the map to the next."""

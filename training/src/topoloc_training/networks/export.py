@@ -12,11 +12,11 @@ from pathlib import Path
 
 import onnx
 import torch
-from topoloc_training.networks.edgepoint2 import SIZES, EdgePoint2
-from topoloc_training.networks.xfeat import UNUSED, XFeat
 from torch import Tensor, nn
 
 from topoloc.sequences.atomic import replaced_file
+from topoloc_training.networks.edgepoint2 import SIZES, EdgePoint2
+from topoloc_training.networks.xfeat import UNUSED, XFeat
 
 VERSION = 1
 _OPSET = 17

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import torch
 from jaxtyping import Float
-from topoloc_training.networks.layers import ConvNormReLU, enlarged
 from torch import Tensor, nn
 from torch.nn import functional
+
+from topoloc_training.networks.layers import ConvNormReLU, enlarged
 
 STRIDE = 8
 """Pixels from one descriptor of the map to the next; also the side of a cell of the key point head."""

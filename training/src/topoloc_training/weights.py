@@ -13,7 +13,7 @@ import urllib.request
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -22,7 +22,7 @@ from torch import Tensor
 from topoloc.errors import WeightsError
 from topoloc.features.network_files import cache_folder
 from topoloc.places.backbones import NUM_CHANNELS, Backbone
-from topoloc.places.classifier_config import BACKBONES, BackboneName
+from topoloc.places.network_config import BackboneName
 from topoloc.sequences.atomic import replaced_file
 
 SCRATCH = "scratch"
@@ -148,7 +148,7 @@ def _split_netvlad(tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[
 def _check(path: Path, tensors: dict[str, Tensor], netvlad: dict[str, Tensor] | None, backbone: BackboneName) -> None:
     shapes = {name: tuple(value.shape) for name, value in tensors.items()}
     if fault := _misfit(shapes, backbone):
-        others = [other for other in BACKBONES if other != backbone and not _misfit(shapes, other)]
+        others = [other for other in get_args(BackboneName) if other != backbone and not _misfit(shapes, other)]
         looks = f"; the file looks like {others[0]}" if others else ""
         raise WeightsError(f"weights {path} are not those of {backbone}: {fault}{looks}")
     if netvlad is not None:
