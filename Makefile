@@ -41,11 +41,11 @@ $(VENV)/installed-core: BRINGS := core
 $(VENV)/installed-docs: EXTRAS := [docs]
 $(VENV)/installed-docs: BRINGS := core docs
 $(VENV)/installed-test: EXTRAS := [test]
-$(VENV)/installed-test $(VENV)/installed-all: WORKSHOP := --editable ./worlds --editable ./paper
+$(VENV)/installed-test $(VENV)/installed-all: WORKSHOP := --editable ./worlds --editable ./training --editable ./paper
 $(VENV)/installed-test: BRINGS := core docs test
 $(VENV)/installed-all: EXTRAS := [all,test]
 $(VENV)/installed-all: BRINGS := core docs test all
-$(VENV)/installed-core $(VENV)/installed-docs $(VENV)/installed-test $(VENV)/installed-all: pyproject.toml worlds/pyproject.toml paper/pyproject.toml constraints.txt $(BIN)/python
+$(VENV)/installed-core $(VENV)/installed-docs $(VENV)/installed-test $(VENV)/installed-all: pyproject.toml worlds/pyproject.toml training/pyproject.toml paper/pyproject.toml constraints.txt $(BIN)/python
 	@echo "installing topoloc$(EXTRAS) into $(VENV) ..."
 	@$(PIP) hatchling editables
 	@$(PIP) --no-build-isolation --editable '.$(EXTRAS)' $(WORKSHOP)

@@ -23,14 +23,15 @@ import numpy as np
 
 from topoloc.evaluation.experiments import neighbours_of
 from topoloc.features.extraction import extract_features
-from topoloc.map.coarse_training import CoarseTrainingConfig, train_coarse
 from topoloc.map.nodes import NodePoses, node_distances
 from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.classifier_config import CnnFcConfig, PictureConfig
 from topoloc.places.coarse import CoarseLocalizer, open_coarse
+from topoloc.places.network_config import PictureConfig
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import open_sequence
 from topoloc.sequences.pictures import grey_image
+from topoloc_training.classifier_config import CnnFcConfig
+from topoloc_training.coarse_training import CoarseTrainingConfig, train_coarse
 
 COMPACT_PICTURE = PictureConfig(112, 84)
 METHODS = ("surf-vlad", "cnn-nn", "vlad-nn", "cnn-fc compact", "cnn-fc squeezenet1_1")

@@ -17,15 +17,17 @@ import torch
 from topoloc.compiled import set_num_threads
 from topoloc.features.features import Features
 from topoloc.places.backbones import Backbone
-from topoloc.places.classifier_config import BackboneName, CnnNnConfig, PictureConfig, VladNnConfig
 from topoloc.places.cnn_fc import CnnFc, NodeClassifier
 from topoloc.places.cnn_nn import DEPTHS as CNN_DEPTHS
 from topoloc.places.cnn_nn import PooledFeatures
 from topoloc.places.coarse import CoarseLocalizer, CoarseModel
-from topoloc.places.inference import has_bfloat16, to_arrays
+from topoloc.places.inference import has_bfloat16
+from topoloc.places.network_config import BackboneName, PictureConfig
 from topoloc.places.vector_search import VectorSearch
 from topoloc.places.vlad_nn import DEPTHS as VLAD_DEPTHS
 from topoloc.places.vlad_nn import VladNetwork
+from topoloc_training.classifier_config import CnnNnConfig, VladNnConfig
+from topoloc_training.stored_weights import to_arrays
 
 NUM_NODES, NUM_IMAGES, DIMENSION = 100, 2000, 256
 NETWORKS: tuple[tuple[str, BackboneName], ...] = (

@@ -20,10 +20,11 @@ from topoloc.evaluation.metrics import summarize
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.classifier_config import PictureConfig, TrainingConfig
-from topoloc.places.weights import find_weights
+from topoloc.places.network_config import PictureConfig
 from topoloc.sequences.open import open_sequence
 from topoloc_paper.posenet import PoseNet, PoseNetConfig, train_posenet
+from topoloc_training.classifier_config import TrainingConfig
+from topoloc_training.weights import find_weights
 
 LOSSES = ("beta", "learnt", "reprojection")
 LEARNING_RATES = (3e-4, 1e-3)

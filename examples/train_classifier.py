@@ -1,4 +1,4 @@
-"""A map gets one of the paper's learned coarse localizers, trained from the small pictures that it keeps. Needs the extra `deep`.
+"""A map gets one of the paper's learned coarse localizers, trained from the small pictures that it keeps. Needs topoloc-training.
 
     python examples/train_classifier.py [MAP] [--weights FILE] [--epochs 8] [--out FILE]
 
@@ -13,9 +13,10 @@ import topoloc
 from topoloc.demo.recordings import SHIPPED
 from topoloc.evaluation.experiments import answer_queries
 from topoloc.evaluation.metrics import summarize
-from topoloc.map.coarse_training import CoarseTrainingConfig, store_coarse, train_coarse
 from topoloc.map.nodes import NodeConfig
-from topoloc.places.classifier_config import CnnFcConfig, PictureConfig, TrainingConfig
+from topoloc.places.network_config import PictureConfig
+from topoloc_training.classifier_config import CnnFcConfig, TrainingConfig
+from topoloc_training.coarse_training import CoarseTrainingConfig, store_coarse, train_coarse
 
 
 def main(map_file: Path | None, weights: str | None, epochs: int, out: Path) -> None:

@@ -13,12 +13,13 @@ from jaxtyping import install_import_hook
 
 import topoloc
 import topoloc_paper
+import topoloc_training
 import topoloc_worlds
 
 
 def _modules_with_checked_shapes() -> list[str]:
     """All leaf modules but the Numba kernels, whose compiler cannot take a wrapped function."""
-    packages = (topoloc, topoloc_worlds, topoloc_paper)
+    packages = (topoloc, topoloc_worlds, topoloc_training, topoloc_paper)
     modules = [m for package in packages for m in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")]
     return [m.name for m in modules if not m.ispkg and not m.name.endswith("_kernels")]
 
@@ -48,6 +49,24 @@ def tiny_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from tiny_world import write_stereo_recording  # after the hook above
 
     return write_stereo_recording(tmp_path_factory.mktemp("tiny") / "room")
+
+
+@pytest.fixture(scope="session")
+def room_map(tiny_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The map of `tiny_recording`; not to be written to."""
+    from built_room import built_room
+
+    path = tmp_path_factory.mktemp("map") / "room.topo"
+    built_room(tiny_recording).save(path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def queries(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of pictures of the room, with calibration and truth; not to be written to."""
+    from built_room import unseen_views, write_pictures
+
+    return write_pictures(tmp_path_factory.mktemp("queries") / "unseen", unseen_views())
 
 
 @pytest.fixture

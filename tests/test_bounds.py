@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import topoloc
 from built_room import built_room
 from topoloc.bounds import Above, AtLeast, Between, annotations_of, bounds_of, check_bounds, complaint, settings_from
-from topoloc.cli.settings_file import TABLES, config_class, meanings_of
+from topoloc.cli.settings_file import all_tables, config_class, meanings_of
 from topoloc.errors import ConfigError
 from topoloc.map.nodes import NodeConfig
 from topoloc.slam.odometry import OdometryConfig
@@ -95,7 +95,7 @@ def _is_of_numbers(declared: Any) -> bool:
     return declared in (int, float) or any(map(_is_of_numbers, get_args(declared)))
 
 
-@pytest.mark.parametrize("table", TABLES)
+@pytest.mark.parametrize("table", all_tables())
 def test_every_setting_has_a_meaning_and_every_number_bounds(table: str):
     settings = _settings_of(config_class(table), table)
     assert len(settings) > 10
@@ -110,7 +110,7 @@ def test_every_setting_has_a_meaning_and_every_number_bounds(table: str):
             assert bounds_of(declared), f"{key} has no bounds"
 
 
-@pytest.mark.parametrize("table", TABLES)
+@pytest.mark.parametrize("table", all_tables())
 def test_defaults_are_within_their_bounds(table: str):
     check_bounds(config_class(table)())
 

@@ -120,7 +120,7 @@ def test_python_examples_compile_and_use_public_names():
 
 
 def test_the_plan_names_the_files_that_are_there():
-    for package in ("src/topoloc", "worlds/src/topoloc_worlds", "paper/src/topoloc_paper"):
+    for package in ("src/topoloc", "worlds/src/topoloc_worlds", "training/src/topoloc_training", "paper/src/topoloc_paper"):
         rooms = re.search(rf"^{package}/\n(.*?)^\w", PLAN, re.MULTILINE | re.DOTALL)
         assert rooms
         named = set(re.findall(r"\b(\w+\.py)\b", rooms.group(1)))

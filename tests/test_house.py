@@ -19,6 +19,7 @@ HARD_LIMIT = 1.5
 PACKAGES = {
     SRC: TESTS,
     ROOT / "worlds" / "src" / "topoloc_worlds": TESTS / "worlds",
+    ROOT / "training" / "src" / "topoloc_training": TESTS / "training",
     ROOT / "paper" / "src" / "topoloc_paper": TESTS / "paper",
 }
 MODULES = sorted(path for package in PACKAGES for path in package.rglob("*.py") if path.stat().st_size > 0)

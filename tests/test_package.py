@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import topoloc
-from topoloc.cli import COMMANDS, all_commands, main
+from topoloc.cli import BROUGHT, COMMANDS, all_commands, main
 
 ROOT = Path(__file__).parents[1]
 HEAVY = ("cv2", "faiss", "matplotlib", "numba", "numpy", "poselib", "torch", "tyro")
@@ -120,10 +120,11 @@ def test_wrong_usage_exits_with_2(args: tuple[str, ...], complaint: str):
     assert "Traceback" not in answer.stderr
 
 
-def test_commands_of_other_distributions_are_named_where_they_are_missing(installed: Path):
-    answer = _run(installed / "topoloc", "simulate", "lab", "out")
+@pytest.mark.parametrize(("command", "distribution"), BROUGHT.items())
+def test_commands_of_other_distributions_are_named_where_they_are_missing(installed: Path, command: str, distribution: str):
+    answer = _run(installed / "topoloc", command, "lab", "out")
     assert (answer.returncode, answer.stdout) == (2, "")
-    assert answer.stderr == "error: `topoloc simulate` comes with topoloc-worlds, which is not installed\n"
+    assert answer.stderr == f"error: `topoloc {command}` comes with {distribution}, which is not installed\n"
 
 
 @pytest.mark.parametrize("command", all_commands())
@@ -147,6 +148,7 @@ def test_every_module_loads_without_extras_but_learned_classifiers_and_figures()
     modules, learning, asked = json.loads(answer.stdout)
     assert "topoloc.localization.localizer" in modules
     assert "topoloc.places.cnn_fc" in learning
+    assert "topoloc.places.network_config" not in learning
     drawing = {f"topoloc.evaluation.{name}" for name in ("figures", "map_figure", "report")}
     assert [name for name in learning if not name.startswith("topoloc.places.") and name not in drawing] == []
     assert "torchvision" not in asked

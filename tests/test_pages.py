@@ -15,7 +15,7 @@ import pytest
 
 import topoloc
 from topoloc.cli import all_commands
-from topoloc.cli.settings_file import TABLES, config_class, read_settings
+from topoloc.cli.settings_file import all_tables, config_class, read_settings
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -90,7 +90,7 @@ def test_settings_that_the_pipeline_names_are_there(capsys: pytest.CaptureFixtur
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
 def test_settings_of_files_that_a_page_names_are_there(page: Path, tmp_path: Path):
     """Lines as `localize.num_candidates = 1`, keys as `train.vlad_nn.tuning.num_epochs`, and blocks of TOML."""
-    text, tables = page.read_text(encoding="utf-8"), "|".join(TABLES)
+    text, tables = page.read_text(encoding="utf-8"), "|".join(all_tables())
     blocks = re.findall(r"^```toml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     blocks += re.findall(rf"`((?:{tables})\.[\w.]+ = [^`]+)`", text)
     for block in blocks:

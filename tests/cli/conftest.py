@@ -1,4 +1,4 @@
-"""A map file and query pictures of the rendered room."""
+"""Pictures of another world, a recording to be broken, and files of settings."""
 
 from __future__ import annotations
 
@@ -8,21 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from built_room import built_room, unseen_views, write_pictures
-
-
-@pytest.fixture(scope="session")
-def room_map(tiny_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The map of `tiny_recording`; not to be written to."""
-    path = tmp_path_factory.mktemp("map") / "room.topo"
-    built_room(tiny_recording).save(path)
-    return path
-
-
-@pytest.fixture(scope="session")
-def queries(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of pictures of the room, with calibration and truth; not to be written to."""
-    return write_pictures(tmp_path_factory.mktemp("queries") / "unseen", unseen_views())
+from built_room import unseen_views, write_pictures
 
 
 @pytest.fixture(scope="session")

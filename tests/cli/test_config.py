@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from topoloc.cli import all_commands, main
-from topoloc.cli.settings_file import TABLES, config_class, read_settings
+from topoloc.cli.settings_file import all_tables, config_class, read_settings
 from topoloc.map.topomap import TopoMetricMap
 
 Complaint = Callable[..., str]
@@ -24,9 +24,9 @@ def test_what_config_prints_is_read_back_as_the_defaults(capsys: pytest.CaptureF
     printed = capsys.readouterr().out
     assert max(map(len, printed.splitlines())) <= 120
     tables = tomllib.loads(printed)
-    assert list(tables) == list(TABLES)
+    assert list(tables) == list(all_tables())
     read = read_settings(file_of(printed))
-    for name in TABLES:
+    for name in all_tables():
         assert tables[name]
         assert read.of(config_class(name)) == config_class(name)()
 
@@ -53,7 +53,7 @@ def test_help_is_short(command: str, columns: str, capsys: pytest.CaptureFixture
     assert len(printed.splitlines()) <= MAX_LINES
     assert len(re.findall(r"^\W*--[a-z]|, --help", printed, re.MULTILINE)) <= MAX_OPTIONS
     assert "--config." not in printed
-    reads = [name for name, (_, _, commands) in TABLES.items() if command in commands]
+    reads = [name for name, (_, _, commands) in all_tables().items() if command in commands]
     assert ("--config FILE" in printed) == bool(reads)
     assert "(default: False)" not in printed
 

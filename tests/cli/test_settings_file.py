@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from topoloc.bounds import Above, Between, check_bounds, settings_from
 from topoloc.cli import settings_file
-from topoloc.cli.settings_file import TABLES, config_class, read_settings, with_option
+from topoloc.cli.settings_file import TABLES, all_tables, config_class, read_settings, with_option
 from topoloc.errors import ConfigError
 from topoloc.localization.localizer import LocalizerConfig
 from topoloc.map.build import BuildConfig
@@ -160,7 +160,7 @@ def _refusal(read: Callable[[], Any]) -> str | None:
     return None
 
 
-@pytest.mark.parametrize("name", TABLES)
+@pytest.mark.parametrize("name", all_tables())
 @settings(max_examples=100, suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data())
 def test_whatever_a_table_holds_it_is_read_or_refused_by_its_key(name: str, data: st.DataObject):
@@ -170,7 +170,9 @@ def test_whatever_a_table_holds_it_is_read_or_refused_by_its_key(name: str, data
 
 
 @settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.binary(max_size=60) | st.text(max_size=60).map(str.encode) | st.sampled_from([f"[{name}]\nx = 1".encode() for name in TABLES]))
+@given(
+    st.binary(max_size=60) | st.text(max_size=60).map(str.encode) | st.sampled_from([f"[{name}]\nx = 1".encode() for name in all_tables()])
+)
 def test_whatever_a_file_holds_it_is_read_or_refused(tmp_path: Path, content: bytes):
     path = tmp_path / "fuzz.toml"
     path.write_bytes(content)

@@ -16,7 +16,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.training_set import decode_picture
+from topoloc.places.network_pictures import decode_picture
 from topoloc.sequences.pictures import jpeg_of
 
 

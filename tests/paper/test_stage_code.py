@@ -12,9 +12,9 @@ from topoloc.places.coarse import _MODULES, COARSE_NAMES
 from topoloc_paper import stage_code
 from topoloc_paper.peers import _CODE
 from topoloc_paper.posenet_baseline import _CODE as POSENET
-from topoloc_paper.stage_code import COARSE_MODULES, MAPPING, ROOTS, StageCode, _file, answering, asking, learning
+from topoloc_paper.stage_code import COARSE_MODULES, MAPPING, ROOTS, TEACHING_MODULES, StageCode, _file, answering, asking, learning
 
-LEARNING = {f"learning {name}": learning(COARSE_MODULES[name]) for name in COARSE_NAMES if name != "surf-vlad"}
+LEARNING = {f"learning {name}": learning(module) for name, module in TEACHING_MODULES.items()}
 STAGES: dict[str, StageCode] = {
     "mapping": MAPPING,
     "asking surf-vlad": asking("surf-vlad"),
@@ -65,8 +65,9 @@ def _done_again(change: Callable[[], object]) -> set[str]:
         ("topoloc/errors.py", set()),
         ("topoloc/places/vlad.py", {"mapping", *ASKING, *PEERS}),
         ("topoloc/places/cnn_nn.py", {"asking cnn-nn", "learning cnn-nn"}),
-        ("topoloc/places/training.py", {"learning cnn-fc", "learning PoseNet"}),
-        ("topoloc/map/coarse_training.py", {*LEARNING, "learning PoseNet"}),
+        ("topoloc_training/cnn_nn.py", {"learning cnn-nn"}),
+        ("topoloc_training/training.py", {"learning cnn-fc", "learning PoseNet"}),
+        ("topoloc_training/coarse_training.py", {*LEARNING, "learning PoseNet"}),
         ("topoloc/map/landmarks.py", {"mapping", *ASKING, *PEERS}),
         ("topoloc/map/reading.py", {"mapping", *ASKING, *PEERS}),
         ("topoloc/features/surf_detector_kernels.py", {"mapping", *ASKING, *PEERS}),
@@ -108,4 +109,5 @@ def test_an_import_for_the_type_checker_alone_does_not_count(code: Path):
 def test_every_module_named_is_there():
     assert {f"topoloc/places/{module}.py" for module in _MODULES.values()} == set(COARSE_MODULES.values())
     assert COARSE_MODULES.keys() == set(COARSE_NAMES)
+    assert TEACHING_MODULES.keys() == set(COARSE_NAMES) - {"surf-vlad"}
     assert [name for name, stage in STAGES.items() if not all(_file(module).is_file() for module in stage.modules)] == []

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
 
 from topoloc.places.backbones import Backbone, normalize_pictures
-from topoloc.places.classifier_config import BackboneName
+from topoloc.places.network_config import BackboneName
 
 
 # Parameters as torchvision's documentation of each model states them.
@@ -47,16 +45,6 @@ def test_a_shallower_backbone_gives_what_the_whole_one_has_on_its_way():
     image = torch.randn(1, 3, 64, 64)
     assert torch.equal(part(image), whole.features[:5](image))
     assert part.num_channels == part(image).shape[1] == 128
-
-
-def test_the_published_weights_load_and_tell_pictures_apart(squeezenet_file: Path):
-    network = Backbone("squeezenet1_1", num_outputs=None).eval()
-    network.load_state_dict(torch.load(squeezenet_file, weights_only=True))
-    checks = (torch.arange(96)[:, None] // 8 + torch.arange(96)[None] // 8) % 2
-    pictures = torch.stack([checks * 200, torch.full((96, 96), 128)]).to(torch.uint8)[..., None].expand(2, 96, 96, 3)
-    with torch.inference_mode():
-        checked, plain = network(normalize_pictures(pictures)).mean(dim=(2, 3))
-    assert torch.nn.functional.cosine_similarity(checked, plain, dim=0) < 0.7
 
 
 def test_pictures_are_normalised_by_imagenets_mean_and_deviation():

@@ -14,17 +14,18 @@ from topoloc.errors import MissingExtraError
 from topoloc.features.extraction import FeatureConfig
 from topoloc.localization.map_facts.building import build_map
 from topoloc.map.build import BuildConfig
-from topoloc.map.coarse_training import CoarseTrainingConfig, train_coarse
 from topoloc.map.nodes import NodeConfig
 from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.classifier_config import CnnFcConfig, PictureConfig
 from topoloc.places.coarse import CoarseModel
+from topoloc.places.network_config import PictureConfig
 from topoloc.sequences.atomic import write_bytes
 from topoloc_paper.datasets import Dataset
 from topoloc_paper.settings import LEARNED, Bench, sequence_digest
-from topoloc_paper.stage_code import COARSE_MODULES, MAPPING, learning
+from topoloc_paper.stage_code import MAPPING, TEACHING_MODULES, learning
 from topoloc_paper.stages import Done, digest_of
 from topoloc_paper.stored_answers import pose_json
+from topoloc_training.classifier_config import CnnFcConfig
+from topoloc_training.coarse_training import CoarseTrainingConfig, train_coarse
 
 Normalization = Literal["none", "paper", "wide"]
 
@@ -115,7 +116,7 @@ def taught(bench: Bench, dataset: Dataset, kind: MapKind, method: str) -> Done:
             checkpoint.unlink(missing_ok=True)
         return {"settings": dict(model.settings), "bytes": target.stat().st_size}
 
-    return bench.store.get(f"coarse-{dataset.name}-{kind.name}-{method}", settings, train, learning(COARSE_MODULES[method]), [target])
+    return bench.store.get(f"coarse-{dataset.name}-{kind.name}-{method}", settings, train, learning(TEACHING_MODULES[method]), [target])
 
 
 def opened(bench: Bench, dataset: Dataset, kind: MapKind, method: str = "surf-vlad") -> tuple[TopoMetricMap, str]:

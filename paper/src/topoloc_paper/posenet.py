@@ -19,17 +19,19 @@ from torch import Generator, Tensor, nn
 from topoloc.bounds import settings_from
 from topoloc.errors import WeightsError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.map.coarse_training import training_set_of
 from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.augmentation import augment
 from topoloc.places.backbones import Backbone, normalize_pictures
-from topoloc.places.classifier_config import AugmentationConfig, BackboneName, PictureConfig, TrainingConfig
 from topoloc.places.coarse import Image
 from topoloc.places.inference import BATCH_SIZE, in_channels_last
-from topoloc.places.training import Task, Training, fit, hold_out
-from topoloc.places.training_set import PictureShape, Progress, decode_pictures, network_pictures
-from topoloc.places.weights import Weights, load_features
+from topoloc.places.network_config import BackboneName, PictureConfig
+from topoloc.places.network_pictures import PictureShape, network_pictures
 from topoloc_paper.pose_losses import beta_loss, learnt_loss, reprojection_loss
+from topoloc_training.augmentation import augment
+from topoloc_training.classifier_config import AugmentationConfig, TrainingConfig
+from topoloc_training.coarse_training import training_set_of
+from topoloc_training.training import Task, Training, fit, hold_out
+from topoloc_training.training_set import Progress, decode_pictures
+from topoloc_training.weights import Weights, load_features
 
 _ROWS, _COLUMNS, _SQUEEZED = 4, 5, 64
 POINTS_PER_IMAGE = 64

@@ -14,7 +14,7 @@ import numpy as np
 
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.classifier_config import PictureConfig
+from topoloc.places.network_config import PictureConfig
 from topoloc_paper.asking import queries_of
 from topoloc_paper.datasets import Dataset
 from topoloc_paper.maps import MapKind, built, path_of
@@ -43,8 +43,8 @@ def trained(bench: Bench, dataset: Dataset) -> Done:
     settings |= {"configs": [asdict(config) for config in configs]}
 
     def train() -> dict[str, Any]:
-        from topoloc.places.weights import find_weights
         from topoloc_paper.posenet import train_posenet
+        from topoloc_training.weights import find_weights
 
         backbone, file = bench.config.weights.choice("posenet")
         weights = find_weights(backbone, file)

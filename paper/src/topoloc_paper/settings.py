@@ -7,11 +7,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from topoloc.places.classifier_config import BackboneName, TrainingConfig
+from topoloc.places.network_config import BackboneName
 from topoloc.sequences.frame import StereoSequence
 from topoloc_paper.datasets import Dataset
 from topoloc_paper.stages import StageStore, digest_of
 from topoloc_paper.stored_answers import pose_json
+from topoloc_training.classifier_config import TrainingConfig
 
 Progress = Callable[[str, int, int], None]
 LEARNED = ("cnn-fc", "cnn-nn", "vlad-nn")

@@ -14,15 +14,18 @@ from functools import cache
 from pathlib import Path
 
 import topoloc
+import topoloc_training
 
+_FILES = {"topoloc": topoloc.__file__, "topoloc_training": topoloc_training.__file__, "topoloc_paper": __file__}
 # the folder that each package lies in
-ROOTS = {"topoloc": Path(topoloc.__file__).parents[1], "topoloc_paper": Path(__file__).parents[1]}
+ROOTS = {name: Path(path).parents[1] for name, path in _FILES.items() if path is not None}
 COARSE_MODULES = {
     "surf-vlad": "topoloc/places/vlad.py",
     "cnn-fc": "topoloc/places/cnn_fc.py",
     "cnn-nn": "topoloc/places/cnn_nn.py",
     "vlad-nn": "topoloc/places/vlad_nn.py",
 }
+TEACHING_MODULES = {name: f"topoloc_training/{name.replace('-', '_')}.py" for name in COARSE_MODULES if name != "surf-vlad"}
 _READING = "topoloc/sequences/open.py"
 _COUNTING = ("topoloc/evaluation/metrics.py", "topoloc_paper/settings.py")  # what is made of answers, and what is asked for
 _NEVER = ("topoloc/errors.py",)  # a stage that fails leaves no result
@@ -67,7 +70,7 @@ def answering(*modules: str) -> StageCode:
 def learning(*modules: str) -> StageCode:
     """A network taught with the mapping images. These the stage's settings name, so how they are read and stored does not count."""
     apart = ("topoloc/features", "topoloc/sequences", "topoloc/map/topomap.py", "topoloc/places/coarse.py")
-    return StageCode(("topoloc/map/coarse_training.py", *modules), apart)
+    return StageCode(("topoloc_training/coarse_training.py", *modules), apart)
 
 
 @cache

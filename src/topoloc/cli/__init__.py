@@ -1,6 +1,7 @@
 """The command line: `topoloc COMMAND`. Each command is a module, imported only when it is called.
 
-Other distributions add commands by an entry point of the group `topoloc.commands`: a dictionary like `COMMANDS`.
+Other distributions add commands by an entry point of the group `topoloc.commands`: a dictionary like `COMMANDS`; and settings by one of
+`topoloc.settings`, like `TABLES` of settings_file.py.
 """
 
 from __future__ import annotations
@@ -10,24 +11,22 @@ import errno
 import importlib
 import os
 import sys
-from typing import TextIO
+from typing import Any, TextIO
 
 # name -> the module, which holds a dataclass of the settings, `Command`, with `run`; and what `topoloc --help` says of it
 COMMANDS = {
     "demo": ("topoloc.cli.demo", "the whole pipeline on the built-in lab: mapped by day, asked by day, by night and with another camera"),
     "slam": ("topoloc.cli.slam", "where did the camera go? a stereo or RGB-D recording becomes a trajectory"),
     "build": ("topoloc.cli.build", "map a place: a stereo or RGB-D recording becomes one map file"),
-    "train": ("topoloc.cli.train", "add a learned coarse localizer to a map, or train it anew"),
     "localize": ("topoloc.cli.localize", "where were these images taken? 6-DoF poses of images, folders, recordings"),
     "evaluate": ("topoloc.cli.evaluate", "localize a recording with known truth and judge the poses"),
     "info": ("topoloc.cli.info", "what a map file holds"),
+    "weights": ("topoloc.cli.weights", "networks of local features: which are known and here, and how to get others"),
     "config": ("topoloc.cli.config", "all other settings as a TOML file, with defaults and meanings"),
 }
-_BROUGHT = {"simulate": "topoloc-worlds", "benchmark": "topoloc-paper"}
+BROUGHT = {"simulate": "topoloc-worlds", "train": "topoloc-training", "benchmark": "topoloc-paper"}
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
-_IN_HELP = ("demo", "simulate", "slam", "build", "train", "localize", "evaluate", "benchmark", "info", "config")
-
-
+_IN_HELP = ("demo", "simulate", "slam", "build", "train", "localize", "evaluate", "benchmark", "info", "weights", "config")
 LEAST_ADDRESS_SPACE = 1_600_000_000
 
 
@@ -63,24 +62,21 @@ def _dispatch(args: list[str]) -> int:
     commands = COMMANDS if name in COMMANDS else all_commands()
     if name in commands:
         return _run(name, *commands[name], rest)
-    known = f"commands: {', '.join(commands)}"
-    brought = (
-        f"`topoloc {name}` comes with {_BROUGHT[name]}, which is not installed"
-        if name in _BROUGHT
-        else f"unknown command {name!r}; {known}"
-    )
-    _print_error(brought)
+    known = f"unknown command {name!r}; commands: {', '.join(commands)}"
+    _print_error(f"`topoloc {name}` comes with {BROUGHT[name]}, which is not installed" if name in BROUGHT else known)
     return 2
 
 
 def all_commands() -> dict[str, tuple[str, str]]:
     """Our commands and those that other distributions bring, as `COMMANDS`; a name of ours is ours."""
+    return brought("topoloc.commands") | COMMANDS
+
+
+def brought(group: str) -> dict[str, Any]:
+    """What other distributions bring by entry points of a group, all in one dictionary."""
     from importlib.metadata import entry_points
 
-    brought: dict[str, tuple[str, str]] = {}
-    for entry_point in entry_points(group="topoloc.commands"):
-        brought |= entry_point.load()
-    return brought | COMMANDS
+    return {name: value for entry_point in entry_points(group=group) for name, value in entry_point.load().items()}
 
 
 def _run(name: str, module_name: str, summary: str, args: list[str]) -> int:

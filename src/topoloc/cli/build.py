@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -15,9 +15,6 @@ from topoloc.errors import RecordingError
 from topoloc.features.kinds import KINDS
 from topoloc.localization.map_facts.building import build_map
 from topoloc.map.build import BuildConfig, Progress
-from topoloc.map.coarse_training import CoarseTrainingConfig, train_coarse
-from topoloc.places.classifier_config import BackboneName
-from topoloc.places.coarse import CoarseName
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import open_sequence
 from topoloc.sequences.recording import SequenceView
@@ -46,12 +43,6 @@ class Command:
         float | None, tyro.conf.arg(name="lambda", metavar="M/RAD", help_behavior_hint="(default: 2 degrees make a node)")
     ] = None
     """How much turning counts beside metres (lambda of Eq. 1)."""
-    coarse: CoarseName = "surf-vlad"
-    """The coarse localizer that answers; all but surf-vlad are trained once the map is built, as by `topoloc train`."""
-    backbone: BackboneName = "squeezenet1_1"
-    """The network that a learned coarse localizer stands on."""
-    weights: Annotated[str | None, tyro.conf.arg(metavar="FILE|scratch", help_behavior_hint="(default: the published)")] = None
-    """Weights of that network: a PyTorch file of torchvision's or NetVLAD's layout, or `scratch` for random ones."""
     features: Annotated[str | None, tyro.conf.arg(metavar="surf|sift", help_behavior_hint="(default: surf)")] = None
     """Local features of the map, and of every query to it."""
     json: File = None
@@ -72,9 +63,6 @@ class Command:
             if poses_from[0] == "slam":
                 sequences = _with_slam(sequences, settings.of(SlamConfig), progress)
             topomap = build_map(sequences, config, progress, poses_from)
-            if self.coarse != "surf-vlad":
-                model = train_coarse(topomap, self.coarse, self.backbone, self.weights, settings.of(CoarseTrainingConfig), progress)
-                topomap = replace(topomap, coarse_models={**topomap.coarse_models, model.name: model}, default_coarse=model.name)
         topomap.save(target)
         info = describe_map(topomap, target)
         if self.json != "-":

@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from topoloc.cli.output import UsageError
-from topoloc.cli.settings_file import TABLES, settings_text
+from topoloc.cli.settings_file import all_tables, settings_text
 
 _ABOUT = """\
 # The settings of topoloc {version} that are no options of its commands, with their defaults.
@@ -21,14 +21,14 @@ class Command:
     """What `topoloc config` takes."""
 
     command: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="COMMAND", help_behavior_hint="(default: all)")] = None
-    """Only what this command reads: build, train, slam, localize or evaluate."""
+    """Only what this command reads: build, slam, localize, evaluate or train."""
 
     def run(self) -> int:
         from topoloc import __version__
 
-        tables = [name for name, (_, _, commands) in TABLES.items() if self.command is None or self.command in commands]
+        tables = [name for name, (_, _, commands) in all_tables().items() if self.command is None or self.command in commands]
         if not tables:
-            known = dict.fromkeys(command for _, _, commands in TABLES.values() for command in commands)
+            known = dict.fromkeys(command for _, _, commands in all_tables().values() for command in commands)
             raise UsageError(f"{self.command} has no settings beside its options; {', '.join(known)} have")
         print(_ABOUT.format(version=__version__) + "\n\n" + settings_text(tables), end="")
         return 0

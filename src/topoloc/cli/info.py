@@ -59,7 +59,7 @@ def describe_map(topomap: Any, path: Path) -> dict[str, Any]:
     """
     import numpy as np
 
-    from topoloc.map.coarse_training import list_coarse
+    from topoloc.map.checking import list_coarse
 
     if len(topomap.summaries) == 0:
         raise EmptyMapError(f"map {path} has no nodes")

@@ -15,18 +15,18 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
 from topoloc.bounds import annotations_of, bare, bounds_of, complaint, did_you_mean, quoted, settings_from
+from topoloc.cli import BROUGHT, all_commands, brought
 from topoloc.cli.output import UsageError
 from topoloc.errors import ConfigError
 
 T = TypeVar("T")
 
-# table of the file: module and class of its configuration, and the commands that it is for
-TABLES = {
+# table of the file: module and class of its configuration, and the commands that it is for; more come with other distributions
+TABLES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "build": ("topoloc.map.build", "BuildConfig", ("build",)),
     "localize": ("topoloc.localization.localizer", "LocalizerConfig", ("localize", "evaluate")),
     "track": ("topoloc.tracking.tracker", "TrackerConfig", ("localize",)),
     "slam": ("topoloc.slam.slam", "SlamConfig", ("slam", "build")),
-    "train": ("topoloc.map.coarse_training", "CoarseTrainingConfig", ("train", "build")),
 }
 _WIDTH = 110
 _LARGEST_FILE = 1_000_000
@@ -54,8 +54,10 @@ def read_settings(path: str | None) -> Settings:
     try:
         configs = []
         for name, table in _parsed(path).items():
-            if name not in TABLES:
-                raise ConfigError(f"{quoted(name)}: no such table{did_you_mean(name, TABLES)}")
+            if name not in all_tables():
+                is_missing = name in BROUGHT and name not in all_commands()
+                missing = f"comes with {BROUGHT[name]}, which is not installed" if is_missing else "no such table"
+                raise ConfigError(f"{quoted(name)}: {missing}{did_you_mean(name, all_tables())}")
             kind = config_class(name)
             configs.append(settings_from(kind, table, name, default=kind()))
     except ConfigError as error:
@@ -63,9 +65,14 @@ def read_settings(path: str | None) -> Settings:
     return Settings({type(config): config for config in configs})
 
 
+def all_tables() -> dict[str, tuple[str, str, tuple[str, ...]]]:
+    """Our tables and those that other distributions bring, as `TABLES`; a name of ours is ours."""
+    return TABLES | brought("topoloc.settings") | TABLES
+
+
 def config_class(table: str) -> type:
     """The configuration that a table of the file sets."""
-    module, name, _ = TABLES[table]
+    module, name, _ = all_tables()[table]
     return getattr(importlib.import_module(module), name)
 
 
@@ -134,9 +141,11 @@ def _toml(value: Any) -> str:
 @cache
 def meanings_of(kind: type) -> dict[str, str]:
     """The docstrings of a dataclass's fields, each in one line."""
+    if not is_dataclass(kind):
+        return {}
     (body,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
     assert isinstance(body, ast.ClassDef)
-    meanings = {}
+    meanings = {name: text for base in kind.__bases__ for name, text in meanings_of(base).items()}
     for item, after in zip(body.body, body.body[1:], strict=False):
         if isinstance(item, ast.AnnAssign) and isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
             meanings[ast.unparse(item.target)] = " ".join(str(after.value.value).split())

@@ -13,7 +13,7 @@ from topoloc.evaluation.match_pictures import JPEG_QUALITY, NodeMatches, draw_pa
 from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION, Answer, by_recording, length_text
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.map.topomap import TopoMetricMap, TopoNode
-from topoloc.places.training_set import decode_picture
+from topoloc.places.network_pictures import decode_picture
 from topoloc.sequences.frame import Image
 from topoloc.sequences.pictures import jpeg_of
 

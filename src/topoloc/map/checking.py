@@ -1,4 +1,5 @@
-"""A map file looked at from end to end: every row's checksum, the digest over all of them, and every entry as it is read for an answer."""
+"""A map file looked at from end to end: every row's checksum, the digest over all of them, and every entry as it is read for an answer;
+and what it says of its coarse localizers."""
 
 from __future__ import annotations
 
@@ -10,6 +11,7 @@ from topoloc.errors import MapError
 from topoloc.map.file import MapFile
 from topoloc.map.schema import ORDER, TABLES
 from topoloc.map.topomap import TopoMetricMap, open_coarse_of
+from topoloc.map.validation import Damage, json_of
 from topoloc.map.writing import digest_of
 from topoloc.places.coarse import open_coarse
 
@@ -25,6 +27,17 @@ def damages(path: Path) -> list[str]:
         assert file is not None, "a map that was just opened"
         found = [*_of_rows(file), *_of_entries(topomap)]
     return list(dict.fromkeys(text.removeprefix(f"map {path} is damaged: ") for text in found))
+
+
+def list_coarse(path: Path) -> list[dict[str, Any]]:
+    """Name, bytes, backbone and weights of each coarse localizer of a map file. Raises MapError."""
+    file = MapFile(path)
+    try:
+        with file.reading() as database:
+            query = "SELECT name, settings, length(arrays) FROM coarse_models ORDER BY name LIMIT 1000"
+            return [_facts(name, json_of(settings), num_bytes) for name, settings, num_bytes in database.execute(query)]
+    finally:
+        file.close()
 
 
 def _of_rows(file: MapFile) -> Iterator[str]:
@@ -82,3 +95,10 @@ def _tried(read: Callable[[], Any]) -> tuple[Any, list[str]]:
         return None, [str(error)]
     except KeyError as error:  # of `row_of`
         return None, [f"node {error} is missing"]
+
+
+def _facts(name: str, settings: Any, num_bytes: int) -> dict[str, Any]:
+    if not isinstance(settings, dict):
+        raise Damage(f"the settings of coarse localizer {name} are none")
+    facts = {"name": name, "bytes": num_bytes}
+    return facts | {key: settings[key] for key in ("backbone", "weights", "trained") if key in settings}

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from topoloc.places.classifier_config import BackboneName
+from topoloc.places.network_config import BackboneName
 
 # Of ImageNet, which all these networks were trained on: input is (RGB in [0, 1] - mean) / deviation.
 IMAGENET_MEAN = (0.485, 0.456, 0.406)

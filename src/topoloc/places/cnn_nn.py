@@ -9,13 +9,9 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from topoloc.places.backbones import Backbone
-from topoloc.places.classifier_config import BackboneName, CnnNnConfig
 from topoloc.places.coarse import CoarseModel, setting
-from topoloc.places.training_set import Progress, TrainingSet
-from topoloc.places.vector_search import VectorSearch, fit_vectors
-from topoloc.places.weights import Weights, describe, load_features
-
-NAME = "cnn-nn"
+from topoloc.places.network_config import BackboneName, PooledNetwork
+from topoloc.places.vector_search import VectorSearch
 
 # Deeper layers know more of things and less of places: the fifth and sixth of SqueezeNet's fire modules rank nodes best.
 DEPTHS: dict[BackboneName, int | None] = {"squeezenet1_1": 11, "vgg11": None, "vgg16": None, "compact": None}
@@ -36,26 +32,13 @@ class PooledFeatures(nn.Module):
         return nn.functional.normalize(pooled.flatten(1))
 
 
-def train(
-    training_set: TrainingSet, backbone: BackboneName, weights: Weights | None, config: CnnNnConfig, progress: Progress
-) -> CoarseModel:
-    """Nothing is trained but the whitening; without weights the features are those of a random network, which ranks far worse.
-
-    Raises:
-        MapError: a mapping image is damaged.
-    """
-    network = _network(backbone, config)
-    if weights is not None:
-        load_features(network.backbone, weights)
-    return fit_vectors(NAME, network, training_set, config, {"backbone": backbone, "weights": describe(weights)}, progress)
-
-
 def open_model(model: CoarseModel) -> VectorSearch:
-    """The localizer of what `train` made."""
-    config = setting(model, "config", CnnNnConfig)
-    return VectorSearch(model, _network(setting(model, "backbone", BackboneName), config), config.picture)
+    """The localizer of a stored model. Raises MapError, ConfigError."""
+    config = setting(model, "config", PooledNetwork)
+    return VectorSearch(model, network_of(setting(model, "backbone", BackboneName), config), config.picture)
 
 
-def _network(backbone: BackboneName, config: CnnNnConfig) -> PooledFeatures:
+def network_of(backbone: BackboneName, config: PooledNetwork) -> PooledFeatures:
+    """The network with random weights."""
     depth = config.depth if config.depth is not None else DEPTHS[backbone]
     return PooledFeatures(backbone, depth, config.grid_rows, config.grid_columns, config.power)

@@ -83,7 +83,11 @@ def open_coarse(model: CoarseModel) -> CoarseLocalizer:
     if name not in COARSE_NAMES:
         raise MapError(f"the map's coarse localizer {model.name!r} is not known to this version (known: {', '.join(COARSE_NAMES)})")
     try:
-        return module_of(name).open_model(model)
+        return importlib.import_module(f"topoloc.places.{_MODULES[name]}").open_model(model)
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        raise MissingExtraError(f"the coarse localizer {model.name!r} needs PyTorch: pip install 'topoloc[deep]'") from error
     except ConfigError as error:
         raise MapError(f"the map's coarse localizer {model.name!r} is damaged: {error}") from error
 
@@ -91,13 +95,3 @@ def open_coarse(model: CoarseModel) -> CoarseLocalizer:
 def setting(model: CoarseModel, name: str, of: Any) -> Any:
     """A setting of a stored model, of this type, without the keys of other versions. Raises ConfigError."""
     return value_from(of, model.settings.get(name), name, is_strict=False)
-
-
-def module_of(name: str) -> Any:
-    """The module of a coarse localizer, loaded now: those that learn need torch. Raises MissingExtraError."""
-    try:
-        return importlib.import_module(f"topoloc.places.{_MODULES[name]}")
-    except ModuleNotFoundError as error:
-        if error.name != "torch":
-            raise
-        raise MissingExtraError(f"the coarse localizer {name!r} needs PyTorch: pip install 'topoloc[deep]'") from error

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from topoloc.compiled import num_threads
 from topoloc.places.backbones import normalize_pictures
-from topoloc.places.training_set import RgbPictures
+from topoloc.places.network_pictures import RgbPictures
 
 BATCH_SIZE = 16
 
@@ -115,23 +115,12 @@ def in_channels_last(network: nn.Module) -> nn.Module:
     return network
 
 
-def rounded_to_half(network: nn.Module) -> nn.Module:
-    """The network with weights as the map file keeps them: what is learnt from it fits what is read back."""
-    with torch.no_grad():
-        for value in network.state_dict().values():
-            if value.is_floating_point():
-                value.copy_(value.half().float())
-    return network
-
-
-def to_arrays(network: nn.Module) -> dict[str, np.ndarray]:
-    """The network's weights as half floats, under names that begin with ``network.``."""
-    state = {name: value.detach().cpu() for name, value in network.state_dict().items()}
-    return {f"network.{name}": (value.half() if value.is_floating_point() else value).numpy() for name, value in state.items()}
-
-
 def from_arrays(network: nn.Module, arrays: Mapping[str, np.ndarray]) -> nn.Module:
-    """The inverse of `to_arrays`: puts the weights into `network`. Raises KeyError or RuntimeError where they do not fit."""
+    """Puts the weights that a map keeps, half floats under names that begin with ``network.``, into `network`.
+
+    Raises:
+        KeyError, RuntimeError: they do not fit.
+    """
     state = {name.removeprefix("network."): torch.from_numpy(value) for name, value in arrays.items() if name.startswith("network.")}
     network.load_state_dict({name: value.float() if value.is_floating_point() else value for name, value in state.items()})
     return network

@@ -1,10 +1,8 @@
-"""What cnn-nn and vlad-nn share: a network turns a picture into a vector; the nodes of the nearest mapping images answer."""
+"""cnn-nn and vlad-nn as they answer: a network turns a picture into a vector; the nodes of the nearest mapping images answer."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float32
@@ -12,43 +10,11 @@ from torch import nn
 
 from topoloc.errors import MapError
 from topoloc.features.features import Features
-from topoloc.places.classifier_config import CnnNnConfig, PictureConfig, VladNnConfig
 from topoloc.places.coarse import CoarseModel, Image, NodeScore, model_array, setting
-from topoloc.places.inference import Predictor, from_arrays, rounded_to_half, to_arrays
-from topoloc.places.neighbours import PlaceIndex, Whitening, learn_whitening
-from topoloc.places.training_set import PictureShape, Progress, TrainingSet, decode_pictures, network_pictures
-
-_CHUNK = 64
-
-
-def fit_vectors(
-    name: str,
-    network: nn.Module,
-    training_set: TrainingSet,
-    config: CnnNnConfig | VladNnConfig,
-    facts: Mapping[str, Any],
-    progress: Progress,
-) -> CoarseModel:
-    """The model of a network: vectors of all mapping images and their whitening; `facts` go with its settings.
-
-    The network's weights are rounded to half floats, as the map keeps them.
-
-    Raises:
-        MapError: a mapping image is damaged.
-    """
-    pictures, shape = decode_pictures(training_set)
-    predict = Predictor(rounded_to_half(network))
-    raw = []
-    for start in range(0, len(pictures), _CHUNK):
-        raw.append(predict(network_pictures(pictures[start : start + _CHUNK], shape, config.picture)))
-        progress(f"{name}: vectors", min(start + _CHUNK, len(pictures)), len(pictures))
-    vectors = np.concatenate(raw)
-    whitening = learn_whitening(vectors, config.dimension)
-    whitening = Whitening(whitening.mean, whitening.projection.astype(np.float16).astype(np.float32))
-    arrays = to_arrays(network) | {"mean": whitening.mean, "projection": whitening.projection.astype(np.float16)}
-    arrays |= {"vectors": whitening.apply(vectors).astype(np.float16), "node_ids": training_set.node_ids.astype(np.int32)}
-    settings = {**facts, "config": asdict(config), "picture_shape": [shape.width, shape.height]}
-    return CoarseModel(name, settings, arrays)
+from topoloc.places.inference import Predictor, from_arrays
+from topoloc.places.neighbours import PlaceIndex, Whitening
+from topoloc.places.network_config import PictureConfig
+from topoloc.places.network_pictures import PictureShape, network_pictures
 
 
 class VectorSearch:

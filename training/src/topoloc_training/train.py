@@ -12,10 +12,11 @@ import tyro
 
 from topoloc.cli.output import File, Flag, UsageError, check_outputs, progress_bar, write_json
 from topoloc.cli.settings_file import read_settings
-from topoloc.map.coarse_training import CoarseTrainingConfig, list_coarse, store_coarse, train_coarse
+from topoloc.map.checking import list_coarse
 from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.classifier_config import BackboneName
 from topoloc.places.coarse import CoarseModel
+from topoloc.places.network_config import BackboneName
+from topoloc_training.coarse_training import CoarseTrainingConfig, store_coarse, train_coarse
 
 
 @dataclass(frozen=True)

@@ -10,17 +10,19 @@ import pytest
 import torch
 from test_weights import netvlad_tensors
 
-import topoloc.places.cnn_nn as cnn_nn
-import topoloc.places.vlad_nn as vlad_nn
 from built_room import unseen_views
 from topoloc.errors import MapError, TrainingError
 from topoloc.features.features import Features
-from topoloc.places.classifier_config import CnnNnConfig, PictureConfig, TripletConfig, VladNnConfig
 from topoloc.places.coarse import CoarseLocalizer, CoarseModel, open_coarse
-from topoloc.places.training_set import TrainingSet, decode_picture
+from topoloc.places.network_config import PictureConfig
+from topoloc.places.network_pictures import decode_picture
 from topoloc.places.vector_search import VectorSearch
-from topoloc.places.vlad_nn import tune
-from topoloc.places.weights import read_weights
+from topoloc.places.vlad_nn import VladNetwork
+from topoloc_training import cnn_nn, vlad_nn
+from topoloc_training.classifier_config import CnnNnConfig, TripletConfig, VladNnConfig
+from topoloc_training.training_set import TrainingSet
+from topoloc_training.vlad_nn import tune
+from topoloc_training.weights import read_weights
 
 SMALL = PictureConfig(112, 84)
 NO_FEATURES = Features(*(np.zeros(shape, np.float32) for shape in ((0, 2), (0,), (0,), (0,), (0, 64))))
@@ -104,7 +106,7 @@ def test_netvlads_own_vocabulary_is_taken_from_its_checkpoint(two_images: Traini
 def test_triplets_bring_near_images_together(room_set: TrainingSet):
     torch.manual_seed(0)
     tuning = TripletConfig(num_epochs=3, learning_rate=1e-3, near=3.0, far=4.0, margin=0.3)
-    network = vlad_nn.VladNetwork("squeezenet1_1", 5, 8)
+    network = VladNetwork("squeezenet1_1", 5, 8)
     pictures = np.stack([np.ascontiguousarray(decode_picture(jpeg)[:64, :64]) for jpeg in room_set.jpegs])
     losses = tune(network, pictures, room_set, tuning, silent)
     assert losses[-1] < losses[0]

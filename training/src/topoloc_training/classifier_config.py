@@ -3,22 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Literal, get_args
+from typing import Annotated
 
 from topoloc.bounds import Above, AtLeast, Between
-
-BackboneName = Literal["squeezenet1_1", "vgg11", "vgg16", "compact"]
-BACKBONES: tuple[BackboneName, ...] = get_args(BackboneName)
-
-
-@dataclass(frozen=True)
-class PictureConfig:
-    """How a picture is brought to the network: cut to the mapping pictures' shape, reduced, and stretched to one size."""
-
-    width_px: Annotated[int, Between(32, 2048)] = 224
-    """Width that the network sees."""
-    height_px: Annotated[int, Between(32, 2048)] = 168
-    """Height that the network sees."""
+from topoloc.places.network_config import ClassifierNetwork, PooledNetwork, VladNetworkConfig
 
 
 @dataclass(frozen=True)
@@ -68,10 +56,9 @@ class AugmentationConfig:
 
 
 @dataclass(frozen=True)
-class CnnFcConfig:
+class CnnFcConfig(ClassifierNetwork):
     """Settings of cnn-fc: a network whose outputs are the nodes."""
 
-    picture: PictureConfig = field(default_factory=PictureConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
     augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
     label_spread: Annotated[float, AtLeast(0)] = 1.0
@@ -80,18 +67,9 @@ class CnnFcConfig:
 
 
 @dataclass(frozen=True)
-class CnnNnConfig:
+class CnnNnConfig(PooledNetwork):
     """Settings of cnn-nn: features of a pretrained network, pooled, whitened; nearest neighbours."""
 
-    picture: PictureConfig = field(default_factory=PictureConfig)
-    depth: Annotated[int | None, Between(1, 100)] = None
-    """Layers of the backbone's `features` that are used (None: what measured best for each backbone)."""
-    grid_rows: Annotated[int, Between(1, 32)] = 2
-    """Features are pooled in cells, since neighbouring nodes see the same things at other places of the picture."""
-    grid_columns: Annotated[int, Between(1, 32)] = 3
-    """The same, across."""
-    power: Annotated[float, Between(1, 100)] = 3.0
-    """Exponent of the generalised mean (Radenovic et al. 2018): 1 is the mean, infinity the maximum."""
     dimension: Annotated[int, Between(1, 65_536)] = 256
     """Length of a place vector after whitening, at most."""
 
@@ -119,12 +97,9 @@ class TripletConfig:
 
 
 @dataclass(frozen=True)
-class VladNnConfig:
+class VladNnConfig(VladNetworkConfig):
     """Settings of vlad-nn: NetVLAD of a network's features; nearest neighbours."""
 
-    picture: PictureConfig = field(default_factory=PictureConfig)
-    depth: Annotated[int | None, Between(1, 100)] = None
-    """Layers of the backbone's `features` that are used (None: what measured best for each backbone)."""
     num_clusters: Annotated[int, Between(1, 4096)] = 64
     """Words of the vocabulary, where none come with the weights."""
     num_sampled_features: Annotated[int, Between(1, 100_000)] = 100

@@ -21,10 +21,10 @@ from jaxtyping import Bool, Int
 from torch import Generator, Tensor, nn
 
 from topoloc.errors import TrainingError
-from topoloc.places.classifier_config import TrainingConfig
 from topoloc.places.inference import has_bfloat16, threads
-from topoloc.places.training_set import Progress
 from topoloc.sequences.atomic import replaced_file
+from topoloc_training.classifier_config import TrainingConfig
+from topoloc_training.training_set import Progress
 
 BatchLoss = Callable[[Tensor, Generator], Tensor]
 """The mean loss of these rows of the training set, a scalar with gradient; randomness from the generator."""

@@ -7,8 +7,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from topoloc.places.classifier_config import TrainingConfig
-from topoloc.places.training import Task, fit, hold_out
+from topoloc_training.classifier_config import TrainingConfig
+from topoloc_training.training import Task, fit, hold_out
 
 
 @given(st.lists(st.integers(0, 8), min_size=1, max_size=80), st.floats(0.0, 0.9), st.integers(0, 100))

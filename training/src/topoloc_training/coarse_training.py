@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from topoloc.bounds import check_bounds
 from topoloc.errors import EmptyMapError, TrainingError
-from topoloc.map.file import MapFile
 from topoloc.map.nodes import NodePoses, node_distances
 from topoloc.map.schema import SCHEMA_VERSION
 from topoloc.map.sessions import Edit, today
 from topoloc.map.topomap import TopoMetricMap, in_ids
-from topoloc.map.validation import Damage, json_of
-from topoloc.places.classifier_config import BackboneName, CnnFcConfig, CnnNnConfig, VladNnConfig
-from topoloc.places.coarse import CoarseModel, module_of
-from topoloc.places.training_set import Progress, TrainingSet
+from topoloc.places.coarse import CoarseModel
+from topoloc.places.network_config import BackboneName
+from topoloc_training.classifier_config import CnnFcConfig, CnnNnConfig, VladNnConfig
+from topoloc_training.training_set import Progress, TrainingSet
 
 
 @dataclass(frozen=True)
@@ -47,16 +46,15 @@ def train_coarse(
 
     Raises:
         ConfigError: a value of `config` is out of its bounds.
-        MissingExtraError: torch is not installed.
         WeightsError: see `find_weights`.
         TrainingError: `name` does not learn, or the training failed.
         EmptyMapError, MapError: the map holds no images, or is damaged.
     """
     if name == "surf-vlad":
         raise TrainingError("surf-vlad learns from the recording's local features: `topoloc build` makes it")
-    module = module_of(name)
-    from topoloc.places.weights import find_weights  # needs torch
+    from topoloc_training.weights import find_weights  # PyTorch takes its time
 
+    module = importlib.import_module(f"topoloc_training.{name.replace('-', '_')}")
     config = config or CoarseTrainingConfig()
     check_bounds(config)
     of_name = {"cnn-fc": config.cnn_fc, "cnn-nn": config.cnn_nn, "vlad-nn": config.vlad_nn}[name]
@@ -98,21 +96,3 @@ def store_coarse(path: Path, target: Path, model: CoarseModel, make_default: boo
         edits = [*topomap.edits, Edit(number, f"train {model.name}", today(), SCHEMA_VERSION)]
         default = model.name if make_default else topomap.default_coarse
         replace(topomap, coarse_models=models, edits=edits, default_coarse=default).save(target)
-
-
-def list_coarse(path: Path) -> list[dict[str, Any]]:
-    """Name, bytes, backbone and weights of each coarse localizer of a map file. Raises MapError."""
-    file = MapFile(path)
-    try:
-        with file.reading() as database:
-            query = "SELECT name, settings, length(arrays) FROM coarse_models ORDER BY name LIMIT 1000"
-            return [_facts(name, json_of(settings), num_bytes) for name, settings, num_bytes in database.execute(query)]
-    finally:
-        file.close()
-
-
-def _facts(name: str, settings: Any, num_bytes: int) -> dict[str, Any]:
-    if not isinstance(settings, dict):
-        raise Damage(f"the settings of coarse localizer {name} are none")
-    facts = {"name": name, "bytes": num_bytes}
-    return facts | {key: settings[key] for key in ("backbone", "weights", "trained") if key in settings}

@@ -13,9 +13,9 @@ import pytest
 import torch
 
 from topoloc.errors import WeightsError
-from topoloc.places import weights as weights_module
-from topoloc.places.backbones import Backbone
-from topoloc.places.weights import find_weights, load_features, read_weights
+from topoloc.places.backbones import Backbone, normalize_pictures
+from topoloc_training import weights as weights_module
+from topoloc_training.weights import find_weights, load_features, read_weights
 
 
 def netvlad_tensors(num_clusters: int = 64) -> dict[str, torch.Tensor]:
@@ -126,3 +126,13 @@ def test_published_weights_are_fetched_once_and_their_hash_is_checked(random_fil
 def test_scratch_and_our_own_backbone_begin_with_nothing():
     assert find_weights("vgg16", "scratch") is None
     assert find_weights("compact", None) is None
+
+
+def test_the_published_weights_load_and_tell_pictures_apart(squeezenet_file: Path):
+    network = Backbone("squeezenet1_1", num_outputs=None).eval()
+    network.load_state_dict(torch.load(squeezenet_file, weights_only=True))
+    checks = (torch.arange(96)[:, None] // 8 + torch.arange(96)[None] // 8) % 2
+    pictures = torch.stack([checks * 200, torch.full((96, 96), 128)]).to(torch.uint8)[..., None].expand(2, 96, 96, 3)
+    with torch.inference_mode():
+        checked, plain = network(normalize_pictures(pictures)).mean(dim=(2, 3))
+    assert torch.nn.functional.cosine_similarity(checked, plain, dim=0) < 0.7

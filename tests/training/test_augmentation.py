@@ -7,9 +7,9 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from topoloc.places.augmentation import augment
 from topoloc.places.backbones import normalize_pictures
-from topoloc.places.classifier_config import AugmentationConfig
+from topoloc_training.augmentation import augment
+from topoloc_training.classifier_config import AugmentationConfig
 
 OFF = AugmentationConfig(**{item.name: 0.0 for item in fields(AugmentationConfig)})
 

@@ -8,7 +8,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 from topoloc.places.backbones import normalize_pictures
-from topoloc.places.classifier_config import AugmentationConfig
+from topoloc_training.classifier_config import AugmentationConfig
 
 
 def augment(pictures: Tensor, config: AugmentationConfig, generator: Generator) -> Tensor:

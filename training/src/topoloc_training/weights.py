@@ -6,7 +6,6 @@ Files are read without running code from them (`weights_only`). A file of anothe
 from __future__ import annotations
 
 import hashlib
-import os
 import pickle
 import shutil
 import urllib.error
@@ -14,15 +13,16 @@ import urllib.request
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from topoloc.errors import WeightsError
+from topoloc.features.network_files import cache_folder
 from topoloc.places.backbones import NUM_CHANNELS, Backbone
-from topoloc.places.classifier_config import BACKBONES, BackboneName
+from topoloc.places.network_config import BackboneName
 from topoloc.sequences.atomic import replaced_file
 
 SCRATCH = "scratch"
@@ -91,13 +91,6 @@ def describe(weights: Weights | None) -> dict[str, str] | None:
     return None if weights is None else {"file": weights.file_name, "sha256": weights.sha256}
 
 
-def cache_folder() -> Path:
-    """Where published weights are kept: $TOPOLOC_CACHE, else `topoloc` in the user's cache folder."""
-    if "TOPOLOC_CACHE" in os.environ:
-        return Path(os.environ["TOPOLOC_CACHE"])
-    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "topoloc"
-
-
 def _published_file(backbone: BackboneName) -> Path:
     """The published weights in the cache, fetched if they are not there yet. Raises WeightsError."""
     name = _PUBLISHED[backbone]
@@ -155,7 +148,7 @@ def _split_netvlad(tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[
 def _check(path: Path, tensors: dict[str, Tensor], netvlad: dict[str, Tensor] | None, backbone: BackboneName) -> None:
     shapes = {name: tuple(value.shape) for name, value in tensors.items()}
     if fault := _misfit(shapes, backbone):
-        others = [other for other in BACKBONES if other != backbone and not _misfit(shapes, other)]
+        others = [other for other in get_args(BackboneName) if other != backbone and not _misfit(shapes, other)]
         looks = f"; the file looks like {others[0]}" if others else ""
         raise WeightsError(f"weights {path} are not those of {backbone}: {fault}{looks}")
     if netvlad is not None:

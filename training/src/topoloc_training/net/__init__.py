@@ -1,0 +1,1 @@
+"""`topoloc-net`: our own network of local features, and how it is trained."""

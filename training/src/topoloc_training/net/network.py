@@ -1,0 +1,60 @@
+"""The network `topoloc-net`: grey picture to key point scores and 64-number descriptors, made for two plain CPU cores.
+
+Where the time of such networks goes (ONNX Runtime, one thread): a 3x3 convolution of 8 channels at half resolution costs as much as one of
+32 channels at an eighth, and runs at half the speed per multiplication. So half resolution sees one strided convolution alone, the depth
+lies at 1/8 and 1/16, the score is made at a quarter and unfolded, and descriptors get their fine detail from one 1x1 at a quarter.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from topoloc_training.networks.layers import ConvNormReLU, Residual, enlarged
+
+KIND = "topoloc-net"
+DIMENSION = 64
+STRIDE = 4
+_SHADOWS = 0.002  # grey below this is noise; also keeps the root's slope finite
+
+
+class TopolocNet(nn.Module):
+    """Levels at 1/4 (16 channels), 1/8 (32), 1/16 (64) and 1/32 (64), added up from coarse to fine."""
+
+    stride = STRIDE
+
+    def __init__(self):
+        super().__init__()
+        self.norm = nn.InstanceNorm2d(1)
+        self.quarter = nn.Sequential(ConvNormReLU(1, 16, 4, 2), ConvNormReLU(16, 16, 3, 2), ConvNormReLU(16, 16))
+        self.eighth = nn.Sequential(ConvNormReLU(16, 32, 3, 2), Residual(32, 32))
+        self.sixteenth = nn.Sequential(ConvNormReLU(32, 64, 3, 2), Residual(64, 64))
+        self.context = nn.Sequential(nn.AvgPool2d(2), ConvNormReLU(64, 64))
+        self.lateral = nn.Conv2d(32, 64, 1)
+        self.across = nn.Conv2d(64, 64, 1)
+        self.fusion = ConvNormReLU(64, 64, groups=4)
+        self.coarse_descriptor = nn.Conv2d(64, DIMENSION, 1)
+        self.fine_descriptor = nn.Conv2d(16, DIMENSION, 1)
+        self.pixels = nn.Conv2d(1, 16, 4, stride=4)
+        self.fine_score = nn.Conv2d(16, 16, 1)
+        self.coarse_score = nn.Conv2d(64, 16, 1)
+        self.score = nn.Sequential(nn.BatchNorm2d(16), nn.ReLU(), ConvNormReLU(16, 16), nn.Conv2d(16, 16, 1), nn.PixelShuffle(4))
+
+    def maps(self, image: Float[Tensor, "b 1 h w"]) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 64 h4 w4"]]:
+        """Score logits and descriptors."""
+        # The root evens out photon noise and keeps lamps from pressing a night picture into the lowest greys.
+        grey = self.norm(torch.sqrt(image + _SHADOWS))
+        quarter = self.quarter(grey)
+        eighth = self.eighth(quarter)
+        sixteenth = self.sixteenth(eighth)
+        sixteenth = sixteenth + enlarged(self.context(sixteenth), 2)
+        fused = self.fusion(functional.relu(self.lateral(eighth) + enlarged(self.across(sixteenth), 2)))
+        descriptors = enlarged(self.coarse_descriptor(fused), 2) + self.fine_descriptor(quarter)
+        logits = self.score(enlarged(self.coarse_score(fused), 2) + self.fine_score(quarter) + self.pixels(grey))
+        return logits, descriptors
+
+    def forward(self, image: Float[Tensor, "b 1 h w"]) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 64 h4 w4"]]:
+        logits, descriptors = self.maps(image)
+        return torch.sigmoid(logits), descriptors

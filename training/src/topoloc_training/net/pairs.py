@@ -1,0 +1,88 @@
+"""The same points by day and in other light: pixels of a stereo recording, seen again in single pictures of the same rendered place.
+
+Depth comes from the day's stereo pair, poses from the truth; what the other picture sees behind something nearer is left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from topoloc.sequences.folder import open_folder
+from topoloc.sequences.frame import StereoFrame
+from topoloc.sequences.kitti import open_kitti
+from topoloc.sequences.pictures import grey_image
+
+_NEAREST = 3  # day's pictures for one of the others
+_REACH = 2.0  # metres
+_TURN = np.cos(np.deg2rad(25))
+_CELL = 8  # pixels of a cell of the depth test
+_SLACK = 1.05
+_FEWEST = 200
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Pixels of the day's picture and the same points' pixels in the other, both by path of the picture."""
+
+    day: str
+    other: str
+    day_px: Float[np.ndarray, "n 2"]
+    other_px: Float[np.ndarray, "n 2"]
+
+
+def find_pairs(day_folder: str, other_folder: str) -> list[Pair]:
+    """Pairs of pictures that see the same, for each picture of the other recording up to three of the day's."""
+    days, others = open_kitti(Path(day_folder)), open_folder(Path(other_folder))
+    day_poses = np.array([pose.matrix() for pose in days.poses])
+    clouds: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    pairs = []
+    for j in range(len(others)):
+        frame = others[j]
+        pose = frame.world_from_cam.matrix()
+        distance = np.linalg.norm(day_poses[:, :3, 3] - pose[:3, 3], axis=1)
+        distance[day_poses[:, :3, 2] @ pose[:3, 2] < _TURN] = np.inf
+        for i in np.argsort(distance)[:_NEAREST]:
+            if distance[i] > _REACH:
+                break
+            if i not in clouds:
+                clouds[i] = _cloud(days[int(i)])
+            pixels, points = clouds[i]
+            seen, at = _project(points, np.linalg.inv(pose) @ day_poses[i], frame)
+            if len(seen) >= _FEWEST:
+                pairs.append(Pair(str(days.root / days.names[i]), str(others.root / others.names[j]), pixels[seen], at))
+    return pairs
+
+
+def _cloud(frame: StereoFrame) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels of the left picture, every other row and column, and their points in the left camera."""
+    left, right = grey_image(frame.image), grey_image(frame.right)
+    matcher = cv2.StereoSGBM.create(0, 64, 5, 200, 800, disp12MaxDiff=1, uniquenessRatio=10, speckleWindowSize=80, speckleRange=2)
+    disparity = matcher.compute(left, right).astype(np.float32) / 16
+    y, x = np.nonzero(disparity > 1.0)
+    chosen = (x % 2 == 0) & (y % 2 == 0)
+    x, y = x[chosen], y[chosen]
+    camera = frame.rig.left
+    z = camera.fx * frame.rig.baseline / disparity[y, x]
+    points = np.column_stack([(x - camera.cx) / camera.fx * z, (y - camera.cy) / camera.fy * z, z])
+    return np.column_stack([x, y]).astype(np.float32), points
+
+
+def _project(points: np.ndarray, other_from_day: np.ndarray, frame: StereoFrame) -> tuple[np.ndarray, np.ndarray]:
+    """Which points the other picture sees, and where. Nearest in its cell wins."""
+    camera = frame.camera
+    local = points @ other_from_day[:3, :3].T + other_from_day[:3, 3]
+    front = np.flatnonzero(local[:, 2] > 0.3)
+    local = local[front]
+    at = local[:, :2] / local[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    inside = (at[:, 0] > 2) & (at[:, 1] > 2) & (at[:, 0] < camera.width - 3) & (at[:, 1] < camera.height - 3)
+    front, at, z = front[inside], at[inside], local[inside, 2]
+    cell = (at[:, 1] // _CELL).astype(int) * (camera.width // _CELL + 1) + (at[:, 0] // _CELL).astype(int)
+    nearest = np.full(cell.max() + 1 if len(cell) else 1, np.inf)
+    np.minimum.at(nearest, cell, z)
+    visible = z < nearest[cell] * _SLACK
+    return front[visible], at[visible].astype(np.float32)

@@ -1,0 +1,189 @@
+"""Train `topoloc-net`: `python -m topoloc_training.net.train --teacher edgepoint2-e64.onnx --pictures FOLDER... --out FOLDER`.
+
+Resumable: started again with the same folder it goes on from its last state. One line of JSON a hundred steps goes to `log.jsonl`.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+import tyro
+from torch import Tensor, nn
+
+from topoloc_training.net.losses import likeness, peaks, sampled, told_apart
+from topoloc_training.net.network import KIND, STRIDE, TopolocNet
+from topoloc_training.net.pairs import Pair, find_pairs
+from topoloc_training.net.teacher import HEIGHT, learn
+from topoloc_training.net.views import Sample, draw_sample
+from topoloc_training.networks.export import export
+
+_LOG_EVERY = 100
+_SAVE_EVERY = 250
+_KEPT_AVERAGE = 0.998
+
+
+@dataclass(frozen=True)
+class TrainNet:
+    """Distil `topoloc-net` from a teacher on pictures and on day and night pairs of rendered places."""
+
+    teacher: Path
+    """ONNX file of a network of 64-number descriptors and stride 4, of the contract of `networks/export.py`."""
+    pictures: list[str] = field(default_factory=list)
+    """Folders of pictures; `FOLDER::2` takes every other one."""
+    pairs: list[str] = field(default_factory=list)
+    """Pairs of recordings of one rendered place, `DAY:OTHER`: the day's with stereo, both with truth."""
+    out: Path = Path("net")
+    """Folder of the state, of the log and of the network."""
+    steps: int = 8000
+    batch: int = 4
+    """Samples a step; each gives two views."""
+    rate: float = 2e-3
+    """Learning rate, falling to nothing by a cosine."""
+    pair_share: float = 0.3
+    """Share of samples that come from pairs."""
+    seed: int = 1
+    threads: int = 1
+    minutes: Annotated[float, tyro.conf.arg(help="Stop after so long; the state is kept.")] = 1e9
+
+
+def train(config: TrainNet) -> None:
+    """Train, or go on training, and export the averaged network."""
+    torch.set_num_threads(config.threads)
+    config.out.mkdir(parents=True, exist_ok=True)
+    pairs = [pair for names in config.pairs for pair in _cached_pairs(names, config.out)]
+    folders = config.pictures + sorted({path for names in config.pairs for path in _picture_folders(names)})
+    lessons = learn(folders, config.teacher, config.out / "lessons")
+    rows = {os.path.realpath(path): i for i, path in enumerate(lessons.paths)}
+    known = [(rows[os.path.realpath(p.day)], rows[os.path.realpath(p.other)], _cut(p)) for p in pairs]
+    torch.manual_seed(config.seed)
+    network, average, optimizer, step = _begin(config)
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda s: _rate(s + step, config.steps))
+    network.train()
+    end, sums, since = time.monotonic() + 60 * config.minutes, np.zeros(4), time.monotonic()
+    while step < config.steps and time.monotonic() < end:
+        # The generator follows from the step, so that a resumed run goes on as the first would have.
+        generator = np.random.default_rng([config.seed, step])
+        share = config.pair_share if known else 0.0
+        parts = _step(network, [draw_sample(lessons, known, share, generator) for _ in range(config.batch)])
+        loss = parts[0] + parts[1] + 0.5 * parts[2] + 2.0 * parts[3]
+        optimizer.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(network.parameters(), 5.0)
+        optimizer.step()
+        schedule.step()
+        step += 1
+        _follow(average, network, min(_KEPT_AVERAGE, step / (step + 20)))
+        sums += [float(part.detach()) for part in parts]
+        if step % _LOG_EVERY == 0:
+            names = ("cosine", "to_teacher", "across_light", "score")
+            line = {"step": step, "rate": schedule.get_last_lr()[0], "seconds": round(time.monotonic() - since, 1)}
+            _log(config.out, line | {n: round(v / _LOG_EVERY, 4) for n, v in zip(names, sums, strict=True)})
+            sums, since = np.zeros(4), time.monotonic()
+        if step % _SAVE_EVERY == 0:
+            _save(config.out, network, average, optimizer, step)
+    _save(config.out, network, average, optimizer, step)
+
+
+def _step(network: TopolocNet, samples: list[Sample]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Cosine to the teacher, told apart against the teacher, told apart across light, score."""
+
+    def both(name: str) -> Tensor:
+        """First views of all samples, then second ones."""
+        stacked = np.array([getattr(sample, name) for sample in samples])
+        return torch.from_numpy(np.concatenate([stacked[:, 0], stacked[:, 1]]))
+
+    logits, maps = network.maps(both("views").float()[:, None])
+    points, valid = both("points"), both("valid")
+    near = torch.from_numpy(np.array([sample.near for sample in samples]))
+    taught = torch.from_numpy(np.array([sample.taught for sample in samples]))
+    ours = sampled(maps, points, STRIDE)
+    theirs = torch.cat([taught, taught])
+    first, second = ours.chunk(2)
+    seen_twice = valid.chunk(2)[0] & valid.chunk(2)[1]
+    return (
+        likeness(ours, theirs, valid),
+        told_apart(ours, theirs, valid, torch.cat([near, near])),
+        told_apart(first, second, seen_twice, near),
+        peaks(logits, both("scores").float()[:, None], both("inside")[:, None]),
+    )
+
+
+def _begin(config: TrainNet) -> tuple[TopolocNet, TopolocNet, torch.optim.Optimizer, int]:
+    network = TopolocNet()
+    optimizer = torch.optim.AdamW(network.parameters(), lr=config.rate, weight_decay=1e-4)
+    average, step = copy.deepcopy(network), 0
+    if (state := config.out / "state.pt").is_file():
+        kept = torch.load(state, weights_only=True)
+        network.load_state_dict(kept["network"])
+        average.load_state_dict(kept["average"])
+        optimizer.load_state_dict(kept["optimizer"])
+        step = kept["step"]
+    for group in optimizer.param_groups:
+        group["lr"] = group["initial_lr"] = config.rate
+    return network, average, optimizer, step
+
+
+def _rate(step: int, steps: int) -> float:
+    return min(1.0, (step + 1) / 100) * (0.5 + 0.5 * np.cos(np.pi * min(1.0, step / steps))) + 1e-3
+
+
+def _follow(average: nn.Module, network: nn.Module, kept: float) -> None:
+    with torch.no_grad():
+        for old, new in zip(average.state_dict().values(), network.state_dict().values(), strict=True):
+            if old.dtype.is_floating_point:
+                old.lerp_(new, 1 - kept)
+            else:
+                old.copy_(new)
+
+
+def _save(out: Path, network: nn.Module, average: TopolocNet, optimizer: torch.optim.Optimizer, step: int) -> None:
+    part = out / "state.part"
+    state = {"network": network.state_dict(), "average": average.state_dict(), "optimizer": optimizer.state_dict(), "step": step}
+    torch.save(state, part)
+    part.replace(out / "state.pt")
+    origin = {"topoloc_network": KIND, "licence": "Apache-2.0", "source": f"trained by topoloc_training.net.train, {step} steps"}
+    export(copy.deepcopy(average).eval(), out / f"{KIND}.onnx", origin)
+
+
+def _log(out: Path, line: dict[str, float]) -> None:
+    with (out / "log.jsonl").open("a") as file:
+        file.write(json.dumps(line) + "\n")
+
+
+def _picture_folders(names: str) -> tuple[str, str]:
+    day, _, other = names.partition(":")
+    return f"{day}/image_2", f"{other}/images"
+
+
+def _cached_pairs(names: str, out: Path) -> list[Pair]:
+    file = out / f"pairs-{names.replace('/', '_').replace(':', '-')}.npz"
+    if not file.is_file():
+        day, _, other = names.partition(":")
+        pairs = find_pairs(day, other)
+        arrays = {f"{i}{part}": getattr(p, part) for i, p in enumerate(pairs) for part in ("day", "other", "day_px", "other_px")}
+        np.savez(file, **arrays)
+    with np.load(file) as kept:
+        count = len(kept.files) // 4
+        return [Pair(str(kept[f"{i}day"]), str(kept[f"{i}other"]), kept[f"{i}day_px"], kept[f"{i}other_px"]) for i in range(count)]
+
+
+def _cut(pair: Pair) -> Pair:
+    """Without what lies below the rows that the teacher saw."""
+    kept = (pair.day_px[:, 1] < HEIGHT - 1) & (pair.other_px[:, 1] < HEIGHT - 1)
+    return Pair(pair.day, pair.other, pair.day_px[kept], pair.other_px[kept])
+
+
+def _main() -> None:
+    train(tyro.cli(TrainNet, description=TrainNet.__doc__))
+
+
+if __name__ == "__main__":
+    _main()

@@ -1,0 +1,128 @@
+"""What one step of training looks at: two views of the same points in different light, and what the teacher says of the points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from numpy.random import Generator
+
+from topoloc_training.net.light import changed
+from topoloc_training.net.pairs import Pair
+from topoloc_training.net.teacher import HEIGHT, WIDTH, Lessons
+
+VIEW_WIDTH, VIEW_HEIGHT = 320, 256
+NUM_POINTS = 320
+_EDGE = 6  # pixels from a view's border that points keep
+_NEAR = 8.0  # pixels of the source closer than this are no rivals
+_TRIES = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Two views (2, h, w) in [0, 1], the teacher's scores seen the same way and where they hold, points (2, n, 2), their descriptors
+    (n, 64), whether a point lies in each view (2, n), and which points are near each other (n, n).
+    """
+
+    views: np.ndarray
+    scores: np.ndarray
+    inside: np.ndarray
+    points: np.ndarray
+    taught: np.ndarray
+    valid: np.ndarray
+    near: np.ndarray
+
+
+def draw_sample(lessons: Lessons, pairs: list[tuple[int, int, Pair]], share: float, generator: Generator) -> Sample:
+    """A picture and its copy in another light, or, in `share` of the cases, a pair of the list (its numbers are rows of `lessons`)."""
+    if pairs and generator.random() < share:
+        first, second, pair = pairs[int(generator.integers(len(pairs)))]
+        return _of_pair(lessons, first, second, pair, generator)
+    index = int(generator.integers(len(lessons.paths)))
+    place = _random_homography(generator, generator.uniform((0.25, 0.25), (0.75, 0.75)) * (WIDTH, HEIGHT), 1.0)
+    other = _nudged(place, generator)
+    views, scores, inside = _seen(lessons, [index, index], [place, other], (0.35, 1.0), generator)
+    points = _chosen_points(scores[0], generator)
+    source = _mapped(points, place)
+    return _sample(lessons, index, source, [points, _mapped(source, np.linalg.inv(other))], views, scores, inside)
+
+
+def _of_pair(lessons: Lessons, first: int, second: int, pair: Pair, generator: Generator) -> Sample:
+    for _ in range(_TRIES):
+        middle = int(generator.integers(len(pair.day_px)))
+        place = _random_homography(generator, pair.day_px[middle], 0.6)
+        other = _random_homography(generator, pair.other_px[middle], 0.6)
+        here, there = _mapped(pair.day_px, np.linalg.inv(place)), _mapped(pair.other_px, np.linalg.inv(other))
+        both = np.flatnonzero(_within(here) & _within(there))
+        if len(both) >= NUM_POINTS:
+            break
+    chosen = generator.choice(both if len(both) else len(here), NUM_POINTS, replace=len(both) < NUM_POINTS)
+    views, scores, inside = _seen(lessons, [first, second], [place, other], (0.3, 0.3), generator)
+    return _sample(lessons, first, pair.day_px[chosen], [here[chosen], there[chosen]], views, scores, inside)
+
+
+def _sample(
+    lessons: Lessons, index: int, source: np.ndarray, points: list[np.ndarray], views: np.ndarray, scores: np.ndarray, inside: np.ndarray
+) -> Sample:
+    known = (source[:, 0] >= 0) & (source[:, 1] >= 0) & (source[:, 0] <= WIDTH - 1) & (source[:, 1] <= HEIGHT - 1)
+    valid = np.array([_within(view) & known for view in points])
+    x, y = source.astype(np.float32).T
+    near = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2 < _NEAR**2
+    np.fill_diagonal(near, False)
+    stacked = np.array(points, np.float32)
+    return Sample(views, scores, inside, stacked, lessons.described(index, source), valid, near)
+
+
+def _seen(
+    lessons: Lessons, indices: list[int], places: list[np.ndarray], strengths: tuple[float, float], generator: Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    size = (VIEW_WIDTH, VIEW_HEIGHT)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    views, scores, inside = [], [], []
+    for index, place, strength in zip(indices, places, strengths, strict=True):
+        picture = cv2.warpPerspective(lessons.pictures[index], place, size, flags=flags, borderMode=cv2.BORDER_REFLECT_101)
+        views.append(changed(picture.astype(np.float32) / 255, strength, generator))
+        scores.append(cv2.warpPerspective(lessons.scores[index], place, size, flags=flags).astype(np.float32) / 255)
+        inside.append(cv2.warpPerspective(np.ones((HEIGHT, WIDTH), np.uint8), place, size, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP))
+    return np.array(views), np.array(scores), np.array(inside, bool)
+
+
+def _random_homography(generator: Generator, middle: Float[np.ndarray, "2"], spread: float) -> Float[np.ndarray, "3 3"]:
+    """Source pixels from a view's pixels: the view's middle comes to `middle`."""
+    angle = np.deg2rad(generator.normal(0, 12)) * spread
+    scale = np.exp(generator.normal(0.05, 0.3 * spread))
+    cosine, sine = scale * np.cos(angle), scale * np.sin(angle)
+    to_origin = np.array([[1, 0, -(VIEW_WIDTH - 1) / 2], [0, 1, -(VIEW_HEIGHT - 1) / 2], [0, 0, 1.0]])
+    bend = generator.normal(0, 3e-4 * spread, 2)
+    turn = np.array([[cosine, -sine, 0], [sine, cosine, 0], [bend[0], bend[1], 1]])
+    return np.array([[1, 0, middle[0]], [0, 1, middle[1]], [0, 0, 1.0]]) @ turn @ to_origin
+
+
+def _nudged(place: Float[np.ndarray, "3 3"], generator: Generator) -> Float[np.ndarray, "3 3"]:
+    """Another look at about the same: corners of the view moved by up to a sixth of its size."""
+    corners = np.array([[0, 0], [VIEW_WIDTH, 0], [VIEW_WIDTH, VIEW_HEIGHT], [0, VIEW_HEIGHT]], np.float32)
+    moved = corners + generator.uniform(-1 / 6, 1 / 6, (4, 2)) * (VIEW_WIDTH, VIEW_HEIGHT)
+    return place @ cv2.getPerspectiveTransform(corners, moved.astype(np.float32))
+
+
+def _chosen_points(score: np.ndarray, generator: Generator) -> Float[np.ndarray, "n 2"]:
+    """Two thirds where the teacher sees key points, the rest anywhere; with fractions of a pixel."""
+    inner = score[_EDGE:-_EDGE, _EDGE:-_EDGE]
+    weight = inner.ravel().astype(np.float64) + 1e-5
+    flat = generator.choice(weight.size, NUM_POINTS * 2 // 3, p=weight / weight.sum())
+    rows, columns = np.divmod(flat, inner.shape[1])
+    high = np.array([VIEW_WIDTH, VIEW_HEIGHT]) - _EDGE
+    anywhere = generator.uniform(_EDGE, high, (NUM_POINTS - len(flat), 2))
+    return np.vstack([np.column_stack([columns, rows]) + _EDGE, anywhere])
+
+
+def _mapped(points: np.ndarray, homography: np.ndarray) -> np.ndarray:
+    moved = np.column_stack([points, np.ones(len(points))]) @ homography.T
+    return moved[:, :2] / moved[:, 2:]
+
+
+def _within(points: np.ndarray) -> np.ndarray:
+    low, high = _EDGE, np.array([VIEW_WIDTH, VIEW_HEIGHT]) - 1 - _EDGE
+    return np.all((points >= low) & (points <= high), axis=1)
