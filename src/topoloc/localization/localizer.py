@@ -12,18 +12,16 @@ behaviour.
 from __future__ import annotations
 
 import time
-from functools import cached_property
 
 from topoloc.bounds import check_bounds
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
-from topoloc.localization.answer import answer
+from topoloc.localization.answer import Answered, answer
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.fitted_weights import FittedWeights, weights_of
 from topoloc.localization.map_facts.correlated_errors import correlated_errors_of
 from topoloc.localization.open_map import OpenMap
-from topoloc.localization.pose_fit import SeenPoints
 from topoloc.localization.propose import propose
 from topoloc.localization.query import Query, check_size, reduced_image
 from topoloc.localization.refine import hypothesis_of
@@ -63,6 +61,9 @@ class Localizer:
         self.map = OpenMap(topomap, coarse or config.coarse)
         self.config = config.for_kind(self.map.kind)
         self.weights = weights or weights_of(self.map.kind.name)
+        c, shared_errors = self.config, self.weights.shared_errors
+        # rho of the map: the share of a match's variance that its points have in common
+        self.correlated_errors = correlated_errors_of(topomap, c.guided, c.pose, c.correlated_errors, shared_errors)
 
     def localize(
         self,
@@ -97,8 +98,8 @@ class Localizer:
         prior: Rigid3 | None,
         max_ms: float | None = None,
         trace: Trace | None = None,
-    ) -> tuple[Localization | NotLocalized, SeenPoints | None]:
-        """As `localize`; also the points that the pose stands on, in pixels of `image`."""
+    ) -> tuple[Localization | NotLocalized, list[Answered]]:
+        """As `localize`; also each pose that the result names (its own, or its alternatives) with the points that it stands on."""
         check_size(image, camera)
         search = Search(self._query(image, camera, max_ms), self.map, self.config, self.weights, self.correlated_errors, trace)
         for proposal in propose(search, prior):
@@ -110,14 +111,7 @@ class Localizer:
                 break
         return answer(search)
 
-    @cached_property
-    def correlated_errors(self) -> float:
-        """rho of the map: the share of a match's variance that its points have in common (see `correlated_errors.py`)."""
-        c = self.config
-        return correlated_errors_of(self.topomap, c.guided, c.pose, c.correlated_errors, self.weights.shared_errors)
-
     def _query(self, image: Image, camera: Camera | RoughCamera, max_ms: float | None) -> Query:
-        _ = self.correlated_errors, self.map.focal  # of the first query alone; the map's time, not the query's
         start, limit = time.perf_counter(), max_ms if max_ms is not None else self.config.max_ms
         reduced, lens = reduced_image(image, camera, self.map.focal, self.config.max_finer, self.config.max_side_px)
         deadline = float("inf") if limit is None else start + limit / 1e3
