@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 
 from topoloc.errors import MissingExtraError, WeightsError
 from topoloc.features.kinds import check_available
@@ -18,11 +17,13 @@ from topoloc.places.coarse import CoarseLocalizer
 
 @dataclass(frozen=True, eq=False)
 class AskedKind:
-    """`config` has the kind's own thresholds where none are set."""
+    """`config` has the kind's own thresholds where none are set; `correlated_errors` is rho of the map: the share of a match's variance
+    that its points have in common (see `correlated_errors.py`)."""
 
     map: OpenMap
     config: LocalizerConfig
     weights: FittedWeights
+    correlated_errors: float
 
     @staticmethod
     def of(
@@ -30,13 +31,9 @@ class AskedKind:
     ) -> AskedKind:
         """Of a map's first kind; `weights` instead of those that ship for it. Raises as `OpenMap`."""
         opened = OpenMap(topomap, coarse or config.coarse)
-        return AskedKind(opened, config.for_kind(opened.kind), weights or weights_of(opened.kind.name))
-
-    @cached_property
-    def correlated_errors(self) -> float:
-        """rho of the map: the share of a match's variance that its points have in common (see `correlated_errors.py`)."""
-        c = self.config
-        return correlated_errors_of(self.map.topomap, c.guided, c.pose, c.correlated_errors, self.weights.shared_errors)
+        c, weights = config.for_kind(opened.kind), weights or weights_of(opened.kind.name)
+        rho = correlated_errors_of(topomap, c.guided, c.pose, c.correlated_errors, weights.shared_errors)
+        return AskedKind(opened, c, weights, rho)
 
 
 def kinds_to_ask(topomap: TopoMetricMap, wanted: tuple[str, ...] | None) -> Iterator[str]:

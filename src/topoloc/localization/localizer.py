@@ -18,11 +18,10 @@ from topoloc.bounds import check_bounds
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
-from topoloc.localization.answer import answer
+from topoloc.localization.answer import Answered, answer
 from topoloc.localization.asked_kind import AskedKind, kinds_to_ask
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.fitted_weights import FittedWeights
-from topoloc.localization.pose_fit import SeenPoints
 from topoloc.localization.propose import propose
 from topoloc.localization.query import Query, check_size, reduced_image
 from topoloc.localization.refine import hypothesis_of
@@ -96,8 +95,8 @@ class Localizer:
         prior: Rigid3 | None,
         max_ms: float | None = None,
         trace: Trace | None = None,
-    ) -> tuple[Localization | NotLocalized, SeenPoints | None]:
-        """As `localize`; also the points that the pose stands on, in pixels of `image`."""
+    ) -> tuple[Localization | NotLocalized, list[Answered]]:
+        """As `localize`; also each pose that the result names (its own, or its alternatives) with the points that it stands on."""
         check_size(image, camera)
         query, answered, search = self._query(image, camera, max_ms), None, None
         for number, kind in enumerate(self._kinds):
@@ -113,11 +112,10 @@ class Localizer:
 
     @property
     def correlated_errors(self) -> float:
-        """rho of the map by its first kind of features (see `correlated_errors.py`)."""
+        """rho of the map by its first kind of features: the share of a match's variance that its points have in common."""
         return self._kinds[0].correlated_errors
 
     def _query(self, image: Image, camera: Camera | RoughCamera, max_ms: float | None) -> Query:
-        _ = [kind.correlated_errors for kind in self._kinds], self.map.focal  # of the first query alone; the map's time, not the query's
         start, limit = time.perf_counter(), max_ms if max_ms is not None else self.config.max_ms
         reduced, lens = reduced_image(image, camera, self.map.focal, self.config.max_finer, self.config.max_side_px)
         deadline = float("inf") if limit is None else start + limit / 1e3
