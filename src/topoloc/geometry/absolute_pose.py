@@ -64,7 +64,7 @@ class AbsolutePoseConfig:
 
 @dataclass(frozen=True, eq=False)
 class AbsolutePose:
-    """A pose with its inliers among n matches. `covariance` of the left perturbation (m, rad) of `cam_from_world`."""
+    """A pose with its inliers among n matches; `covariance` is of the left perturbation (translation, rotation; m, rad)."""
 
     cam_from_world: Rigid3
     inliers: Bool[np.ndarray, " n"]
