@@ -110,7 +110,8 @@ def check_network(path: Path) -> KnownNetwork:
         raise WeightsError(f"network {path}: ONNX, but none that topoloc knows ({', '.join(NETWORKS)})")
     if properties.get("topoloc_version") != str(CONTRACT):
         raise WeightsError(f"network {path}: of version {properties.get('topoloc_version')}, not {CONTRACT}; convert it again")
-    scores, descriptors = session.run(None, {"image": np.zeros((1, 1, _SMALLEST, _SMALLEST), np.float32)})
+    outputs = session.run(None, {"image": np.zeros((1, 1, _SMALLEST, _SMALLEST), np.float32)})
+    scores, descriptors = (np.asarray(output) for output in outputs)
     if scores.shape != (1, 1, _SMALLEST, _SMALLEST) or descriptors.ndim != 4 or not np.isfinite(descriptors).all():
         raise WeightsError(f"network {path}: its outputs are not scores and descriptors of the picture")
     return NETWORKS[properties["topoloc_network"]]

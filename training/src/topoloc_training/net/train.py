@@ -87,7 +87,7 @@ def train(config: TrainNet) -> None:
         if step % _LOG_EVERY == 0:
             names = ("cosine", "to_teacher", "across_light", "score")
             line = {"step": step, "rate": schedule.get_last_lr()[0], "seconds": round(time.monotonic() - since, 1)}
-            _log(config.out, line | {n: round(v / _LOG_EVERY, 4) for n, v in zip(names, sums, strict=True)})
+            _log(config.out, line | {n: round(float(v) / _LOG_EVERY, 4) for n, v in zip(names, sums, strict=True)})
             sums, since = np.zeros(4), time.monotonic()
         if step % _SAVE_EVERY == 0:
             _save(config.out, network, average, optimizer, step)
