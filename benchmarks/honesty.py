@@ -139,9 +139,10 @@ def ask_place(place: Place, places: list[Place], topomap: TopoMetricMap, data: P
 
 def answer(localizer: Localizer, image: np.ndarray, camera: Camera | RoughCamera) -> tuple[Localization | NotLocalized, float]:
     """The result, and the median distance (metres) of the points that it stands on."""
-    result, seen = localizer.localize_near(image, camera, None)
-    if not isinstance(result, Localization) or seen is None:
+    result, named = localizer.localize_near(image, camera, None)
+    if not isinstance(result, Localization):
         return result, 0.0
+    ((_, seen),) = named
     return result, float(np.median(result.world_from_cam.inverse().apply(seen.points_world)[:, 2]))
 
 

@@ -12,6 +12,7 @@ import pytest
 
 from topoloc.cli import all_commands, main
 from topoloc.cli.settings_file import all_tables, config_class, read_settings
+from topoloc.errors import ConfigError
 from topoloc.map.topomap import TopoMetricMap
 
 Complaint = Callable[..., str]
@@ -35,7 +36,18 @@ def test_a_command_can_be_named(capsys: pytest.CaptureFixture[str]):
     assert main(["config", "evaluate"]) == 0
     assert list(tomllib.loads(capsys.readouterr().out)) == ["localize"]
     assert main(["config", "build"]) == 0
-    assert list(tomllib.loads(capsys.readouterr().out)) == ["build", "slam", "train"]
+    assert list(tomllib.loads(capsys.readouterr().out)) == ["build", "slam"]
+    assert main(["config", "train"]) == 0
+    assert list(tomllib.loads(capsys.readouterr().out)) == ["train"]
+
+
+def test_a_table_of_a_distribution_that_is_not_installed_names_it(file_of: FileOf, monkeypatch: pytest.MonkeyPatch):
+    path = file_of("train.cnn_fc.label_spread = 0.5")
+    assert "train" in all_tables()
+    read_settings(path)
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: [])
+    with pytest.raises(ConfigError, match=r"train: comes with topoloc-training, which is not installed$"):
+        read_settings(path)
 
 
 def test_only_commands_with_settings_can_be_named(complaint: Complaint):

@@ -66,9 +66,9 @@ def test_a_camera_of_many_more_pixels_is_as_good_as_the_map_s_own(lens: str, loc
 def test_the_points_seen_by_a_finer_camera_are_in_its_own_pixels(localizer: Localizer):
     camera = CAMERA.rescaled(3 * CAMERA.width, 3 * CAMERA.height)
     truth = path_pose(5.5)
-    result, seen = localizer.localize_near(render(room(), truth, camera)[0], camera, None)
+    result, named = localizer.localize_near(render(room(), truth, camera)[0], camera, None)
     assert isinstance(result, Localization)
-    assert seen is not None
+    ((_, seen),) = named
     expected = camera.img_from_cam(truth.inverse().apply(seen.points_world))
     assert np.median(np.linalg.norm(seen.points_img - expected, axis=1)) < 3.0  # a pixel of the map's camera
 

@@ -7,11 +7,11 @@ import numpy as np
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
-from topoloc.localization.belief import Hypothesis
+from topoloc.localization.answer import Answered
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.pose_fit import PoseFit, SeenPoints
+from topoloc.localization.pose_fit import SeenPoints
 from topoloc.localization.result import Alternative, Localization, NotLocalized
-from topoloc.localization.search import Trace, Tried
+from topoloc.localization.search import Trace
 from topoloc.tracking.stream_result import StreamedPose
 from topoloc.tracking.tracker import Tracker
 
@@ -36,42 +36,24 @@ class PanelWall(Localizer):
 
     def localize_near(
         self, image: np.ndarray, camera: Camera | RoughCamera, prior: Rigid3 | None, max_ms: float | None = None, trace: Trace | None = None
-    ) -> tuple[Localization | NotLocalized, SeenPoints | None]:
+    ) -> tuple[Localization | NotLocalized, list[Answered]]:
         self.num_asked += 1
         xs = self.xs
         if prior is not None:
             xs = sorted((x for x in xs if abs(x - prior.translation[0]) < 0.5), key=lambda x: abs(x - prior.translation[0]))[:1]
         if not xs:
-            return NotLocalized("not_in_map"), None
+            return NotLocalized("not_in_map"), []
         if len(xs) == 1:
-            return Localization(at(xs[0]), _SIGMA, 0.99, int(xs[0]), [], 40, 40), _points(xs[0])
+            named = _answered(xs[0], 0.99)
+            return named[0], [named]
         shares = [0.9 * (len(xs) - number) / sum(range(len(xs) + 1)) for number in range(len(xs))]
-        if trace is not None:
-            trace.tried += [Tried("retrieval", _Fit(x), None, _Hypothesis(x), 0.0) for x in xs]
-        return NotLocalized("ambiguous", alternatives=tuple(Alternative(at(x), p, int(x)) for x, p in zip(xs, shares, strict=True))), None
+        alternatives = tuple(Alternative(at(x), p, int(x)) for x, p in zip(xs, shares, strict=True))
+        return NotLocalized("ambiguous", alternatives=alternatives), [_answered(x, p) for x, p in zip(xs, shares, strict=True)]
 
 
-class _Fit(PoseFit):
-    """Of the pose at x, with points too few to be followed."""
-
-    def __init__(self, x: float) -> None:
-        vars(self).update(x=x, camera=CAMERA, matches=range(40))
-
-    @property
-    def num_inliers(self) -> int:
-        return 40
-
-    def seen_points(self, scale: float) -> SeenPoints:
-        return _points(vars(self)["x"])
-
-
-class _Hypothesis(Hypothesis):
-    def __init__(self, x: float) -> None:
-        vars(self).update(x=x, fit=_Fit(x), covariance=_SIGMA, noise_share=1.0)
-
-    @property
-    def world_from_cam(self) -> Rigid3:
-        return at(vars(self)["x"])
+def _answered(x: float, probability: float) -> Answered:
+    """A pose with points too few to be followed."""
+    return Localization(at(x), _SIGMA, probability, int(x), [], 40, 40), _points(x)
 
 
 def _points(x: float) -> SeenPoints:

@@ -17,6 +17,7 @@ from jaxtyping import UInt8
 from topoloc.bounds import AtLeast, Between
 from topoloc.errors import FeatureKindError
 from topoloc.features.features import Features
+from topoloc.features.learned import LearnedConfig, check_network, extract_learned
 from topoloc.features.sift import SiftConfig, extract_sift
 from topoloc.features.surf import DESCRIPTOR_LENGTH, SurfConfig, extract_surf
 
@@ -68,6 +69,8 @@ class FeatureKind:
     does not look at them.
     sigma_px: standard deviation (pixels) of a matched key point along x and along y.
     ratio: a match must be nearer than this times its nearest rival; wall_ratio, of walls seen from the side, which repeat themselves.
+    position_weight: how much a feature's place in the picture counts beside its descriptor where pictures are ranked (`places/vlad.py`).
+    network: what gives the features, if a network does (`network_files.py`).
     guided: thresholds for key points near their projection; distant: far from it, where the pose is only that of a node nearby.
     """
 
@@ -83,6 +86,8 @@ class FeatureKind:
     sigma_px: float = 1.0
     ratio: float = 0.8
     wall_ratio: float = 0.9
+    position_weight: float = 0.9
+    network: str | None = None
 
 
 def _extract_surf(image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None) -> Features:
@@ -94,6 +99,27 @@ def _extract_sift(image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_th
     return extract_sift(image, SiftConfig(max_features=config.max_features, contrast_threshold=config.contrast_threshold))
 
 
+def _learned_kind(network: str, descriptor_size: int, min_score: float) -> FeatureKind:
+    """A kind whose features a network gives: no size, no angle, and the picture as it is."""
+
+    def extract(image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None) -> Features:
+        return extract_learned(image, LearnedConfig(network, descriptor_size, config.max_features, min_score, num_threads))
+
+    return FeatureKind(
+        network,
+        extract,
+        descriptor_size,
+        guided=GuidedThresholds(min_similarity=0.7, min_margin=0.02),
+        distant=GuidedThresholds(min_similarity=0.75, min_margin=0.02),
+        normalization="none",
+        has_scale=False,
+        has_angle=False,
+        ratio=0.92,
+        position_weight=1.5,
+        network=network,
+    )
+
+
 SURF = FeatureKind(
     "surf",
     _extract_surf,
@@ -103,7 +129,14 @@ SURF = FeatureKind(
 )
 SIFT = FeatureKind("sift", _extract_sift, 128, guided=SURF.guided, distant=SURF.distant)
 
-KINDS: dict[str, FeatureKind] = {kind.name: kind for kind in (SURF, SIFT)}
+LEARNED = (
+    _learned_kind("edgepoint2-s64", 64, min_score=0.0067),
+    _learned_kind("edgepoint2-t32", 32, min_score=0.0067),
+    _learned_kind("edgepoint2-e64", 64, min_score=0.0067),
+    _learned_kind("xfeat", 64, min_score=0.05),
+)
+
+KINDS: dict[str, FeatureKind] = {kind.name: kind for kind in (SURF, SIFT, *LEARNED)}
 
 
 def find_kind(name: str) -> FeatureKind:
@@ -115,3 +148,15 @@ def find_kind(name: str) -> FeatureKind:
     if name not in KINDS:
         raise FeatureKindError(f"no features of kind {name!r}; there are {', '.join(KINDS)}")
     return KINDS[name]
+
+
+def check_available(name: str) -> None:
+    """Can features of this kind be had here?
+
+    Raises:
+        FeatureKindError: there is no such kind.
+        MissingExtraError, WeightsError: what its network needs is not there.
+    """
+    network = find_kind(name).network
+    if network is not None:
+        check_network(network)

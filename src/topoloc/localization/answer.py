@@ -18,18 +18,23 @@ _ELSEWHERE_DEG = 10.0
 _MIN_ALTERNATIVE = 0.01  # ones that are less probable beside the best one are not named
 
 
-def answer(search: Search) -> tuple[Localization | NotLocalized, SeenPoints | None]:
-    """The result, and the points that its pose stands on, in pixels of the image as it came."""
+Answered = tuple[Localization, SeenPoints]
+"""A pose, and the points that it stands on, in pixels of the image as it came."""
+
+
+def answer(search: Search) -> tuple[Localization | NotLocalized, list[Answered]]:
+    """The result, and each pose that it names: its own, or its alternatives, in their order."""
     ranked = search.belief.ranked(search.weights.rivals)
     min_probability = search.config.evidence.min_probability
     if not ranked or ranked[0].probability < min_probability:
-        return _refusal(search, ranked), None
+        return _refusal(search, ranked), []
     best, leads = ranked[0], [_lead(search, ranked[0], other) for other in ranked[1:]]
     others = math.exp(-best.log_odds) + sum(math.exp(-one) for one in leads)
     probability = precision_of(best.evidence) / (1.0 + others)
     if min(leads, default=math.inf) >= MIN_LEAD and probability >= min_probability:
-        return _localization(search, best, probability), best.fit.seen_points(search.query.scale)
-    return _ambiguity(search, ranked, leads, others), None
+        named = _answered(search, best, probability)
+        return named[0], [named]
+    return _ambiguity(search, ranked, leads, others)
 
 
 def _lead(search: Search, best: Hypothesis, other: Hypothesis) -> float:
@@ -42,10 +47,10 @@ def _lead(search: Search, best: Hypothesis, other: Hypothesis) -> float:
     return min(by_all, best.log_odds - other.log_odds) if is_elsewhere and not is_clear else by_all
 
 
-def _localization(search: Search, best: Hypothesis, probability: float) -> Localization:
+def _answered(search: Search, best: Hypothesis, probability: float) -> Answered:
     assert best.fit.pose is not None
     is_rough = isinstance(best.fit.lens, RoughCamera)
-    return Localization(
+    localization = Localization(
         world_from_cam=best.world_from_cam,
         covariance=covariance_of_inverse(best.fit.pose.cam_from_world, best.covariance),
         probability=probability,
@@ -59,21 +64,22 @@ def _localization(search: Search, best: Hypothesis, probability: float) -> Local
         noise_share=best.noise_share,
         calibrated=search.weights.is_calibrated,
     )
+    return localization, best.fit.seen_points(search.query.scale)
 
 
-def _ambiguity(search: Search, ranked: list[Hypothesis], leads: list[float], others: float) -> NotLocalized:
+def _ambiguity(search: Search, ranked: list[Hypothesis], leads: list[float], others: float) -> tuple[NotLocalized, list[Answered]]:
     """It is one of these; how probable each is, beside "nowhere"."""
     best = ranked[0]
     shares = [1.0 / (1.0 + others), *(math.exp(-one) / (1.0 + others) for one in leads)]
-    named = [(one, share) for one, share in zip(ranked, shares, strict=True) if share >= _MIN_ALTERNATIVE * shares[0]]
-    alternatives = [Alternative(one.world_from_cam, share, one.fit.node_id) for one, share in named]
-    alternatives.sort(key=lambda one: -one.probability)
+    probable = [pair for pair in zip(ranked, shares, strict=True) if pair[1] >= _MIN_ALTERNATIVE * shares[0]]
+    named = [_answered(search, one, share) for one, share in sorted(probable, key=lambda pair: -pair[1])]
+    alternatives = tuple(Alternative(one.world_from_cam, one.probability, one.node_id) for one, _ in named)
     if len(alternatives) > 1:
         detail = f"as much like node {alternatives[1].node_id} as like node {alternatives[0].node_id}"
     else:
         metres = float(np.sqrt(np.linalg.eigvalsh(best.covariance[:3, :3])[-1]))
         detail = f"in the map, but where is known to {metres:.2f} m only"
-    return _refused(search, "ambiguous" if len(alternatives) > 1 else "too_few_inliers", best, detail, tuple(alternatives))
+    return _refused(search, "ambiguous" if len(alternatives) > 1 else "too_few_inliers", best, detail, alternatives), named
 
 
 def _refusal(search: Search, ranked: list[Hypothesis]) -> NotLocalized:

@@ -63,9 +63,16 @@ class Hypothesis:
 
 def lead(a: Hypothesis, b: Hypothesis, weights: RivalWeights) -> float:
     """By how much `a` is likelier than `b`, in logarithms of odds."""
-    if a.is_from_walls or b.is_from_walls:
-        return a.log_odds - b.log_odds
-    return _strength(a, weights) - _strength(b, weights)
+    return float(_leads((a, b), weights)[0, 1])
+
+
+def _leads(hypotheses: tuple[Hypothesis, ...], weights: RivalWeights) -> Float[np.ndarray, "n n"]:
+    """By how much each is likelier than each: by their strengths, or their odds where one of the two comes from walls."""
+    strength = np.array([_strength(one, weights) for one in hypotheses])
+    log_odds = np.array([one.log_odds for one in hypotheses])
+    from_walls = np.array([one.is_from_walls for one in hypotheses])
+    by_odds = from_walls[:, None] | from_walls
+    return np.where(by_odds, log_odds[:, None] - log_odds, strength[:, None] - strength)
 
 
 def _strength(hypothesis: Hypothesis, weights: RivalWeights) -> float:
@@ -134,15 +141,10 @@ class Belief:
 def _ranked(hypotheses: tuple[Hypothesis, ...], weights: RivalWeights) -> list[Hypothesis]:
     if len(hypotheses) < 2:
         return list(hypotheses)
-    strength = np.array([_strength(one, weights) for one in hypotheses])
-    log_odds = np.array([one.log_odds for one in hypotheses])
-    from_walls = np.array([one.is_from_walls for one in hypotheses])
-    by_odds = from_walls[:, None] | from_walls
-    leads = np.where(by_odds, log_odds[:, None] - log_odds, strength[:, None] - strength)
+    leads = _leads(hypotheses, weights)
     np.fill_diagonal(leads, np.inf)
-    least = leads.min(axis=1)
-    order = sorted(range(len(hypotheses)), key=lambda k: (hypotheses[k].probability >= 0.5, least[k], log_odds[k]), reverse=True)
-    return [hypotheses[k] for k in order]
+    least = {id(one): float(row.min()) for one, row in zip(hypotheses, leads, strict=True)}
+    return sorted(hypotheses, key=lambda one: (one.probability >= 0.5, least[id(one)], one.log_odds), reverse=True)
 
 
 def _say_the_same(a: Hypothesis, b: Hypothesis, config: EvidenceConfig) -> bool:

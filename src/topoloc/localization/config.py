@@ -24,16 +24,17 @@ class LookAlikesConfig:
     """A look-alike's score is at least this share of the best one's: where the pose is clear, and where it is not."""
     reach: Annotated[float, AtLeast(0)] = 5.0
     """Nodes within so many D_thresh of a pose (Eq. 1) belong to it; look-alikes are farther away."""
-    max_groups: Annotated[int, Between(0, 1000)] = 3
-    """Parts of the map that are asked on their own, at most; 0 asks none."""
+    max_groups: Annotated[int | None, Between(0, 1000)] = None
+    """Parts of the map that are asked on their own, at most; 0 asks none. Unset: what suits the kind of features."""
 
 
 @dataclass(frozen=True)
 class ViewpointsConfig:
     """Where an image that is not clear is compared with what nodes saw."""
 
-    num_nodes: Annotated[int, Between(0, 10_000)] = 24
-    """Nodes of the best coarse rank that are compared, one by one; 0 compares none."""
+    num_nodes: Annotated[int | None, Between(0, 10_000)] = None
+    """Nodes of the best coarse rank that are compared, one by one; 0 compares none. Unset: 24, none for features without size and angle,
+    which tell little so."""
     shift_px: Annotated[float, Above(0)] = 12.0
     """Matches whose displacements differ by less than this agree, in an image whose longer side is 640 pixels; grows with that."""
     min_alike: Annotated[int, AtLeast(0)] = 8
@@ -79,6 +80,9 @@ class WallsConfig:
 class LocalizerConfig:
     """How a query is answered. The features are those that the map was built with."""
 
+    kinds: tuple[str, ...] | None = None
+    """Which of the map's kinds of features are asked, in turn, each where the one before leaves the pose unclear (None: all whose networks
+    are there)."""
     coarse: str | None = None
     """Which of the map's coarse localizers is asked (None: the map's default)."""
     max_ms: Annotated[float | None, AtLeast(0)] = None
@@ -111,12 +115,16 @@ class LocalizerConfig:
 
     def for_kind(self, kind: FeatureKind) -> LocalizerConfig:
         """With the thresholds of this kind of features where none are set."""
-        walls, viewpoints = self.walls, self.viewpoints
+        walls, viewpoints, look_alikes = self.walls, self.viewpoints, self.look_alikes
+        has_shape = kind.has_scale and kind.has_angle
+        num_nodes = viewpoints.num_nodes if viewpoints.num_nodes is not None else 24 if has_shape else 0
+        max_groups = look_alikes.max_groups if look_alikes.max_groups is not None else 3 if has_shape else 8
         return replace(
             self,
             matching=self.matching.resolved(kind.ratio),
             guided=self.guided.resolved(kind),
             pose=self.pose if self.pose.sigma_px is not None else replace(self.pose, sigma_px=kind.sigma_px),
-            viewpoints=replace(viewpoints, matching=viewpoints.matching.resolved(kind, kind.distant)),
+            look_alikes=replace(look_alikes, max_groups=max_groups),
+            viewpoints=replace(viewpoints, num_nodes=num_nodes, matching=viewpoints.matching.resolved(kind, kind.distant)),
             walls=replace(walls, matching=walls.matching.resolved(kind.wall_ratio), guided=walls.guided.resolved(kind)),
         )

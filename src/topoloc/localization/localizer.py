@@ -12,18 +12,16 @@ behaviour.
 from __future__ import annotations
 
 import time
-from functools import cached_property
+from dataclasses import replace
 
 from topoloc.bounds import check_bounds
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
-from topoloc.localization.answer import answer
+from topoloc.localization.answer import Answered, answer
+from topoloc.localization.asked_kind import AskedKind, kinds_to_ask
 from topoloc.localization.config import LocalizerConfig
-from topoloc.localization.fitted_weights import FittedWeights, weights_of
-from topoloc.localization.map_facts.correlated_errors import correlated_errors_of
-from topoloc.localization.open_map import OpenMap
-from topoloc.localization.pose_fit import SeenPoints
+from topoloc.localization.fitted_weights import FittedWeights
 from topoloc.localization.propose import propose
 from topoloc.localization.query import Query, check_size, reduced_image
 from topoloc.localization.refine import hypothesis_of
@@ -60,9 +58,9 @@ class Localizer:
         config = config or LocalizerConfig()
         check_bounds(config)
         self.topomap = topomap
-        self.map = OpenMap(topomap, coarse or config.coarse)
-        self.config = config.for_kind(self.map.kind)
-        self.weights = weights or weights_of(self.map.kind.name)
+        kinds = list(kinds_to_ask(topomap, config.kinds))
+        self._kinds = [AskedKind.of(topomap.by_kind(kind), config, coarse, weights if kind == kinds[0] else None) for kind in kinds]
+        self.map, self.config, self.weights = self._kinds[0].map, self._kinds[0].config, self._kinds[0].weights
 
     def localize(
         self,
@@ -97,28 +95,39 @@ class Localizer:
         prior: Rigid3 | None,
         max_ms: float | None = None,
         trace: Trace | None = None,
-    ) -> tuple[Localization | NotLocalized, SeenPoints | None]:
-        """As `localize`; also the points that the pose stands on, in pixels of `image`."""
+    ) -> tuple[Localization | NotLocalized, list[Answered]]:
+        """As `localize`; also each pose that the result names (its own, or its alternatives) with the points that it stands on."""
         check_size(image, camera)
-        search = Search(self._query(image, camera, max_ms), self.map, self.config, self.weights, self.correlated_errors, trace)
-        for proposal in propose(search, prior):
-            hypothesis = hypothesis_of(search, proposal)
-            if hypothesis is not None:
-                search.belief = search.belief.given(hypothesis, self.config.evidence, self.weights.rivals)
-            if search.query.is_late:
-                search.is_stopped = True
+        query, answered, search = self._query(image, camera, max_ms), None, None
+        for number, kind in enumerate(self._kinds):
+            of_kind = query if number == 0 else replace(query, feature_config=kind.map.feature_config)
+            search = Search(of_kind, kind.map, kind.config, kind.weights, kind.correlated_errors, trace, before=search)
+            search.has_next = number + 1 < len(self._kinds)
+            _follow_up(search, prior)
+            answered = answer(search)
+            if search.is_stopped or (isinstance(answered[0], Localization) and search.is_clear):
                 break
-        return answer(search)
+        assert answered is not None
+        return answered
 
-    @cached_property
+    @property
     def correlated_errors(self) -> float:
-        """rho of the map: the share of a match's variance that its points have in common (see `correlated_errors.py`)."""
-        c = self.config
-        return correlated_errors_of(self.topomap, c.guided, c.pose, c.correlated_errors, self.weights.shared_errors)
+        """rho of the map by its first kind of features: the share of a match's variance that its points have in common."""
+        return self._kinds[0].correlated_errors
 
     def _query(self, image: Image, camera: Camera | RoughCamera, max_ms: float | None) -> Query:
-        _ = self.correlated_errors, self.map.focal  # of the first query alone; the map's time, not the query's
         start, limit = time.perf_counter(), max_ms if max_ms is not None else self.config.max_ms
         reduced, lens = reduced_image(image, camera, self.map.focal, self.config.max_finer, self.config.max_side_px)
         deadline = float("inf") if limit is None else start + limit / 1e3
         return Query(reduced, lens, image.shape[1] / lens.width, self.map.feature_config, deadline=deadline)
+
+
+def _follow_up(search: Search, prior: Rigid3 | None) -> None:
+    """All that is proposed, until time is up."""
+    for proposal in propose(search, prior):
+        hypothesis = hypothesis_of(search, proposal)
+        if hypothesis is not None:
+            search.belief = search.belief.given(hypothesis, search.config.evidence, search.weights.rivals)
+        if search.query.is_late:
+            search.is_stopped = True
+            return

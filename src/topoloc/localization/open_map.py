@@ -51,14 +51,9 @@ class OpenMap:
         self.lambda_rot, self.d_thresh = topomap.config.lambda_rot, topomap.config.d_thresh
         self._local_map = RememberedNodes(lambda row: LocalMap.of_node(topomap.nodes[row]))
         self._moves = RememberedNodes(self._find_moves)
+        self._known_moves = _known_moves(topomap)
+        self.focal = _finest_focal(topomap)
         self._expected: tuple[Camera, RememberedNodes[Float32[np.ndarray, "n 5"]]] | None = None
-
-    @cached_property
-    def focal(self) -> float:
-        """Focal length (pixels) of the finest camera that mapped; each recording is taken to have one camera."""
-        summaries = self.topomap.summaries
-        first_rows = {summaries[row].session_id: row for row in reversed(range(len(summaries)))}
-        return max(self.topomap.nodes[row].camera.fx for row in first_rows.values())
 
     @cached_property
     def walls(self) -> WallIndex | None:
@@ -93,13 +88,8 @@ class OpenMap:
 
     def moves(self, row: int) -> Float[np.ndarray, "k 4 4"]:
         """The moves (world) by which what a node shows is found elsewhere in the map; as the map tells them, or found now."""
-        known = self._known_repetitions
+        known = self._known_moves
         return self._moves(row) if known is None else known.get(self.node_ids[row], _NO_MOVES)
-
-    @cached_property
-    def _known_repetitions(self) -> Mapping[int, Float[np.ndarray, "k 4 4"]] | None:
-        known = self.topomap.repetitions
-        return dict(known.moves) if known is not None and known.digest == digest_of(self.topomap.summaries) else None
 
     def _find_moves(self, row: int) -> Float[np.ndarray, "k 4 4"]:
         node = self.topomap.nodes[row]
@@ -145,6 +135,18 @@ class OpenMap:
     def nearest(self, world_from_cam: Rigid3, num_nodes: int) -> Int[np.ndarray, " n"]:
         """The rows of the nodes nearest to a camera, the nearest first."""
         return np.argsort(self.distances(world_from_cam), kind="stable")[:num_nodes]
+
+
+def _known_moves(topomap: TopoMetricMap) -> Mapping[int, Float[np.ndarray, "k 4 4"]] | None:
+    """The moves that the map tells by the ids of its nodes, where they were found of the nodes that it has."""
+    known = topomap.repetitions
+    return dict(known.moves) if known is not None and known.digest == digest_of(topomap.summaries) else None
+
+
+def _finest_focal(topomap: TopoMetricMap) -> float:
+    """Focal length (pixels) of the finest camera that mapped; each recording is taken to have one camera."""
+    first_rows = {topomap.summaries[row].session_id: row for row in reversed(range(len(topomap.summaries)))}
+    return max(topomap.nodes[row].camera.fx for row in first_rows.values())
 
 
 QUARTER = Rigid3(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))

@@ -82,10 +82,9 @@ class PoseFit:
         (low, high), (other_low, other_high) = self._box, other._box
         return bool(np.all(low <= other_high) and np.all(other_low <= high))
 
-    def seen_points(self, scale: float) -> SeenPoints | None:
-        """The inliers in a picture that is `scale` times as wide as that of the features; None without a pose."""
-        if self.pose is None:
-            return None
+    def seen_points(self, scale: float) -> SeenPoints:
+        """The inliers of a fit with a pose, in a picture that is `scale` times as wide as that of the features."""
+        assert self.pose is not None
         query_idx, train_idx = self.matches.query_idx[self.pose.inliers], self.matches.train_idx[self.pose.inliers]
         points_world, covariances = self.local_map.points_world[train_idx], self.local_map.covariances[train_idx]
         return SeenPoints(self.features.points_img[query_idx], points_world, covariances).in_image(scale)

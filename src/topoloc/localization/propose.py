@@ -24,6 +24,7 @@ from dataclasses import replace
 import numpy as np
 
 from topoloc.features.matching import match_pooled
+from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.belief import Hypothesis, is_same_pose
 from topoloc.localization.guided import largest_shift, match_expected, match_guided
@@ -35,6 +36,7 @@ from topoloc.map.nodes import node_distances
 from topoloc.places.coarse import NodeScore
 
 _BESIDE = 0.25  # radians
+_MAX_OTHERS = 3  # poses of other features that are asked
 _LEAST_FOUND_SHARE = 0.2  # of what is found at a pose, that must be found at one that is as likely
 
 
@@ -49,6 +51,9 @@ def propose(search: Search, prior: Rigid3 | None) -> Iterator[Proposal]:
         search.ranked = search.map.coarse.rank(search.query.image, features, num_ranked)
     retrieved = _pooled(search, "retrieval", search.candidates)
     yield retrieved
+    if search.has_next and not search.is_clear:
+        return
+    yield from _of_other_features(search)
     viewpoints = [] if search.is_clear else list(_viewpoints(search))
     yield from viewpoints
     if search.is_clear or viewpoints or retrieved.fit.num_inliers >= search.config.num_chance_inliers:
@@ -90,7 +95,7 @@ def _matched(search: Search, source: Source, rows: list[int], max_features: int 
 def _look_alikes(search: Search) -> Iterator[Proposal]:
     """Parts of the map far from what is believed that look like the image about as much as the best node does."""
     config, best, nodes = search.config.look_alikes, search.best, search.map.node_poses
-    if not search.ranked or config.max_groups == 0:
+    if not search.ranked or not config.max_groups:
         return
     least = config.min_score_share[0 if search.is_clear else 1] * search.ranked[0].score
     left = [candidate.node_id for candidate in search.ranked if candidate.score >= least]
@@ -138,6 +143,17 @@ def _viewpoints(search: Search) -> Iterator[Proposal]:
             return
 
 
+def _of_other_features(search: Search) -> Iterator[Proposal]:
+    """The poses that other features left open, where these features did not settle it."""
+    config, before = search.config, search.before
+    if before is None or search.is_clear:
+        return
+    for hypothesis in before.belief.ranked(before.weights.rivals)[:_MAX_OTHERS]:
+        fit = _around_pose(search, hypothesis.world_from_cam, hypothesis.fit.camera, config.evidence.min_found)
+        if fit is not None:
+            yield Proposal("other features", fit, is_guided=True)
+
+
 def _repetitions(search: Search) -> Iterator[Proposal]:
     """The poses that a repetition of the place allows as well as those that are believed, and theirs in turn."""
     config, tried, num_asked = search.config, list[Rigid3](), 0
@@ -171,8 +187,12 @@ def _is_beside(world_from_cam: Rigid3, others: list[Rigid3]) -> bool:
 
 def _moved(search: Search, world_from_cam: Rigid3, hypothesis: Hypothesis) -> PoseFit | None:
     """What is found around a pose that is known to a few centimetres; None where it is far less than at the one that it repeats."""
-    query, config, start = search.query, search.config, (world_from_cam.inverse(), hypothesis.fit.camera)
-    least = _LEAST_FOUND_SHARE * hypothesis.evidence.num_found
+    return _around_pose(search, world_from_cam, hypothesis.fit.camera, _LEAST_FOUND_SHARE * hypothesis.evidence.num_found)
+
+
+def _around_pose(search: Search, world_from_cam: Rigid3, camera: Camera, least: float) -> PoseFit | None:
+    """What is found around a pose; None where fewer than so many agree."""
+    query, config, start = search.query, search.config, (world_from_cam.inverse(), camera)
     with query.clock.stage("matching"):
         local_map = search.map.local_map(search.map.nearest(world_from_cam, config.guided.num_nodes))
         matches = match_guided(query.features, local_map, *start, replace(config.guided, radius_px=2.0 * config.guided.radius_px))

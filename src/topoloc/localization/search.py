@@ -37,7 +37,7 @@ class Trace:
     tried: list[Tried] = field(default_factory=list)
 
 
-Source = Literal["prior", "retrieval", "look-alikes", "viewpoints", "repetition", "walls"]
+Source = Literal["prior", "retrieval", "other features", "look-alikes", "viewpoints", "repetition", "walls"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +64,10 @@ class Search:
     weights: FittedWeights
     rho: float
     trace: Trace | None = None
+    before: Search | None = None
+    """The search by the kind of features that was asked before, and left it open."""
+    has_next: bool = False
+    """Another kind of features is asked where this one leaves it open."""
     belief: Belief = field(default_factory=Belief)
     ranked: list[NodeScore] = field(default_factory=list)
     first: PoseFit | None = None

@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float32
 
 from topoloc.bounds import check_bounds
 from topoloc.errors import EmptyMapError, TrajectoryError
@@ -29,7 +29,8 @@ from topoloc.map.schema import SCHEMA_VERSION
 from topoloc.map.sessions import Edit, Light, Session, light_of, mean_light, path_of, poses_source_of, today
 from topoloc.map.side_nodes import describe_sides, gather_sides, nodes_with_sides
 from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.vlad import SurfVlad, learn_words, placed, vlad
+from topoloc.places.coarse import CoarseModel
+from topoloc.places.vlad import SurfVlad, VladConfig, learn_words, placed, vlad
 from topoloc.sequences.frame import Image, StereoSequence
 from topoloc.sequences.frame_view import FrameView, frame_view
 from topoloc.sequences.pictures import jpeg_of
@@ -59,31 +60,35 @@ class _MappingFrame:
 
 @dataclass(frozen=True, eq=False)
 class _MappingImage:
-    """What the map needs of a frame once its pixels are let go. The pose is that of `camera`, which rectification may have turned."""
+    """What the map needs of a frame once its pixels are let go: its features, by their kinds. The pose is that of `camera`, which
+    rectification may have turned."""
 
     camera: Camera
     world_from_cam: Rigid3
-    features: Features
+    features: dict[str, Features]
     place_jpeg: bytes
     light: Light
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
+class _DraftPoints:
+    """Points of a node in the making as first measured, and what other images saw of them so far."""
+
+    features: Features
+    points_cam: Float[np.ndarray, "n 3"]
+    covariances: Float[np.ndarray, "n 3 3"]
+    observations: list[Observations]
+
+
+@dataclass(frozen=True, eq=False)
 class _NodeDraft:
-    """A node in the making: its points (features `rows` of its image) as first measured, and what other images saw of them so far."""
+    """A node in the making, its points by their kinds of features."""
 
     frame: _MappingFrame
     image: _MappingImage
     template_jpeg: bytes
-    rows: Int[np.ndarray, " n"]
-    points_cam: Float[np.ndarray, "n 3"]
-    covariances: Float[np.ndarray, "n 3 3"]
-    observations: list[Observations]
+    points: dict[str, _DraftPoints]
     sides: list[TopoNode]
-
-    @property
-    def features(self) -> Features:
-        return self.image.features.select(self.rows)
 
 
 def build_map(
@@ -113,7 +118,8 @@ def build_map(
     node_config = _resolve_node_config(frames, config)
     drafts = _draft_nodes(frames, node_config, config, progress)
     place_images, lights, coarse = _visit_all_images(frames, drafts, node_config, config, progress)
-    nodes = [_finish_node(node_id, draft, config) for node_id, draft in enumerate(drafts)]
+    of_kind = {kind: [_finish_node(node_id, draft, kind, config) for node_id, draft in enumerate(drafts)] for kind in config.kinds}
+    nodes = of_kind.pop(config.features.kind)
     sides = [replace(side, summary=replace(side.summary, of_node=node_id)) for node_id, draft in enumerate(drafts) for side in draft.sides]
     poses_from = poses_from or [poses_source_of(sequence) for sequence in sequences]
     return TopoMetricMap(
@@ -121,12 +127,13 @@ def build_map(
         nodes=nodes,
         edges=_edges_along(frames, [image.node_id for image in place_images]),
         place_images=place_images,
-        coarse_models={SurfVlad.name: coarse.to_model()},
+        coarse_models={model.name: model for model in coarse},
         config=replace(config, nodes=node_config),
         length_m=_trajectory_length(frames),
         sides=gather_sides(sides, config.sides),
         sessions=[_session(k, sequence, frames, lights, poses_from[k], drafts) for k, sequence in enumerate(sequences)],
         edits=[Edit(1, "build", today(), SCHEMA_VERSION)],
+        other_kinds=of_kind,
     )
 
 
@@ -179,7 +186,7 @@ def _draft_nodes(frames: list[_MappingFrame], node_config: NodeConfig, config: B
     drafts: list[_NodeDraft] = []
     for done, i in enumerate(frame_idx):
         draft = _draft_node(frames[i], done in with_sides, config)
-        if len(draft.rows) >= config.min_node_points:
+        if len(draft.points[kind.name].features) >= config.min_node_points:
             drafts.append(draft)
         progress("nodes", done + 1, len(frame_idx))
     if not drafts:
@@ -190,38 +197,43 @@ def _draft_nodes(frames: list[_MappingFrame], node_config: NodeConfig, config: B
 def _draft_node(frame: _MappingFrame, with_sides: bool, config: BuildConfig) -> _NodeDraft:
     view = frame.view()
     image = _mapping_image(frame, view, config)
-    located = locate_points(image.features, view, config.points)
-    rows = np.flatnonzero(located.valid)
+    points = {}
+    for kind, features in image.features.items():
+        located = locate_points(features, view, config.points)
+        rows = np.flatnonzero(located.valid)
+        points[kind] = _DraftPoints(features.select(rows), located.points_cam[rows], located.covariances[rows], [])
     template_jpeg = _encode_jpeg(view.picture, config.template_side_px, quality=75)
-    summary = NodeSummary(-1, frame.sequence.name, frame.name, frame.t_ns, image.world_from_cam, len(rows), frame.session_id)
+    summary = NodeSummary(-1, frame.sequence.name, frame.name, frame.t_ns, image.world_from_cam, 0, frame.session_id)
     sides = describe_sides(summary, view, config.features, config.points, config.sides) if with_sides else []
-    return _NodeDraft(frame, image, template_jpeg, rows, located.points_cam[rows], located.covariances[rows], [], sides)
+    return _NodeDraft(frame, image, template_jpeg, points, sides)
 
 
 def _mapping_image(frame: _MappingFrame, view: FrameView, config: BuildConfig) -> _MappingImage:
     jpeg = _encode_jpeg(view.picture, config.place_side_px, quality=60)
     world_from_view = frame.world_from_cam @ view.view_from_cam.inverse()
-    return _MappingImage(view.camera, world_from_view, extract_features(view.grey, config.features), jpeg, light_of(view.picture))
+    features = {kind: extract_features(view.grey, config.features_of(kind)) for kind in config.kinds}
+    return _MappingImage(view.camera, world_from_view, features, jpeg, light_of(view.picture))
 
 
 def _visit_all_images(
     frames: list[_MappingFrame], drafts: list[_NodeDraft], node_config: NodeConfig, config: BuildConfig, progress: Progress
-) -> tuple[list[PlaceImage], list[Light], SurfVlad]:
+) -> tuple[list[PlaceImage], list[Light], list[CoarseModel]]:
     """Label every mapping image with its nearest node, let it observe the points of the nodes around, and teach the
-    coarse localizer with it; its light is measured on the way."""
+    coarse localizer of each kind of features with it; its light is measured on the way."""
     assert node_config.lambda_rot is not None
-    words = learn_words(np.concatenate([_placed(draft.features, draft.image, config) for draft in drafts]), config.vlad)
+    words = {kind: _words(drafts, kind, config) for kind in config.kinds}
     node_poses = NodePoses.of([draft.image.world_from_cam for draft in drafts])
     drafted = {draft.frame: draft.image for draft in drafts}  # read already
     images: list[PlaceImage] = []
-    vlads, lights = [], []
+    lights, vlads = [], {kind: [] for kind in config.kinds}
     for done, frame in enumerate(frames):
         image = drafted.get(frame) or _mapping_image(frame, frame.view(with_depth=False), config)
         nearest = np.argsort(node_distances(image.world_from_cam, node_poses, node_config.lambda_rot), kind="stable")
         for node_id in nearest[: config.landmarks.nodes_per_image]:
             if drafts[node_id].frame is not frame:
                 _observe(drafts[node_id], image, frame.session_id, config)
-        vlads.append(vlad(_placed(image.features, image, config), words))
+        for kind, features in image.features.items():
+            vlads[kind].append(vlad(_placed(features, image, config.vlad_of(kind)), words[kind]))
         node_id, number = int(nearest[0]), done + 1
         images.append(
             PlaceImage(frame.sequence.name, frame.name, node_id, image.world_from_cam, image.place_jpeg, frame.session_id, number)
@@ -229,33 +241,40 @@ def _visit_all_images(
         lights.append(image.light)
         progress("images", done + 1, len(frames))
     node_ids = np.array([image.node_id for image in images])
-    return images, lights, SurfVlad.fit(words, np.stack(vlads), node_ids, config.vlad)
+    coarse = {kind: SurfVlad.fit(words[kind], np.stack(vlads[kind]), node_ids, config.vlad_of(kind)) for kind in config.kinds}
+    first, models = config.features.kind, {kind: one.to_model() for kind, one in coarse.items()}
+    return images, lights, [model if kind == first else replace(model, name=f"{model.name}@{kind}") for kind, model in models.items()]
 
 
-def _placed(features: Features, image: _MappingImage, config: BuildConfig) -> np.ndarray:
-    return placed(features, image.camera.width, image.camera.height, config.vlad)
+def _words(drafts: list[_NodeDraft], kind: str, config: BuildConfig) -> Float32[np.ndarray, "k d"]:
+    placed_features = [_placed(draft.points[kind].features, draft.image, config.vlad_of(kind)) for draft in drafts]
+    return learn_words(np.concatenate(placed_features), config.vlad)
+
+
+def _placed(features: Features, image: _MappingImage, config: VladConfig) -> np.ndarray:
+    return placed(features, image.camera.width, image.camera.height, config)
 
 
 def _observe(draft: _NodeDraft, image: _MappingImage, session_id: int, config: BuildConfig) -> None:
     cam_from_node = image.world_from_cam.inverse() @ draft.image.world_from_cam
-    sigmas_px = keypoint_sigmas(image.features, config.points)
-    known = (draft.features, draft.points_cam, draft.covariances)
-    seen = observe_points(*known, image.features, sigmas_px, image.camera, cam_from_node, config.landmarks, session_id)
-    draft.observations.append(seen)
+    for kind, features in image.features.items():
+        points, sigmas_px = draft.points[kind], keypoint_sigmas(features, config.points)
+        known, seen_by = (points.features, points.points_cam, points.covariances), (features, sigmas_px, image.camera, cam_from_node)
+        points.observations.append(observe_points(*known, *seen_by, config.landmarks, session_id))
 
 
-def _finish_node(node_id: int, draft: _NodeDraft, config: BuildConfig) -> TopoNode:
-    """Refine the points by what was observed; keep those seen again first, the strongest among them."""
-    refined = refine_points(draft.points_cam, draft.covariances, draft.observations, config.landmarks)
+def _finish_node(node_id: int, draft: _NodeDraft, kind: str, config: BuildConfig) -> TopoNode:
+    """Refine the points of a kind by what was observed; keep those seen again first, the strongest among them."""
+    points, frame, image = draft.points[kind], draft.frame, draft.image
+    refined = refine_points(points.points_cam, points.covariances, points.observations, config.landmarks)
     rows = np.flatnonzero(refined.agrees)
     rows = np.sort(rows[np.argsort(-np.minimum(refined.num_observations[rows], 2), kind="stable")][: config.max_node_points])
     sqrt_covs = np.linalg.cholesky(refined.covariances[rows])[:, *np.tril_indices(3)]
-    frame, image = draft.frame, draft.image
-    sums = session_sums(refined.points_cam, draft.points_cam, draft.covariances, draft.observations, rows, frame.session_id)
+    sums = session_sums(refined.points_cam, points.points_cam, points.covariances, points.observations, rows, frame.session_id)
     return TopoNode(
         NodeSummary(node_id, frame.sequence.name, frame.name, frame.t_ns, image.world_from_cam, len(rows), frame.session_id),
         image.camera,
-        draft.features.select(rows),
+        points.features.select(rows),
         refined.points_cam[rows].astype(np.float32),
         sqrt_covs.astype(np.float32),
         draft.template_jpeg,

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Annotated, Any
 
 from topoloc.bounds import Between, settings_from
 from topoloc.errors import ConfigError
-from topoloc.features.kinds import FeatureConfig
+from topoloc.features.kinds import FeatureConfig, find_kind
 from topoloc.map.landmarks import LandmarkConfig
 from topoloc.map.nodes import NodeConfig
 from topoloc.map.side_nodes import SideNodesConfig
@@ -26,6 +26,8 @@ class MapConfig:
 
     nodes: NodeConfig = field(default_factory=NodeConfig)
     features: FeatureConfig = field(default_factory=FeatureConfig)
+    other_kinds: tuple[str, ...] = ()
+    """Further kinds of features that the same nodes are described with: a query asks them where the first one leaves its pose unclear."""
     points: MetricPointsConfig = field(default_factory=MetricPointsConfig)
     landmarks: LandmarkConfig = field(default_factory=LandmarkConfig)
     vlad: VladConfig = field(default_factory=VladConfig)
@@ -38,6 +40,20 @@ class MapConfig:
     """Shorter side of the template picture that a node keeps, at most."""
     place_side_px: Annotated[int, Between(16, 4096)] = 160
     """Shorter side of the other mapping images, at most: what the coarse localizers of section III-B are trained with."""
+
+    @property
+    def kinds(self) -> list[str]:
+        """All kinds of features, the first one first."""
+        return [self.features.kind, *self.other_kinds]
+
+    def features_of(self, kind: str) -> FeatureConfig:
+        """The settings of the features of this kind: those of `features`, but for the picture's normalization, which suits the kind."""
+        return self.features if kind == self.features.kind else replace(self.features, kind=kind, normalization=None)
+
+    def vlad_of(self, kind: str) -> VladConfig:
+        """The settings of surf-vlad by features of this kind."""
+        weight = self.vlad.position_weight
+        return replace(self.vlad, position_weight=find_kind(kind).position_weight if weight is None else weight)
 
     @property
     def d_thresh(self) -> float:

@@ -30,7 +30,8 @@ class MapContents:
     was built with, `length_m` the metres of trajectory that were mapped. `default_coarse` names the coarse localizer that answers
     where the user names none. `shared_errors` and `repetitions` are None where nobody has measured
     them, `sides` where no mapping picture is wide enough to show the walls along the way. `edits` begins with the build.
-    `other_kinds` are the same nodes with points of further kinds of features, by the kind's name.
+    `other_kinds` are the same nodes with points of further kinds of features, by the kind's name, and `other_shared_errors` what
+    `shared_errors` are of these.
     """
 
     summaries: Sequence[NodeSummary]
@@ -48,8 +49,14 @@ class MapContents:
     edits: Sequence[Edit] = ()
     next_ids: NextIds = NextIds()
     other_kinds: Mapping[str, Sequence[TopoNode]] = field(default_factory=dict)
+    other_shared_errors: Mapping[str, SharedErrors] = field(default_factory=dict)
 
     @property
     def kind(self) -> str:
         """The kind of features that the nodes' points are described with, and queries must be."""
         return self.config.features.kind
+
+    @property
+    def kinds(self) -> list[str]:
+        """All kinds of features that the map holds, that of the nodes first."""
+        return [self.kind, *sorted(self.other_kinds)]

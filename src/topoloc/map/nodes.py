@@ -6,6 +6,8 @@ nearest node there is: on a first pass that is the last node, on a second lap th
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -14,6 +16,7 @@ from jaxtyping import Float, Int
 
 from topoloc.bounds import Above, AtLeast
 from topoloc.geometry.rigid import Rigid3
+from topoloc.map.entries import NodeSummary
 
 # Where the user names no D_thresh, it is this share of the scene's median depth: the parallax from one node to the next
 # is then the same in a kitchen (0.25 m) and in a street (3 m).
@@ -73,3 +76,11 @@ def place_nodes(world_from_cams: list[Rigid3], config: NodeConfig) -> Int[np.nda
         if node_distances(world_from_cam, nodes, config.lambda_rot).min() > config.d_thresh:
             frame_idx.append(k)
     return np.array(frame_idx)
+
+
+def digest_of_nodes(summaries: Sequence[NodeSummary], method: bytes) -> str:
+    """A short name for what follows from the nodes, by their poses and numbers of points, and from how it was found (`method`)."""
+    digest = hashlib.sha256(method)
+    for summary in summaries:
+        digest.update(summary.world_from_cam.matrix().astype("<f8").tobytes() + summary.num_points.to_bytes(4, "little"))
+    return digest.hexdigest()[:16]

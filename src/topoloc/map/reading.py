@@ -75,7 +75,8 @@ def _contents_of(file: MapFile) -> MapContents:
         config=config,
         length_m=value_from(float, json_of(facts["length_m"]), "length_m"),
         default_coarse=value_from(str, json_of(facts.get("default_coarse", '"surf-vlad"')), "default_coarse"),
-        shared_errors=_shared_errors_of(facts.get("shared_errors")),
+        shared_errors=_shared_errors_of(facts, "shared_errors"),
+        other_shared_errors={kind: found for kind in kinds if (found := _shared_errors_of(facts, f"shared_errors@{kind}"))},
         repetitions=Repetitions(facts["repetitions"], _Keyed(file, "repetitions", _moves_of)) if "repetitions" in facts else None,
         sides=sides,
         sessions=list(_sessions_of(file).values()),
@@ -97,10 +98,10 @@ def _kinds_of(facts: Mapping[str, str], config: MapConfig) -> list[str]:
     return kinds
 
 
-def _shared_errors_of(text: str | None) -> SharedErrors | None:
-    if text is None:
+def _shared_errors_of(facts: Mapping[str, str], key: str) -> SharedErrors | None:
+    if key not in facts:
         return None
-    found = settings_from(SharedErrors, json_of(text), "shared_errors")
+    found = settings_from(SharedErrors, json_of(facts[key]), key)
     if not 0.0 <= found.rho < math.inf:
         raise Damage("shared errors that are no share")
     return found

@@ -17,7 +17,7 @@ from typing import Any, no_type_check
 
 import numpy as np
 
-from topoloc.errors import MapError
+from topoloc.errors import FeatureKindError, MapError
 from topoloc.map.contents import MapContents
 from topoloc.map.entries import Edge, NodeSummary, PlaceImage, Repetitions, SharedErrors, SideNodes, TopoNode
 from topoloc.map.file import MapFile
@@ -58,6 +58,26 @@ class TopoMetricMap(MapContents):
     @cached_property
     def _rows(self) -> dict[int, int]:
         return {summary.node_id: row for row, summary in enumerate(self.summaries)}
+
+    def by_kind(self, kind: str) -> TopoMetricMap:
+        """The map as if it were made of this one of its kinds of features alone, the walls left out; itself by its first kind.
+
+        Raises:
+            FeatureKindError: it holds no such features.
+        """
+        if kind == self.kind:
+            return self
+        if kind not in self.other_kinds:
+            raise FeatureKindError(f"the map holds no features {kind} (it holds: {', '.join(self.kinds)})")
+        return replace(
+            self,
+            nodes=self.other_kinds[kind],
+            config=replace(self.config, features=self.config.features_of(kind), other_kinds=()),
+            shared_errors=self.other_shared_errors.get(kind),
+            sides=None,
+            other_kinds={},
+            other_shared_errors={},
+        )
 
     def save(self, path: str | Path) -> None:
         """Write the map file at once or not at all. Raises MapError."""
@@ -104,6 +124,8 @@ def _opened(read: tuple[MapContents, MapFile]) -> TopoMetricMap:
 
 def open_coarse_of(topomap: TopoMetricMap, name: str) -> CoarseLocalizer:
     """A map's coarse localizer, which names nodes by their rows. Raises MapError where the map has none of this name, or it is damaged."""
+    if (of_kind := f"{name}@{topomap.kind}") in topomap.coarse_models:
+        name = of_kind
     if name not in topomap.coarse_models:
         available = ", ".join(topomap.coarse_models) or "none"
         raise MapError(f"the map has no coarse localizer {name!r} (it has: {available})")

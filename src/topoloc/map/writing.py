@@ -125,6 +125,8 @@ class _Writer:
         }
         if topomap.shared_errors is not None:
             facts["shared_errors"] = json.dumps(asdict(topomap.shared_errors))
+        for kind, errors in topomap.other_shared_errors.items():
+            facts[f"shared_errors@{kind}"] = json.dumps(asdict(errors))
         if topomap.repetitions is not None:
             facts["repetitions"] = topomap.repetitions.digest
         for key, value in sorted(facts.items()):

@@ -79,10 +79,11 @@ def open_coarse(model: CoarseModel) -> CoarseLocalizer:
         MapError: the model is damaged, or of a name that this version does not know.
         MissingExtraError: it needs torch, which is not installed.
     """
-    if model.name not in COARSE_NAMES:
+    name = model.name.partition("@")[0]  # behind it stands the kind of features that it ranks by
+    if name not in COARSE_NAMES:
         raise MapError(f"the map's coarse localizer {model.name!r} is not known to this version (known: {', '.join(COARSE_NAMES)})")
     try:
-        return importlib.import_module(f"topoloc.places.{_MODULES[model.name]}").open_model(model)
+        return importlib.import_module(f"topoloc.places.{_MODULES[name]}").open_model(model)
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise

@@ -29,8 +29,9 @@ class VladConfig:
 
     num_words: Annotated[int, Between(1, 65_536)] = 64
     """Visual words of the vocabulary."""
-    position_weight: Annotated[float, AtLeast(0)] = 0.9
-    """How far two descriptors (of length 1) are apart for lying at opposite borders of the picture; 0 leaves their places out."""
+    position_weight: Annotated[float | None, AtLeast(0)] = None
+    """How far two descriptors (of length 1) are apart for lying at opposite borders of the picture; 0 leaves their places out. Unset: what
+    suits the kind of features."""
     dimension: Annotated[int, Between(1, 65_536)] = 128
     """Length of a place vector after PCA, at most."""
     max_training_descriptors: Annotated[int, AtLeast(1)] = 100_000
@@ -98,7 +99,7 @@ open_model = SurfVlad.from_model
 
 def placed(features: Features, width: int, height: int, config: VladConfig) -> Float32[np.ndarray, "n d"]:
     """Descriptors with their places in a picture of that size behind them; as they are where places do not count."""
-    if config.position_weight == 0.0:
+    if not config.position_weight:
         return features.descriptors
     places = (features.points_img + 0.5) / np.array([width, height], np.float32) - 0.5
     return np.hstack([features.descriptors, config.position_weight * places]).astype(np.float32)

@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.geometry.rigid import Rigid3, covariance_of_inverse
+from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import SeenPoints
-from topoloc.localization.result import Alternative, Localization, NotLocalized
-from topoloc.localization.search import Trace
+from topoloc.localization.result import Localization, NotLocalized
 from topoloc.tracking.pose_errors import PoseErrors, errors_of
 from topoloc.tracking.pose_hypotheses import Candidate, PoseHypotheses, is_same_place
 from topoloc.tracking.tracker_state import StreamPicture
@@ -98,32 +97,11 @@ class StreamSearch:
 
     def _ask(self, picture: StreamPicture, near: Rigid3 | None) -> tuple[NotLocalized | None, list[Found]]:
         """The poses that the picture may have: one, the alternatives of an ambiguous one, or none and why."""
-        trace = Trace()
-        result, seen = self._localizer.localize_near(picture.image, picture.camera, near, trace=trace)
+        result, named = self._localizer.localize_near(picture.image, picture.camera, near)
         if isinstance(result, NotLocalized):
-            return result, [self._alternative(picture, result, one, trace) for one in result.alternatives]
-        assert seen is not None, "points are seen where a pose was found"
+            return result, [self._found(one, seen, one.probability) for one, seen in named]
         # its probability is also that of being precise, which says nothing of other places
-        return None, [self._found(result, seen, 1.0 - self._hypotheses.config.miss)]
-
-    def _alternative(self, picture: StreamPicture, asked: NotLocalized, one: Alternative, trace: Trace) -> Found:
-        pose = one.world_from_cam.matrix()
-        hypotheses = [tried.hypothesis for tried in trace.tried if tried.hypothesis is not None]
-        hypothesis = next(other for other in hypotheses if np.array_equal(other.world_from_cam.matrix(), pose))
-        seen = hypothesis.fit.seen_points(picture.camera.width / hypothesis.fit.camera.width)
-        assert seen is not None, "an alternative has a pose"
-        result = Localization(
-            one.world_from_cam,
-            covariance_of_inverse(one.world_from_cam.inverse(), hypothesis.covariance),
-            one.probability,
-            one.node_id,
-            asked.candidates,
-            len(hypothesis.fit.matches),
-            hypothesis.fit.num_inliers,
-            asked.times_ms,
-            noise_share=hypothesis.noise_share,
-        )
-        return self._found(result, seen, one.probability)
+        return None, [self._found(one, seen, 1.0 - self._hypotheses.config.miss) for one, seen in named]
 
     def _found(self, result: Localization, seen: SeenPoints, probability: float) -> Found:
         depth = float(np.median(result.world_from_cam.inverse().apply(seen.points_world)[:, 2]))

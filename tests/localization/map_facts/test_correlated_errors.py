@@ -113,3 +113,18 @@ def test_a_map_of_one_node_is_taken_to_be_of_middling_quality(tiny_recording: Pa
 def test_without_correlated_errors_the_covariance_stays_as_it_is():
     assert inflation(500, 0.0) == 1.0
     assert inflation(100, 0.1) == pytest.approx(11.0)
+
+
+def test_the_first_query_computes_nothing_of_the_map(saved: Path, tiny_recording: Path, monkeypatch: pytest.MonkeyPatch):
+    localizer, frame = Localizer(TopoMetricMap.load(saved)), topoloc.open_sequence(tiny_recording)[1]
+    assert localizer.map.focal == frame.camera.fx
+
+    def never(*args: object) -> None:
+        raise AssertionError("a digest of the nodes, or what the map knows, at a query")
+
+    monkeypatch.setattr("topoloc.map.nodes.hashlib.sha256", never)
+    monkeypatch.setattr(correlated_errors, "measure_correlated_errors", never)
+    assert localizer.localize(frame.image, frame.camera).localized
+    localizer.map.moves(0)
+    with pytest.raises(AssertionError, match="a digest of the nodes"):
+        Localizer(TopoMetricMap.load(saved))

@@ -91,9 +91,9 @@ def test_an_answer_by_the_walls_says_what_it_stands_on(localizer: Localizer):
 def test_the_points_seen_are_handed_on(localizer: Localizer):
     """Streams follow them: each is a point of the walls, at the pixel of the picture."""
     picture, truth = seen_on_the_way_back()[2]
-    result, seen = localizer.localize_near(picture, WIDE, None)
+    result, named = localizer.localize_near(picture, WIDE, None)
     assert isinstance(result, Localization)
-    assert seen is not None
+    ((_, seen),) = named
     assert len(seen.points_img) == result.num_inliers
     offsets = np.linalg.norm(WIDE.img_from_cam(truth.inverse().apply(seen.points_world)) - seen.points_img, axis=1)
     assert np.median(offsets) < 3.0

@@ -11,11 +11,11 @@ from jaxtyping import Float
 from topoloc.features.kinds import find_kind
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.fitted_weights import weights_of
-from topoloc.localization.map_facts.correlated_errors import with_correlated_errors
+from topoloc.localization.map_facts.correlated_errors import correlated_errors_to_keep
 from topoloc.localization.map_facts.repetition import digest_of
 from topoloc.localization.open_map import OpenMap
 from topoloc.map import build
-from topoloc.map.topomap import Repetitions, TopoMetricMap
+from topoloc.map.topomap import Repetitions, SharedErrors, TopoMetricMap
 from topoloc.sequences.frame import StereoSequence
 
 
@@ -38,10 +38,18 @@ def build_map(
         RecordingError, CalibrationError, UnreadableImageError: from reading the recordings.
     """
     config = config or build.BuildConfig()
-    kind = find_kind(config.features.kind)
-    topomap, asked = build.build_map(sequences, config, progress, poses_from), LocalizerConfig().for_kind(kind)
-    topomap = with_correlated_errors(topomap, asked.guided, asked.pose, asked.correlated_errors, weights_of(kind.name).shared_errors)
+    for kind in config.kinds:
+        find_kind(kind)
+    topomap = build.build_map(sequences, config, progress, poses_from)
+    errors = {kind: _correlated_errors(topomap.by_kind(kind)) for kind in topomap.kinds}
+    topomap = replace(topomap, shared_errors=errors.pop(topomap.kind), other_shared_errors=errors)
     return with_repetitions(topomap, progress)
+
+
+def _correlated_errors(topomap: TopoMetricMap) -> SharedErrors:
+    """rho of a map by its first kind of features, so that who opens its file need not measure it."""
+    asked = LocalizerConfig().for_kind(find_kind(topomap.kind))
+    return correlated_errors_to_keep(topomap, asked.guided, asked.pose, asked.correlated_errors, weights_of(topomap.kind).shared_errors)
 
 
 def with_repetitions(topomap: TopoMetricMap, progress: build.Progress | None = None) -> TopoMetricMap:

@@ -12,9 +12,8 @@ of and with, and where that is not what is asked for, it is measured anew.
 
 from __future__ import annotations
 
-import hashlib
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Annotated
 
 import numpy as np
@@ -25,7 +24,7 @@ from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, est
 from topoloc.localization.fitted_weights import SharedErrorWeights
 from topoloc.localization.guided import GuidedConfig, match_guided
 from topoloc.localization.local_map import LocalMap
-from topoloc.map.nodes import NodePoses, node_distances
+from topoloc.map.nodes import NodePoses, digest_of_nodes, node_distances
 from topoloc.map.topomap import SharedErrors, TopoMetricMap, TopoNode
 
 _MEDIAN_CHI_SQUARE_6 = 5.348
@@ -70,12 +69,12 @@ def correlated_errors_of(
     return measure_correlated_errors(topomap, guided, pose, config, weights)
 
 
-def with_correlated_errors(
+def correlated_errors_to_keep(
     topomap: TopoMetricMap, guided: GuidedConfig, pose: AbsolutePoseConfig, config: CorrelatedErrorsConfig, weights: SharedErrorWeights
-) -> TopoMetricMap:
-    """The map, rho measured, so that who opens its file need not."""
+) -> SharedErrors:
+    """rho measured, for the map to keep."""
     rho = measure_correlated_errors(topomap, guided, pose, config, weights)
-    return replace(topomap, shared_errors=SharedErrors(rho, _digest(topomap, guided, pose, config, weights)))
+    return SharedErrors(rho, _digest(topomap, guided, pose, config, weights))
 
 
 def measure_correlated_errors(
@@ -103,17 +102,14 @@ def measure_correlated_errors(
 def _digest(
     topomap: TopoMetricMap, guided: GuidedConfig, pose: AbsolutePoseConfig, config: CorrelatedErrorsConfig, weights: SharedErrorWeights
 ) -> str:
-    """A short name for all that rho follows from: the settings, and the nodes by their poses and numbers of points."""
+    """A short name for all that rho follows from."""
     settings = {
         "guided": asdict(guided),
         "pose": asdict(pose),
         "config": asdict(config) | asdict(weights),
         "nodes": asdict(topomap.config.nodes),
     }
-    digest = hashlib.sha256(json.dumps([_METHOD, settings], sort_keys=True).encode())
-    for summary in topomap.summaries:
-        digest.update(summary.world_from_cam.matrix().astype("<f8").tobytes() + summary.num_points.to_bytes(4, "little"))
-    return digest.hexdigest()[:16]
+    return digest_of_nodes(topomap.summaries, json.dumps([_METHOD, settings], sort_keys=True).encode())
 
 
 def _rho_of_node(

@@ -13,7 +13,6 @@ all of them (`refine.py`). What tells them apart is what does not repeat itself,
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 
 import numpy as np
@@ -24,6 +23,7 @@ from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.local_map import LocalMap
 from topoloc.map.entries import NodeSummary, TopoNode
+from topoloc.map.nodes import digest_of_nodes
 
 NUM_NEIGHBOURS = 9
 LEAST_SHIFT = 0.3
@@ -41,11 +41,8 @@ _HALF = 1000  # cells to either side: more than any shift is long
 
 
 def digest_of(summaries: Sequence[NodeSummary]) -> str:
-    """A short name for what repetitions follow from: the nodes, by their poses and numbers of points."""
-    digest = hashlib.sha256(bytes([_METHOD]))
-    for summary in summaries:
-        digest.update(summary.world_from_cam.matrix().astype("<f8").tobytes() + summary.num_points.to_bytes(4, "little"))
-    return digest.hexdigest()[:16]
+    """A short name for what repetitions follow from."""
+    return digest_of_nodes(summaries, bytes([_METHOD]))
 
 
 def may_repeat(node: LocalMap) -> bool:

@@ -1,0 +1,99 @@
+"""Learned local features: a network reads the whole picture once and gives a score for every pixel and a descriptor for every few.
+
+All networks come as ONNX files of one form and run in ONNX Runtime: grey in [0, 1] goes in, its sides multiples of 32; out come the score
+of each pixel being a key point, and descriptors on a coarser grid. Key points are the maxima of the scores, to a fraction of a pixel by a
+parabola through each and its neighbours.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from topoloc import compiled
+from topoloc.errors import MissingExtraError, WeightsError
+from topoloc.features.features import Features
+from topoloc.features.learned_kernels import find_maxima, sample_descriptors
+from topoloc.features.network_files import find_network
+
+_SIDE_MULTIPLE = 32
+_BORDER_PX = 4
+SIZE_PX = 16.0
+"""The size that all these key points are said to have."""
+
+
+@dataclass(frozen=True)
+class LearnedConfig:
+    """Which network, and how many of its key points.
+
+    min_score: key points score more than this.
+    """
+
+    network: str
+    descriptor_size: int
+    max_features: int = 1000
+    min_score: float = 0.007
+    num_threads: int | None = None
+
+
+def extract_learned(image: UInt8[np.ndarray, "h w"], config: LearnedConfig) -> Features:
+    """Key points and descriptors of a grey image, strongest first; without size and angle.
+
+    Raises:
+        MissingExtraError: ONNX Runtime is not installed.
+        WeightsError: the network's file is missing, damaged or another network's.
+    """
+    height, width = image.shape
+    scores, dense = run_network(image, config.network, config.num_threads)
+    if dense.shape[0] != config.descriptor_size:
+        raise WeightsError(f"the network {config.network} gives descriptors of {dense.shape[0]} numbers, not {config.descriptor_size}")
+    points_img, found = find_maxima(scores, height, width, _BORDER_PX, np.float32(config.min_score))
+    order = np.argsort(-found, kind="stable")[: config.max_features]
+    points_img = points_img[order]
+    descriptors = sample_descriptors(dense, points_img, np.float32(scores.shape[0] / dense.shape[1]))
+    sizes, angles = np.full(len(order), SIZE_PX, np.float32), np.zeros(len(order), np.float32)
+    return Features(points_img, sizes, angles, found[order], descriptors)
+
+
+def check_network(network: str) -> None:
+    """Is the network there? Raises as `extract_learned`."""
+    _session(find_network(network), compiled.num_threads(), os.getpid())
+
+
+def run_network(
+    image: UInt8[np.ndarray, "h w"], network: str, num_threads: int | None = None
+) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "d h/s w/s"]]:
+    """The scores and the dense descriptors (not normalised) of a picture, which is continued by its border to the sides asked."""
+    height, width = image.shape
+    padding = [(0, -side % _SIDE_MULTIPLE) for side in (height, width)]
+    grey = np.pad(image, padding, mode="edge").astype(np.float32) / np.float32(255.0)
+    session = _session(find_network(network), num_threads or compiled.num_threads(), os.getpid())
+    scores, dense = session.run(["scores", "descriptors"], {"image": grey[None, None]})
+    return scores[0, 0], dense[0]
+
+
+@functools.lru_cache(maxsize=8)
+def _session(path: Path, num_threads: int, process_id: int) -> Any:
+    """The network made ready; several threads may run it at once, a forked child makes its own."""
+    try:
+        import onnxruntime as ort
+    except ImportError as error:
+        raise MissingExtraError("learned features need ONNX Runtime: pip install 'topoloc[learned]'") from error
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = num_threads
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # beside another busy program it would eat a core
+    options.log_severity_level = 3
+    try:
+        session = ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # ONNX Runtime has a dozen classes for files that are none
+        raise WeightsError(f"{path}: no network that ONNX Runtime can read") from error
+    names = {output.name for output in session.get_outputs()}
+    if [one.name for one in session.get_inputs()] != ["image"] or not {"scores", "descriptors"} <= names:
+        raise WeightsError(f"{path}: not a network of local features")
+    return session

@@ -1,0 +1,53 @@
+"""A map as it is asked by one of its kinds of features: with the settings, the fitted weights and the shared errors of that kind."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from topoloc.errors import MissingExtraError, WeightsError
+from topoloc.features.kinds import check_available
+from topoloc.localization.config import LocalizerConfig
+from topoloc.localization.fitted_weights import FittedWeights, weights_of
+from topoloc.localization.map_facts.correlated_errors import correlated_errors_of
+from topoloc.localization.open_map import OpenMap
+from topoloc.map.topomap import TopoMetricMap
+from topoloc.places.coarse import CoarseLocalizer
+
+
+@dataclass(frozen=True, eq=False)
+class AskedKind:
+    """`config` has the kind's own thresholds where none are set; `correlated_errors` is rho of the map: the share of a match's variance
+    that its points have in common (see `correlated_errors.py`)."""
+
+    map: OpenMap
+    config: LocalizerConfig
+    weights: FittedWeights
+    correlated_errors: float
+
+    @staticmethod
+    def of(
+        topomap: TopoMetricMap, config: LocalizerConfig, coarse: CoarseLocalizer | None = None, weights: FittedWeights | None = None
+    ) -> AskedKind:
+        """Of a map's first kind; `weights` instead of those that ship for it. Raises as `OpenMap`."""
+        opened = OpenMap(topomap, coarse or config.coarse)
+        c, weights = config.for_kind(opened.kind), weights or weights_of(opened.kind.name)
+        rho = correlated_errors_of(topomap, c.guided, c.pose, c.correlated_errors, weights.shared_errors)
+        return AskedKind(opened, c, weights, rho)
+
+
+def kinds_to_ask(topomap: TopoMetricMap, wanted: tuple[str, ...] | None) -> Iterator[str]:
+    """The kinds of features by which a map is asked, in turn: those that are wanted, else all whose networks are there.
+
+    Raises:
+        MissingExtraError, WeightsError: a network that is wanted, or that the map cannot be asked without, is not there.
+    """
+    first, *others = wanted if wanted is not None else topomap.kinds
+    for kind in (first, *others):
+        try:
+            check_available(kind)
+        except (MissingExtraError, WeightsError):
+            if wanted is not None or kind == first:
+                raise
+            continue
+        yield kind
