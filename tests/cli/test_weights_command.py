@@ -11,8 +11,9 @@ from types import SimpleNamespace
 
 import pytest
 
+import topoloc.cli.weights as weights
 from tiny_network import write_network
-from topoloc.cli import main, weights
+from topoloc.cli import main
 from topoloc.features.network_files import NETWORKS, check_network, find_network
 
 PUBLISHED = b"the published weights"

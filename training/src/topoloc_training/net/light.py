@@ -31,7 +31,7 @@ def changed(picture: Grey, strength: float, generator: Generator) -> Grey:
     if generator.random() < 0.25 * strength:
         quality = int(generator.integers(25, 90))
         encoded = cv2.imencode(".jpg", (result * 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
-        result = cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE).astype(np.float32) / 255
+        result = np.asarray(cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE), np.float32) / 255
     return result
 
 

@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.errors import RecordingError
+from topoloc.geometry.camera import Camera
 from topoloc.sequences.folder import open_folder
 from topoloc.sequences.frame import StereoFrame
 from topoloc.sequences.kitti import open_kitti
@@ -36,13 +38,21 @@ class Pair:
 
 
 def find_pairs(day_folder: str, other_folder: str) -> list[Pair]:
-    """Pairs of pictures that see the same, for each picture of the other recording up to three of the day's."""
+    """Pairs of pictures that see the same, for each picture of the other recording up to three of the day's.
+
+    Raises:
+        RecordingError: a frame has no pose, no calibration or, of the day's, no right picture.
+    """
     days, others = open_kitti(Path(day_folder)), open_folder(Path(other_folder))
-    day_poses = np.array([pose.matrix() for pose in days.poses])
+    day_poses = np.array([pose.matrix() for pose in days.poses if pose is not None])
+    if len(day_poses) < len(days):
+        raise RecordingError(f"{day_folder}: every frame needs a pose")
     clouds: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     pairs = []
     for j in range(len(others)):
         frame = others[j]
+        if frame.world_from_cam is None or frame.camera is None:
+            raise RecordingError(f"{other_folder}: {frame.name} needs a pose and a calibration")
         pose = frame.world_from_cam.matrix()
         distance = np.linalg.norm(day_poses[:, :3, 3] - pose[:3, 3], axis=1)
         distance[day_poses[:, :3, 2] @ pose[:3, 2] < _TURN] = np.inf
@@ -52,7 +62,7 @@ def find_pairs(day_folder: str, other_folder: str) -> list[Pair]:
             if i not in clouds:
                 clouds[i] = _cloud(days[int(i)])
             pixels, points = clouds[i]
-            seen, at = _project(points, np.linalg.inv(pose) @ day_poses[i], frame)
+            seen, at = _project(points, np.linalg.inv(pose) @ day_poses[i], frame.camera)
             if len(seen) >= _FEWEST:
                 pairs.append(Pair(str(days.root / days.names[i]), str(others.root / others.names[j]), pixels[seen], at))
     return pairs
@@ -60,6 +70,8 @@ def find_pairs(day_folder: str, other_folder: str) -> list[Pair]:
 
 def _cloud(frame: StereoFrame) -> tuple[np.ndarray, np.ndarray]:
     """Pixels of the left picture, every other row and column, and their points in the left camera."""
+    if frame.right is None or frame.rig is None:
+        raise RecordingError(f"{frame.name}: no stereo pair")
     left, right = grey_image(frame.image), grey_image(frame.right)
     matcher = cv2.StereoSGBM.create(0, 64, 5, 200, 800, disp12MaxDiff=1, uniquenessRatio=10, speckleWindowSize=80, speckleRange=2)
     disparity = matcher.compute(left, right).astype(np.float32) / 16
@@ -72,9 +84,8 @@ def _cloud(frame: StereoFrame) -> tuple[np.ndarray, np.ndarray]:
     return np.column_stack([x, y]).astype(np.float32), points
 
 
-def _project(points: np.ndarray, other_from_day: np.ndarray, frame: StereoFrame) -> tuple[np.ndarray, np.ndarray]:
+def _project(points: np.ndarray, other_from_day: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Which points the other picture sees, and where. Nearest in its cell wins."""
-    camera = frame.camera
     local = points @ other_from_day[:3, :3].T + other_from_day[:3, 3]
     front = np.flatnonzero(local[:, 2] > 0.3)
     local = local[front]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -41,7 +42,8 @@ class Lessons:
         maps = self.descriptors[index]
         weights = [(1 - right) * (1 - down), right * (1 - down), (1 - right) * down, right * down]
         corners = [(0, 0), (1, 0), (0, 1), (1, 1)]
-        values = sum(w * maps[:, y + dy, x + dx].astype(np.float32) for w, (dx, dy) in zip(weights, corners, strict=True)).T
+        parts = [w * maps[:, y + dy, x + dx].astype(np.float32) for w, (dx, dy) in zip(weights, corners, strict=True)]
+        values = np.sum(parts, axis=0).T
         return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-6)
 
 
@@ -62,9 +64,10 @@ def learn(folders: list[str], teacher: Path, cache: Path) -> Lessons:
     session = onnxruntime.InferenceSession(str(teacher), options, providers=["CPUExecutionProvider"])
     for i, path in enumerate(paths):
         lessons.pictures[i], lessons.scales[i] = _fitted(grey_image(read_image(Path(path))))
-        scores, descriptors = session.run(None, {"image": lessons.pictures[i].astype(np.float32)[None, None] / 255})
-        descriptors = descriptors[0] / np.linalg.norm(descriptors[0], axis=0, keepdims=True)
-        lessons.scores[i] = np.round(scores[0, 0] * 255)
+        outputs = session.run(None, {"image": lessons.pictures[i].astype(np.float32)[None, None] / 255})
+        scores, descriptors = (np.asarray(output)[0] for output in outputs)
+        descriptors = descriptors / np.linalg.norm(descriptors, axis=0, keepdims=True)
+        lessons.scores[i] = np.round(scores[0] * 255)
         lessons.descriptors[i] = np.round(descriptors * _UNIT)
     index_file.write_text(json.dumps({"key": key, "paths": paths, "scales": lessons.scales.tolist()}))
     return lessons
@@ -75,7 +78,7 @@ def _listed(folder: str) -> list[Path]:
     return list_pictures(Path(name))[:: int(step or 1)]
 
 
-def _opened(cache: Path, paths: list[str], scales: list[float], mode: str) -> Lessons:
+def _opened(cache: Path, paths: list[str], scales: list[float], mode: Literal["r", "w+"]) -> Lessons:
     def mapped(name: str, dtype: type, shape: tuple[int, ...]) -> np.ndarray:
         return np.memmap(cache / name, dtype, mode, shape=(len(paths), *shape))
 

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 import os
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import torch
@@ -51,7 +51,8 @@ class TrainNet:
     """Share of samples that come from pairs."""
     seed: int = 1
     threads: int = 1
-    minutes: Annotated[float, tyro.conf.arg(help="Stop after so long; the state is kept.")] = 1e9
+    minutes: float = 1e9
+    """Stop after so long; the state is kept."""
 
 
 def train(config: TrainNet) -> None:
@@ -65,7 +66,8 @@ def train(config: TrainNet) -> None:
     known = [(rows[os.path.realpath(p.day)], rows[os.path.realpath(p.other)], _cut(p)) for p in pairs]
     torch.manual_seed(config.seed)
     network, average, optimizer, step = _begin(config)
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda s: _rate(s + step, config.steps))
+    begun = step
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda taken: _rate(begun + taken, config.steps))
     network.train()
     end, sums, since = time.monotonic() + 60 * config.minutes, np.zeros(4), time.monotonic()
     while step < config.steps and time.monotonic() < end:
@@ -85,7 +87,7 @@ def train(config: TrainNet) -> None:
         if step % _LOG_EVERY == 0:
             names = ("cosine", "to_teacher", "across_light", "score")
             line = {"step": step, "rate": schedule.get_last_lr()[0], "seconds": round(time.monotonic() - since, 1)}
-            _log(config.out, line | {n: round(v / _LOG_EVERY, 4) for n, v in zip(names, sums, strict=True)})
+            _log(config.out, line | {n: round(float(v) / _LOG_EVERY, 4) for n, v in zip(names, sums, strict=True)})
             sums, since = np.zeros(4), time.monotonic()
         if step % _SAVE_EVERY == 0:
             _save(config.out, network, average, optimizer, step)
@@ -132,7 +134,8 @@ def _begin(config: TrainNet) -> tuple[TopolocNet, TopolocNet, torch.optim.Optimi
 
 
 def _rate(step: int, steps: int) -> float:
-    return min(1.0, (step + 1) / 100) * (0.5 + 0.5 * np.cos(np.pi * min(1.0, step / steps))) + 1e-3
+    """Share of the full rate: up within a hundred steps, then down by a cosine."""
+    return min(1.0, (step + 1) / 100) * (0.5 + 0.5 * math.cos(math.pi * min(1.0, step / steps))) + 1e-3
 
 
 def _follow(average: nn.Module, network: nn.Module, kept: float) -> None:
@@ -153,7 +156,7 @@ def _save(out: Path, network: nn.Module, average: TopolocNet, optimizer: torch.o
     export(copy.deepcopy(average).eval(), out / f"{KIND}.onnx", origin)
 
 
-def _log(out: Path, line: dict[str, float]) -> None:
+def _log(out: Path, line: dict[str, int | float]) -> None:
     with (out / "log.jsonl").open("a") as file:
         file.write(json.dumps(line) + "\n")
 

@@ -50,17 +50,22 @@ def draw_sample(lessons: Lessons, pairs: list[tuple[int, int, Pair]], share: flo
 
 
 def _of_pair(lessons: Lessons, first: int, second: int, pair: Pair, generator: Generator) -> Sample:
+    places, here, there, both = _looks(pair, generator)
     for _ in range(_TRIES):
-        middle = int(generator.integers(len(pair.day_px)))
-        place = _random_homography(generator, pair.day_px[middle], 0.6)
-        other = _random_homography(generator, pair.other_px[middle], 0.6)
-        here, there = _mapped(pair.day_px, np.linalg.inv(place)), _mapped(pair.other_px, np.linalg.inv(other))
-        both = np.flatnonzero(_within(here) & _within(there))
         if len(both) >= NUM_POINTS:
             break
+        places, here, there, both = _looks(pair, generator)
     chosen = generator.choice(both if len(both) else len(here), NUM_POINTS, replace=len(both) < NUM_POINTS)
-    views, scores, inside = _seen(lessons, [first, second], [place, other], (0.3, 0.3), generator)
+    views, scores, inside = _seen(lessons, [first, second], places, (0.3, 0.3), generator)
     return _sample(lessons, first, pair.day_px[chosen], [here[chosen], there[chosen]], views, scores, inside)
+
+
+def _looks(pair: Pair, generator: Generator) -> tuple[list[np.ndarray], np.ndarray, np.ndarray, np.ndarray]:
+    """Two views around the same point: their homographies, the pair's points in each, and the numbers of those that both see."""
+    middle = int(generator.integers(len(pair.day_px)))
+    places = [_random_homography(generator, px[middle], 0.6) for px in (pair.day_px, pair.other_px)]
+    here, there = (_mapped(px, np.linalg.inv(place)) for px, place in zip((pair.day_px, pair.other_px), places, strict=True))
+    return places, here, there, np.flatnonzero(_within(here) & _within(there))
 
 
 def _sample(

@@ -47,7 +47,6 @@ class XFeat(nn.Module):
         self.block_fusion = nn.Sequential(*_chain((64, 64, 3, 1), (64, 64, 3, 1)), nn.Conv2d(64, 64, 1))
         self.heatmap_head = nn.Sequential(*_chain((64, 64, 1, 1), (64, 64, 1, 1)), nn.Conv2d(64, 1, 1), nn.Sigmoid())
         self.keypoint_head = nn.Sequential(*_chain((64, 64, 1, 1), (64, 64, 1, 1), (64, 64, 1, 1)), nn.Conv2d(64, 65, 1))
-        self.register_buffer("bilinear", _bilinear_weights(), persistent=False)
 
     def maps(
         self, image: Float[Tensor, "b 1 h w"]
@@ -59,9 +58,10 @@ class XFeat(nn.Module):
         coarse = self.block5(sixteenth)
         features = self.block_fusion(eighth + enlarged(sixteenth, 2) + enlarged(coarse, 4))
         # The head's first 1x1 convolution sees the 64 pixels of a cell as channels: one of 8x8 pixels and stride 8.
-        convolution, *first = self.keypoint_head[0].layer
-        cells = functional.conv2d(grey, convolution.weight.view(64, 1, STRIDE, STRIDE), stride=STRIDE)
-        logits = self.keypoint_head[1:](nn.Sequential(*first)(cells))
+        first, *others = self.keypoint_head
+        assert isinstance(first, ConvNormReLU)
+        cells = functional.conv2d(grey, dict(first.named_parameters())["layer.0.weight"].view(64, 1, STRIDE, STRIDE), stride=STRIDE)
+        logits = nn.Sequential(*list(first.layer)[1:], *others)(cells)
         return features, logits, self.heatmap_head(features)
 
     def forward(self, image: Float[Tensor, "b 1 h w"]) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 64 h8 w8"]]:
@@ -71,5 +71,5 @@ class XFeat(nn.Module):
         shares = torch.exp(logits.clamp(max=_LARGEST_LOGIT))
         # Reliability is enlarged cell by cell, as channels: the same bilinear weights, without a map of one channel at full size.
         around = functional.pad(reliability, (1, 1, 1, 1), mode="replicate")
-        cells = shares[:, :64] * (functional.conv2d(around, self.bilinear) / shares.sum(dim=1, keepdim=True))
+        cells = shares[:, :64] * (functional.conv2d(around, _bilinear_weights()) / shares.sum(dim=1, keepdim=True))
         return functional.pixel_shuffle(cells, STRIDE), features

@@ -1,0 +1,126 @@
+"""Training of our own network, as small as can be: it learns, goes on where it was stopped, and leaves a network of the contract."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from tiny_world import path_pose, render, room, write_stereo_recording
+from topoloc.features.network_files import check_network
+from topoloc.sequences.camera_json import read_camera_json
+from topoloc_training.net import teacher as teaching
+from topoloc_training.net import train as training
+from topoloc_training.net.network import TopolocNet
+from topoloc_training.net.pairs import find_pairs
+from topoloc_training.net.teacher import learn
+from topoloc_training.net.train import TrainNet, train
+from topoloc_training.net.views import draw_sample
+from topoloc_training.networks.edgepoint2 import EdgePoint2
+from topoloc_training.networks.export import export
+
+
+@pytest.fixture(scope="module")
+def teacher(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("teacher") / "teacher.onnx"
+    export(EdgePoint2("s64").eval(), path, {"topoloc_network": "edgepoint2-s64"})
+    return path
+
+
+@pytest.fixture(scope="module")
+def config(teacher: Path, tmp_path_factory: pytest.TempPathFactory) -> TrainNet:
+    folder = tmp_path_factory.mktemp("pictures")
+    generator = np.random.default_rng(0)
+    for i, size in enumerate(((400, 640), (360, 640), (600, 960))):
+        noise = generator.integers(0, 256, (size[0] // 16, size[1] // 16)).astype(np.uint8)
+        cv2.imwrite(str(folder / f"{i}.png"), cv2.resize(noise, size[::-1], interpolation=cv2.INTER_CUBIC))
+    return TrainNet(teacher, [str(folder)], batch=1, steps=4)
+
+
+def test_training_goes_on_where_it_was_stopped(config: TrainNet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(training, "_LOG_EVERY", 2)
+    monkeypatch.setattr(training, "_SAVE_EVERY", 2)
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    train(replace(config, out=whole))
+    stopped_after_two_steps = iter([0.0, 0.0, 0.0, 0.0, 1e9])
+
+    class Clock:
+        @staticmethod
+        def monotonic() -> float:
+            return next(stopped_after_two_steps, 1e9)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(training, "time", Clock)
+        train(replace(config, out=parts, minutes=1.0))
+    assert 0 < torch.load(parts / "state.pt", weights_only=True)["step"] < 4
+    train(replace(config, out=parts))
+    states = [torch.load(folder / "state.pt", weights_only=True) for folder in (whole, parts)]
+    assert [state["step"] for state in states] == [4, 4]
+    for name, value in states[0]["network"].items():
+        torch.testing.assert_close(value, states[1]["network"][name], rtol=1e-4, atol=1e-5)
+    lines = [json.loads(line) for line in (whole / "log.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [2, 4]
+    again = [json.loads(line) for line in (parts / "log.jsonl").read_text().splitlines()]
+    assert again[-1]["rate"] == pytest.approx(lines[-1]["rate"])
+    assert check_network(whole / "topoloc-net.onnx").name == "topoloc-net"
+
+
+def test_the_network_comes_nearer_to_its_teacher(config: TrainNet, tmp_path: Path):
+    lessons = learn(config.pictures, config.teacher, tmp_path)
+    sample = draw_sample(lessons, [], 0.0, np.random.default_rng(0))
+    torch.manual_seed(0)
+    network = TopolocNet().train()
+    optimizer = torch.optim.AdamW(network.parameters(), lr=5e-3)
+    parts = []
+    for _ in range(12):
+        parts.append(training._step(network, [sample]))
+        optimizer.zero_grad()
+        sum(parts[-1]).backward()
+        optimizer.step()
+    first, last = ([float(part.detach()) for part in step] for step in (parts[0], parts[-1]))
+    assert all(after < before for before, after in zip(first, last, strict=True)), (first, last)
+    assert last[0] < 0.6 * first[0]
+
+
+def test_a_teacher_is_asked_once(config: TrainNet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    lessons = learn(config.pictures, config.teacher, tmp_path)
+    assert lessons.pictures.shape == (3, teaching.HEIGHT, teaching.WIDTH)
+    pixels = np.array([[100.0, 50.0], [321.5, 200.25]])
+    found = lessons.described(1, pixels)
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-5)
+    x, y = (np.round((pixels[0] + 0.5) / 4 - 0.5)).astype(int)
+    stored = lessons.descriptors[1][:, y, x].astype(float)
+    assert found[0] @ stored / np.linalg.norm(stored) > 0.98
+    monkeypatch.setattr(teaching, "onnxruntime", None)
+    assert np.array_equal(learn(config.pictures, config.teacher, tmp_path).scores, lessons.scores)
+
+
+def test_pairs_are_the_same_points_of_a_place(tmp_path: Path):
+    day = write_stereo_recording(tmp_path / "day", indices=[0.0, 1.0, 2.0])
+    camera = read_camera_json(day / "camera.json").camera
+    other = tmp_path / "other"
+    (other / "images").mkdir(parents=True)
+    (other / "camera.json").write_text((day / "camera.json").read_text())
+    for name in ("times.txt", "truth.tum"):
+        (other / name).write_text("")
+    pose = path_pose(1.5)
+    cv2.imwrite(str(other / "images" / "000000.png"), render(room(), pose, camera)[0])
+    quaternion = np.roll(pose.quat_wxyz(), -1)
+    (other / "times.txt").write_text("0.0\n")
+    (other / "truth.tum").write_text("0.0 " + " ".join(f"{v:.9f}" for v in (*pose.translation, *quaternion)) + "\n")
+    pairs = find_pairs(str(day), str(other))
+    assert len(pairs) == 3
+    for pair in pairs:
+        first, second = (cv2.imread(path, cv2.IMREAD_GRAYSCALE).astype(float) for path in (pair.day, pair.other))
+        assert len(pair.day_px) > 1000
+        x, y = np.round(pair.day_px).astype(int).T
+        u, v = np.round(pair.other_px).astype(int).T
+        apart = np.abs(first[y, x] - second[v, u])
+        shuffled = np.abs(first[y, x] - np.roll(second[v, u], 777))
+        assert np.median(apart) < 0.25 * np.median(shuffled)

@@ -1,0 +1,104 @@
+"""Every network is exported by one contract and answers in ONNX Runtime as it does in PyTorch, at any size."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from torch import nn
+from torch.nn import functional
+
+from topoloc.features.network_files import NETWORKS, check_network
+from topoloc_training.net.network import TopolocNet
+from topoloc_training.networks.edgepoint2 import EdgePoint2
+from topoloc_training.networks.export import build_network, convert, export
+from topoloc_training.networks.xfeat import XFeat
+
+
+def of_random_weights(network: nn.Module) -> nn.Module:
+    """Also the batch norms' averages, so that one left out would show."""
+    torch.manual_seed(0)
+    for norm in (module for module in network.modules() if isinstance(module, nn.BatchNorm2d)):
+        norm.running_mean.normal_(0, 0.1)
+        norm.running_var.uniform_(0.5, 1.5)
+    return network.eval()
+
+
+def picture(height: int, width: int) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(1)
+    coarse = torch.rand(1, 1, height // 8, width // 8, generator=generator)
+    return functional.interpolate(coarse, (height, width), mode="bicubic").clamp(0, 1)
+
+
+@pytest.mark.parametrize(
+    ("kind", "network", "length", "stride"),
+    [
+        ("xfeat", XFeat, 64, 8),
+        ("edgepoint2-t32", lambda: EdgePoint2("t32"), 32, 4),
+        ("edgepoint2-e64", lambda: EdgePoint2("e64"), 64, 4),
+        ("topoloc-net", TopolocNet, 64, 4),
+    ],
+)
+def test_the_exported_network_answers_as_the_original(kind: str, network: type, length: int, stride: int, tmp_path: Path):
+    original = of_random_weights(network())
+    path = tmp_path / "network.onnx"
+    export(original, path, {"topoloc_network": kind})
+    assert check_network(path) == NETWORKS[kind]
+    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    for height, width in ((96, 160), (160, 64)):
+        image = picture(height, width)
+        scores, descriptors = session.run(None, {"image": image.numpy()})
+        with torch.no_grad():
+            expected = original(image)
+        assert scores.shape == (1, 1, height, width)
+        assert descriptors.shape == (1, length, height // stride, width // stride)
+        assert 0 <= scores.min() < scores.max() <= 1
+        np.testing.assert_allclose(scores, expected[0].numpy(), atol=1e-4)
+        np.testing.assert_allclose(descriptors, expected[1].numpy(), atol=1e-3)
+
+
+def test_the_cheap_tail_of_xfeat_is_softmax_times_enlarged_reliability():
+    network = of_random_weights(XFeat())
+    image = picture(96, 128)
+    with torch.no_grad():
+        scores, _ = network(image)
+        _, logits, reliability = network.maps(image)
+        first = network.keypoint_head(functional.pixel_unshuffle(network.norm(image), 8))
+    cells = functional.pixel_shuffle(torch.softmax(first, 1)[:, :64], 8)
+    expected = cells * functional.interpolate(reliability, scale_factor=8, mode="bilinear", align_corners=False)
+    np.testing.assert_allclose(logits.numpy(), first.numpy(), atol=1e-4)
+    np.testing.assert_allclose(scores.numpy(), expected.numpy(), atol=1e-6)
+
+
+def test_weights_of_another_network_are_refused():
+    tensors = EdgePoint2("s64").state_dict()
+    assert isinstance(build_network("edgepoint2-s64", tensors), EdgePoint2)
+    with pytest.raises(ValueError, match="not the weights of edgepoint2-m64"):
+        build_network("edgepoint2-m64", tensors)
+    with pytest.raises(ValueError, match="no network 'superpoint'"):
+        build_network("superpoint", tensors)
+
+
+def test_published_weights_answer_as_published(shared: Path, tmp_path: Path):
+    weights = shared / "weights"
+    if not weights.is_dir():
+        pytest.skip(f"no weights at {weights}")
+    image = picture(96, 160).numpy()
+    convert("xfeat", (weights / "xfeat" / "xfeat.pt").read_bytes(), tmp_path / "xfeat.onnx", {"topoloc_network": "xfeat"})
+    runs = [
+        onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+        for path in (tmp_path / "xfeat.onnx", weights / "xfeat" / "xfeat_own_dyn.onnx")
+    ]
+    scores, descriptors = runs[0].run(None, {"image": image})
+    expected, logits, _ = runs[1].run(None, {"gray": image})
+    np.testing.assert_allclose(descriptors, expected, atol=1e-3)
+    likeliest = np.argmax(logits[0, :64], axis=0)
+    cells = scores[0, 0].reshape(12, 8, 20, 8).transpose(0, 2, 1, 3).reshape(12, 20, 64)
+    assert np.mean(np.argmax(cells, axis=2) == likeliest) > 0.8  # reliability changes within a cell, a little
+    for size in ("T32", "S32", "S64", "M64", "E64"):
+        kind = f"edgepoint2-{size.lower()}"
+        convert(kind, (weights / "edgepoint2" / f"{size}.pth").read_bytes(), tmp_path / "out.onnx", {"topoloc_network": kind})
+        assert check_network(tmp_path / "out.onnx").name == kind
