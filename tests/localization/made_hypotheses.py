@@ -34,7 +34,7 @@ def made_fit(x: float, points_world: np.ndarray | None = None, features: Feature
     local_map = LocalMap(
         np.zeros((count, 64), np.float32), points_world, np.zeros((count, 3, 3)), one, np.full(count, node_id), one, np.zeros((count, 3))
     )
-    pose = AbsolutePose(Rigid3(np.eye(3), np.array([-x, 0.0, 0.0])), np.ones(count, bool), np.eye(6), np.zeros(count))
+    pose = AbsolutePose(Rigid3(np.eye(3), np.array([-x, 0.0, 0.0])), np.ones(count, bool), np.eye(6))
     return PoseFit(features, CAMERA, CAMERA, local_map, Matches(rows, rows, np.zeros(count, np.float32)), pose)
 
 

@@ -19,8 +19,9 @@ from topoloc.localization.map_facts.building import build_map
 from topoloc.localization.result import Localization
 from topoloc.map.entries import Edge, SideNodes
 from topoloc.map.nodes import NodePoses, node_distances
-from topoloc.map.topomap import TopoMetricMap, in_ids, in_rows
+from topoloc.map.topomap import TopoMetricMap, in_rows
 from topoloc.sequences.recording import SequenceView
+from topoloc_training.coarse_training import in_ids
 
 
 def with_ids(topomap: TopoMetricMap, ids: list[int], kept: list[int]) -> TopoMetricMap:

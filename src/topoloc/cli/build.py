@@ -8,11 +8,11 @@ from typing import Annotated
 
 import tyro
 
+from topoloc.cli.features_option import BUILD_FEATURES, kinds_to_build
 from topoloc.cli.info import describe_map
 from topoloc.cli.output import File, Format, UsageError, check_outputs, progress_bar, write_json
 from topoloc.cli.settings_file import read_settings, with_option
 from topoloc.errors import RecordingError
-from topoloc.features.kinds import KINDS
 from topoloc.localization.map_facts.building import build_map
 from topoloc.map.build import BuildConfig, Progress
 from topoloc.sequences.frame import StereoSequence
@@ -43,8 +43,9 @@ class Command:
         float | None, tyro.conf.arg(name="lambda", metavar="M/RAD", help_behavior_hint="(default: 2 degrees make a node)")
     ] = None
     """How much turning counts beside metres (lambda of Eq. 1)."""
-    features: Annotated[str | None, tyro.conf.arg(metavar="surf|sift", help_behavior_hint="(default: surf)")] = None
-    """Local features of the map, and of every query to it."""
+    features: BUILD_FEATURES = None
+    """Local features of the map, and of every query to it. `learned`: of the first network that `topoloc weights list` finds;
+    `both`: of SURF, too."""
     json: File = None
     """Write what `topoloc info` says of the new map to this file (- for standard output)."""
     config: File = None
@@ -55,9 +56,7 @@ class Command:
         read = [path for path in (*self.trajectory, self.config) if path not in ("truth", "slam", None)]
         check_outputs([str(target), self.json], inputs=read)
         settings = read_settings(self.config)
-        config = self._with_options(settings.of(BuildConfig))
-        if config.features.kind not in KINDS:
-            raise UsageError(f"no features {config.features.kind}; there are {', '.join(KINDS)}")
+        config = kinds_to_build(self._with_options(settings.of(BuildConfig)), self.features)
         sequences, poses_from = self._open(recordings)
         with progress_bar() as progress:
             if poses_from[0] == "slam":
@@ -85,8 +84,7 @@ class Command:
 
     def _with_options(self, config: BuildConfig) -> BuildConfig:
         config = with_option(config, "nodes.d_thresh", self.d_thresh, "--d-thresh")
-        config = with_option(config, "nodes.lambda_rot", self.lambda_rot, "--lambda")
-        return with_option(config, "features.kind", self.features, "--features")
+        return with_option(config, "nodes.lambda_rot", self.lambda_rot, "--lambda")
 
     def _open(self, recordings: list[str]) -> tuple[list[StereoSequence], list[str]]:
         """The recordings with their poses, and where those of each come from; with `slam` they are still to be found."""

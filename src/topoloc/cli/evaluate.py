@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
+from topoloc.cli.features_option import ASKED_FEATURES, kinds_to_ask
 from topoloc.cli.info import describe_map
 from topoloc.cli.output import (
     File,
@@ -51,6 +52,8 @@ class Command:
     """A JSON file with the 4x4 matrix (metres) that takes the world of the recordings' truth into the map's, where they differ."""
     coarse: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")] = None
     """Coarse localizer that is asked; `topoloc info` names those of the map."""
+    features: ASKED_FEATURES = None
+    """Which of the map's features are asked; of several, the next where the one before leaves the pose unclear."""
     format: Format = None
     """The recordings' format: kitti, euroc, tum, seven_scenes or folder."""
     json: File = None
@@ -71,7 +74,7 @@ class Command:
         map_from_truth = _read_rigid(Path(self.map_from_truth)) if self.map_from_truth else None
         sequences = [open_sequence(path, self.format) for path in self.sequences]
         others = [open_sequence(path, self.format) for path in self.elsewhere]
-        localizer = Localizer(topomap, config)
+        localizer = Localizer(topomap, kinds_to_ask(topomap, config, self.features))
         labels = _labels([*self.sequences, *self.elsewhere], [*sequences, *others])
         answers: list[Answer] = []
         with progress_bar() as progress:

@@ -11,6 +11,7 @@ from typing import Annotated
 
 import tyro
 
+from topoloc.cli.features_option import ASKED_FEATURES, kinds_to_ask
 from topoloc.cli.output import File, Flag, Format, UsageError, check_outputs, interruptible, progress_bar, write_text
 from topoloc.cli.query_answers import QueryAnswer, answer_line, exit_status, stream_summary, trajectory_of
 from topoloc.cli.settings_file import read_settings, with_option
@@ -74,6 +75,8 @@ class Command:
     """The recordings' format: kitti, euroc, tum, seven_scenes, video or folder."""
     coarse: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")] = None
     """Coarse localizer that is asked; `topoloc info` names those of the map."""
+    features: ASKED_FEATURES = None
+    """Which of the map's features are asked; of several, the next where the one before leaves the pose unclear."""
     max_ms: Annotated[float | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: no limit)")] = None
     """After so many milliseconds no further hypothesis is sought for an image; the first one is always tried."""
     json: File = None
@@ -96,7 +99,7 @@ class Command:
         topomap = TopoMetricMap.load(self.map)
         camera = None if self.camera is None else _camera_of_size(self.camera, topomap)
         queries = [self._open(path) for path in self.inputs]
-        localizer = Localizer(topomap, config)
+        localizer = Localizer(topomap, kinds_to_ask(topomap, config, self.features))
         answers: list[QueryAnswer] = []
         total = sum(len(query.sequence) for query in queries)
         start = time.perf_counter()

@@ -56,8 +56,8 @@ def read_settings(path: str | None) -> Settings:
         for name, table in _parsed(path).items():
             if name not in all_tables():
                 is_missing = name in BROUGHT and name not in all_commands()
-                missing = f"comes with {BROUGHT[name]}, which is not installed" if is_missing else "no such table"
-                raise ConfigError(f"{quoted(name)}: {missing}{did_you_mean(name, all_tables())}")
+                unknown = f"no such table{did_you_mean(name, all_tables())}"
+                raise ConfigError(f"{quoted(name)}: {f'comes with {BROUGHT[name]}, which is not installed' if is_missing else unknown}")
             kind = config_class(name)
             configs.append(settings_from(kind, table, name, default=kind()))
     except ConfigError as error:

@@ -8,6 +8,7 @@ their probability is not calibrated.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -15,7 +16,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from topoloc.bounds import AtLeast, Between
-from topoloc.errors import FeatureKindError
+from topoloc.errors import FeatureKindError, WeightsError
 from topoloc.features.features import Features
 from topoloc.features.learned import LearnedConfig, check_network, extract_learned
 from topoloc.features.sift import SiftConfig, extract_sift
@@ -148,6 +149,20 @@ def find_kind(name: str) -> FeatureKind:
     if name not in KINDS:
         raise FeatureKindError(f"no features of kind {name!r}; there are {', '.join(KINDS)}")
     return KINDS[name]
+
+
+def learned_kind() -> str:
+    """The learned features that are taken where the user names none: the first of `LEARNED` whose network is here.
+
+    Raises:
+        MissingExtraError, WeightsError: there is none; of the first one.
+    """
+    for kind in LEARNED:
+        with suppress(WeightsError):
+            check_available(kind.name)
+            return kind.name
+    check_available(LEARNED[0].name)
+    return LEARNED[0].name
 
 
 def check_available(name: str) -> None:

@@ -17,10 +17,10 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from topoloc import compiled
-from topoloc.errors import MissingExtraError, WeightsError
+from topoloc.errors import WeightsError
 from topoloc.features.features import Features
 from topoloc.features.learned_kernels import find_maxima, sample_descriptors
-from topoloc.features.network_files import find_network
+from topoloc.features.network_files import find_network, open_network
 
 _SIDE_MULTIPLE = 32
 _BORDER_PX = 4
@@ -80,20 +80,5 @@ def run_network(
 
 @functools.lru_cache(maxsize=8)
 def _session(path: Path, num_threads: int, process_id: int) -> Any:
-    """The network made ready; several threads may run it at once, a forked child makes its own."""
-    try:
-        import onnxruntime as ort
-    except ImportError as error:
-        raise MissingExtraError("learned features need ONNX Runtime: pip install 'topoloc[learned]'") from error
-    options = ort.SessionOptions()
-    options.intra_op_num_threads = num_threads
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # beside another busy program it would eat a core
-    options.log_severity_level = 3
-    try:
-        session = ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # ONNX Runtime has a dozen classes for files that are none
-        raise WeightsError(f"{path}: no network that ONNX Runtime can read") from error
-    names = {output.name for output in session.get_outputs()}
-    if [one.name for one in session.get_inputs()] != ["image"] or not {"scores", "descriptors"} <= names:
-        raise WeightsError(f"{path}: not a network of local features")
-    return session
+    """The network made ready; a forked child makes its own."""
+    return open_network(path, num_threads)[1]

@@ -9,8 +9,11 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from topoloc.errors import WeightsError
+import numpy as np
+
+from topoloc.errors import MissingExtraError, WeightsError
 
 CONTRACT = 1
 """Version of what a file's inputs and outputs mean (`topoloc_version` of its metadata)."""
@@ -84,20 +87,21 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "topoloc"
 
 
-def check_network(path: Path) -> KnownNetwork:
-    """Which network a ready ONNX file is; it is loaded and tried on a small picture.
+def open_network(path: Path, num_threads: int) -> tuple[KnownNetwork, Any]:
+    """Which network an ONNX file is, and its session of ONNX Runtime, which several threads may run at once.
 
     Raises:
-        WeightsError: unreadable, not ONNX, not by our contract, of an unknown network; or ONNX Runtime is not installed.
+        MissingExtraError: ONNX Runtime is not installed.
+        WeightsError: unreadable, not ONNX, not by our contract, or of an unknown network.
     """
     try:
-        import numpy as np
         import onnxruntime
     except ImportError as error:
-        raise WeightsError("networks need ONNX Runtime: pip install 'topoloc[learned]'") from error
+        raise MissingExtraError("learned features need ONNX Runtime: pip install 'topoloc[learned]'") from error
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 4
-    options.intra_op_num_threads = 1
+    options.intra_op_num_threads = num_threads
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # beside another busy program it would eat a core
     try:
         session = onnxruntime.InferenceSession(read_bytes(path), options, providers=["CPUExecutionProvider"])
         properties = session.get_modelmeta().custom_metadata_map
@@ -110,11 +114,16 @@ def check_network(path: Path) -> KnownNetwork:
         raise WeightsError(f"network {path}: ONNX, but none that topoloc knows ({', '.join(NETWORKS)})")
     if properties.get("topoloc_version") != str(CONTRACT):
         raise WeightsError(f"network {path}: of version {properties.get('topoloc_version')}, not {CONTRACT}; convert it again")
-    outputs = session.run(None, {"image": np.zeros((1, 1, _SMALLEST, _SMALLEST), np.float32)})
-    scores, descriptors = (np.asarray(output) for output in outputs)
+    return NETWORKS[properties["topoloc_network"]], session
+
+
+def check_network(path: Path) -> KnownNetwork:
+    """Which network a ready ONNX file is; it is tried on a small picture, too. Raises as `open_network`."""
+    network, session = open_network(path, num_threads=1)
+    scores, descriptors = map(np.asarray, session.run(None, {"image": np.zeros((1, 1, _SMALLEST, _SMALLEST), np.float32)}))
     if scores.shape != (1, 1, _SMALLEST, _SMALLEST) or descriptors.ndim != 4 or not np.isfinite(descriptors).all():
         raise WeightsError(f"network {path}: its outputs are not scores and descriptors of the picture")
-    return NETWORKS[properties["topoloc_network"]]
+    return network
 
 
 def known_network(name: str) -> KnownNetwork:

@@ -64,16 +64,11 @@ class AbsolutePoseConfig:
 
 @dataclass(frozen=True, eq=False)
 class AbsolutePose:
-    """A pose with its evidence, for n matches.
-
-    `covariance` is that of the left perturbation (translation, rotation) of `cam_from_world` (m, rad).
-    `reprojection_errors_px` are distances in the image as it was taken; infinite behind the camera or outside its field.
-    """
+    """A pose with its inliers among n matches; `covariance` is of the left perturbation (translation, rotation; m, rad)."""
 
     cam_from_world: Rigid3
     inliers: Bool[np.ndarray, " n"]
     covariance: Float[np.ndarray, "6 6"]
-    reprojection_errors_px: Float[np.ndarray, " n"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +159,7 @@ def _solve_with_poselib(matches: _Matches, camera: Camera, config: AbsolutePoseC
 
 def _refine_on_inliers(cam_from_world: Rigid3, matches: _Matches, camera: Camera, config: AbsolutePoseConfig) -> Rigid3 | None:
     for _ in range(2):  # the second time with the inliers of the first
-        inliers = _select_inliers(cam_from_world, matches, _reprojection_errors(cam_from_world, matches, camera), config)
+        inliers = _select_inliers(cam_from_world, matches, camera, config)
         if not _spans_a_plane(matches.points_world[inliers]):
             return None
         cam_from_world = _refine(cam_from_world, matches, inliers, config.max_refinement_steps)
@@ -206,8 +201,7 @@ def _solve_with_opencv(matches: _Matches, camera: Camera, config: AbsolutePoseCo
 def _with_evidence(
     cam_from_world: Rigid3, matches: _Matches, camera: Camera, config: AbsolutePoseConfig, order: np.ndarray, num_points: int
 ) -> AbsolutePose | None:
-    errors = _reprojection_errors(cam_from_world, matches, camera)
-    active = _select_inliers(cam_from_world, matches, errors, config)
+    active = _select_inliers(cam_from_world, matches, camera, config)
     if np.count_nonzero(active) < _MIN_POINTS or not _spans_a_plane(matches.points_world[active]):
         return None
     scale = _noise_scale(squared_errors(*_arguments(cam_from_world, matches))[active])
@@ -218,9 +212,7 @@ def _with_evidence(
     covariance = _VARIANCE_OF_ESTIMATE * scale**2 * inverse
     inliers = np.zeros(num_points, dtype=np.bool_)
     inliers[order] = active
-    all_errors = np.full(num_points, np.inf)
-    all_errors[order] = errors
-    return AbsolutePose(cam_from_world, inliers, covariance, all_errors)
+    return AbsolutePose(cam_from_world, inliers, covariance)
 
 
 def _noise_scale(squares: Float[np.ndarray, " n"]) -> float:
@@ -263,20 +255,14 @@ def _inverse(information: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"] 
     return (inverse + inverse.T) / 2.0
 
 
-def _select_inliers(
-    cam_from_world: Rigid3, matches: _Matches, errors_px: Float[np.ndarray, " n"], config: AbsolutePoseConfig
-) -> Bool[np.ndarray, " n"]:
-    limit_px = config.max_reprojection_error_px
+def _select_inliers(cam_from_world: Rigid3, matches: _Matches, camera: Camera, config: AbsolutePoseConfig) -> Bool[np.ndarray, " n"]:
+    errors_px = np.linalg.norm(camera.img_from_cam(cam_from_world.apply(matches.points_world)) - matches.points_img, axis=1)
+    limit_px = config.max_reprojection_error_px  # NaN, behind the camera or outside its field, is not below it
     if config.method == "opencv" or len(matches.point_covariances) == 0:
         return errors_px <= limit_px
     # A plain threshold would cut the errors of uncertain points short, and what is left would look too precise.
     squares = squared_errors(*_arguments(cam_from_world, matches))
     return (squares <= (limit_px / config.key_point_sigma_px) ** 2) & (errors_px <= _MAX_WIDENING * limit_px)
-
-
-def _reprojection_errors(cam_from_world: Rigid3, matches: _Matches, camera: Camera) -> Float[np.ndarray, " n"]:
-    errors = np.linalg.norm(camera.img_from_cam(cam_from_world.apply(matches.points_world)) - matches.points_img, axis=1)
-    return np.where(np.isfinite(errors), errors, np.inf)
 
 
 def _normalized_covariances(camera: Camera, normalized: Float[np.ndarray, "n 2"], sigma_px: float) -> Float[np.ndarray, "n 2 2"]:

@@ -18,6 +18,7 @@ from topoloc.geometry.rigid import Rigid3
 # A spread below this share of the longest one, or of a micrometre, is rounding: the points are on a line.
 _MIN_RELATIVE_SPREAD = 1e-6
 _MIN_SPREAD = 1e-6
+_SIGMA_TRANSLATION, _SIGMA_ROTATION = 0.05, 0.02  # m, rad
 KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 SHORT_LENGTHS = (10.0, 20.0, 30.0, 40.0, 50.0)
 _SHORTEST_FOR_KITTI = 200.0
@@ -54,16 +55,11 @@ def align_trajectories(world_a_from_cams: Sequence[Rigid3], world_b_from_cams: S
     return align_points(_positions(world_a_from_cams), _positions(world_b_from_cams))
 
 
-def align_poses(
-    world_a_from_cams: Sequence[Rigid3],
-    world_b_from_cams: Sequence[Rigid3],
-    sigma_translation: float = 0.05,
-    sigma_rotation: float = 0.02,
-) -> Rigid3:
+def align_poses(world_a_from_cams: Sequence[Rigid3], world_b_from_cams: Sequence[Rigid3]) -> Rigid3:
     """world_a_from_world_b by positions and orientations together: for short, straight and standing trajectories, too.
 
-    The rotation minimises squared position residuals over `sigma_translation` (m) plus squared chordal distances of the
-    orientations over `sigma_rotation` (rad): one Wahba problem, in closed form. With a long way the positions decide,
+    The rotation minimises squared position residuals over `_SIGMA_TRANSLATION` plus squared chordal distances of the
+    orientations over `_SIGMA_ROTATION`: one Wahba problem, in closed form. With a long way the positions decide,
     with a short one the orientations.
 
     Raises:
@@ -74,10 +70,10 @@ def align_poses(
         raise TrajectoryError("no common pose to align the trajectories by")
     positions_a, positions_b = _positions(world_a_from_cams), _positions(world_b_from_cams)
     centre_a, centre_b = positions_a.mean(axis=0), positions_b.mean(axis=0)
-    correlation = (positions_a - centre_a).T @ (positions_b - centre_b) / sigma_translation**2
+    correlation = (positions_a - centre_a).T @ (positions_b - centre_b) / _SIGMA_TRANSLATION**2
     for a, b in zip(world_a_from_cams, world_b_from_cams, strict=True):
         # A chordal distance ||R_a - R R_b||^2 is twice the squared angle, for small angles.
-        correlation += a.rotation @ b.rotation.T / (2.0 * sigma_rotation**2)
+        correlation += a.rotation @ b.rotation.T / (2.0 * _SIGMA_ROTATION**2)
     if not np.isfinite(correlation).all():
         raise TrajectoryError("trajectories to align hold poses that are not finite")
     rotation = _nearest_rotation(correlation)
@@ -119,10 +115,8 @@ def absolute_trajectory_errors(true_world_from_cams: Sequence[Rigid3], world_fro
     return np.linalg.norm(positions - np.array([pose.translation for pose in true_world_from_cams]), axis=1)
 
 
-def relative_drift(
-    true_world_from_cams: Sequence[Rigid3], world_from_cams: Sequence[Rigid3], lengths: Sequence[float] | None = None
-) -> Drift | None:
-    """Mean error over all pieces of these lengths (metres of the true way), from every frame on; None where no piece fits.
+def relative_drift(true_world_from_cams: Sequence[Rigid3], world_from_cams: Sequence[Rigid3]) -> Drift | None:
+    """Mean error over all pieces of some lengths (of the true way), from every frame on; None where no piece fits.
 
     Geiger et al., *Are we ready for autonomous driving?*, CVPR 2012: 100 m to 800 m. Ways below 200 m are measured over 10 m to 50 m.
 
@@ -133,8 +127,7 @@ def relative_drift(
         raise TrajectoryError(f"trajectories to compare have {len(true_world_from_cams)} and {len(world_from_cams)} poses")
     positions = np.array([pose.translation for pose in true_world_from_cams]).reshape(-1, 3)
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
-    if lengths is None:
-        lengths = KITTI_LENGTHS if way[-1] >= _SHORTEST_FOR_KITTI else SHORT_LENGTHS
+    lengths = KITTI_LENGTHS if way[-1] >= _SHORTEST_FOR_KITTI else SHORT_LENGTHS
     translations, rotations = [], []
     for length in lengths:
         for first, last in enumerate(np.searchsorted(way, way + length).tolist()):

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from topoloc.errors import TrajectoryError
 
 _SMALL_ANGLE = 1e-7
+_TOLERANCE = 1e-2
 
 
 def skew(v: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
@@ -96,11 +97,11 @@ class Rigid3:
         return Rigid3(np.eye(3), np.zeros(3))
 
     @staticmethod
-    def from_matrix(matrix: np.ndarray, tolerance: float = 1e-2) -> Rigid3:
+    def from_matrix(matrix: np.ndarray) -> Rigid3:
         """From a 3x4 or 4x4 matrix, its rotation made exactly orthonormal.
 
         Raises:
-            TrajectoryError: not finite, or not a rotation within `tolerance`.
+            TrajectoryError: not finite, or not a rotation within `_TOLERANCE`.
         """
         m = np.asarray(matrix, dtype=np.float64)
         if m.shape not in ((3, 4), (4, 4)):
@@ -108,7 +109,7 @@ class Rigid3:
         if not np.all(np.isfinite(m)):
             raise TrajectoryError("not a pose: NaN or infinite entries")
         u, singular, vt = np.linalg.svd(m[:3, :3])
-        if np.any(np.abs(singular - 1.0) > tolerance) or np.linalg.det(u @ vt) < 0:
+        if np.any(np.abs(singular - 1.0) > _TOLERANCE) or np.linalg.det(u @ vt) < 0:
             raise TrajectoryError("not a pose: its 3x3 part is no rotation")
         return Rigid3(u @ vt, m[:3, 3].copy())
 

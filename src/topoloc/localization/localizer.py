@@ -12,6 +12,7 @@ behaviour.
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from dataclasses import replace
 
 from topoloc.bounds import check_bounds
@@ -20,13 +21,15 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.answer import Answered, answer
 from topoloc.localization.asked_kind import AskedKind, kinds_to_ask
+from topoloc.localization.belief import Belief
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.fitted_weights import FittedWeights
 from topoloc.localization.propose import propose
 from topoloc.localization.query import Query, check_size, reduced_image
 from topoloc.localization.refine import hypothesis_of
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.localization.search import Search, Trace
+from topoloc.localization.search import Proposal, Search, Trace
+from topoloc.localization.walls.propose_walls import propose_walls
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.coarse import CoarseLocalizer, Image
 
@@ -98,17 +101,31 @@ class Localizer:
     ) -> tuple[Localization | NotLocalized, list[Answered]]:
         """As `localize`; also each pose that the result names (its own, or its alternatives) with the points that it stands on."""
         check_size(image, camera)
-        query, answered, search = self._query(image, camera, max_ms), None, None
-        for number, kind in enumerate(self._kinds):
-            of_kind = query if number == 0 else replace(query, feature_config=kind.map.feature_config)
-            search = Search(of_kind, kind.map, kind.config, kind.weights, kind.correlated_errors, trace, before=search)
-            search.has_next = number + 1 < len(self._kinds)
-            _follow_up(search, prior)
-            answered = answer(search)
-            if search.is_stopped or (isinstance(answered[0], Localization) and search.is_clear):
-                break
-        assert answered is not None
-        return answered
+        searches, result, named = self._searches(self._query(image, camera, max_ms), trace), None, list[Answered]()
+        for search in searches:
+            _follow_up(search, propose(search, prior))
+            result, named = answer(search)
+            if search.is_stopped or (isinstance(result, Localization) and (search.is_clear or search.following is None)):
+                return result, named
+        if len(searches) > 1 and not named and prior is None:  # only the first kind knows of walls
+            walls = replace(searches[0], belief=Belief(), following=None)
+            _follow_up(walls, propose_walls(walls))
+            by_walls = answer(walls)
+            if isinstance(by_walls[0], Localization):
+                return by_walls
+        assert result is not None
+        return result, named
+
+    def _searches(self, query: Query, trace: Trace | None) -> list[Search]:
+        """One by each kind of features, which know each other."""
+        searches = list[Search]()
+        for kind in self._kinds:
+            of_kind = replace(query, feature_config=kind.map.feature_config)
+            search = Search(of_kind, kind.map, kind.config, kind.weights, kind.correlated_errors, trace)
+            if searches:
+                search.before, searches[-1].following = searches[-1], search
+            searches.append(search)
+        return searches
 
     @property
     def correlated_errors(self) -> float:
@@ -122,9 +139,9 @@ class Localizer:
         return Query(reduced, lens, image.shape[1] / lens.width, self.map.feature_config, deadline=deadline)
 
 
-def _follow_up(search: Search, prior: Rigid3 | None) -> None:
+def _follow_up(search: Search, proposals: Iterable[Proposal]) -> None:
     """All that is proposed, until time is up."""
-    for proposal in propose(search, prior):
+    for proposal in proposals:
         hypothesis = hypothesis_of(search, proposal)
         if hypothesis is not None:
             search.belief = search.belief.given(hypothesis, search.config.evidence, search.weights.rivals)

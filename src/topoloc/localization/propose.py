@@ -51,7 +51,7 @@ def propose(search: Search, prior: Rigid3 | None) -> Iterator[Proposal]:
         search.ranked = search.map.coarse.rank(search.query.image, features, num_ranked)
     retrieved = _pooled(search, "retrieval", search.candidates)
     yield retrieved
-    if search.has_next and not search.is_clear:
+    if search.following is not None and not search.is_clear:
         return
     yield from _of_other_features(search)
     viewpoints = [] if search.is_clear else list(_viewpoints(search))

@@ -111,6 +111,7 @@ def build_map(
     """
     config = config or BuildConfig()
     check_bounds(config)
+    config = replace(config, other_kinds=tuple(config.kinds[1:]))
     progress = progress or (lambda stage, done, total: None)
     if isinstance(sequences, StereoSequence):
         sequences = [sequences]

@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Annotated, Any
 
 from topoloc.bounds import Between, settings_from
-from topoloc.errors import ConfigError
-from topoloc.features.kinds import FeatureConfig, find_kind
+from topoloc.errors import ConfigError, MissingExtraError, WeightsError
+from topoloc.features.kinds import SURF, FeatureConfig, find_kind, learned_kind
 from topoloc.map.landmarks import LandmarkConfig
 from topoloc.map.nodes import NodeConfig
 from topoloc.map.side_nodes import SideNodesConfig
@@ -26,8 +26,9 @@ class MapConfig:
 
     nodes: NodeConfig = field(default_factory=NodeConfig)
     features: FeatureConfig = field(default_factory=FeatureConfig)
-    other_kinds: tuple[str, ...] = ()
-    """Further kinds of features that the same nodes are described with: a query asks them where the first one leaves its pose unclear."""
+    other_kinds: tuple[str, ...] | None = None
+    """Further kinds of features that the same nodes are described with: a query asks them where the first one leaves its pose unclear.
+    Unset: beside SURF the learned ones whose network is here, if any is."""
     points: MetricPointsConfig = field(default_factory=MetricPointsConfig)
     landmarks: LandmarkConfig = field(default_factory=LandmarkConfig)
     vlad: VladConfig = field(default_factory=VladConfig)
@@ -44,7 +45,12 @@ class MapConfig:
     @property
     def kinds(self) -> list[str]:
         """All kinds of features, the first one first."""
-        return [self.features.kind, *self.other_kinds]
+        if self.other_kinds is not None or self.features.kind != SURF.name:
+            return [self.features.kind, *(self.other_kinds or ())]
+        try:
+            return [self.features.kind, learned_kind()]
+        except (MissingExtraError, WeightsError):
+            return [self.features.kind]
 
     def features_of(self, kind: str) -> FeatureConfig:
         """The settings of the features of this kind: those of `features`, but for the picture's normalization, which suits the kind."""

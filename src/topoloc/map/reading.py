@@ -108,10 +108,7 @@ def _shared_errors_of(facts: Mapping[str, str], key: str) -> SharedErrors | None
 
 
 def _sessions_of(file: MapFile) -> dict[int, Session]:
-    def read() -> dict[int, Session]:
-        return {row["session_id"]: _session(row) for row in file.rows("sessions")}
-
-    return file.kept("sessions", read)
+    return file.kept("sessions", lambda: {row["session_id"]: _session(row) for row in file.rows("sessions")})
 
 
 def _session_of(file: MapFile, session_id: int) -> Session:
@@ -219,10 +216,8 @@ def unit_descriptors(stored: np.ndarray) -> np.ndarray:
 
 
 def _camera_of(file: MapFile, prefix: str, node_id: int) -> Camera:
-    def read_ids() -> dict[int, int]:
-        return {row["node_id"]: row["camera_id"] for row in file.rows(f"{prefix}nodes", ("node_id", "camera_id"))}
-
-    camera_id = file.kept(f"{prefix}camera_ids", read_ids)[node_id]
+    rows = partial(file.rows, f"{prefix}nodes", ("node_id", "camera_id"))
+    camera_id = file.kept(f"{prefix}camera_ids", lambda: {row["node_id"]: row["camera_id"] for row in rows()})[node_id]
 
     def read() -> Camera:
         return camera_from(_found(file.row("cameras", camera_id=camera_id), f"camera {camera_id}")["json"])
@@ -253,11 +248,8 @@ class _StoredSums:
 
 
 def _image_at(file: MapFile, row: int) -> PlaceImage:
-    def read_ids() -> list[int]:
-        return [row["image_id"] for row in file.rows("place_images", ("image_id",))]
-
     with file.reading():
-        image_id = file.kept("image_ids", read_ids)[row]
+        image_id = file.kept("image_ids", lambda: [row["image_id"] for row in file.rows("place_images", ("image_id",))])[row]
         found = _found(file.row("place_images", image_id=image_id), f"place image {image_id}")
         session = _session_of(file, found["session_id"])
         pose = pose_from(found["world_from_cam"])

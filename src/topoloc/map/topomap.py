@@ -150,14 +150,6 @@ def in_rows(model: CoarseModel, ids: Sequence[int]) -> CoarseModel:
     return replace(model, arrays={**model.arrays, **per_vector, "node_ids": of_known[kept]})
 
 
-def in_ids(model: CoarseModel, ids: Sequence[int]) -> CoarseModel:
-    """The inverse of `in_rows`: a model that was made of the map's rows, as the map keeps it."""
-    if list(ids) == list(range(len(ids))):
-        return model
-    rows = model.arrays.get("node_ids", np.arange(len(ids)))
-    return replace(model, arrays={**model.arrays, "node_ids": np.asarray(ids, np.int64)[rows]})
-
-
 def _outputs_of(model: CoarseModel) -> np.ndarray | None:
     """Of a model with an output for each node there was when it was made, in the order of their ids."""
     num_nodes = model.settings.get("num_nodes")

@@ -25,13 +25,13 @@ class Damage(Exception):
     """Something in a map file that no map can hold; the text says what."""
 
 
-def array_from(data: bytes, dtype: str, shape: tuple[int, ...], what: str, bound: float = _FAR) -> np.ndarray:
-    """An array of exactly this shape; finite and within ± `bound`, where it is of floating point."""
+def array_from(data: bytes, dtype: str, shape: tuple[int, ...], what: str) -> np.ndarray:
+    """An array of exactly this shape; finite and within ± `_FAR`, where it is of floating point."""
     if len(data) != math.prod(shape) * np.dtype(dtype).itemsize:
         raise Damage(f"{what}: {len(data)} bytes are not {' x '.join(map(str, shape))} {dtype}")
     array = np.frombuffer(data, dtype).reshape(shape)
-    if array.dtype.kind == "f" and array.size and not (float(np.abs(array).max()) <= bound):  # NaN compares as false
-        raise Damage(f"{what}: a number that is not finite or beyond {bound:g}")
+    if array.dtype.kind == "f" and array.size and not (float(np.abs(array).max()) <= _FAR):  # NaN compares as false
+        raise Damage(f"{what}: a number that is not finite or beyond {_FAR:g}")
     return array
 
 

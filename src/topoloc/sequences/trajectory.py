@@ -99,7 +99,7 @@ def poses_at(trajectory: Trajectory, t_ns: Sequence[int], max_gap: float = 0.2) 
     return [_pose_at(trajectory.t_ns, trajectory.world_from_cam, time, round(max_gap * NANOSECONDS)) for time in t_ns]
 
 
-def frame_poses(trajectory: Trajectory, t_ns: Sequence[int], path: Path, max_gap: float = 0.2) -> list[Rigid3 | None]:
+def frame_poses(trajectory: Trajectory, t_ns: Sequence[int], path: Path) -> list[Rigid3 | None]:
     """The pose of each frame: by time, or by row where the trajectory has no times.
 
     Raises:
@@ -109,7 +109,7 @@ def frame_poses(trajectory: Trajectory, t_ns: Sequence[int], path: Path, max_gap
         if len(trajectory) != len(t_ns):
             raise TrajectoryError(f"{path}: {len(trajectory)} poses for {len(t_ns)} frames")
         return list(trajectory.world_from_cam)
-    poses = poses_at(trajectory, t_ns, max_gap)
+    poses = poses_at(trajectory, t_ns)
     if t_ns and all(pose is None for pose in poses):
         span = f"{trajectory.t_ns[0] / 1e9:.3f} to {trajectory.t_ns[-1] / 1e9:.3f} s"
         raise TrajectoryError(f"{path}: no frame has a pose; it covers {span}, the frames {t_ns[0] / 1e9:.3f} to {t_ns[-1] / 1e9:.3f} s")

@@ -71,7 +71,6 @@ def measure_disparities(
     points_img: Float32[np.ndarray, "n 2"],
     guesses_px: Float[np.ndarray, " n"],
     config: DisparityConfig,
-    num_threads: int | None = None,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Disparity of points of the left picture, that of an infinitely far one being 0, and its standard deviation, pixels.
 
@@ -99,7 +98,7 @@ def measure_disparities(
             config.min_correlation, config.max_second_correlation, disparities[part], sigmas[part],
         )  # fmt: skip
 
-    run_in_bands(run, len(points), num_threads)
+    run_in_bands(run, len(points))
     found, found_sigmas = np.full(len(points), np.nan), np.full(len(points), np.nan)
     found[order] = disparities.astype(np.float64) - at_infinity
     found_sigmas[order] = np.hypot(sigmas.astype(np.float64), config.min_sigma_px)

@@ -21,7 +21,7 @@ from topoloc_paper.fit.evidence import (
     fit_evidence,
     fit_shared_errors,
     judged,
-    try_on_other_families,
+    try_on_others,
 )
 from topoloc_paper.fit.rivals import MIN_HARD_PAIRS, fit_rivals, num_mistaken, pairs_of
 from topoloc_paper.fit.tried_poses import TriedPose, load_poses, save_poses
@@ -87,7 +87,7 @@ def test_every_family_is_judged_by_a_fit_without_it():
     poses = _drawn(3000)
     # in one family the evidence says the opposite: only a fit that has seen it could know
     turned = [replace(pose, error_m=3.0 if pose.is_right else 0.01) if pose.mapping == MAPS[0] else pose for pose in poses]
-    held_out = {part.family: part for part in try_on_other_families(turned, PRIOR, 0.1)}
+    held_out = {part.family: part for part in try_on_others(turned, PRIOR, 0.1)}
     assert set(held_out) == {"corridor", "lab", "kitchen"}
     assert calibration_error(held_out["corridor"].log_odds, held_out["corridor"].is_right) > 0.3
     assert sum(len(part.is_right) for part in held_out.values()) == len(decided(turned))

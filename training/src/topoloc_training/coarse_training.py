@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from topoloc.errors import EmptyMapError, TrainingError
 from topoloc.map.nodes import NodePoses, node_distances
 from topoloc.map.schema import SCHEMA_VERSION
 from topoloc.map.sessions import Edit, today
-from topoloc.map.topomap import TopoMetricMap, in_ids
+from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.coarse import CoarseModel
 from topoloc.places.network_config import BackboneName
 from topoloc_training.classifier_config import CnnFcConfig, CnnNnConfig, VladNnConfig
@@ -62,6 +63,14 @@ def train_coarse(
     arguments = (training_set_of(topomap), backbone, found, of_name, progress or (lambda stage, done, total: None))
     model = module.train(*arguments, checkpoint) if name == "cnn-fc" else module.train(*arguments)
     return in_ids(model, [summary.node_id for summary in topomap.summaries])
+
+
+def in_ids(model: CoarseModel, ids: Sequence[int]) -> CoarseModel:
+    """The inverse of `topomap.in_rows`: a model that was made of the map's rows, as the map keeps it."""
+    if list(ids) == list(range(len(ids))):
+        return model
+    rows = model.arrays.get("node_ids", np.arange(len(ids)))
+    return replace(model, arrays={**model.arrays, "node_ids": np.asarray(ids, np.int64)[rows]})
 
 
 def training_set_of(topomap: TopoMetricMap) -> TrainingSet:

@@ -7,7 +7,7 @@ Each place of `corpus.py` is mapped with features of this kind, and asked about 
 other places and about drawn pictures; every pose that was tried is kept, not only the one answered. A pose is right within 0.25 m (5 % of
 the distance, where that is less) and 2 degrees, wrong beyond 0.5 m or 10 degrees; what lies between is left out. The walls to both sides
 are asked where a place is walked back that was mapped in one direction. --step N asks every N-th of the pictures, --families only of the
-maps of these places; --save keeps the poses, after each place, and --load fits to poses that were kept. FILE is what ships as
+maps of these places; --by-recording tries each recording's poses on what was fitted to all others, not each family's; --save keeps the poses, after each place, and --load fits to poses that were kept. FILE is what ships as
 `localization/weights/KIND.json`.
 """
 
@@ -33,7 +33,7 @@ from topoloc_paper.fit.evidence import (
     fit_evidence,
     fit_shared_errors,
     judged,
-    try_on_other_families,
+    try_on_others,
 )
 from topoloc_paper.fit.rivals import MIN_HARD_PAIRS, fit_rivals, num_mistaken, pairs_of
 from topoloc_paper.fit.tried_poses import TriedPose, ask_place, load_poses, save_poses
@@ -49,6 +49,7 @@ def main() -> None:
     parser.add_argument("--rendered", type=Path)
     parser.add_argument("--step", type=int, default=1)
     parser.add_argument("--families", nargs="+", choices=sorted(set(FAMILIES.values()) - {"drawn"}))
+    parser.add_argument("--by-recording", action="store_true")
     parser.add_argument("--save", type=Path)
     parser.add_argument("--load", type=Path, nargs="+")
     parser.add_argument("--out", type=Path)
@@ -64,7 +65,7 @@ def main() -> None:
     verdicts = {(family_of(pose.mapping), pose.is_right) for pose in decided(poses)}
     if sum((family, False) in verdicts and (family, True) in verdicts for family in set(FAMILIES.values())) < 2:
         raise SystemExit("error: right and wrong poses of two families of places are needed")
-    weights = fit(asked.kind, poses, asked.step)
+    weights = fit(asked.kind, poses, asked.step, asked.by_recording)
     if asked.out:
         asked.out.write_text(json.dumps(weights.to_json(), indent=2) + "\n")
 
@@ -82,18 +83,18 @@ def ask_places(kind: str, data: Path, rendered: Path | None, step: int, kept: Pa
     return poses
 
 
-def fit(kind: str, poses: list[TriedPose], step: int) -> FittedWeights:
-    """Fitted weights of this kind, with a report of how they do beside those in use."""
+def fit(kind: str, poses: list[TriedPose], step: int, by_recording: bool) -> FittedWeights:
+    """Fitted weights of this kind, with a report of how they do beside those in use; `by_recording`: see `try_on_others`."""
     before, prior = weights_of(kind), weights_of(STAND_IN).evidence
     walls, num_walls = fit_walls(poses, before.walls)
     poses = [pose for pose in poses if pose.evidence.num_distinct is None]
-    strength = best_strength(poses, prior)
-    evidence, held_out = fit_evidence(poses, prior, strength), try_on_other_families(poses, prior, strength)
+    strength = best_strength(poses, prior, by_recording)
+    evidence, held_out = fit_evidence(poses, prior, strength), try_on_others(poses, prior, strength, by_recording)
     log_odds, is_right = (np.concatenate([getattr(part, name) for part in held_out]) for name in ("log_odds", "is_right"))
     rivals, num_hard = fit_rivals(poses, evidence, before.rivals)
     fitted = FittedWeights(
         kind,
-        corpus_of(poses, strength, num_hard, num_walls),
+        corpus_of(poses, strength, num_hard, num_walls, by_recording),
         datetime.date.today().isoformat(),
         f"python -m topoloc_paper.fit --kind {kind} --rendered FOLDER --step {step} --out FILE",
         round(calibration_error(log_odds, is_right), 4),
@@ -107,7 +108,7 @@ def fit(kind: str, poses: list[TriedPose], step: int) -> FittedWeights:
     return fitted
 
 
-def corpus_of(poses: list[TriedPose], strength: float, num_hard: int, num_walls: int) -> str:
+def corpus_of(poses: list[TriedPose], strength: float, num_hard: int, num_walls: int, by_recording: bool) -> str:
     """One sentence on what was fitted to."""
     num_right, told = sum(pose.is_right for pose in poses), decided(poses)
     places = ", ".join(dict.fromkeys(pose.mapping for pose in poses))
@@ -118,7 +119,8 @@ def corpus_of(poses: list[TriedPose], strength: float, num_hard: int, num_walls:
         f"drawn to the weights of {STAND_IN} with the strength {strength:g}; rivals {rivals}; "
         f"walls {f'fitted to {num_walls} poses' if num_walls else 'taken over'}; "
         "taken over: the weights of the doubt; shared_errors where fewer than 200 right poses tell. "
-        "Calibration error: of poses that would be answered, each family of places judged by a fit without it"
+        f"Calibration error: of poses that would be answered, each {'recording' if by_recording else 'family of places'} judged by a fit "
+        "without it"
     )
 
 
@@ -133,13 +135,15 @@ def report(poses: list[TriedPose], before: FittedWeights, fitted: FittedWeights,
         print(f"  {verdict(all_poses)}; log odds of the clearest wrong pose {clearest:.1f},")
         print(f"  probability of the most probable of {len(elsewhere.is_right)} from elsewhere {1 / (1 + np.exp(-most)):.2f}")
     for part in held_out:
-        in_use = judged(part.family, [pose for pose in told if family_of(pose.mapping) == part.family], before.evidence)
+        in_use = judged(
+            part.family, [pose for pose in told if part.family in (family_of(pose.mapping), pose.queries)], before.evidence
+        )
         print(f"{part.family}, fitted without it: {verdict(part)}\n  in use: {verdict(in_use)}")
     differences, is_hard = pairs_of(poses, fitted.evidence)
     was, now = (num_mistaken(differences[is_hard], rivals) for rivals in (before.rivals, fitted.rivals))
     print(f"rivals: {fitted.rivals}, {now} of {np.sum(is_hard)} hard pairs mistaken ({was})")
     print(f"{fitted.shared_errors} ({before.shared_errors})")
-    print(f"calibration error, every family judged by a fit without it: {fitted.calibration_error}")
+    print(f"calibration error, each part judged by a fit without it: {fitted.calibration_error}")
 
 
 def verdict(part: Judged) -> str:

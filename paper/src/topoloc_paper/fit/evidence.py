@@ -75,22 +75,31 @@ def _logistic_regression(poses: list[TriedPose], prior: EvidenceWeights, strengt
     return EvidenceWeights(*fitted, doubt=prior.doubt, bias=bias, clear_log_odds=prior.clear_log_odds)
 
 
-def try_on_other_families(poses: list[TriedPose], prior: EvidenceWeights, strength: float) -> list[Judged]:
-    """Each family's poses, judged by weights fitted to those that have nothing of it."""
+def try_on_others(poses: list[TriedPose], prior: EvidenceWeights, strength: float, by_recording: bool = False) -> list[Judged]:
+    """Each family's poses, judged by weights fitted to those that have nothing of it.
+
+    Args:
+        by_recording: instead the poses of each recording that was asked, by those of all others: where only one family has places
+            that look alike, the others cannot tell what a pose in them is worth.
+    """
     poses, tried = decided(poses), []
-    for family in dict.fromkeys(family_of(pose.mapping) for pose in poses):
-        here = [pose for pose in poses if family_of(pose.mapping) == family]
-        rest = [pose for pose in poses if family not in (family_of(pose.mapping), family_of(pose.queries))]
+
+    def parts(pose: TriedPose) -> tuple[str, ...]:
+        return (pose.queries,) if by_recording else (family_of(pose.mapping), family_of(pose.queries))
+
+    for part in dict.fromkeys(parts(pose)[0] for pose in poses):
+        here = [pose for pose in poses if parts(pose)[0] == part]
+        rest = [pose for pose in poses if part not in parts(pose)]
         if len({pose.is_right for pose in rest}) == 2:
-            tried.append(judged(family, here, fit_evidence(rest, prior, strength)))
+            tried.append(judged(part, here, fit_evidence(rest, prior, strength)))
     return tried
 
 
-def best_strength(poses: list[TriedPose], prior: EvidenceWeights) -> float:
-    """With how much of the prior families that were not fitted to are judged best, by the logarithm of the likelihood."""
+def best_strength(poses: list[TriedPose], prior: EvidenceWeights, by_recording: bool = False) -> float:
+    """With how much of the prior poses that were not fitted to are judged best (see `try_on_others`), by the logarithm of the likelihood."""
 
     def loss(strength: float) -> float:
-        parts = try_on_other_families(poses, prior, strength)
+        parts = try_on_others(poses, prior, strength, by_recording)
         return sum(float(np.sum(np.logaddexp(0.0, np.where(part.is_right, -part.log_odds, part.log_odds)))) for part in parts)
 
     return min(STRENGTHS, key=loss)

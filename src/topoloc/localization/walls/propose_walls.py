@@ -39,7 +39,6 @@ class WallProposal(Proposal):
     """A first pose from view `view` and a side node, on which `num_agreeing` of their matches agree."""
 
     view: int
-    side_row: int
     num_agreeing: int
     cam_from_world: Rigid3
     walls: SeenWalls
@@ -119,9 +118,7 @@ def _compared(walls: SeenWalls, view: int, row: int) -> WallProposal | None:
     num_agreeing, side_from_world = agreeing
     fit = PoseFit(side.in_picture, walls.camera, walls.camera, local_map, matches, None)
     cam_from_world = side.view.cam_from_side @ side_from_world
-    return WallProposal(
-        "walls", fit, is_guided=True, view=view, side_row=row, num_agreeing=num_agreeing, cam_from_world=cam_from_world, walls=walls
-    )
+    return WallProposal("walls", fit, is_guided=True, view=view, num_agreeing=num_agreeing, cam_from_world=cam_from_world, walls=walls)
 
 
 def refine_wall(proposal: WallProposal) -> tuple[PoseFit, SideMatches] | None:

@@ -1,0 +1,61 @@
+"""--features: which kinds of local features a map is built of, and which it is asked by."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Annotated
+
+import tyro
+
+from topoloc.cli.output import UsageError
+from topoloc.errors import FeatureKindError
+from topoloc.features.kinds import KINDS, SURF, learned_kind
+from topoloc.localization.config import LocalizerConfig
+from topoloc.map.config import MapConfig
+from topoloc.map.topomap import TopoMetricMap
+
+BUILD_FEATURES = Annotated[
+    str | None, tyro.conf.arg(metavar="surf|sift|learned|both|KIND[,KIND]", help_behavior_hint="(default: both where a network is here)")
+]
+ASKED_FEATURES = Annotated[
+    str | None, tyro.conf.arg(metavar="surf|learned|both|KIND[,KIND]", help_behavior_hint="(default: all that the map holds)")
+]
+
+
+def kinds_to_build(config: MapConfig, features: str | None) -> MapConfig:
+    """The configuration with the kinds of features that the option names, the first one first.
+
+    Raises:
+        UsageError: an unknown kind.
+        WeightsError: learned features are wanted, and no network of them is here.
+    """
+    if features is None:
+        kinds = config.kinds
+    elif features == "both":
+        kinds = [SURF.name, learned_kind()]
+    else:
+        kinds = [learned_kind()] if features == "learned" else features.split(",")
+        config = replace(config, other_kinds=())
+    if unknown := [kind for kind in kinds if kind not in KINDS]:
+        raise UsageError(f"no features {unknown[0]!r}; there are {', '.join(KINDS)}")
+    if len(set(kinds)) < len(kinds):
+        raise UsageError(f"--features {features}: a kind is named twice")
+    return replace(config, features=replace(config.features, kind=kinds[0]), other_kinds=tuple(kinds[1:]))
+
+
+def kinds_to_ask(topomap: TopoMetricMap, config: LocalizerConfig, features: str | None) -> LocalizerConfig:
+    """The configuration with those of the map's kinds of features that the option names.
+
+    Raises:
+        FeatureKindError: the map holds none of them.
+    """
+    if features is None:
+        return config
+    if features == "both":
+        return replace(config, kinds=tuple(topomap.kinds))
+    named = features.split(",")
+    kinds = [kind for kind in topomap.kinds if kind in named or (features == "learned" and KINDS[kind].network is not None)]
+    missing = [name for name in named if name not in kinds] if features != "learned" else []
+    if missing or not kinds:
+        raise FeatureKindError(f"the map holds no features {(missing or [features])[0]} (it holds: {', '.join(topomap.kinds)})")
+    return replace(config, kinds=tuple(kinds))
