@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 import poselib
 import tyro
-from topoloc.features.learned import LearnedConfig, extract_learned
 
 from topoloc.features.features import Features
+from topoloc.features.learned import LearnedConfig, extract_learned
 from topoloc.features.surf import SurfConfig, extract_surf
 from topoloc.sequences.folder import open_folder
 from topoloc.sequences.frame import StereoFrame

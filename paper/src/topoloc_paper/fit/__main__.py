@@ -7,8 +7,8 @@ Each place of `corpus.py` is mapped with features of this kind, and asked about 
 other places and about drawn pictures; every pose that was tried is kept, not only the one answered. A pose is right within 0.25 m (5 % of
 the distance, where that is less) and 2 degrees, wrong beyond 0.5 m or 10 degrees; what lies between is left out. The walls to both sides
 are asked where a place is walked back that was mapped in one direction. --step N asks every N-th of the pictures, --families only of the
-maps of these places; --by-recording tries each recording's poses on what was fitted to all others, not each family's; --save keeps the poses, after each place, and --load fits to poses that were kept. FILE is what ships as
-`localization/weights/KIND.json`.
+maps of these places; --by-recording tries each recording's poses on what was fitted to all others, not each family's; --save keeps the
+poses, after each place, and --load fits to poses that were kept. FILE is what ships as `localization/weights/KIND.json`.
 """
 
 from __future__ import annotations
@@ -135,9 +135,7 @@ def report(poses: list[TriedPose], before: FittedWeights, fitted: FittedWeights,
         print(f"  {verdict(all_poses)}; log odds of the clearest wrong pose {clearest:.1f},")
         print(f"  probability of the most probable of {len(elsewhere.is_right)} from elsewhere {1 / (1 + np.exp(-most)):.2f}")
     for part in held_out:
-        in_use = judged(
-            part.family, [pose for pose in told if part.family in (family_of(pose.mapping), pose.queries)], before.evidence
-        )
+        in_use = judged(part.family, [pose for pose in told if part.family in (family_of(pose.mapping), pose.queries)], before.evidence)
         print(f"{part.family}, fitted without it: {verdict(part)}\n  in use: {verdict(in_use)}")
     differences, is_hard = pairs_of(poses, fitted.evidence)
     was, now = (num_mistaken(differences[is_hard], rivals) for rivals in (before.rivals, fitted.rivals))

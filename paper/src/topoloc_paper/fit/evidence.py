@@ -96,7 +96,7 @@ def try_on_others(poses: list[TriedPose], prior: EvidenceWeights, strength: floa
 
 
 def best_strength(poses: list[TriedPose], prior: EvidenceWeights, by_recording: bool = False) -> float:
-    """With how much of the prior poses that were not fitted to are judged best (see `try_on_others`), by the logarithm of the likelihood."""
+    """With how much of the prior those are judged best that were not fitted to (`try_on_others`), by the logarithm of the likelihood."""
 
     def loss(strength: float) -> float:
         parts = try_on_others(poses, prior, strength, by_recording)
