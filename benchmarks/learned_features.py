@@ -1,10 +1,11 @@
 """Local features side by side where light changes: pairs of pictures of rendered places (exact truth) and of a path by day and by night.
 
-    python benchmarks/learned_features.py --kinds surf xfeat topoloc-net --pairs DAY:OTHER [--shared ../shared]
+    python benchmarks/learned_features.py --kinds surf xfeat topoloc-net --pairs DAY,OTHER [--shared ../shared]
 
-DAY is a stereo recording, OTHER single pictures, both with truth. Each picture of OTHER is matched to the nearest one of DAY that looks the
-same way (mutual nearest neighbours, no ratio), the day's points get their depth by block matching, one PnP follows. Real pictures: frame i
-of the night walk of `gardenspoint` against the day's frame i and against those from elsewhere, inliers of a fundamental matrix.
+DAY is a stereo recording, OTHER any other, both with truth; parts of one (`street1@0::2,street1@1::2`) do as well. Each picture of OTHER is
+matched to the nearest one of DAY that looks the same way (mutual nearest neighbours, no ratio), the day's points get their depth by block
+matching, one PnP follows. Real pictures: frame i of the night walk of `gardenspoint` against the day's frame i and against those from
+elsewhere, inliers of a fundamental matrix.
 """
 
 from __future__ import annotations
@@ -21,12 +22,10 @@ import tyro
 from topoloc.features.features import Features
 from topoloc.features.learned import LearnedConfig, extract_learned
 from topoloc.features.surf import SurfConfig, extract_surf
-from topoloc.sequences.folder import open_folder
 from topoloc.sequences.frame import StereoFrame
-from topoloc.sequences.kitti import open_kitti
+from topoloc.sequences.open import open_sequence
 from topoloc.sequences.pictures import grey_image, read_image
 
-_REACH_M = 2.0
 _TURN = np.cos(np.deg2rad(25))
 _SOLVED = (0.10, 1.0)  # metres, degrees
 _RIGHT_PX = 3.0
@@ -39,6 +38,8 @@ class Args:
     kinds: tuple[str, ...] = ("surf", "xfeat", "edgepoint2-t32", "edgepoint2-s64", "edgepoint2-e64", "topoloc-net")
     pairs: tuple[str, ...] = ()
     shared: Path = Path(os.environ.get("TOPOLOC_SHARED", Path(__file__).parents[2] / "shared"))
+    reach: float = 2.0
+    """Metres from a picture to the day's that it is matched to, at most."""
     every: int = 1
     """Of the rendered pictures."""
     walk_step: int = 5
@@ -69,8 +70,8 @@ def day_points(frame: StereoFrame, points_img: np.ndarray) -> np.ndarray:
 
 
 def rendered(names: str, args: Args) -> None:
-    day_folder, _, other_folder = names.partition(":")
-    days, others = open_kitti(Path(day_folder)), open_folder(Path(other_folder))
+    day_folder, _, other_folder = names.partition(",")
+    days, others = open_sequence(day_folder), open_sequence(other_folder)
     day_poses = np.array([pose.matrix() for pose in days.poses])
     outcomes: dict[str, list[tuple[int, int, float, float]]] = {kind: [] for kind in args.kinds}
     for j in range(0, len(others), args.every):
@@ -79,12 +80,15 @@ def rendered(names: str, args: Args) -> None:
         distance = np.linalg.norm(day_poses[:, :3, 3] - pose[:3, 3], axis=1)
         distance[day_poses[:, :3, 2] @ pose[:3, 2] < _TURN] = np.inf
         nearest = int(distance.argmin())
-        if distance[nearest] > _REACH_M:
+        if distance[nearest] > args.reach:
             continue
         day = days[nearest]
         other_from_day = np.linalg.inv(pose) @ day_poses[nearest]
         for kind in args.kinds:
             outcomes[kind].append(ask(day, frame, other_from_day, kind, args.features))
+    if not outcomes[args.kinds[0]]:
+        print(f"{names}: no two pictures within {args.reach:g} m")
+        return
     print(f"{names}: {len(outcomes[args.kinds[0]])} pictures; solved within 10 cm and 1 deg")
     for kind, rows in outcomes.items():
         matches, right, metres, degrees = np.array(rows).T
