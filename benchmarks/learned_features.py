@@ -60,10 +60,14 @@ def match(first: Features, second: Features) -> tuple[np.ndarray, np.ndarray]:
     return rows, there[rows]
 
 
-def day_points(frame: StereoFrame, points_img: np.ndarray) -> np.ndarray:
-    """Points in the left camera, metres; NaN where block matching gives no depth."""
+def disparity_map(frame: StereoFrame) -> np.ndarray:
+    """Of the left picture, pixels; below 1 where block matching finds none."""
     matcher = cv2.StereoSGBM.create(0, 64, 5, 200, 800, disp12MaxDiff=1, uniquenessRatio=10, speckleWindowSize=80, speckleRange=2)
-    disparity = matcher.compute(grey_image(frame.image), grey_image(frame.right)).astype(np.float64) / 16
+    return matcher.compute(grey_image(frame.image), grey_image(frame.right)).astype(np.float64) / 16
+
+
+def day_points(frame: StereoFrame, disparity: np.ndarray, points_img: np.ndarray) -> np.ndarray:
+    """Points in the left camera, metres; NaN where there is no depth."""
     x, y = np.round(points_img).astype(int).T
     z = np.where(disparity[y, x] > 1, frame.camera.fx * frame.rig.baseline / np.maximum(disparity[y, x], 1e-6), np.nan)
     return np.column_stack([frame.camera.normalized_from_img(points_img) * z[:, None], z])
@@ -83,9 +87,11 @@ def rendered(names: str, args: Args) -> None:
         if distance[nearest] > args.reach:
             continue
         day = days[nearest]
+        disparity = disparity_map(day)
         other_from_day = np.linalg.inv(pose) @ day_poses[nearest]
         for kind in args.kinds:
-            outcomes[kind].append(ask(day, frame, other_from_day, kind, args.features))
+            sets = [extract(grey_image(each.image), kind, args.features) for each in (day, frame)]
+            outcomes[kind].append(ask(day, disparity, frame, other_from_day, sets))
     if not outcomes[args.kinds[0]]:
         print(f"{names}: no two pictures within {args.reach:g} m")
         return
@@ -98,11 +104,13 @@ def rendered(names: str, args: Args) -> None:
         print(f"right matches {np.median(right):4.0f} of {np.median(matches):4.0f} ({share:.0%})")
 
 
-def ask(day: StereoFrame, other: StereoFrame, other_from_day: np.ndarray, kind: str, count: int) -> tuple[int, int, float, float]:
+def ask(
+    day: StereoFrame, disparity: np.ndarray, other: StereoFrame, other_from_day: np.ndarray, sets: list[Features]
+) -> tuple[int, int, float, float]:
     """Matches with depth, those of them that are right, and the errors of one PnP (m, deg)."""
-    here, there = extract(grey_image(day.image), kind, count), extract(grey_image(other.image), kind, count)
+    here, there = sets
     rows, columns = match(here, there)
-    points = day_points(day, here.points_img[rows])
+    points = day_points(day, disparity, here.points_img[rows])
     known = np.isfinite(points[:, 2])
     points, pixels = points[known], there.points_img[columns][known].astype(np.float64)
     local = points @ other_from_day[:3, :3].T + other_from_day[:3, 3]
