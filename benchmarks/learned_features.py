@@ -1,10 +1,11 @@
 """Local features side by side where light changes: pairs of pictures of rendered places (exact truth) and of a path by day and by night.
 
-    python benchmarks/learned_features.py --kinds surf xfeat topoloc-net --pairs DAY:OTHER [--shared ../shared]
+    python benchmarks/learned_features.py --kinds surf xfeat topoloc-net --pairs DAY,OTHER [--shared ../shared]
 
-DAY is a stereo recording, OTHER single pictures, both with truth. Each picture of OTHER is matched to the nearest one of DAY that looks the
-same way (mutual nearest neighbours, no ratio), the day's points get their depth by block matching, one PnP follows. Real pictures: frame i
-of the night walk of `gardenspoint` against the day's frame i and against those from elsewhere, inliers of a fundamental matrix.
+DAY is a stereo recording, OTHER any other, both with truth; parts of one (`street1@0::2,street1@1::2`) do as well. Each picture of OTHER is
+matched to the nearest one of DAY that looks the same way (mutual nearest neighbours, no ratio), the day's points get their depth by block
+matching, one PnP follows. Real pictures: frame i of the night walk of `gardenspoint` against the day's frame i and against those from
+elsewhere, inliers of a fundamental matrix.
 """
 
 from __future__ import annotations
@@ -21,12 +22,10 @@ import tyro
 from topoloc.features.features import Features
 from topoloc.features.learned import LearnedConfig, extract_learned
 from topoloc.features.surf import SurfConfig, extract_surf
-from topoloc.sequences.folder import open_folder
 from topoloc.sequences.frame import StereoFrame
-from topoloc.sequences.kitti import open_kitti
+from topoloc.sequences.open import open_sequence
 from topoloc.sequences.pictures import grey_image, read_image
 
-_REACH_M = 2.0
 _TURN = np.cos(np.deg2rad(25))
 _SOLVED = (0.10, 1.0)  # metres, degrees
 _RIGHT_PX = 3.0
@@ -39,6 +38,8 @@ class Args:
     kinds: tuple[str, ...] = ("surf", "xfeat", "edgepoint2-t32", "edgepoint2-s64", "edgepoint2-e64", "topoloc-net")
     pairs: tuple[str, ...] = ()
     shared: Path = Path(os.environ.get("TOPOLOC_SHARED", Path(__file__).parents[2] / "shared"))
+    reach: float = 2.0
+    """Metres from a picture to the day's that it is matched to, at most."""
     every: int = 1
     """Of the rendered pictures."""
     walk_step: int = 5
@@ -59,18 +60,22 @@ def match(first: Features, second: Features) -> tuple[np.ndarray, np.ndarray]:
     return rows, there[rows]
 
 
-def day_points(frame: StereoFrame, points_img: np.ndarray) -> np.ndarray:
-    """Points in the left camera, metres; NaN where block matching gives no depth."""
+def disparity_map(frame: StereoFrame) -> np.ndarray:
+    """Of the left picture, pixels; below 1 where block matching finds none."""
     matcher = cv2.StereoSGBM.create(0, 64, 5, 200, 800, disp12MaxDiff=1, uniquenessRatio=10, speckleWindowSize=80, speckleRange=2)
-    disparity = matcher.compute(grey_image(frame.image), grey_image(frame.right)).astype(np.float64) / 16
+    return matcher.compute(grey_image(frame.image), grey_image(frame.right)).astype(np.float64) / 16
+
+
+def day_points(frame: StereoFrame, disparity: np.ndarray, points_img: np.ndarray) -> np.ndarray:
+    """Points in the left camera, metres; NaN where there is no depth."""
     x, y = np.round(points_img).astype(int).T
     z = np.where(disparity[y, x] > 1, frame.camera.fx * frame.rig.baseline / np.maximum(disparity[y, x], 1e-6), np.nan)
     return np.column_stack([frame.camera.normalized_from_img(points_img) * z[:, None], z])
 
 
 def rendered(names: str, args: Args) -> None:
-    day_folder, _, other_folder = names.partition(":")
-    days, others = open_kitti(Path(day_folder)), open_folder(Path(other_folder))
+    day_folder, _, other_folder = names.partition(",")
+    days, others = open_sequence(day_folder), open_sequence(other_folder)
     day_poses = np.array([pose.matrix() for pose in days.poses])
     outcomes: dict[str, list[tuple[int, int, float, float]]] = {kind: [] for kind in args.kinds}
     for j in range(0, len(others), args.every):
@@ -79,12 +84,17 @@ def rendered(names: str, args: Args) -> None:
         distance = np.linalg.norm(day_poses[:, :3, 3] - pose[:3, 3], axis=1)
         distance[day_poses[:, :3, 2] @ pose[:3, 2] < _TURN] = np.inf
         nearest = int(distance.argmin())
-        if distance[nearest] > _REACH_M:
+        if distance[nearest] > args.reach:
             continue
         day = days[nearest]
+        disparity = disparity_map(day)
         other_from_day = np.linalg.inv(pose) @ day_poses[nearest]
         for kind in args.kinds:
-            outcomes[kind].append(ask(day, frame, other_from_day, kind, args.features))
+            sets = [extract(grey_image(each.image), kind, args.features) for each in (day, frame)]
+            outcomes[kind].append(ask(day, disparity, frame, other_from_day, sets))
+    if not outcomes[args.kinds[0]]:
+        print(f"{names}: no two pictures within {args.reach:g} m")
+        return
     print(f"{names}: {len(outcomes[args.kinds[0]])} pictures; solved within 10 cm and 1 deg")
     for kind, rows in outcomes.items():
         matches, right, metres, degrees = np.array(rows).T
@@ -94,11 +104,13 @@ def rendered(names: str, args: Args) -> None:
         print(f"right matches {np.median(right):4.0f} of {np.median(matches):4.0f} ({share:.0%})")
 
 
-def ask(day: StereoFrame, other: StereoFrame, other_from_day: np.ndarray, kind: str, count: int) -> tuple[int, int, float, float]:
+def ask(
+    day: StereoFrame, disparity: np.ndarray, other: StereoFrame, other_from_day: np.ndarray, sets: list[Features]
+) -> tuple[int, int, float, float]:
     """Matches with depth, those of them that are right, and the errors of one PnP (m, deg)."""
-    here, there = extract(grey_image(day.image), kind, count), extract(grey_image(other.image), kind, count)
+    here, there = sets
     rows, columns = match(here, there)
-    points = day_points(day, here.points_img[rows])
+    points = day_points(day, disparity, here.points_img[rows])
     known = np.isfinite(points[:, 2])
     points, pixels = points[known], there.points_img[columns][known].astype(np.float64)
     local = points @ other_from_day[:3, :3].T + other_from_day[:3, 3]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tiny_network import write_network
-from topoloc.errors import WeightsError
+from topoloc.errors import MissingExtraError, WeightsError
 from topoloc.features.network_files import NETWORKS, check_network, find_network
 
 
@@ -53,7 +53,7 @@ def test_damaged_files_are_refused(tmp_path: Path):
 def test_without_onnx_runtime_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     path = write_network(tmp_path / "any.onnx")
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(WeightsError, match=r"topoloc\[learned\]"):
+    with pytest.raises(MissingExtraError, match=r"topoloc\[learned\]"):
         check_network(path)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch.nn import functional
 
-from topoloc_training.net.losses import likeness, peaks, sampled, told_apart
+from topoloc_training.net.losses import likeness, peaks, placed, sampled, told_apart
 
 
 def units(seed: int, count: int = 20) -> torch.Tensor:
@@ -55,3 +55,15 @@ def test_scores_are_drawn_to_the_teachers_peaks_inside_the_picture():
     assert peaks(right, target, inside) < 0.01 < peaks(missed, target, inside)
     inside[0, 0, 4, 4] = False
     assert peaks(missed, target, inside) < 0.01
+
+
+def test_a_key_point_is_asked_for_in_its_own_pixel():
+    target = torch.zeros(1, 1, 16, 16)
+    target[0, 0, 4, 4], target[0, 0, 12, 3] = 0.9, 0.03
+    inside = torch.ones(1, 1, 16, 16, dtype=torch.bool)
+    right, beside = torch.zeros_like(target), torch.zeros_like(target)
+    right[0, 0, 4, 4] = beside[0, 0, 4, 5] = 12
+    assert placed(right, target, inside) < 0.01 < 4 < placed(beside, target, inside)
+    beside[0, 0, 4, 4] = 24
+    beside[0, 0, 8:, 5] = 12
+    assert placed(beside, target, inside) < 0.01, "where the teacher sees no key point, no place is asked for"

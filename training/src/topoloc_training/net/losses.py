@@ -12,6 +12,8 @@ from torch.nn import functional
 
 _TEMPERATURE = 0.06
 _PEAK_WEIGHT = 30.0
+_CELL = 8
+_LEAST_PEAK = 0.05
 
 
 def sampled(maps: Float[Tensor, "b c hs ws"], pixels: Float[Tensor, "b n 2"], stride: int) -> Float[Tensor, "b n c"]:
@@ -39,6 +41,14 @@ def told_apart(
     diagonal = torch.diagonal(likes, dim1=1, dim2=2)
     lost = torch.logsumexp(likes, 2) + torch.logsumexp(likes, 1) - 2 * diagonal
     return (lost * valid).sum() / (2 * valid.sum().clamp(min=1))
+
+
+def placed(logits: Float[Tensor, "b 1 h w"], target: Float[Tensor, "b 1 h w"], inside: Bool[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
+    """In which pixel of its 8x8 cell a key point lies, as one choice among 64; cells count by their key point's score."""
+    scores, best = functional.pixel_unshuffle(target, _CELL).max(dim=1)
+    weight = scores * (scores > _LEAST_PEAK) * (functional.pixel_unshuffle(inside.float(), _CELL).amin(dim=1) > 0)
+    lost = functional.cross_entropy(functional.pixel_unshuffle(logits, _CELL), best, reduction="none")
+    return (lost * weight).sum() / weight.sum().clamp(min=1)
 
 
 def peaks(logits: Float[Tensor, "b 1 h w"], target: Float[Tensor, "b 1 h w"], inside: Bool[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:

@@ -17,6 +17,7 @@ from topoloc_training.networks.layers import ConvNormReLU, Residual, enlarged
 KIND = "topoloc-net"
 DIMENSION = 64
 STRIDE = 4
+_SCORE_WIDTH = 40
 _SHADOWS = 0.002  # grey below this is noise; also keeps the root's slope finite
 
 
@@ -37,22 +38,32 @@ class TopolocNet(nn.Module):
         self.fusion = ConvNormReLU(64, 64, groups=4)
         self.coarse_descriptor = nn.Conv2d(64, DIMENSION, 1)
         self.fine_descriptor = nn.Conv2d(16, DIMENSION, 1)
-        self.pixels = nn.Conv2d(1, 16, 4, stride=4)
-        self.fine_score = nn.Conv2d(16, 16, 1)
-        self.coarse_score = nn.Conv2d(64, 16, 1)
-        self.score = nn.Sequential(nn.BatchNorm2d(16), nn.ReLU(), ConvNormReLU(16, 16), nn.Conv2d(16, 16, 1), nn.PixelShuffle(4))
+        self.detail_score = nn.Conv2d(16, _SCORE_WIDTH, 2, stride=2)
+        self.fine_score = nn.Conv2d(16, _SCORE_WIDTH, 1)
+        self.coarse_score = nn.Conv2d(64, _SCORE_WIDTH, 1)
+        self.score = nn.Sequential(
+            nn.BatchNorm2d(_SCORE_WIDTH),
+            nn.ReLU(),
+            ConvNormReLU(_SCORE_WIDTH, _SCORE_WIDTH, 1, padding=0),
+            nn.Conv2d(_SCORE_WIDTH, 16, 1),
+            nn.PixelShuffle(4),
+        )
 
     def maps(self, image: Float[Tensor, "b 1 h w"]) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 64 h4 w4"]]:
         """Score logits and descriptors."""
         # The root evens out photon noise and keeps lamps from pressing a night picture into the lowest greys.
         grey = self.norm(torch.sqrt(image + _SHADOWS))
-        quarter = self.quarter(grey)
+        stem, *deeper = self.quarter
+        half = stem(grey)
+        quarter = half
+        for layer in deeper:
+            quarter = layer(quarter)
         eighth = self.eighth(quarter)
         sixteenth = self.sixteenth(eighth)
         sixteenth = sixteenth + enlarged(self.context(sixteenth), 2)
         fused = self.fusion(functional.relu(self.lateral(eighth) + enlarged(self.across(sixteenth), 2)))
         descriptors = enlarged(self.coarse_descriptor(fused), 2) + self.fine_descriptor(quarter)
-        logits = self.score(enlarged(self.coarse_score(fused), 2) + self.fine_score(quarter) + self.pixels(grey))
+        logits = self.score(enlarged(self.coarse_score(fused), 2) + self.fine_score(quarter) + self.detail_score(half))
         return logits, descriptors
 
     def forward(self, image: Float[Tensor, "b 1 h w"]) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 64 h4 w4"]]:

@@ -18,7 +18,7 @@ import torch
 import tyro
 from torch import Tensor, nn
 
-from topoloc_training.net.losses import likeness, peaks, sampled, told_apart
+from topoloc_training.net.losses import likeness, peaks, placed, sampled, told_apart
 from topoloc_training.net.network import KIND, STRIDE, TopolocNet
 from topoloc_training.net.pairs import Pair, find_pairs
 from topoloc_training.net.teacher import HEIGHT, learn
@@ -27,6 +27,7 @@ from topoloc_training.networks.export import export
 
 _LOG_EVERY = 100
 _SAVE_EVERY = 250
+_WEIGHTS = (1.0, 1.0, 0.5, 4.0, 0.2)
 _KEPT_AVERAGE = 0.998
 
 
@@ -50,6 +51,8 @@ class TrainNet:
     pair_share: float = 0.3
     """Share of samples that come from pairs."""
     seed: int = 1
+    start: Path | None = None
+    """State of an earlier training to begin with; what it lacks begins at random."""
     threads: int = 1
     minutes: float = 1e9
     """Stop after so long; the state is kept."""
@@ -69,13 +72,13 @@ def train(config: TrainNet) -> None:
     begun = step
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda taken: _rate(begun + taken, config.steps))
     network.train()
-    end, sums, since = time.monotonic() + 60 * config.minutes, np.zeros(4), time.monotonic()
+    end, sums, since = time.monotonic() + 60 * config.minutes, np.zeros(5), time.monotonic()
     while step < config.steps and time.monotonic() < end:
         # The generator follows from the step, so that a resumed run goes on as the first would have.
         generator = np.random.default_rng([config.seed, step])
         share = config.pair_share if known else 0.0
         parts = _step(network, [draw_sample(lessons, known, share, generator) for _ in range(config.batch)])
-        loss = parts[0] + parts[1] + 0.5 * parts[2] + 2.0 * parts[3]
+        loss = sum(weight * part for weight, part in zip(_WEIGHTS, parts, strict=True))
         optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(network.parameters(), 5.0)
@@ -85,17 +88,17 @@ def train(config: TrainNet) -> None:
         _follow(average, network, min(_KEPT_AVERAGE, step / (step + 20)))
         sums += [float(part.detach()) for part in parts]
         if step % _LOG_EVERY == 0:
-            names = ("cosine", "to_teacher", "across_light", "score")
+            names = ("cosine", "to_teacher", "across_light", "score", "place")
             line = {"step": step, "rate": schedule.get_last_lr()[0], "seconds": round(time.monotonic() - since, 1)}
             _log(config.out, line | {n: round(float(v) / _LOG_EVERY, 4) for n, v in zip(names, sums, strict=True)})
-            sums, since = np.zeros(4), time.monotonic()
+            sums, since = np.zeros(5), time.monotonic()
         if step % _SAVE_EVERY == 0:
             _save(config.out, network, average, optimizer, step)
     _save(config.out, network, average, optimizer, step)
 
 
-def _step(network: TopolocNet, samples: list[Sample]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Cosine to the teacher, told apart against the teacher, told apart across light, score."""
+def _step(network: TopolocNet, samples: list[Sample]) -> tuple[Tensor, ...]:
+    """Cosine to the teacher, told apart against the teacher, told apart across light, score, place of key points."""
 
     def both(name: str) -> Tensor:
         """First views of all samples, then second ones."""
@@ -110,17 +113,21 @@ def _step(network: TopolocNet, samples: list[Sample]) -> tuple[Tensor, Tensor, T
     theirs = torch.cat([taught, taught])
     first, second = ours.chunk(2)
     seen_twice = valid.chunk(2)[0] & valid.chunk(2)[1]
+    target, inside = both("scores").float()[:, None], both("inside")[:, None]
     return (
         likeness(ours, theirs, valid),
         told_apart(ours, theirs, valid, torch.cat([near, near])),
         told_apart(first, second, seen_twice, near),
-        peaks(logits, both("scores").float()[:, None], both("inside")[:, None]),
+        peaks(logits, target, inside),
+        placed(logits, target, inside),
     )
 
 
 def _begin(config: TrainNet) -> tuple[TopolocNet, TopolocNet, torch.optim.Optimizer, int]:
     network = TopolocNet()
     optimizer = torch.optim.AdamW(network.parameters(), lr=config.rate, weight_decay=1e-4)
+    if config.start is not None:
+        _begin_with(network, torch.load(config.start, weights_only=True)["average"])
     average, step = copy.deepcopy(network), 0
     if (state := config.out / "state.pt").is_file():
         kept = torch.load(state, weights_only=True)
@@ -131,6 +138,11 @@ def _begin(config: TrainNet) -> tuple[TopolocNet, TopolocNet, torch.optim.Optimi
     for group in optimizer.param_groups:
         group["lr"] = group["initial_lr"] = config.rate
     return network, average, optimizer, step
+
+
+def _begin_with(network: nn.Module, earlier: dict[str, Tensor]) -> None:
+    own = network.state_dict()
+    network.load_state_dict({n: value for n, value in earlier.items() if n in own and own[n].shape == value.shape}, strict=False)
 
 
 def _rate(step: int, steps: int) -> float:

@@ -18,12 +18,15 @@ NUM_POINTS = 320
 _EDGE = 6  # pixels from a view's border that points keep
 _NEAR = 8.0  # pixels of the source closer than this are no rivals
 _TRIES = 8
+_CLEAN = 0.3  # share of first views in unchanged light
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Two views (2, h, w) in [0, 1], the teacher's scores seen the same way and where they hold, points (2, n, 2), their descriptors
-    (n, 64), whether a point lies in each view (2, n), and which points are near each other (n, n).
+    """Two views (2, h, w) in [0, 1], the teacher's scores seen the same way and where they are to be learned.
+
+    Points (2, n, 2), the teacher's descriptors of them (n, 64), whether a point lies in each view (2, n), and which points are so
+    near each other that they are no rivals (n, n).
     """
 
     views: np.ndarray
@@ -41,9 +44,11 @@ def draw_sample(lessons: Lessons, pairs: list[tuple[int, int, Pair]], share: flo
         first, second, pair = pairs[int(generator.integers(len(pairs)))]
         return _of_pair(lessons, first, second, pair, generator)
     index = int(generator.integers(len(lessons.paths)))
-    place = _random_homography(generator, generator.uniform((0.25, 0.25), (0.75, 0.75)) * (WIDTH, HEIGHT), 1.0)
-    other = _nudged(place, generator)
-    views, scores, inside = _seen(lessons, [index, index], [place, other], (0.35, 1.0), generator)
+    place = _crop(generator.uniform((0.25, 0.25), (0.75, 0.75)) * (WIDTH, HEIGHT))
+    other = _nudged(place @ _random_homography(generator, np.array([VIEW_WIDTH, VIEW_HEIGHT]) / 2, 0.8), generator)
+    strengths = (0.0 if generator.random() < _CLEAN else generator.random(), 0.3 + 0.7 * generator.random())
+    views, scores, inside = _seen(lessons, [index, index], [place, other], strengths, generator)
+    inside[1] = False
     points = _chosen_points(scores[0], generator)
     source = _mapped(points, place)
     return _sample(lessons, index, source, [points, _mapped(source, np.linalg.inv(other))], views, scores, inside)
@@ -56,14 +61,14 @@ def _of_pair(lessons: Lessons, first: int, second: int, pair: Pair, generator: G
             break
         places, here, there, both = _looks(pair, generator)
     chosen = generator.choice(both if len(both) else len(here), NUM_POINTS, replace=len(both) < NUM_POINTS)
-    views, scores, inside = _seen(lessons, [first, second], places, (0.3, 0.3), generator)
+    views, scores, inside = _seen(lessons, [first, second], places, (0.2, 0.2), generator)
     return _sample(lessons, first, pair.day_px[chosen], [here[chosen], there[chosen]], views, scores, inside)
 
 
 def _looks(pair: Pair, generator: Generator) -> tuple[list[np.ndarray], np.ndarray, np.ndarray, np.ndarray]:
     """Two views around the same point: their homographies, the pair's points in each, and the numbers of those that both see."""
     middle = int(generator.integers(len(pair.day_px)))
-    places = [_random_homography(generator, px[middle], 0.6) for px in (pair.day_px, pair.other_px)]
+    places = [_crop(pair.day_px[middle]), _crop(pair.other_px[middle])]
     here, there = (_mapped(px, np.linalg.inv(place)) for px, place in zip((pair.day_px, pair.other_px), places, strict=True))
     return places, here, there, np.flatnonzero(_within(here) & _within(there))
 
@@ -92,6 +97,13 @@ def _seen(
         scores.append(cv2.warpPerspective(lessons.scores[index], place, size, flags=flags).astype(np.float32) / 255)
         inside.append(cv2.warpPerspective(np.ones((HEIGHT, WIDTH), np.uint8), place, size, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP))
     return np.array(views), np.array(scores), np.array(inside, bool)
+
+
+def _crop(middle: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3 3"]:
+    """Whole pixels of the source: there alone are the teacher's scores exact, for they change when a picture is scaled or turned."""
+    size = np.array([VIEW_WIDTH, VIEW_HEIGHT])
+    x, y = np.clip(np.round(middle - size / 2), 0, np.array([WIDTH, HEIGHT]) - size)
+    return np.array([[1, 0, x], [0, 1, y], [0, 0, 1.0]])
 
 
 def _random_homography(generator: Generator, middle: Float[np.ndarray, "2"], spread: float) -> Float[np.ndarray, "3 3"]:
