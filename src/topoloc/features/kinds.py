@@ -8,7 +8,6 @@ their probability is not calibrated.
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -16,7 +15,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from topoloc.bounds import AtLeast, Between
-from topoloc.errors import FeatureKindError, WeightsError
+from topoloc.errors import FeatureKindError
 from topoloc.features.features import Features
 from topoloc.features.learned import LearnedConfig, check_network, extract_learned
 from topoloc.features.sift import SiftConfig, extract_sift
@@ -131,11 +130,13 @@ SURF = FeatureKind(
 SIFT = FeatureKind("sift", _extract_sift, 128, guided=SURF.guided, distant=SURF.distant)
 
 LEARNED = (
+    _learned_kind("topoloc-net", 64, min_score=0.0067),
     _learned_kind("edgepoint2-s64", 64, min_score=0.0067),
     _learned_kind("edgepoint2-t32", 32, min_score=0.0067),
     _learned_kind("edgepoint2-e64", 64, min_score=0.0067),
     _learned_kind("xfeat", 64, min_score=0.05),
 )
+"""The first one is what is meant by learned features where none are named."""
 
 KINDS: dict[str, FeatureKind] = {kind.name: kind for kind in (SURF, SIFT, *LEARNED)}
 
@@ -152,15 +153,11 @@ def find_kind(name: str) -> FeatureKind:
 
 
 def learned_kind() -> str:
-    """The learned features that are taken where the user names none: the first of `LEARNED` whose network is here.
+    """The learned features that are taken where the user names none: those whose answers are calibrated.
 
     Raises:
-        MissingExtraError, WeightsError: there is none; of the first one.
+        MissingExtraError, WeightsError: what their network needs is not here.
     """
-    for kind in LEARNED:
-        with suppress(WeightsError):
-            check_available(kind.name)
-            return kind.name
     check_available(LEARNED[0].name)
     return LEARNED[0].name
 

@@ -2,7 +2,7 @@
 
 These numbers carry every probability and covariance, and belong to one kind of features each: `weights/KIND.json` holds them with the
 corpus and the command that they come from, and the calibration error on places that they were not fitted to. They are no settings.
-A kind without a file answers with those of SURF, and says that its probability is not calibrated.
+A kind without a file answers with those of a kind like it, and says that its probability is not calibrated.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from topoloc.errors import FeatureKindError
+from topoloc.features.kinds import KINDS, LEARNED
 
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
-STAND_IN = "surf"
-"""The kind whose weights others take that have none."""
+STAND_IN, LEARNED_STAND_IN = "surf", LEARNED[0].name
+"""The kinds whose weights others take that have none: where no network is asked, and where one is."""
 
 _T = TypeVar("_T")
 
@@ -125,14 +126,15 @@ _SOURCE = ("kind", "corpus", "date", "command", "calibration_error")
 
 @cache
 def weights_of(kind: str) -> FittedWeights:
-    """The weights that ship for this kind of features; those of SURF, not calibrated, where there are none.
+    """The weights that ship for this kind of features; those of a kind like it, not calibrated, where there are none.
 
     Raises:
         FeatureKindError: the file is damaged, or of another kind.
     """
     path = WEIGHTS_FOLDER / f"{kind}.json"
     if not path.exists():
-        return replace(weights_of(STAND_IN), kind=kind, calibration_error=None)
+        like = LEARNED_STAND_IN if kind in KINDS and KINDS[kind].network is not None else STAND_IN
+        return replace(weights_of(like), kind=kind, calibration_error=None)
     weights = read_weights(path)
     if weights.kind != kind:
         raise FeatureKindError(f"{path}: weights of {weights.kind}, not of {kind}")

@@ -112,6 +112,9 @@ def _evidence(search: Search, proposal: Proposal, final: PoseFit, covariance: Fl
     at_best = replace(counted, num_matches=final.num_inliers, num_inliers=final.num_inliers)
     if log_odds_of(at_best, search.weights) < _HOPELESS:  # whatever the unguided matches say
         return None
+    of_strongest = _with_unguided(search, counted, _unguided(search, final, search.config.num_first_features), final)
+    if log_odds_of(of_strongest, search.weights) < 2.0 * _HOPELESS:  # whatever those of the other features say
+        return None
     return _with_unguided(search, counted, _unguided(search, final), final)
 
 
@@ -143,11 +146,11 @@ def _with_unguided(search: Search, evidence: Evidence, unguided: PoseFit, final:
     return replace(evidence, num_matches=len(unguided.matches), num_inliers=num_agreeing)
 
 
-def _unguided(search: Search, final: PoseFit) -> PoseFit:
-    """Matches with the points around the final pose that owe nothing to it."""
+def _unguided(search: Search, final: PoseFit, max_features: int | None = None) -> PoseFit:
+    """Matches of the strongest features with the points around the final pose that owe nothing to it."""
     points = final.local_map
     positions = folded(points.points_world, _repeats(search, final))  # copies of a point are no rivals of it
-    matches = match_pooled(final.features.descriptors, points.descriptors, positions, points.radii, search.config.matching)
+    matches = match_pooled(final.features.descriptors[:max_features], points.descriptors, positions, points.radii, search.config.matching)
     return replace(final, matches=matches, pose=None)
 
 
