@@ -1,8 +1,8 @@
 """The network `topoloc-net`: grey picture to key point scores and 64-number descriptors, made for two plain CPU cores.
 
-Where the time of such networks goes (ONNX Runtime, one thread): a 3x3 convolution of 8 channels at half resolution costs as much as one of
-32 channels at an eighth, and runs at half the speed per multiplication. So half resolution sees one strided convolution alone, the depth
-lies at 1/8 and 1/16, the score is made at a quarter and unfolded, and descriptors get their fine detail from one 1x1 at a quarter.
+Where the time of such networks goes (ONNX Runtime, one thread): a 3x3 convolution of 8 channels at half resolution costs twice what one of 32
+channels costs at an eighth, of as many multiplications. So half resolution sees one strided convolution alone, the depth lies at 1/8 and
+1/16, descriptors get their fine detail from one 1x1 at a quarter, and scores are made there, of what half resolution saw, and unfolded.
 """
 
 from __future__ import annotations
