@@ -78,7 +78,7 @@ def train(config: TrainNet) -> None:
         generator = np.random.default_rng([config.seed, step])
         share = config.pair_share if known else 0.0
         parts = _step(network, [draw_sample(lessons, known, share, generator) for _ in range(config.batch)])
-        loss = sum(weight * part for weight, part in zip(_WEIGHTS, parts, strict=True))
+        loss = torch.stack([weight * part for weight, part in zip(_WEIGHTS, parts, strict=True)]).sum()
         optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(network.parameters(), 5.0)
