@@ -10,7 +10,7 @@ import tyro
 
 from topoloc.cli.output import UsageError
 from topoloc.errors import FeatureKindError
-from topoloc.features.kinds import KINDS, SURF, learned_kind
+from topoloc.features.kinds import KINDS, SURF, check_available, learned_kind
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.map.config import MapConfig
 from topoloc.map.topomap import TopoMetricMap
@@ -27,8 +27,8 @@ def kinds_to_build(config: MapConfig, features: str | None) -> MapConfig:
     """The configuration with the kinds of features that the option names, the first one first.
 
     Raises:
-        UsageError: an unknown kind.
-        WeightsError: learned features are wanted, and no network of them is here.
+        UsageError: an unknown kind, or one that is named twice.
+        MissingExtraError, WeightsError: what a kind that is wanted needs is not here.
     """
     if features is None:
         kinds = config.kinds
@@ -41,6 +41,8 @@ def kinds_to_build(config: MapConfig, features: str | None) -> MapConfig:
         raise UsageError(f"no features {unknown[0]!r}; there are {', '.join(KINDS)}")
     if len(set(kinds)) < len(kinds):
         raise UsageError(f"--features {features}: a kind is named twice")
+    for kind in kinds:
+        check_available(kind)
     return replace(config, features=replace(config.features, kind=kinds[0]), other_kinds=tuple(kinds[1:]))
 
 
