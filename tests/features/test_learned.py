@@ -56,7 +56,7 @@ def test_weak_ones_and_those_beside_stronger_ones_are_none_and_of_equals_there_i
     scores[25, 8] = 0.1
     points, found = find_maxima(scores, 32, 32, 4, np.float32(0.1))
     assert sorted(np.rint(points).tolist()) == [[10.0, 10.0], [20.0, 20.0]]
-    np.testing.assert_array_equal(found, np.float32([0.5, 0.2]))
+    np.testing.assert_array_equal(found, np.array([0.5, 0.2], np.float32))
 
 
 # descriptors between the grid's points
