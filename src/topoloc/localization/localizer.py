@@ -24,16 +24,17 @@ from topoloc.localization.asked_kind import AskedKind, kinds_to_ask
 from topoloc.localization.belief import Belief
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.fitted_weights import FittedWeights
-from topoloc.localization.propose import propose
+from topoloc.localization.propose import propose, propose_more
 from topoloc.localization.query import Query, check_size, reduced_image
-from topoloc.localization.refine import hypothesis_of
+from topoloc.localization.refine import hypothesis_of, say_on
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Proposal, Search, Trace
-from topoloc.localization.walls.propose_walls import propose_walls
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.coarse import CoarseLocalizer, Image
 
 __all__ = ["Localizer", "LocalizerConfig"]
+
+_LEAST_SECOND = 1.4  # log odds of a pose that only the features asked first found: twins of the true place come to 1.2
 
 
 class Localizer:
@@ -111,14 +112,24 @@ class Localizer:
             result, named = answer(search)
             if search.is_stopped or (isinstance(result, Localization) and (search.is_clear or search.following is None)):
                 return result, named
-        if len(searches) > 1 and not named and prior is None:  # only the first kind knows of walls
-            walls = replace(searches[0], belief=Belief(), following=None)
-            _follow_up(walls, propose_walls(walls))
-            by_walls = answer(walls)
-            if isinstance(by_walls[0], Localization):
-                return by_walls
+        if len(searches) > 1 and not named and prior is None:
+            of_first = self._second_look(searches[0], searches[-1])
+            if of_first[1]:
+                return of_first
         assert result is not None
         return result, named
+
+    def _second_look(self, first: Search, last: Search) -> tuple[Localization | NotLocalized, list[Answered]]:
+        """What the first kind of features finds by all that it has, where the others found nothing; they are heard on it."""
+        _follow_up(first, propose_more(first))
+        weights = first.weights.rivals
+        believed = [one for one in first.belief.hypotheses if one.probability >= self.config.evidence.min_probability]
+        seconded = Belief()
+        for one in believed:
+            log_odds = one.log_odds if one.is_from_walls else one.log_odds + say_on(last, one)
+            if one.is_from_walls or log_odds >= _LEAST_SECOND:
+                seconded = seconded.given(replace(one, log_odds=log_odds), self.config.evidence, weights)
+        return answer(replace(first, belief=seconded))
 
     def _searches(self, query: Query, trace: Trace | None) -> list[Search]:
         """One by each kind of features, which know each other."""

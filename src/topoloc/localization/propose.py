@@ -41,7 +41,7 @@ _LEAST_FOUND_SHARE = 0.2  # of what is found at a pose, that must be found at on
 
 
 def propose(search: Search, prior: Rigid3 | None) -> Iterator[Proposal]:
-    """All first poses worth a look, each made when it is asked for."""
+    """All first poses worth a look, each made when it is asked for; only the first of them where another kind of features is asked next."""
     if prior is not None:
         yield _pooled(search, "prior", _near(search, prior))
         return
@@ -50,13 +50,19 @@ def propose(search: Search, prior: Rigid3 | None) -> Iterator[Proposal]:
         num_ranked = max(search.config.num_candidates, search.config.look_alikes.num_ranked)
         search.ranked = search.map.coarse.rank(search.query.image, features, num_ranked)
     retrieved = _pooled(search, "retrieval", search.candidates)
+    search.retrieved = retrieved.fit
     yield retrieved
-    if search.following is not None and not search.is_clear:
-        return
-    yield from _of_other_features(search)
+    if search.following is None or search.is_clear:
+        yield from _of_other_features(search)
+        yield from propose_more(search)
+
+
+def propose_more(search: Search) -> Iterator[Proposal]:
+    """What is left to look at once retrieval has had its say, which was the first tried."""
     viewpoints = [] if search.is_clear else list(_viewpoints(search))
     yield from viewpoints
-    if search.is_clear or viewpoints or retrieved.fit.num_inliers >= search.config.num_chance_inliers:
+    assert search.retrieved is not None
+    if search.is_clear or viewpoints or search.retrieved.num_inliers >= search.config.num_chance_inliers:
         yield from _look_alikes(search)
     yield from _repetitions(search)
     yield from propose_walls(search)

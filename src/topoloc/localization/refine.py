@@ -24,6 +24,7 @@ from topoloc.localization.pose_fit import PoseFit, fit_pose
 from topoloc.localization.search import Proposal, Search, Tried
 from topoloc.localization.walls.propose_walls import WallProposal, refine_wall, weigh_wall
 
+_MOST_SAID, _FEW_MATCHES = 3.0, 30.0  # odds, in logarithms, that one kind adds to another's; matches with which it is heard by half
 _HOPELESS = -3.0  # odds, in logarithms, that nothing can mend
 
 
@@ -83,6 +84,16 @@ def weigh(search: Search, proposal: Proposal, final: PoseFit) -> Hypothesis | No
             return None
         log_odds = log_odds_of(evidence, search.weights)
     return Hypothesis(proposal.source, final, evidence, covariance, 1.0 / inflated, log_odds)
+
+
+def say_on(search: Search, hypothesis: Hypothesis) -> float:
+    """What these features say on a pose of others, in logarithms of odds: little where few of them match anything, as in the dark."""
+    final = _around(search, hypothesis.fit)
+    weighed = weigh(search, Proposal("other features", final, is_guided=True), final)
+    if weighed is None:
+        return 0.0
+    num_matches = weighed.evidence.num_matches
+    return float(np.clip(weighed.log_odds, -_MOST_SAID, _MOST_SAID)) * num_matches / (num_matches + _FEW_MATCHES)
 
 
 def _evidence(search: Search, proposal: Proposal, final: PoseFit, covariance: Float[np.ndarray, "6 6"]) -> Evidence | None:

@@ -70,6 +70,8 @@ class Search:
     """That by the kind which is asked where this one leaves it open."""
     belief: Belief = field(default_factory=Belief)
     ranked: list[NodeScore] = field(default_factory=list)
+    retrieved: PoseFit | None = None
+    """What retrieval led to."""
     first: PoseFit | None = None
     """What was tried first: where nothing is believed, it says why."""
     is_repeated: bool = False
