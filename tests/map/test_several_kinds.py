@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from built_room import built_room, room_of_two_kinds, unseen_views
+from built_room import room_of_two_kinds, unseen_views
 from tiny_world import CAMERA
 from topoloc.errors import FeatureKindError, WeightsError
 from topoloc.geometry.alignment import translation_error
@@ -51,11 +51,10 @@ def test_both_kinds_come_back_and_are_saved_again_to_the_byte(of_two: TopoMetric
     assert damages(path) == []
 
 
-def test_the_first_kind_is_what_it_would_be_alone(of_two: TopoMetricMap, tiny_recording: Path):
-    alone = built_room(tiny_recording)
-    assert alone.kinds == ["surf"]  # no network is here
-    assert len(of_two.nodes) == len(alone.nodes)
-    for one, other in zip(of_two.nodes, alone.nodes, strict=True):
+def test_the_first_kind_is_what_it_would_be_alone(of_two: TopoMetricMap, tiny_map: TopoMetricMap):
+    assert tiny_map.kinds == ["surf"]  # no network is here
+    assert len(of_two.nodes) == len(tiny_map.nodes)
+    for one, other in zip(of_two.nodes, tiny_map.nodes, strict=True):
         np.testing.assert_array_equal(one.points_cam, other.points_cam)
         np.testing.assert_array_equal(one.features.descriptors, other.features.descriptors)
 
@@ -73,7 +72,7 @@ def test_it_localizes_by_the_second_kind_alone(path: Path):
     assert (by_sift.kinds, by_sift.config.kinds, by_sift.sides) == (["sift"], ["sift"], None)
     localizer = Localizer(by_sift)
     results = [(localizer.localize(picture, CAMERA), truth) for picture, truth in unseen_views()]
-    assert all(isinstance(result, Localization) and translation_error(result.world_from_cam, truth) < 0.02 for result, truth in results)
+    assert all(isinstance(result, Localization) and translation_error(result.world_from_cam, truth) < 0.03 for result, truth in results)
 
 
 def test_it_is_itself_by_its_first_kind_and_nothing_by_one_that_it_does_not_hold(of_two: TopoMetricMap):
