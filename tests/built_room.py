@@ -12,6 +12,7 @@ import numpy as np
 from tiny_world import CAMERA, path_pose, render, room, tum_line
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.map_facts.building import build_map
+from topoloc.map.build import BuildConfig
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.open import open_sequence
 
@@ -20,6 +21,12 @@ from topoloc.sequences.open import open_sequence
 def built_room(recording: Path) -> TopoMetricMap:
     """The map of the recording `tiny_recording`."""
     return build_map(open_sequence(recording))
+
+
+@cache
+def room_of_two_kinds(recording: Path) -> TopoMetricMap:
+    """A map of every other pair, of SURF and SIFT."""
+    return build_map(open_sequence(f"{recording}@0::2"), BuildConfig(other_kinds=("sift",)))
 
 
 @cache

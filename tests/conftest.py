@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import pkgutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -38,6 +38,14 @@ def shared() -> Path:
     if not (SHARED / "data").is_dir():
         pytest.skip(f"no recordings at {SHARED} (set TOPOLOC_SHARED)")
     return SHARED
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_networks_but_the_tests_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """An empty cache: what a test finds does not depend on what its user has fetched."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TOPOLOC_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -4,18 +4,34 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import onnx
-from onnx import TensorProto, helper
+from onnx import TensorProto, helper, numpy_helper
+
+STRIDE = 8
 
 
-def write_network(path: Path, name: str = "xfeat", version: str = "1", outputs: tuple[str, str] = ("scores", "descriptors")) -> Path:
-    """The smallest network of the contract: the picture as its scores, a descriptor of its means."""
+def cells(descriptor_size: int = 64) -> np.ndarray:
+    """The weights of its descriptors: each is as many sums over the pixels of a cell."""
+    return np.random.default_rng(0).normal(size=(descriptor_size, 1, STRIDE, STRIDE)).astype(np.float32)
+
+
+def write_network(
+    path: Path,
+    name: str = "xfeat",
+    version: str = "1",
+    outputs: tuple[str, str] = ("scores", "descriptors"),
+    descriptor_size: int = 64,
+) -> Path:
+    """The smallest network of the contract: the picture as its scores, sums over each cell as a descriptor."""
     nodes = [
         helper.make_node("Identity", ["image"], [outputs[0]]),
-        helper.make_node("AveragePool", ["image"], [outputs[1]], kernel_shape=[8, 8], strides=[8, 8]),
+        helper.make_node("Conv", ["image", "cells"], [outputs[1]], kernel_shape=[STRIDE, STRIDE], strides=[STRIDE, STRIDE]),
     ]
-    values = [helper.make_tensor_value_info(n, TensorProto.FLOAT, [1, 1, None, None]) for n in ("image", *outputs)]
-    model = helper.make_model(helper.make_graph(nodes, "tiny", values[:1], values[1:]), opset_imports=[helper.make_opsetid("", 17)])
+    sizes = {"image": 1, outputs[0]: 1, outputs[1]: descriptor_size}
+    values = [helper.make_tensor_value_info(n, TensorProto.FLOAT, [1, size, None, None]) for n, size in sizes.items()]
+    graph = helper.make_graph(nodes, "tiny", values[:1], values[1:], [numpy_helper.from_array(cells(descriptor_size), "cells")])
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)])
     model.ir_version = 8
     helper.set_model_props(model, {"topoloc_network": name, "topoloc_version": version})
     onnx.save(model, path)

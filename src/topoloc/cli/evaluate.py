@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from topoloc.cli.features_option import ASKED_FEATURES, kinds_to_ask
+from topoloc.cli.features_option import ASKED_FEATURES, localizer_of
 from topoloc.cli.info import describe_map
 from topoloc.cli.output import (
     File,
@@ -29,7 +29,7 @@ from topoloc.errors import TrajectoryError
 from topoloc.evaluation.experiments import answer_elsewhere, answer_queries
 from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION, Answer, summarize
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.localizer import LocalizerConfig
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import open_sequence
@@ -74,7 +74,7 @@ class Command:
         map_from_truth = _read_rigid(Path(self.map_from_truth)) if self.map_from_truth else None
         sequences = [open_sequence(path, self.format) for path in self.sequences]
         others = [open_sequence(path, self.format) for path in self.elsewhere]
-        localizer = Localizer(topomap, kinds_to_ask(topomap, config, self.features))
+        localizer = localizer_of(topomap, config, self.features)
         labels = _labels([*self.sequences, *self.elsewhere], [*sequences, *others])
         answers: list[Answer] = []
         with progress_bar() as progress:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from typing import Annotated
 
@@ -9,8 +10,8 @@ import tyro
 
 from topoloc.cli.output import UsageError
 from topoloc.errors import FeatureKindError
-from topoloc.features.kinds import KINDS, SURF, learned_kind
-from topoloc.localization.config import LocalizerConfig
+from topoloc.features.kinds import KINDS, SURF, check_available, learned_kind
+from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.map.config import MapConfig
 from topoloc.map.topomap import TopoMetricMap
 
@@ -26,8 +27,8 @@ def kinds_to_build(config: MapConfig, features: str | None) -> MapConfig:
     """The configuration with the kinds of features that the option names, the first one first.
 
     Raises:
-        UsageError: an unknown kind.
-        WeightsError: learned features are wanted, and no network of them is here.
+        UsageError: an unknown kind, or one that is named twice.
+        MissingExtraError, WeightsError: what a kind that is wanted needs is not here.
     """
     if features is None:
         kinds = config.kinds
@@ -40,15 +41,25 @@ def kinds_to_build(config: MapConfig, features: str | None) -> MapConfig:
         raise UsageError(f"no features {unknown[0]!r}; there are {', '.join(KINDS)}")
     if len(set(kinds)) < len(kinds):
         raise UsageError(f"--features {features}: a kind is named twice")
+    for kind in kinds:
+        check_available(kind)
     return replace(config, features=replace(config.features, kind=kinds[0]), other_kinds=tuple(kinds[1:]))
 
 
-def kinds_to_ask(topomap: TopoMetricMap, config: LocalizerConfig, features: str | None) -> LocalizerConfig:
-    """The configuration with those of the map's kinds of features that the option names.
+def localizer_of(topomap: TopoMetricMap, config: LocalizerConfig, features: str | None) -> Localizer:
+    """Asks the map by the kinds of features that the option names; one line on standard error for each of the map's that cannot be asked.
 
     Raises:
-        FeatureKindError: the map holds none of them.
+        FeatureKindError: the map does not hold them.
+        MissingExtraError, WeightsError: what they need is not here.
     """
+    localizer = Localizer(topomap, _with_kinds(topomap, config, features))
+    for kind, lacking in localizer.left_out.items():
+        print(f"warning: features {kind} of the map are not asked: {lacking}", file=sys.stderr)
+    return localizer
+
+
+def _with_kinds(topomap: TopoMetricMap, config: LocalizerConfig, features: str | None) -> LocalizerConfig:
     if features is None:
         return config
     if features == "both":

@@ -78,6 +78,7 @@ def describe_map(topomap: Any, path: Path) -> dict[str, Any]:
         "edits": [asdict(edit) for edit in topomap.edits],
         "coarse": sorted(topomap.coarse_models),
         "default_coarse": topomap.default_coarse,
+        "kinds": topomap.kinds,
         "coarse_models": list_coarse(path),
         "config": topomap.config.to_json(),
     }
@@ -89,7 +90,7 @@ def _session_facts(session: Any) -> dict[str, Any]:
 
 
 def _print(info: dict[str, Any]) -> None:
-    nodes, features = info["config"].get("nodes", {}), info["config"].get("features", {})
+    nodes, normalization = info["config"].get("nodes", {}), info["config"].get("features", {}).get("normalization")
     nan = float("nan")
     print_facts(
         [
@@ -102,7 +103,7 @@ def _print(info: dict[str, Any]) -> None:
             ("recordings", ", ".join(info["recordings"])),
             *(("coarse localizer", _coarse_line(facts, info["default_coarse"])) for facts in info["coarse_models"]),
             ("Eq. 1", f"D_thresh {nodes.get('d_thresh', nan):.3g} m, lambda {nodes.get('lambda_rot', nan):.3g} m/rad"),
-            ("features", ", ".join(f"{key} {value}" for key, value in features.items() if isinstance(value, str))),
+            ("features", ", ".join(info["kinds"]) + (f", normalization {normalization}" if normalization else "")),
             *([("check", info["check"])] if "check" in info else []),
         ]
     )

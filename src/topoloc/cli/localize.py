@@ -11,7 +11,7 @@ from typing import Annotated
 
 import tyro
 
-from topoloc.cli.features_option import ASKED_FEATURES, kinds_to_ask
+from topoloc.cli.features_option import ASKED_FEATURES, localizer_of
 from topoloc.cli.output import File, Flag, Format, UsageError, check_outputs, interruptible, progress_bar, write_text
 from topoloc.cli.query_answers import QueryAnswer, answer_line, exit_status, stream_summary, trajectory_of
 from topoloc.cli.settings_file import read_settings, with_option
@@ -99,7 +99,7 @@ class Command:
         topomap = TopoMetricMap.load(self.map)
         camera = None if self.camera is None else _camera_of_size(self.camera, topomap)
         queries = [self._open(path) for path in self.inputs]
-        localizer = Localizer(topomap, kinds_to_ask(topomap, config, self.features))
+        localizer = localizer_of(topomap, config, self.features)
         answers: list[QueryAnswer] = []
         total = sum(len(query.sequence) for query in queries)
         start = time.perf_counter()

@@ -80,7 +80,7 @@ def fetch_network(name: str) -> Path:
     """Fetch the published weights of a network, check their hash, and keep the network in the cache.
 
     Raises:
-        WeightsError: unknown, not to be fetched, of another hash; as `keep_network`.
+        WeightsError: unknown, of another hash, or of a package, which is then named; as `keep_network`.
     """
     network = known_network(name)
     if not network.url:

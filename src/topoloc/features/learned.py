@@ -63,22 +63,25 @@ def extract_learned(image: UInt8[np.ndarray, "h w"], config: LearnedConfig) -> F
 
 def check_network(network: str) -> None:
     """Is the network there? Raises as `extract_learned`."""
-    _session(find_network(network), compiled.num_threads(), os.getpid())
+    _session(network, find_network(network), compiled.num_threads(), os.getpid())
 
 
 def run_network(
     image: UInt8[np.ndarray, "h w"], network: str, num_threads: int | None = None
-) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "d h/s w/s"]]:
+) -> tuple[Float32[np.ndarray, "padded_h padded_w"], Float32[np.ndarray, "d grid_h grid_w"]]:
     """The scores and the dense descriptors (not normalised) of a picture, which is continued by its border to the sides asked."""
     height, width = image.shape
     padding = [(0, -side % _SIDE_MULTIPLE) for side in (height, width)]
     grey = np.pad(image, padding, mode="edge").astype(np.float32) / np.float32(255.0)
-    session = _session(find_network(network), num_threads or compiled.num_threads(), os.getpid())
+    session = _session(network, find_network(network), num_threads or compiled.num_threads(), os.getpid())
     scores, dense = session.run(["scores", "descriptors"], {"image": grey[None, None]})
     return scores[0, 0], dense[0]
 
 
 @functools.lru_cache(maxsize=8)
-def _session(path: Path, num_threads: int, process_id: int) -> Any:
+def _session(network: str, path: Path, num_threads: int, process_id: int) -> Any:
     """The network made ready; a forked child makes its own."""
-    return open_network(path, num_threads)[1]
+    known, session = open_network(path, num_threads)
+    if known.name != network:
+        raise WeightsError(f"network {path}: holds {known.name}, not {network}")
+    return session

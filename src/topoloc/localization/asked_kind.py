@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 from topoloc.errors import MissingExtraError, WeightsError
@@ -36,18 +35,22 @@ class AskedKind:
         return AskedKind(opened, c, weights, rho)
 
 
-def kinds_to_ask(topomap: TopoMetricMap, wanted: tuple[str, ...] | None) -> Iterator[str]:
-    """The kinds of features by which a map is asked, in turn: those that are wanted, else all whose networks are there.
+def kinds_to_ask(topomap: TopoMetricMap, wanted: tuple[str, ...] | None) -> tuple[list[str], dict[str, str]]:
+    """The kinds of features by which a map is asked, in turn: those that are wanted, else all whose networks are here. And those of the
+    map that are left out, each with what it lacks.
 
     Raises:
-        MissingExtraError, WeightsError: a network that is wanted, or that the map cannot be asked without, is not there.
+        MissingExtraError, WeightsError: what a kind that is wanted needs is not here, or what each kind of the map needs.
     """
-    first, *others = wanted if wanted is not None else topomap.kinds
-    for kind in (first, *others):
+    asked, left_out, first = list[str](), dict[str, str](), None
+    for kind in wanted or topomap.kinds:
         try:
             check_available(kind)
-        except (MissingExtraError, WeightsError):
-            if wanted is not None or kind == first:
+            asked.append(kind)
+        except (MissingExtraError, WeightsError) as error:
+            if wanted:
                 raise
-            continue
-        yield kind
+            first, left_out[kind] = first or error, str(error)
+    if first is not None and not asked:
+        raise first
+    return asked, left_out

@@ -40,6 +40,9 @@ _LEAST_SECOND = 1.4  # log odds of a pose that only the features asked first fou
 class Localizer:
     """Holds an open map, its coarse localizer and the nodes used lately.
 
+    `left_out` names the map's kinds of features that are not asked because their network, or ONNX Runtime, is not here, each with what it
+    lacks.
+
     Args:
         coarse: names the candidate nodes instead of one of the map's own coarse localizers: any object with `CoarseLocalizer.rank`
             (`topoloc/places/coarse.py`), such as retrieval of another kind or a prior from elsewhere. `config.coarse` is then left aside.
@@ -50,6 +53,7 @@ class Localizer:
         FeatureKindError: the map's features are of a kind that there is not.
         EmptyMapError: the map has no node.
         MapError: the map has no such coarse localizer.
+        MissingExtraError, WeightsError: a network of features is not here, and the map has no others, or `config.kinds` names them.
     """
 
     def __init__(
@@ -62,7 +66,7 @@ class Localizer:
         config = config or LocalizerConfig()
         check_bounds(config)
         self.topomap = topomap
-        kinds = list(kinds_to_ask(topomap, config.kinds))
+        kinds, self.left_out = kinds_to_ask(topomap, config.kinds)
         self._kinds = [AskedKind.of(topomap.by_kind(kind), config, coarse, weights if kind == kinds[0] else None) for kind in kinds]
         self.map, self.config, self.weights = self._kinds[0].map, self._kinds[0].config, self._kinds[0].weights
 

@@ -155,7 +155,7 @@ def _of_other_features(search: Search) -> Iterator[Proposal]:
     if before is None or search.is_clear:
         return
     for hypothesis in before.belief.ranked(before.weights.rivals)[:_MAX_OTHERS]:
-        fit = _around_pose(search, hypothesis.world_from_cam, hypothesis.fit.camera, config.evidence.min_found)
+        fit = _around_pose(search, hypothesis.world_from_cam, hypothesis.fit.camera, float(config.evidence.min_found))
         if fit is not None:
             yield Proposal("other features", fit, is_guided=True)
 

@@ -36,11 +36,9 @@ from topoloc.sequences.frame_view import FrameView, frame_view
 from topoloc.sequences.pictures import jpeg_of
 from topoloc.slam.metric_points import keypoint_sigmas, locate_points
 
+BuildConfig = MapConfig
 Progress = Callable[[str, int, int], None]
 """Called with a stage's name, steps done and steps in all."""
-
-
-BuildConfig = MapConfig
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,8 +111,7 @@ def build_map(
     check_bounds(config)
     config = replace(config, other_kinds=tuple(config.kinds[1:]))
     progress = progress or (lambda stage, done, total: None)
-    if isinstance(sequences, StereoSequence):
-        sequences = [sequences]
+    sequences = [sequences] if isinstance(sequences, StereoSequence) else sequences
     frames = [frame for session_id, sequence in enumerate(sequences) for frame in _posed_frames(sequence, session_id)]
     node_config = _resolve_node_config(frames, config)
     drafts = _draft_nodes(frames, node_config, config, progress)

@@ -193,6 +193,7 @@ def _node_at(file: MapFile, kind: str, prefix: str, is_default: bool, row: int) 
             raise Damage(f"node {node_id} has {n} points")
         if points["descriptor_size"] != size:
             raise Damage(f"the points of {what} are not described as {kind} is")
+        summary = summary if summary.num_points == n else replace(summary, num_points=n)
         stored = array_from(points["descriptors"], "i1", (n, size), what)
         sizes, angles, responses = np.ascontiguousarray(array_from(points["shapes"], "<f4", (n, 3), what).T)
         points_img = array_from(points["points_img"], "<f4", (n, 2), what)

