@@ -62,9 +62,11 @@ def main() -> None:
         poses = [pose for path in asked.load for pose in load_poses(path)]
     else:
         poses = ask_places(asked.kind, asked.shared.resolve() / "data", asked.rendered, asked.step, asked.save, asked.families)
-    verdicts = {(family_of(pose.mapping), pose.is_right) for pose in decided(poses)}
-    if sum((family, False) in verdicts and (family, True) in verdicts for family in set(FAMILIES.values())) < 2:
-        raise SystemExit("error: right and wrong poses of two families of places are needed")
+    wrong_of = {pose.queries if asked.by_recording else family_of(pose.mapping) for pose in decided(poses) if pose.is_wrong}
+    right_of = {pose.queries if asked.by_recording else family_of(pose.mapping) for pose in decided(poses) if pose.is_right}
+    if len(wrong_of) < 2 or len(right_of) < 2:
+        parts = "recordings" if asked.by_recording else "families of places"
+        raise SystemExit(f"error: right and wrong poses of two {parts} are needed")
     weights = fit(asked.kind, poses, asked.step, asked.by_recording)
     if asked.out:
         asked.out.write_text(json.dumps(weights.to_json(), indent=2) + "\n")
