@@ -86,7 +86,7 @@ def test_the_default_changes_when_asked_to_and_the_map_can_stay_as_it_is(
 def test_cnn_fc_needs_no_weights_and_says_what_that_costs(copied_map: Path, small: tuple[str, ...], capsys: pytest.CaptureFixture[str]):
     assert main(["train", str(copied_map), "--coarse", "cnn-fc", "--backbone", "compact", "--weights", "scratch", *small]) == 0
     assert "knows these images alone" in capsys.readouterr().err
-    (facts, _) = list_coarse(copied_map)
+    facts, *_ = list_coarse(copied_map)
     assert facts["trained"]["epochs"] == 1
     assert facts["weights"] is None
 
