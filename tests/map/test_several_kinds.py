@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 from built_room import room_of_two_kinds, unseen_views
 from tiny_world import CAMERA
 from topoloc.errors import FeatureKindError, WeightsError
+from topoloc.features import learned
+from topoloc.features.kinds import learned_kind
 from topoloc.geometry.alignment import translation_error
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.building import build_map
@@ -52,7 +55,6 @@ def test_both_kinds_come_back_and_are_saved_again_to_the_byte(of_two: TopoMetric
 
 
 def test_the_first_kind_is_what_it_would_be_alone(of_two: TopoMetricMap, tiny_map: TopoMetricMap):
-    assert tiny_map.kinds == ["surf"]  # no network is here
     assert len(of_two.nodes) == len(tiny_map.nodes)
     for one, other in zip(of_two.nodes, tiny_map.nodes, strict=True):
         np.testing.assert_array_equal(one.points_cam, other.points_cam)
@@ -89,7 +91,10 @@ def test_kinds_that_cannot_be_had_are_told_before_the_work(tiny_recording: Path)
         assert not done
 
 
-def test_beside_surf_stand_the_learned_ones_that_are_here_unless_others_are_named():
+def test_beside_surf_stand_the_learned_ones_that_are_here_unless_others_are_named(monkeypatch: pytest.MonkeyPatch):
+    assert MapConfig().kinds == ["surf", learned_kind()]
+    learned._session.cache_clear()
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
     assert MapConfig().kinds == ["surf"]
     assert MapConfig(other_kinds=("sift",)).kinds == ["surf", "sift"]
     sift = MapConfig(other_kinds=("sift",)).features_of("sift")

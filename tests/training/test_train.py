@@ -56,7 +56,7 @@ def test_a_map_learns_and_is_asked(
     written = json.loads(facts.read_text())
     assert written["weights"]["file"] == "squeezenet.pth"
     after = TopoMetricMap.load(copied_map)
-    assert (sorted(after.coarse_models), after.default_coarse) == (["cnn-nn", "surf-vlad"], "surf-vlad")
+    assert (sorted(after.coarse_models), after.default_coarse) == (["cnn-nn", "surf-vlad", "surf-vlad@topoloc-net"], "surf-vlad")
     assert after.nodes[0].template_jpeg == before.nodes[0].template_jpeg
     assert main(["evaluate", str(copied_map), str(queries), "--coarse", "cnn-nn", "--json", str(facts)]) == 0
     evaluation = json.loads(facts.read_text())
@@ -86,7 +86,7 @@ def test_the_default_changes_when_asked_to_and_the_map_can_stay_as_it_is(
 def test_cnn_fc_needs_no_weights_and_says_what_that_costs(copied_map: Path, small: tuple[str, ...], capsys: pytest.CaptureFixture[str]):
     assert main(["train", str(copied_map), "--coarse", "cnn-fc", "--backbone", "compact", "--weights", "scratch", *small]) == 0
     assert "knows these images alone" in capsys.readouterr().err
-    (facts, _) = list_coarse(copied_map)
+    facts, *_ = list_coarse(copied_map)
     assert facts["trained"]["epochs"] == 1
     assert facts["weights"] is None
 

@@ -127,7 +127,7 @@ def open_coarse_of(topomap: TopoMetricMap, name: str) -> CoarseLocalizer:
     if (of_kind := f"{name}@{topomap.kind}") in topomap.coarse_models:
         name = of_kind
     if name not in topomap.coarse_models:
-        available = ", ".join(topomap.coarse_models) or "none"
+        available = ", ".join(name for name in topomap.coarse_models if "@" not in name) or "none"
         raise MapError(f"the map has no coarse localizer {name!r} (it has: {available})")
     return open_coarse(in_rows(topomap.coarse_models[name], [summary.node_id for summary in topomap.summaries]))
 
