@@ -19,8 +19,8 @@ from topoloc.sequences.open import open_sequence
 
 @cache
 def built_room(recording: Path) -> TopoMetricMap:
-    """The map of the recording `tiny_recording`."""
-    return build_map(open_sequence(recording))
+    """The map of the recording `tiny_recording`, of SURF alone."""
+    return build_map(open_sequence(recording), BuildConfig(other_kinds=()))
 
 
 @cache

@@ -110,7 +110,8 @@ class Localizer:
         for search in searches:
             _follow_up(search, propose(search, prior))
             result, named = answer(search)
-            if search.is_stopped or (isinstance(result, Localization) and (search.is_clear or search.following is None)):
+            is_settled = search.is_clear or search.following is None or prior is not None
+            if search.is_stopped or (isinstance(result, Localization) and is_settled):
                 return result, named
         if len(searches) > 1 and not named and prior is None:
             of_first = self._second_look(searches[0], searches[-1])
