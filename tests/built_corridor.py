@@ -16,6 +16,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.map_facts.building import build_map
+from topoloc.map.build import BuildConfig
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.frame import StereoFrame
 
@@ -88,8 +89,8 @@ class WalkAhead:
 
 @cache
 def built_corridor() -> TopoMetricMap:
-    """The map of the walk ahead, with side nodes."""
-    return build_map(WalkAhead(0))
+    """The map of the walk ahead, with side nodes, of SURF alone."""
+    return build_map(WalkAhead(0), BuildConfig(other_kinds=()))
 
 
 @cache

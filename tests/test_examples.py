@@ -136,7 +136,7 @@ def test_train_classifier(run: Run, coarse: str, tmp_path: Path, request: pytest
     if coarse == "cnn-nn":
         weights = ("--weights", request.getfixturevalue("shared") / "weights/squeezenet1_1-imagenet-features.pth")
     printed = run("train_classifier", "--epochs", 1, *weights)
-    assert set(TopoMetricMap.load(tmp_path / "lab_learned.topo").coarse_models) == {"surf-vlad", coarse}
+    assert set(TopoMetricMap.load(tmp_path / "lab_learned.topo").coarse_models) >= {"surf-vlad", coarse}
     near = re.search(rf"^{coarse}: .* in (\d+) %$", printed, re.MULTILINE)
     assert near
     if coarse == "cnn-nn":  # one epoch from nothing promises little

@@ -56,7 +56,7 @@ def test_a_map_learns_and_is_asked(
     written = json.loads(facts.read_text())
     assert written["weights"]["file"] == "squeezenet.pth"
     after = TopoMetricMap.load(copied_map)
-    assert (sorted(after.coarse_models), after.default_coarse) == (["cnn-nn", "surf-vlad", "surf-vlad@topoloc-net"], "surf-vlad")
+    assert (sorted(after.coarse_models), after.default_coarse) == (["cnn-nn", "surf-vlad"], "surf-vlad")
     assert after.nodes[0].template_jpeg == before.nodes[0].template_jpeg
     assert main(["evaluate", str(copied_map), str(queries), "--coarse", "cnn-nn", "--json", str(facts)]) == 0
     evaluation = json.loads(facts.read_text())

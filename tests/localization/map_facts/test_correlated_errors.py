@@ -61,7 +61,7 @@ def measurings(monkeypatch: pytest.MonkeyPatch) -> list[TopoMetricMap]:
 @pytest.fixture
 def saved(tiny_recording: Path, tmp_path: Path) -> Path:
     path = tmp_path / "room.topo"
-    topoloc.build_map(topoloc.open_sequence(tiny_recording)).save(path)
+    topoloc.build_map(topoloc.open_sequence(tiny_recording), topoloc.BuildConfig(other_kinds=())).save(path)
     return path
 
 
