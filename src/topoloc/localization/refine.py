@@ -89,11 +89,12 @@ def weigh(search: Search, proposal: Proposal, final: PoseFit) -> Hypothesis | No
 def say_on(search: Search, hypothesis: Hypothesis) -> float:
     """What these features say on a pose of others, in logarithms of odds: little where few of them match anything, as in the dark."""
     final = _around(search, hypothesis.fit)
-    weighed = weigh(search, Proposal("other features", final, is_guided=True), final)
-    if weighed is None:
+    if final.num_inliers < search.config.evidence.min_found:
         return 0.0
-    num_matches = weighed.evidence.num_matches
-    return float(np.clip(weighed.log_odds, -_MOST_SAID, _MOST_SAID)) * num_matches / (num_matches + _FEW_MATCHES)
+    weighed = weigh(search, Proposal("other features", final, is_guided=True), final)
+    num_matches = len(_unguided(search, final).matches) if weighed is None else weighed.evidence.num_matches
+    log_odds = -_MOST_SAID if weighed is None else weighed.log_odds  # None: it is hopeless
+    return float(np.clip(log_odds, -_MOST_SAID, _MOST_SAID)) * num_matches / (num_matches + _FEW_MATCHES)
 
 
 def _evidence(search: Search, proposal: Proposal, final: PoseFit, covariance: Float[np.ndarray, "6 6"]) -> Evidence | None:
