@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 
 from topoloc.sequences.open import open_sequence
-from topoloc.sequences.picture_headers import header_size
+from topoloc.sequences.pictures import image_size
 
 
 def least_ms(action: Callable[[], object], repetitions: int) -> float:
@@ -28,8 +28,8 @@ def main(paths: list[str]) -> None:
         sequence = open_sequence(path)
         open_ms = least_ms(lambda path=path: open_sequence(path), 5)
         frame_ms = least_ms(lambda sequence=sequence: sequence[0], 20)
-        data = (sequence.root / sequence.names[0]).read_bytes()
-        check_ms = least_ms(lambda data=data: header_size(data), 20)
+        first = sequence.root / sequence.names[0]
+        check_ms = least_ms(lambda first=first: image_size(first), 20)
         print(f"{path[-40:]:40s} {len(sequence):6d} {open_ms:8.2f} {frame_ms:8.2f} {check_ms:8.3f}")
 
 

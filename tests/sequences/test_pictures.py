@@ -1,4 +1,6 @@
+import os
 import struct
+import sys
 import zlib
 from pathlib import Path
 
@@ -64,14 +66,33 @@ def test_grey_of_colour_and_of_grey():
     assert grey_image(grey) is grey
 
 
-def test_exif_orientation_is_not_applied(tmp_path: Path):
+def test_exif_orientation_is_obeyed(tmp_path: Path):
     jpeg = cv2.imencode(".jpg", smooth(3))[1].tobytes()
     tiff = b"II*\0" + struct.pack("<IHHHIII", 8, 1, 0x0112, 3, 1, 6, 0)
     exif = b"\xff\xe1" + struct.pack(">H", 2 + 6 + len(tiff)) + b"Exif\0\0" + tiff
     path = tmp_path / "turned.jpg"
     path.write_bytes(jpeg[:2] + exif + jpeg[2:])
-    assert image_size(path) == (320, 240)
-    assert read_image(path).shape == (240, 320, 3)
+    assert image_size(path) == (240, 320)
+    upright = cv2.cvtColor(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    np.testing.assert_allclose(read_image(path).astype(int), np.rot90(upright, -1).astype(int), atol=2)
+
+
+def test_heic_is_read_where_its_decoder_is(tmp_path: Path):
+    pytest.importorskip("pi_heif", reason="the extra heic is not installed")
+    y, x = np.mgrid[:48, :64]
+    path = Path(__file__).parent / "pictures" / "ramp.heic"
+    np.testing.assert_allclose(read_image(path), np.stack([4 * x, 5 * y, np.full_like(x, 90)], axis=2), atol=12)
+    assert image_size(path) == (64, 48)
+    (tmp_path / "cut.heic").write_bytes(path.read_bytes()[:300])
+    with pytest.raises(UnreadableImageError, match=r"cut\.heic"):
+        read_image(tmp_path / "cut.heic")
+
+
+def test_heic_without_its_decoder_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "pi_heif", None)
+    (tmp_path / "a.heic").write_bytes(b"x" * 100)
+    with pytest.raises(UnreadableImageError, match=r"a\.heic.*topoloc\[heic\]"):
+        read_image(tmp_path / "a.heic")
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg", "bmp", "tiff", "webp", "ppm"])
@@ -132,7 +153,7 @@ def test_missing_empty_and_folder(tmp_path: Path):
 
 def test_too_large_is_refused_before_it_is_decoded(tmp_path: Path):
     (tmp_path / "bomb.png").write_bytes(png(20_000, 20_000, 0, b""))
-    with pytest.raises(UnreadableImageError, match=r"20000x20000.*100 megapixels"):
+    with pytest.raises(UnreadableImageError, match=r"bomb\.png.*100 megapixels"):
         read_image(tmp_path / "bomb.png")
     with pytest.raises(UnreadableImageError, match="megapixels"):
         image_size(tmp_path / "bomb.png")
@@ -154,3 +175,33 @@ def test_depth_in_metres_unknown_is_nan(tmp_path: Path):
 def test_depth_of_eight_bits_is_refused(tmp_path: Path):
     with pytest.raises(UnreadableImageError, match="16 bits"):
         read_depth(write(tmp_path / "d.png", picture(0)), 1000.0)
+
+
+def test_a_pipe_and_odd_names_are_refused(tmp_path: Path):
+    os.mkfifo(tmp_path / "a.png")
+    with pytest.raises(UnreadableImageError, match="not a file"):
+        read_image(tmp_path / "a.png")
+    with pytest.raises(UnreadableImageError, match="not the name"):
+        read_image(tmp_path / "a\0b.png")
+
+
+@pytest.mark.parametrize("header", [b"P5" + b" " * 41, b"P5\n" + b"9" * 5000 + b" 1 255\n", b"P5 0 0 255\n", b"P6 9 9 70000\n"])
+def test_odd_pnm_headers_are_refused_at_once(tmp_path: Path, header: bytes):
+    (tmp_path / "a.pgm").write_bytes(header)
+    with pytest.raises(UnreadableImageError, match=r"a\.pgm"):
+        read_image(tmp_path / "a.pgm")
+
+
+@pytest.mark.parametrize("suffix", ["tiff", "webp", "png"])
+def test_size_is_known_before_decoding(tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch):
+    path = tmp_path / f"large.{suffix}"
+    path.write_bytes(cv2.imencode(f".{suffix}", smooth(3))[1].tobytes())
+    monkeypatch.setattr("topoloc.sequences.pictures.MAX_PIXELS", 1000)
+    monkeypatch.setattr("PIL.ImageFile.ImageFile.load", lambda self: pytest.fail("decoded"))
+    with pytest.raises(UnreadableImageError, match="320x240"):
+        read_image(path)
+
+
+def test_sixteen_bits_of_colour_become_eight(tmp_path: Path):
+    levels = np.linspace(0, 65535, 24 * 32 * 3).astype(np.uint16).reshape(24, 32, 3)
+    np.testing.assert_allclose(read_image(write(tmp_path / "a.png", levels)), levels[:, :, ::-1] / 257.0, atol=1.0)

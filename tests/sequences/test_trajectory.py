@@ -147,3 +147,22 @@ def test_euroc_trajectory_in_nanoseconds(euroc: Path, tmp_path: Path):
     path.write_text("".join(f"{tum_line(f'{t_ns}.000000', pose(i))}\n" for i, t_ns in enumerate(sequence.t_ns)))
     for index, found in enumerate(with_trajectory(sequence, path).poses):
         assert_same_pose(found, pose(index))
+
+
+def test_times_beyond_all_clocks_are_refused_at_once(tmp_path: Path):
+    (tmp_path / "a.tum").write_text(f"1e999999999999 {tum_line('0', pose(0)).partition(' ')[2]}\n")
+    with pytest.raises(TrajectoryError, match=r"line 1.*not a time"):
+        read_trajectory(tmp_path / "a.tum")
+
+
+@pytest.mark.parametrize("turned", [1.0, -1.0])
+def test_rotations_of_kitti_rows_are_made_exact(tmp_path: Path, turned: float):
+    row = np.hstack([turned * (pose(1).rotation + 1e-4 * np.arange(9).reshape(3, 3)), np.zeros((3, 1))])
+    (tmp_path / "a.txt").write_text(" ".join(f"{value:.12f}" for value in row.ravel()) + "\n")
+    if turned < 0:
+        with pytest.raises(TrajectoryError, match="line 1: not a rotation"):
+            read_trajectory(tmp_path / "a.txt")
+        return
+    rotation = read_trajectory(tmp_path / "a.txt").world_from_cam[0].rotation
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-14)
+    np.testing.assert_allclose(rotation, pose(1).rotation, atol=2e-3)

@@ -24,6 +24,7 @@ MODELS: dict[str, tuple[str, ...]] = {
     "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
+_LEAST_FOCAL, _MOST_FOCAL = 1e-3, 1e4  # times the longer side of the picture; real lenses have 0.2 to 100
 _TWO_FOCAL = {"SIMPLE_PINHOLE": "PINHOLE", "SIMPLE_RADIAL": "OPENCV", "RADIAL": "OPENCV"}
 
 
@@ -32,7 +33,7 @@ class Camera:
     """One camera: COLMAP model name, image size in pixels, parameters in the model's order.
 
     Raises:
-        CalibrationError: unknown model, wrong number of parameters, values not finite, focal length not positive.
+        CalibrationError: unknown model, wrong number of parameters, values not finite, focal length not positive or of no lens.
     """
 
     model: str
@@ -50,6 +51,9 @@ class Camera:
             raise CalibrationError(f"camera parameters are not finite: {self.params}")
         if self.width < 1 or self.height < 1 or self.fx <= 0 or self.fy <= 0:
             raise CalibrationError(f"camera needs a positive size and focal length, not {self.width}x{self.height}, f = {self.fx:g}")
+        side = max(self.width, self.height)
+        if not all(_LEAST_FOCAL < focal / side < _MOST_FOCAL for focal in (self.fx, self.fy)):
+            raise CalibrationError(f"no lens has a focal length of {self.fx:g}, {self.fy:g} pixels with a picture of {side} pixels")
 
     @staticmethod
     def pinhole(width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> Camera:

@@ -31,7 +31,7 @@ def read_camera_json(path: Path) -> CameraFile:
     """
     try:
         data = json.loads(read_text(path, CalibrationError, "no such camera file"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise CalibrationError(f"{path}: not a JSON file ({error})") from None
     if not isinstance(data, dict):
         raise CalibrationError(f"{path}: not a JSON object")
@@ -45,6 +45,10 @@ def _positive(data: dict[str, object], key: str) -> float | None:
     value = data.get(key)
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value <= 0:
-        raise CalibrationError(f"{key} must be a positive number, not {value!r}")
-    return float(value)
+    try:
+        number = math.nan if isinstance(value, bool) or not isinstance(value, int | float) else float(value)
+    except OverflowError:  # an integer of hundreds of digits
+        number = math.inf
+    if not 0.0 < number < math.inf:
+        raise CalibrationError(f"{key} must be a positive number, not {str(value)[:40]}")
+    return number

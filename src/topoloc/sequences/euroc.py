@@ -94,7 +94,7 @@ def read_sensor(path: Path) -> Sensor:
     try:
         camera = Camera(model, int(width), int(height), tuple(intrinsics + coefficients))
         return Sensor(camera, Rigid3.from_matrix(np.array(_numbers(path, text, "T_BS", 16)).reshape(4, 4)))
-    except (CalibrationError, TrajectoryError) as error:
+    except (CalibrationError, TrajectoryError, ValueError, OverflowError) as error:
         raise CalibrationError(f"{path}: {error}") from None
 
 

@@ -73,7 +73,8 @@ def read_calib(path: Path) -> dict[str, Float[np.ndarray, "3 4"]]:
             matrix = np.array([float(value) for value in values.split()]).reshape(3, 4)
         except ValueError:
             raise CalibrationError(f"{path}, line {number}: {key} is not 12 numbers") from None
-        if not np.all(np.isfinite(matrix)) or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
+        is_finite = np.all(np.isfinite(matrix))
+        if not is_finite or matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or np.linalg.matrix_rank(matrix[:, :3]) < 3:
             raise CalibrationError(f"{path}, line {number}: {key} is not a projection matrix")
         projections[key] = matrix
     return projections

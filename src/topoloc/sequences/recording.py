@@ -12,14 +12,14 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.frame import DepthImage, Image, StereoFrame, StereoSequence
-from topoloc.sequences.picture_headers import exif_focal_length
-from topoloc.sequences.pictures import PICTURE_SUFFIXES, read_depth, read_image
+from topoloc.sequences.pictures import PICTURE_SUFFIXES, exif_focal_length, read_depth, read_image
 
 # Recordings without times are taken to be of this rate.
 DEFAULT_RATE_HZ = 10
-_SLICE = re.compile(r"(-?\d+)?:(-?\d+)?(?::([1-9]\d*)?)?")
-_BLOCK = re.compile(r"(\d+)-(\d+)/([1-9]\d*)")
-_INDEX = re.compile(r"-?\d+")
+# Numbers of up to 18 digits: longer ones name no frame, and Python refuses to read those of thousands.
+_SLICE = re.compile(r"(-?\d{1,18})?:(-?\d{1,18})?(?::([1-9]\d{0,17})?)?")
+_BLOCK = re.compile(r"(\d{1,18})-(\d{1,18})/([1-9]\d{0,17})")
+_INDEX = re.compile(r"-?\d{1,18}")
 
 
 @dataclass(frozen=True, eq=False)

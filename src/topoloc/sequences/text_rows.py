@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from decimal import Decimal, InvalidOperation
-from pathlib import Path
+from pathlib import Path, PurePath
 
 from topoloc.errors import TopolocError
 
 NANOSECONDS = 1_000_000_000
 # Above this a time is taken for nanoseconds (ORB-SLAM3 writes EuRoC's so): as seconds it would be 30 000 years.
 _MAX_SECONDS = 10**12
+_MAX_DIGITS = 25  # before the decimal point; no clock counts further, and an integer of a million digits takes minutes
 
 
 def read_text(path: Path, error: type[TopolocError], missing: str = "no such file") -> str:
@@ -31,9 +32,9 @@ def read_rows(path: Path, error: type[TopolocError]) -> list[tuple[int, list[str
     Raises:
         error: the file is missing, no text, or holds no row; names it.
     """
-    lines = enumerate(read_text(path, error).splitlines(), start=1)
-    numbered = ((number, line.partition("#")[0].replace(",", " ").split()) for number, line in lines)
-    rows = [(number, columns) for number, columns in numbered if columns]
+    text = read_text(path, error).replace(",", " ")
+    lines = text.splitlines() if "#" not in text else [line.partition("#")[0] for line in text.splitlines()]
+    rows = [(number, columns) for number, line in enumerate(lines, start=1) if (columns := line.split())]
     if not rows:
         raise error(f"{path}: nothing in this file")
     return rows
@@ -51,25 +52,28 @@ def parse_times(rows: Sequence[tuple[int, list[str]]], path: Path, error: type[T
             time = Decimal(columns[0])
         except InvalidOperation:
             time = Decimal("nan")
-        if not time.is_finite():
-            raise error(f"{path}, line {line}: {columns[0]!r} is not a time")
+        if not time.is_finite() or time.adjusted() > _MAX_DIGITS:
+            raise error(f"{path}, line {line}: {columns[0][:40]!r} is not a time")
         times.append(time)
     in_nanoseconds = max(times) > _MAX_SECONDS
     t_ns = [int((time if in_nanoseconds else time.scaleb(9)).to_integral_value()) for time in times]
     for (line, columns), before, after in zip(rows[1:], t_ns[:-1], t_ns[1:], strict=True):
         if after <= before:
-            raise error(f"{path}, line {line}: time {columns[0]} is not after the one before")
+            raise error(f"{path}, line {line}: time {columns[0][:40]} is not after the one before")
     return t_ns
 
 
 def read_file_list(path: Path, error: type[TopolocError]) -> tuple[list[int], list[str]]:
-    """Times in nanoseconds and file names of a list of pictures.
+    """Times in nanoseconds and file names of a list of pictures, which lie below the list's folder.
 
     Raises:
-        error: as `read_rows` and `parse_times`, or a line has no second column.
+        error: as `read_rows` and `parse_times`, a line has no second column, or a name leads out of the folder.
     """
     rows = read_rows(path, error)
     for line, columns in rows:
         if len(columns) < 2:
             raise error(f"{path}, line {line}: not a time and a file name")
+        name = PurePath(columns[1])
+        if name.is_absolute() or ".." in name.parts or "\0" in columns[1]:
+            raise error(f"{path}, line {line}: {columns[1][:80]!r} is no picture below this folder")
     return parse_times(rows, path, error), [columns[1] for _, columns in rows]

@@ -8,12 +8,14 @@ Both are world_from_cam, in metres.
 from __future__ import annotations
 
 import bisect
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
+from typing import overload
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from topoloc.errors import RecordingError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
@@ -24,14 +26,15 @@ from topoloc.sequences.text_rows import NANOSECONDS, parse_times, read_rows
 
 # Times written with few decimals still mean the frame they were made from.
 _SAME_TIME_NS = 1_000_000
-_QUATERNION_TOLERANCE = 1e-2
+_ROTATION_TOLERANCE = 1e-2
+_Rows = Sequence[tuple[int, list[str]]]
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """Poses in order of time. `t_ns` are their times, strictly increasing, or None where a pose goes with a frame by its row."""
 
-    world_from_cam: list[Rigid3]
+    world_from_cam: Sequence[Rigid3]
     t_ns: list[int] | None = None
 
     def __len__(self) -> int:
@@ -52,9 +55,12 @@ def read_trajectory(path: Path) -> Trajectory:
         if len(tokens) != num_columns:
             raise TrajectoryError(f"{path}, line {line}: {len(tokens)} columns, the lines before have {num_columns}")
     if num_columns == 12:
-        return Trajectory([_pose(path, line, lambda t=tokens: Rigid3.from_matrix(_floats(t).reshape(3, 4))) for line, tokens in rows])
+        matrices = _numbers(path, rows, range(12)).reshape(-1, 3, 4)
+        rotations, is_rotation = _rotations_near(matrices[:, :, :3])
+        _check(is_rotation, "not a rotation", path, rows)
+        return Trajectory(_StackedPoses(rotations, matrices[:, :, 3]))
     t_ns = parse_times(rows, path, TrajectoryError)
-    return Trajectory([_pose(path, line, lambda t=tokens: _pose_from_tum(t)) for line, tokens in rows], t_ns)
+    return Trajectory(_poses_of_quaternions(path, rows, wxyz=(7, 4, 5, 6)), t_ns)
 
 
 def read_asl_poses(path: Path) -> Trajectory:
@@ -68,8 +74,7 @@ def read_asl_poses(path: Path) -> Trajectory:
         if len(tokens) < 8:
             raise TrajectoryError(f"{path}, line {line}: {len(tokens)} columns, a pose has 8")
     t_ns = parse_times(rows, path, TrajectoryError)
-    in_tum_order = [(line, [*tokens[:4], *tokens[5:8], tokens[4]]) for line, tokens in rows]
-    return Trajectory([_pose(path, line, lambda t=tokens: _pose_from_tum(t)) for line, tokens in in_tum_order], t_ns)
+    return Trajectory(_poses_of_quaternions(path, rows, wxyz=(4, 5, 6, 7)), t_ns)
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
@@ -157,7 +162,7 @@ def read_times(path: Path, num_frames: int) -> list[int]:
     return t_ns
 
 
-def _pose_at(times: list[int], poses: list[Rigid3], time: int, max_gap_ns: int) -> Rigid3 | None:
+def _pose_at(times: list[int], poses: Sequence[Rigid3], time: int, max_gap_ns: int) -> Rigid3 | None:
     after = bisect.bisect_left(times, time)
     if after < len(times) and times[after] == time:
         return poses[after]
@@ -169,23 +174,76 @@ def _pose_at(times: list[int], poses: list[Rigid3], time: int, max_gap_ns: int) 
     return poses[nearest] if nearest is not None and abs(times[nearest] - time) <= _SAME_TIME_NS else None
 
 
-def _floats(tokens: list[str]) -> np.ndarray:
+def _numbers(path: Path, rows: _Rows, columns: Iterable[int]) -> Float[np.ndarray, "n c"]:
+    """These columns of the rows."""
+    wanted = list(columns)
     try:
-        return np.array([float(token) for token in tokens])
+        numbers = np.array([float(tokens[column]) for _, tokens in rows for column in wanted]).reshape(len(rows), -1)
     except ValueError:
-        raise TrajectoryError("not a number in it") from None
+        for line, tokens in rows:
+            for column in wanted:
+                _number(path, line, tokens[column])
+        raise
+    _check(np.isfinite(numbers).all(axis=1), "NaN or infinite numbers", path, rows)
+    return numbers
 
 
-def _pose_from_tum(tokens: list[str]) -> Rigid3:
-    _, tx, ty, tz, qx, qy, qz, qw = _floats(tokens)
-    quat_wxyz = np.array([qw, qx, qy, qz])
-    if abs(np.linalg.norm(quat_wxyz) - 1.0) > _QUATERNION_TOLERANCE:
-        raise TrajectoryError(f"not a rotation: quaternion of length {np.linalg.norm(quat_wxyz):g}")
-    return Rigid3.from_quat_wxyz(quat_wxyz, np.array([tx, ty, tz]))
-
-
-def _pose(path: Path, line: int, make: Callable[[], Rigid3]) -> Rigid3:
+def _number(path: Path, line: int, token: str) -> float:
     try:
-        return make()
-    except TrajectoryError as error:
-        raise TrajectoryError(f"{path}, line {line}: {error}") from None
+        return float(token)
+    except ValueError:
+        raise TrajectoryError(f"{path}, line {line}: {token[:40]!r} is not a number") from None
+
+
+def _poses_of_quaternions(path: Path, rows: _Rows, wxyz: Sequence[int]) -> Sequence[Rigid3]:
+    """Poses of rows whose columns 1 to 3 are a position (metres), and these columns a quaternion."""
+    numbers = _numbers(path, rows, (1, 2, 3, *wxyz))
+    with np.errstate(over="ignore", invalid="ignore"):
+        length = np.linalg.norm(numbers[:, 3:], axis=1, keepdims=True)
+        w, x, y, z = (numbers[:, 3:] / np.where(length > 0, length, 1.0)).T
+        rotations = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+        ).transpose(2, 0, 1)
+    _check(np.abs(length[:, 0] - 1.0) <= _ROTATION_TOLERANCE, "not a rotation", path, rows)
+    return _StackedPoses(np.ascontiguousarray(rotations), numbers[:, :3])
+
+
+def _rotations_near(matrices: Float[np.ndarray, "n 3 3"]) -> tuple[Float[np.ndarray, "n 3 3"], Bool[np.ndarray, " n"]]:
+    """The rotation nearest to each matrix, and whether it is one but for rounding (Newton's iteration for the polar factor)."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        residual = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        is_rotation = (residual <= 2.0 * _ROTATION_TOLERANCE) & (np.linalg.det(matrices) > 0.0)
+    rotations = np.where(is_rotation[:, None, None], matrices, np.eye(3))
+    for _ in range(4):
+        rotations = 0.5 * rotations @ (3.0 * np.eye(3) - rotations.transpose(0, 2, 1) @ rotations)
+    return rotations, is_rotation
+
+
+def _check(is_good: Bool[np.ndarray, " n"], fault: str, path: Path, rows: _Rows) -> None:
+    if not is_good.all():
+        line, tokens = rows[int(np.argmin(is_good))]
+        raise TrajectoryError(f"{path}, line {line}: {fault} in {' '.join(tokens)[:120]}")
+
+
+@dataclass(frozen=True, eq=False)
+class _StackedPoses(Sequence[Rigid3]):
+    """Poses made when they are asked for: a file may hold a million, a recording few of them."""
+
+    rotations: Float[np.ndarray, "n 3 3"]
+    translations: Float[np.ndarray, "n 3"]
+
+    def __len__(self) -> int:
+        return len(self.rotations)
+
+    @overload
+    def __getitem__(self, index: int) -> Rigid3: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Rigid3]: ...
+    def __getitem__(self, index: int | slice) -> Rigid3 | Sequence[Rigid3]:
+        if isinstance(index, slice):
+            return _StackedPoses(self.rotations[index], self.translations[index])
+        return Rigid3(self.rotations[index], self.translations[index])

@@ -8,6 +8,9 @@ they are stored.
 from __future__ import annotations
 
 import os
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,13 +22,13 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.camera_json import FILE_NAME, read_camera_json
 from topoloc.sequences.frame import Image, StereoFrame
-from topoloc.sequences.pictures import opencv_silent
 from topoloc.sequences.trajectory import read_truth
 
 # FFmpeg prints its own lines about broken files on stderr, beside the error that says it; read once a process, at its first use.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm"})
+_LOG_LEVEL_LOCK = threading.Lock()
 LOOKS_FOR = "a video file (.mp4, .mov, .avi, .mkv, .webm)"
 
 
@@ -118,7 +121,7 @@ def open_video(path: Path) -> Video:
 
 
 def _open(path: Path) -> cv2.VideoCapture:
-    with opencv_silent():
+    with _opencv_silent():
         capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise RecordingError(f"{path}: not a video, damaged, or of a codec that OpenCV cannot read")
@@ -142,3 +145,16 @@ def _times(path: Path, rate: float) -> list[int]:
                 f"{path}, frame {index}: at {t_ns[index] / 1e9:.3f} s, but the frame before is at {t_ns[index - 1] / 1e9:.3f} s"
             )
     return t_ns
+
+
+@contextmanager
+def _opencv_silent() -> Iterator[None]:
+    """No OpenCV messages on stderr beside the error that says it."""
+    logging: Any = getattr(cv2.utils, "logging", cv2)  # OpenCV 4 has these functions in its own name space
+    with _LOG_LEVEL_LOCK:
+        level = logging.getLogLevel()
+        logging.setLogLevel(0)
+        try:
+            yield
+        finally:
+            logging.setLogLevel(level)

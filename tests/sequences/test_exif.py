@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from topoloc.sequences.picture_headers import exif_focal_length
-from topoloc.sequences.pictures import read_image
+from topoloc.sequences.pictures import exif_focal_length, read_image
 
 SHORT, LONG, RATIONAL = 3, 4, 5
 FOCAL, FOCAL_35MM, WIDTH, RESOLUTION, UNIT = 0x920A, 0xA405, 0xA002, 0xA20E, 0xA210
