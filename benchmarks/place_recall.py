@@ -3,9 +3,9 @@
     python benchmarks/place_recall.py --kinds surf topoloc-net --pairs MAPPED,ASKED --reach 1 [--walks day_right,night_right]
 
 MAPPED and ASKED are recordings with truth (parts of one, `street1@0::2`, do as well): surf-vlad by each kind is learnt from all pictures of
-MAPPED, each being a node, and each picture of ASKED is put to it, also without the network's cells (`VLAD alone`). A hit is a mapped picture within
-`--reach` metres and 20 degrees; pictures of ASKED without one are left out. Walks are folders of `gardenspoint`, where pictures of equal
-numbers show the same place, but for a frame or two: a hit is the very frame, and, counted apart, one within two.
+MAPPED, each being a node, and each picture of ASKED is put to it, also without the network's cells (`VLAD alone`). A hit is a mapped
+picture within `--reach` metres and 20 degrees; pictures of ASKED without one are left out. Walks are folders of `gardenspoint`, where pictures of
+equal numbers show the same place, but for a frame or two: a hit is the very frame, and, counted apart, one within two.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def judge(mapped: Described, asked: Described, kind: str, hits: list[tuple[str, 
 
 def recorded(names: str, args: Args) -> None:
     mapped, asked = (open_sequence(name) for name in names.split(","))
-    here, there = (np.array([pose.matrix() for pose in sequence.poses]) for sequence in (mapped, asked))
+    here, there = (np.array([pose.matrix() for pose in sequence.poses if pose is not None]) for sequence in (mapped, asked))
     away = np.linalg.norm(there[:, None, :3, 3] - here[None, :, :3, 3], axis=2)
     right = (away <= args.reach) & (there[:, :3, 2] @ here[:, :3, 2].T >= np.cos(np.deg2rad(_TURN_DEG)))
     rows = np.flatnonzero(right.any(axis=1))[:: args.every]
@@ -92,7 +92,7 @@ def recorded(names: str, args: Args) -> None:
             described((grey_image(sequence[int(k)].image) for k in which), kind)
             for sequence, which in ((mapped, range(len(mapped))), (asked, rows))
         ]
-        judge(*sets, kind, [(f"{args.reach:g} m", right[rows])])
+        judge(sets[0], sets[1], kind, [(f"{args.reach:g} m", right[rows])])
 
 
 def walked(names: str, args: Args) -> None:
@@ -101,7 +101,7 @@ def walked(names: str, args: Args) -> None:
     for kind in args.kinds:
         folders = [args.shared / "data" / "gardenspoint" / walk for walk in names.split(",")]
         sets = [described((reduced(folder, k) for k in range(_NUM_FRAMES)), kind) for folder in folders]
-        judge(*sets, kind, [("the frame", apart == 0), ("within two", apart <= 2)])
+        judge(sets[0], sets[1], kind, [("the frame", apart == 0), ("within two", apart <= 2)])
 
 
 def reduced(folder: Path, k: int) -> np.ndarray:

@@ -1,8 +1,8 @@
 """Learned local features: a network reads the whole picture once and gives a score for every pixel and a descriptor for every few.
 
 All networks come as ONNX files of one form and run in ONNX Runtime: grey in [0, 1] goes in, its sides multiples of 32; out come the score
-of each pixel being a key point, and descriptors on a coarser grid; of some networks also a level by which places are known again. Key points are the maxima of the scores, to a fraction of a pixel by a
-parabola through each and its neighbours.
+of each pixel being a key point, and descriptors on a coarser grid; of some networks also a level by which places are known again. Key
+points are the maxima of the scores, to a fraction of a pixel by a parabola through each and its neighbours.
 """
 
 from __future__ import annotations

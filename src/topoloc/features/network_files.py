@@ -1,8 +1,8 @@
 """Files of networks of local features: which are known, where they lie, and whether a file is one.
 
 All are ONNX of one contract: input `image` (1, 1, h, w), grey in [0, 1], sides multiples of 32; outputs `scores` (1, 1, h, w) and
-`descriptors` (1, c, h/s, w/s); some have a third output, `places` (1, c, h/p, w/p), by which places are known again. Each says in its metadata
-which network it is. Ours lies in the package, others in the user's cache.
+`descriptors` (1, c, h/s, w/s); some have a third output, `places` (1, c, h/p, w/p), by which places are known again. Each says in its
+metadata which network it is. Ours lies in the package, others in the user's cache.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """What a network of local features saw in each cell of the picture (`Features.cells`): it tells places apart where VLAD does not.
 
-VLAD of key points is sharp, but knows a place only from about where it was mapped, for it counts where in the picture things are. Cells are
-blunt and keep through the night; whoever comes by beside the map's way sees the same things in other columns, so two grids are
-compared at several shifts, and the best one counts. Each cell is the mean of one of the network's levels there, less what that cell shows in
-the mapping images on average, its channels whitened by their PCA, brought to unit length.
+VLAD of key points is sharp, but knows a place only from about where it was mapped, for it counts where in the picture things are. Cells
+are blunt and keep through the night; whoever comes by beside the map's way sees the same things in other columns, so two grids are
+compared at several shifts, and the best one counts. Each cell is the mean of one of the network's levels there, less what that cell shows
+in the mapping images on average, its channels whitened by their PCA, brought to unit length.
 """
 
 from __future__ import annotations

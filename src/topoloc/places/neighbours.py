@@ -57,9 +57,7 @@ class PlaceIndex:
         multiply_rows(self._vectors, np.ascontiguousarray(vector), similarities)
         return np.arange(len(self._vectors)), similarities
 
-    def rank_images(
-        self, images: Int[np.ndarray, " k"], similarities: Float32[np.ndarray, " k"], num_candidates: int
-    ) -> list[NodeScore]:
+    def rank_images(self, images: Int[np.ndarray, " k"], similarities: Float32[np.ndarray, " k"], num_candidates: int) -> list[NodeScore]:
         """The nodes of the most similar of these images, as `rank_nodes`."""
         order = np.argsort(-similarities, kind="stable")
         return self._best_of_each_node(images[order], similarities[order], num_candidates)
