@@ -91,7 +91,8 @@ def test_descriptors_are_bilinear_and_of_unit_length():
 @pytest.mark.parametrize(("height", "width"), [(96, 128), (100, 131), (33, 64), (31, 40)])
 def test_pictures_of_any_size_are_continued_by_their_border(network: Path, height: int, width: int):
     picture = np.random.default_rng(2).integers(0, 256, (height, width), dtype=np.uint8)
-    scores, dense = run_network(picture, "xfeat")
+    scores, dense, places = run_network(picture, "xfeat")
+    assert places is None
     assert scores.shape == (32 * -(-height // 32), 32 * -(-width // 32))
     assert dense.shape == (64, scores.shape[0] // STRIDE, scores.shape[1] // STRIDE)
     np.testing.assert_allclose(scores[:height, :width], picture / 255.0, atol=1e-6)
@@ -124,6 +125,27 @@ def test_the_same_on_any_number_of_threads(network: Path):
     one, two = (extract_learned(picture, LearnedConfig("xfeat", 64, 500, 0.05, num_threads)) for num_threads in (1, 2))
     np.testing.assert_array_equal(one.points_img, two.points_img)
     np.testing.assert_array_equal(one.descriptors, two.descriptors)
+
+
+# what it saw in each cell
+
+
+def test_cells_are_means_over_the_picture_and_nothing_beyond_it(network: Path):
+    learned._session.cache_clear()
+    write_network(network, outputs=("scores", "descriptors", "places"))
+    picture = np.random.default_rng(4).integers(0, 256, (96, 144), dtype=np.uint8)  # continued to 96x160
+    features = extract_learned(picture, CONFIG)
+    assert features.cells is not None
+    expected = picture.reshape(4, 24, 6, 24).mean(axis=(1, 3)) / 255.0
+    np.testing.assert_allclose(features.cells[:, :, 0], expected, atol=1e-5)
+    assert features.select(np.arange(2)).cells is None  # of the whole picture alone
+    small = extract_learned(picture[:8, :8], CONFIG).cells
+    assert small is not None
+    np.testing.assert_allclose(small, np.full((4, 6, 1), picture[:8, :8].mean() / 255.0), atol=1e-5)
+
+
+def test_networks_without_have_none(network: Path):
+    assert extract_learned(np.zeros((64, 64), np.uint8), CONFIG).cells is None
 
 
 # what is not here, or is another

@@ -14,13 +14,14 @@ from topoloc.errors import FeatureKindError, WeightsError
 from topoloc.features import learned
 from topoloc.features.kinds import learned_kind
 from topoloc.geometry.alignment import translation_error
-from topoloc.localization.localizer import Localizer
+from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.building import build_map
 from topoloc.localization.result import Localization
 from topoloc.map.build import BuildConfig
 from topoloc.map.checking import damages
 from topoloc.map.config import MapConfig
 from topoloc.map.topomap import TopoMetricMap
+from topoloc.places.cell_grid import CellGrid
 from topoloc.sequences.open import open_sequence
 
 
@@ -81,6 +82,22 @@ def test_it_is_itself_by_its_first_kind_and_nothing_by_one_that_it_does_not_hold
     assert of_two.by_kind("surf") is of_two
     with pytest.raises(FeatureKindError, match=r"no features orb \(it holds: surf, sift\)"):
         of_two.by_kind("orb")
+
+
+def test_the_cells_of_a_network_are_learnt_kept_and_asked(tiny_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    build_map(open_sequence(f"{tiny_recording}@0::2"), BuildConfig(other_kinds=("topoloc-net",))).save(tmp_path / "room.topo")
+    loaded = TopoMetricMap.load(tmp_path / "room.topo")
+    assert "cell_vectors" not in loaded.coarse_models["surf-vlad"].arrays
+    assert len(loaded.coarse_models["surf-vlad@topoloc-net"].arrays["cell_vectors"]) == len(loaded.place_images)
+    assert damages(tmp_path / "room.topo") == []
+    likeness, asked = CellGrid.likeness, list[tuple[int, ...]]()
+    monkeypatch.setattr(CellGrid, "likeness", lambda self, cells, images: asked.append(cells.shape) or likeness(self, cells, images))
+    for kind, expected in (("surf", []), ("topoloc-net", [(4, 6, 64)])):
+        ((picture, truth), *_) = unseen_views()
+        result = Localizer(loaded, LocalizerConfig(kinds=(kind,))).localize(picture, CAMERA)
+        assert isinstance(result, Localization)
+        assert translation_error(result.world_from_cam, truth) < 0.05
+        assert asked == expected
 
 
 def test_kinds_that_cannot_be_had_are_told_before_the_work(tiny_recording: Path):

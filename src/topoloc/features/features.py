@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32, Int32, Shaped
+
+_OF_EACH = ("points_img", "sizes_px", "angles", "responses", "descriptors")
 
 
 @dataclass(frozen=True, eq=False)
@@ -14,6 +16,8 @@ class Features:
 
     points_img are pixels (centre of the top-left pixel at (0, 0)); sizes_px the diameter of the neighbourhood described;
     angles in radians from +x towards +y (clockwise on the screen), 0 for upright ones; descriptors have unit length.
+    `cells` is what a network saw in each cell of the whole picture, where the kind has such; a part of the features is without, and no
+    node keeps it.
     """
 
     points_img: Float32[np.ndarray, "n 2"]
@@ -21,17 +25,18 @@ class Features:
     angles: Float32[np.ndarray, " n"]
     responses: Float32[np.ndarray, " n"]
     descriptors: Float32[np.ndarray, "n d"]
+    cells: Float32[np.ndarray, "rows columns c"] | None = None
 
     def __len__(self) -> int:
         return len(self.points_img)
 
     def select(self, rows: Shaped[np.ndarray, " m"]) -> Features:
         """The features of these rows (indices or a boolean mask)."""
-        return Features(*(getattr(self, field.name)[rows] for field in fields(self)))
+        return Features(*(getattr(self, name)[rows] for name in _OF_EACH))
 
     @staticmethod
     def concatenate(parts: list[Features]) -> Features:
-        return Features(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Features)))
+        return Features(*(np.concatenate([getattr(part, name) for part in parts]) for name in _OF_EACH))
 
     @staticmethod
     def empty(dimension: int) -> Features:

@@ -1,7 +1,8 @@
 """Files of networks of local features: which are known, where they lie, and whether a file is one.
 
 All are ONNX of one contract: input `image` (1, 1, h, w), grey in [0, 1], sides multiples of 32; outputs `scores` (1, 1, h, w) and
-`descriptors` (1, c, h/s, w/s). Each says in its metadata which network it is. Ours lies in the package, others in the user's cache.
+`descriptors` (1, c, h/s, w/s); some have a third output, `places` (1, c, h/p, w/p), by which places are known again. Each says in its
+metadata which network it is. Ours lies in the package, others in the user's cache.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from topoloc.errors import MissingExtraError, WeightsError
 
 CONTRACT = 1
 """Version of what a file's inputs and outputs mean (`topoloc_version` of its metadata)."""
+_OUTPUTS = (["scores", "descriptors"], ["scores", "descriptors", "places"])
 _SHIPPED = Path(__file__).parent / "networks"
 _SMALLEST = 64  # pixels of the picture that a file is tried with
 
@@ -111,12 +113,12 @@ def open_network(path: Path, num_threads: int) -> tuple[KnownNetwork, Any]:
     try:
         session = onnxruntime.InferenceSession(read_bytes(path), options, providers=["CPUExecutionProvider"])
         properties = session.get_modelmeta().custom_metadata_map
-        faces = ([put.name for put in session.get_inputs()], [put.name for put in session.get_outputs()])
+        inputs, outputs = ([put.name for put in puts] for puts in (session.get_inputs(), session.get_outputs()))
     except WeightsError:
         raise
     except Exception as error:  # the runtime's own classes, which are no API
         raise WeightsError(f"network {path}: cut short, damaged, or not ONNX") from error
-    if properties.get("topoloc_network") not in NETWORKS or faces != (["image"], ["scores", "descriptors"]):
+    if properties.get("topoloc_network") not in NETWORKS or inputs != ["image"] or outputs not in _OUTPUTS:
         raise WeightsError(f"network {path}: ONNX, but none that topoloc knows ({', '.join(NETWORKS)})")
     if properties.get("topoloc_version") != str(CONTRACT):
         raise WeightsError(f"network {path}: of version {properties.get('topoloc_version')}, not {CONTRACT}; convert it again")
@@ -126,7 +128,7 @@ def open_network(path: Path, num_threads: int) -> tuple[KnownNetwork, Any]:
 def check_network(path: Path) -> KnownNetwork:
     """Which network a ready ONNX file is; it is tried on a small picture, too. Raises as `open_network`."""
     network, session = open_network(path, num_threads=1)
-    scores, descriptors = map(np.asarray, session.run(None, {"image": np.zeros((1, 1, _SMALLEST, _SMALLEST), np.float32)}))
+    scores, descriptors, *_ = map(np.asarray, session.run(None, {"image": np.zeros((1, 1, _SMALLEST, _SMALLEST), np.float32)}))
     if scores.shape != (1, 1, _SMALLEST, _SMALLEST) or descriptors.ndim != 4 or not np.isfinite(descriptors).all():
         raise WeightsError(f"network {path}: its outputs are not scores and descriptors of the picture")
     return network

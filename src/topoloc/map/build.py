@@ -223,7 +223,7 @@ def _visit_all_images(
     node_poses = NodePoses.of([draft.image.world_from_cam for draft in drafts])
     drafted = {draft.frame: draft.image for draft in drafts}  # read already
     images: list[PlaceImage] = []
-    lights, vlads = [], {kind: [] for kind in config.kinds}
+    lights, vlads, cells = [], {kind: [] for kind in config.kinds}, {kind: [] for kind in config.kinds}
     for done, frame in enumerate(frames):
         image = drafted.get(frame) or _mapping_image(frame, frame.view(with_depth=False), config)
         nearest = np.argsort(node_distances(image.world_from_cam, node_poses, node_config.lambda_rot), kind="stable")
@@ -232,15 +232,14 @@ def _visit_all_images(
                 _observe(drafts[node_id], image, frame.session_id, config)
         for kind, features in image.features.items():
             vlads[kind].append(vlad(_placed(features, image, config.vlad_of(kind)), words[kind]))
-        node_id, number = int(nearest[0]), done + 1
-        images.append(
-            PlaceImage(frame.sequence.name, frame.name, node_id, image.world_from_cam, image.place_jpeg, frame.session_id, number)
-        )
+            cells[kind].append(features.cells)
+        of_image = (int(nearest[0]), image.world_from_cam, image.place_jpeg, frame.session_id, done + 1)
+        images.append(PlaceImage(frame.sequence.name, frame.name, *of_image))
         lights.append(image.light)
         progress("images", done + 1, len(frames))
     node_ids = np.array([image.node_id for image in images])
-    coarse = {kind: SurfVlad.fit(words[kind], np.stack(vlads[kind]), node_ids, config.vlad_of(kind)) for kind in config.kinds}
-    first, models = config.features.kind, {kind: one.to_model() for kind, one in coarse.items()}
+    learnt = {kind: (words[kind], np.stack(vlads[kind]), node_ids, config.vlad_of(kind), cells[kind]) for kind in config.kinds}
+    first, models = config.features.kind, {kind: SurfVlad.fit(*of_kind).to_model() for kind, of_kind in learnt.items()}
     return images, lights, [model if kind == first else replace(model, name=f"{model.name}@{kind}") for kind, model in models.items()]
 
 

@@ -146,7 +146,9 @@ def in_rows(model: CoarseModel, ids: Sequence[int]) -> CoarseModel:
     kept = of_known >= 0
     if not kept.any():
         raise MapError(f"the map's coarse localizer {model.name!r} knows none of its nodes")
-    per_vector = {name: model.arrays[name][kept] for name in ("vectors", "centres") if len(model.arrays.get(name, ())) == len(kept)}
+    per_vector = {
+        name: model.arrays[name][kept] for name in ("vectors", "centres", "cell_vectors") if len(model.arrays.get(name, ())) == len(kept)
+    }
     return replace(model, arrays={**model.arrays, **per_vector, "node_ids": of_known[kept]})
 
 

@@ -15,6 +15,8 @@ from topoloc.places.place_kernels import multiply_rows
 
 # Up to here every vector is compared, in 1 to 3 ms; beyond it an inverted file finds the same neighbour nearly always.
 MAX_EXACT_VECTORS = 8_000
+# Then so many of the nearest are compared by more than their vectors.
+MANY_IMAGES = 2_000
 # Of an inverted file: cells that a query looks into, images that its cells are learnt from, of each.
 NUM_PROBES, IMAGES_PER_CELL = 24, 48
 # The axes of this many images are those of all; beyond it only the time grows.
@@ -38,10 +40,7 @@ class PlaceIndex:
     def rank_nodes(self, vector: Float32[np.ndarray, " d"], num_candidates: int) -> list[NodeScore]:
         """The nodes of the nearest images, each once, with the similarity of its best image; of equal ones the earlier image's."""
         if self._vectors is not None:
-            similarities = np.empty(len(self._vectors), np.float32)
-            multiply_rows(self._vectors, np.ascontiguousarray(vector), similarities)
-            order = np.argsort(-similarities, kind="stable")
-            return self._best_of_each_node(order, similarities[order], num_candidates)
+            return self.rank_images(*self.nearest(vector), num_candidates)
         num_images = 16 * num_candidates
         while True:
             rows, similarities = self._search_cells(vector, num_images)
@@ -49,6 +48,19 @@ class PlaceIndex:
             if len(ranking) == num_candidates or len(rows) < num_images:  # enough, or no more in the cells looked into
                 return ranking
             num_images *= 8
+
+    def nearest(self, vector: Float32[np.ndarray, " d"]) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
+        """All images with their similarities to a vector; where these are many, only the nearest."""
+        if self._vectors is None:
+            return self._search_cells(vector, MANY_IMAGES)
+        similarities = np.empty(len(self._vectors), np.float32)
+        multiply_rows(self._vectors, np.ascontiguousarray(vector), similarities)
+        return np.arange(len(self._vectors)), similarities
+
+    def rank_images(self, images: Int[np.ndarray, " k"], similarities: Float32[np.ndarray, " k"], num_candidates: int) -> list[NodeScore]:
+        """The nodes of the most similar of these images, as `rank_nodes`."""
+        order = np.argsort(-similarities, kind="stable")
+        return self._best_of_each_node(images[order], similarities[order], num_candidates)
 
     def _search_cells(self, vector: Float32[np.ndarray, " d"], num_images: int) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
         assert self._cells is not None

@@ -45,3 +45,17 @@ def multiply_rows(rows, vector, products):
     """products[k] = rows[k] . vector."""
     for k in range(len(rows)):
         products[k] = _dot(rows[k], vector)
+
+
+@kernel(error_model="numpy", fastmath=_FAST)
+def multiply_shifted(rows, chosen, vector, column, max_shift, products):
+    """products[k] = the best of rows[chosen[k]] . vector over shifts by up to `max_shift` columns (of `column` numbers each) either way, of
+    the columns that both have, divided by their number."""
+    length = len(vector)
+    for k in range(len(chosen)):
+        best, row = np.float32(-np.inf), rows[chosen[k]]
+        for shift in range(-max_shift, max_shift + 1):
+            left, right, both = max(shift, 0) * column, max(-shift, 0) * column, length - abs(shift) * column
+            product = _dot(row[left : left + both], vector[right : right + both]) * np.float32(column) / np.float32(both)
+            best = max(best, product)
+        products[k] = best

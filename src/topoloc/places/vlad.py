@@ -4,11 +4,13 @@ The vocabulary is learnt from the map's descriptors, each with its place in the 
 coordinate coding): neighbouring nodes see the same things, but elsewhere, and so do places that repeat their doors
 and lamps. Residuals are normalised one by one (Delhumeau et al. 2013), each
 word's sum is normalised on its own (Arandjelovic & Zisserman 2013), and the whole is whitened by the PCA of the mapping
-images where there are enough of them to learn it from.
+images where there are enough of them to learn it from. Where the features come from a network that also says what it saw in each cell of
+the picture, that has half of the say (`cell_grid.py`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Annotated
 
@@ -18,6 +20,7 @@ from jaxtyping import Float32, Int
 from topoloc.bounds import AtLeast, Between, settings_from
 from topoloc.errors import MapError
 from topoloc.features.features import Features
+from topoloc.places.cell_grid import CellGrid
 from topoloc.places.coarse import CoarseModel, Image, NodeScore, model_array
 from topoloc.places.neighbours import PlaceIndex, learn_whitening, visual_words
 from topoloc.places.place_kernels import add_residuals, multiply_rows
@@ -53,21 +56,29 @@ class SurfVlad:
         vectors: Float32[np.ndarray, "n p"],
         node_ids: Int[np.ndarray, " n"],
         config: VladConfig,
+        grid: CellGrid | None = None,
     ) -> None:
+        self._grid = grid
         self._words, self._mean, self._projection, self._vectors = words, mean, projection, vectors
         self._node_ids, self._config = node_ids, config
         self._index = PlaceIndex(vectors, node_ids)
 
     @staticmethod
     def fit(
-        words: Float32[np.ndarray, "k d"], vlads: Float32[np.ndarray, "n kd"], node_ids: Int[np.ndarray, " n"], config: VladConfig
+        words: Float32[np.ndarray, "k d"],
+        vlads: Float32[np.ndarray, "n kd"],
+        node_ids: Int[np.ndarray, " n"],
+        config: VladConfig,
+        cells: Sequence[Float32[np.ndarray, "rows columns c"] | None] = (),
     ) -> SurfVlad:
-        """From the vocabulary (`learn_words`), the `vlad` of each mapping image's `placed` features and the node it belongs to."""
-        whitening = learn_whitening(vlads, config.dimension)
-        return SurfVlad(words, whitening.mean, whitening.projection, whitening.apply(vlads), node_ids, config)
+        """From the vocabulary (`learn_words`), the `vlad` of each mapping image's `placed` features, the node it belongs to and its cells,
+        where the kind of features has them."""
+        whitening, known = learn_whitening(vlads, config.dimension), [one for one in cells if one is not None]
+        grid = CellGrid.fit(np.stack(known)) if len(known) == len(vlads) else None
+        return SurfVlad(words, whitening.mean, whitening.projection, whitening.apply(vlads), node_ids, config, grid)
 
     def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
-        """See `CoarseLocalizer.rank`; of the picture itself only the size is looked at."""
+        """See `CoarseLocalizer.rank`; of the picture itself only the size is looked at. Features without cells are ranked by VLAD alone."""
         vector = np.empty(len(self._projection), np.float32)
         height, width = image.shape[:2]
         descriptors = placed(features, width, height, self._config)
@@ -75,13 +86,16 @@ class SurfVlad:
             raise MapError(f"the map's coarse localizer {self.name!r} is damaged: its words are not those of the map's features")
         multiply_rows(self._projection, vlad(descriptors, self._words) - self._mean, vector)
         vector /= max(float(np.linalg.norm(vector)), 1e-6)
-        return self._index.rank_nodes(vector, num_candidates)
+        if self._grid is None or features.cells is None:
+            return self._index.rank_nodes(vector, num_candidates)
+        images, similarities = self._index.nearest(vector)
+        return self._index.rank_images(images, 0.5 * (similarities + self._grid.likeness(features.cells, images)), num_candidates)
 
     def to_model(self) -> CoarseModel:
         """What the map file keeps: vectors as half floats, a quarter of a kilobyte to half of one an image."""
         arrays = {"words": self._words, "mean": self._mean, "projection": self._projection.astype(np.float16)}
         arrays |= {"vectors": self._vectors.astype(np.float16), "node_ids": self._node_ids.astype(np.int32)}
-        return CoarseModel(self.name, asdict(self._config), arrays)
+        return CoarseModel(self.name, asdict(self._config), arrays | (self._grid.to_arrays() if self._grid is not None else {}))
 
     @staticmethod
     def from_model(model: CoarseModel) -> SurfVlad:
@@ -91,7 +105,8 @@ class SurfVlad:
         projection = model_array(model, "projection", "f", (None, words.size)).astype(np.float32)
         mean = model_array(model, "mean", "f", (words.size,)).astype(np.float32, copy=False)
         vectors = model_array(model, "vectors", "f", (None, len(projection))).astype(np.float32)
-        return SurfVlad(words, mean, projection, vectors, model_array(model, "node_ids", "iu", (len(vectors),)), config)
+        node_ids = model_array(model, "node_ids", "iu", (len(vectors),))
+        return SurfVlad(words, mean, projection, vectors, node_ids, config, CellGrid.from_model(model, len(vectors)))
 
 
 open_model = SurfVlad.from_model

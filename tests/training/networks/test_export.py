@@ -50,7 +50,7 @@ def test_the_exported_network_answers_as_the_original(kind: str, network: type, 
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     for height, width in ((96, 160), (160, 64)):
         image = picture(height, width)
-        scores, descriptors = session.run(None, {"image": image.numpy()})
+        scores, descriptors, *places = session.run(None, {"image": image.numpy()})
         with torch.no_grad():
             expected = original(image)
         assert scores.shape == (1, 1, height, width)
@@ -58,6 +58,10 @@ def test_the_exported_network_answers_as_the_original(kind: str, network: type, 
         assert 0 <= scores.min() < scores.max() <= 1
         np.testing.assert_allclose(scores, expected[0].numpy(), atol=1e-4)
         np.testing.assert_allclose(descriptors, expected[1].numpy(), atol=1e-3)
+        assert len(places) == (kind == "topoloc-net")
+        for level in places:
+            assert level.shape == (1, 64, height // 16, width // 16)
+            np.testing.assert_allclose(level, expected[2].numpy(), atol=1e-3)
 
 
 def test_the_cheap_tail_of_xfeat_is_softmax_times_enlarged_reliability():

@@ -25,6 +25,7 @@ class TopolocNet(nn.Module):
     """Levels at 1/4 (16 channels), 1/8 (32), 1/16 (64) and 1/32 (64), added up from coarse to fine."""
 
     stride = STRIDE
+    outputs = ("scores", "descriptors", "places")
 
     def __init__(self):
         super().__init__()
@@ -49,8 +50,13 @@ class TopolocNet(nn.Module):
             nn.PixelShuffle(4),
         )
 
-    def maps(self, image: Float[Tensor, "b 1 h w"]) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 64 h4 w4"]]:
-        """Score logits and descriptors."""
+    def maps(self, image: Float[Tensor, "b 1 h w"]) -> tuple[Tensor, Tensor]:
+        """Score logits and descriptors, as they are trained."""
+        return self._maps(image)[:2]
+
+    def _maps(
+        self, image: Float[Tensor, "b 1 h w"]
+    ) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 64 h4 w4"], Float[Tensor, "b 64 h16 w16"]]:
         # The root evens out photon noise and keeps lamps from pressing a night picture into the lowest greys.
         grey = self.norm(torch.sqrt(image + _SHADOWS))
         stem, *deeper = self.quarter
@@ -59,13 +65,14 @@ class TopolocNet(nn.Module):
         for layer in deeper:
             quarter = layer(quarter)
         eighth = self.eighth(quarter)
-        sixteenth = self.sixteenth(eighth)
-        sixteenth = sixteenth + enlarged(self.context(sixteenth), 2)
+        places = self.sixteenth(eighth)
+        sixteenth = places + enlarged(self.context(places), 2)
         fused = self.fusion(functional.relu(self.lateral(eighth) + enlarged(self.across(sixteenth), 2)))
         descriptors = enlarged(self.coarse_descriptor(fused), 2) + self.fine_descriptor(quarter)
         logits = self.score(enlarged(self.coarse_score(fused), 2) + self.fine_score(quarter) + self.detail_score(half))
-        return logits, descriptors
+        return logits, descriptors, places
 
-    def forward(self, image: Float[Tensor, "b 1 h w"]) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 64 h4 w4"]]:
-        logits, descriptors = self.maps(image)
-        return torch.sigmoid(logits), descriptors
+    def forward(self, image: Float[Tensor, "b 1 h w"]) -> tuple[Tensor, Tensor, Tensor]:
+        """Scores, descriptors, and the level by which places are known again: of all levels it keeps best through the night."""
+        logits, descriptors, places = self._maps(image)
+        return torch.sigmoid(logits), descriptors, places
