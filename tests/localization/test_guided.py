@@ -11,7 +11,7 @@ from topoloc.features.features import Features
 from topoloc.features.kinds import SURF
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization.guided import GuidedConfig, count_by_chance, match_guided, visible_pixels
+from topoloc.localization.guided import GuidedConfig, count_by_chance, match_guided, visible_points
 from topoloc.localization.local_map import LocalMap
 from topoloc.map.topomap import NodeSummary, TopoNode
 
@@ -57,7 +57,7 @@ def test_every_point_in_view_is_matched_with_itself(cam_from_world: Rigid3):
     node = _node(np.random.default_rng(0))
     local_map = LocalMap.of_node(node)
     matches = match_guided(_seen(node, cam_from_world), local_map, cam_from_world, CAMERA, GUIDED)
-    num_visible = len(visible_pixels(local_map, cam_from_world, CAMERA))
+    num_visible = len(visible_points(local_map, cam_from_world, CAMERA)[0])
     assert num_visible > 100
     assert len(matches) > 0.95 * num_visible
     assert np.array_equal(matches.query_idx, matches.train_idx)
@@ -80,7 +80,7 @@ def test_a_key_point_is_matched_once_though_two_nodes_hold_it():
 def test_nothing_is_visible_behind_the_camera():
     local_map = LocalMap.of_node(_node(np.random.default_rng(3)))
     backwards = Rigid3(exp_so3(np.array([0.0, np.pi, 0.0])), np.zeros(3))
-    assert len(visible_pixels(local_map, backwards, CAMERA)) == 0
+    assert len(visible_points(local_map, backwards, CAMERA)[0]) == 0
 
 
 def test_chance_finds_next_to_nothing_among_descriptors_that_differ():

@@ -5,6 +5,8 @@ Maps and the queries put to them must be made with the same `FeatureConfig`: a m
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import UInt8
 
@@ -21,12 +23,13 @@ NORMALIZATIONS: dict[str, PatchNormalizationConfig | None] = {
 
 
 def extract_features(image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None = None) -> Features:
-    """The features of a grey image, strongest first; the same for any `num_threads`.
+    """The features of a grey image, strongest first; the same for any `num_threads`. Without dense descriptors, which would fill the
+    memory where features of many images are held.
 
     Raises:
         FeatureKindError: there is no such kind.
     """
-    return extract_normalized(normalize_image(image, config, num_threads), config, num_threads)
+    return replace(extract_normalized(normalize_image(image, config, num_threads), config, num_threads), dense=None)
 
 
 def normalize_image(image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None = None) -> UInt8[np.ndarray, "h w"]:

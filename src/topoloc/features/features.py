@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Int32, Shaped
 
+from topoloc.features.dense import DenseDescriptors
+
 _OF_EACH = ("points_img", "sizes_px", "angles", "responses", "descriptors")
 
 
@@ -16,8 +18,8 @@ class Features:
 
     points_img are pixels (centre of the top-left pixel at (0, 0)); sizes_px the diameter of the neighbourhood described;
     angles in radians from +x towards +y (clockwise on the screen), 0 for upright ones; descriptors have unit length.
-    `cells` is what a network saw in each cell of the whole picture, where the kind has such; a part of the features is without, and no
-    node keeps it.
+    Of a network also what it says of the whole picture, which a part of the features is without, and no node keeps: `cells` is what it
+    saw in each cell, where the network has such, `dense` its descriptors each few pixels.
     """
 
     points_img: Float32[np.ndarray, "n 2"]
@@ -26,17 +28,23 @@ class Features:
     responses: Float32[np.ndarray, " n"]
     descriptors: Float32[np.ndarray, "n d"]
     cells: Float32[np.ndarray, "rows columns c"] | None = None
+    dense: DenseDescriptors | None = None
 
     def __len__(self) -> int:
         return len(self.points_img)
 
     def select(self, rows: Shaped[np.ndarray, " m"]) -> Features:
         """The features of these rows (indices or a boolean mask)."""
-        return Features(*(getattr(self, name)[rows] for name in _OF_EACH))
+        return Features._of_each([getattr(self, name)[rows] for name in _OF_EACH])
 
     @staticmethod
     def concatenate(parts: list[Features]) -> Features:
-        return Features(*(np.concatenate([getattr(part, name) for part in parts]) for name in _OF_EACH))
+        return Features._of_each([np.concatenate([getattr(part, name) for part in parts]) for name in _OF_EACH])
+
+    @staticmethod
+    def _of_each(arrays: list[np.ndarray]) -> Features:
+        points_img, sizes_px, angles, responses, descriptors = arrays
+        return Features(points_img, sizes_px, angles, responses, descriptors)
 
     @staticmethod
     def empty(dimension: int) -> Features:

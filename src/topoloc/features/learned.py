@@ -18,6 +18,7 @@ from jaxtyping import Float32, UInt8
 
 from topoloc import compiled
 from topoloc.errors import WeightsError
+from topoloc.features.dense import DenseDescriptors
 from topoloc.features.features import Features
 from topoloc.features.learned_kernels import find_maxima, sample_descriptors
 from topoloc.features.network_files import find_network, open_network
@@ -57,10 +58,11 @@ def extract_learned(image: UInt8[np.ndarray, "h w"], config: LearnedConfig) -> F
     points_img, found = find_maxima(scores, height, width, _BORDER_PX, np.float32(config.min_score))
     order = np.argsort(-found, kind="stable")[: config.max_features]
     points_img = points_img[order]
-    descriptors = sample_descriptors(dense, points_img, np.float32(scores.shape[0] / dense.shape[1]))
+    stride_px = scores.shape[0] / dense.shape[1]
+    descriptors = sample_descriptors(dense, points_img, np.float32(stride_px))
     sizes, angles = np.full(len(order), SIZE_PX, np.float32), np.zeros(len(order), np.float32)
     cells = None if places is None else mean_cells(places, height / scores.shape[0], width / scores.shape[1])
-    return Features(points_img, sizes, angles, found[order], descriptors, cells)
+    return Features(points_img, sizes, angles, found[order], descriptors, cells, DenseDescriptors(dense, stride_px))
 
 
 def mean_cells(level: Float32[np.ndarray, "c h w"], height_share: float, width_share: float) -> Float32[np.ndarray, "rows columns c"]:

@@ -70,3 +70,43 @@ def sample_descriptors(dense, points_img, stride):
         for c in range(size):
             out[k, c] *= scale
     return out
+
+
+@kernel()
+def turned_to_unit_length(planes):
+    """(rows, columns, d) descriptors of unit length, of (d, rows, columns) of any."""
+    size, rows, columns = planes.shape
+    grid = np.empty((rows, columns, size), np.float32)
+    for y in range(rows):
+        for x in range(columns):
+            total = np.float32(1e-12)
+            for c in range(size):
+                value = planes[c, y, x]
+                grid[y, x, c] = value
+                total += value * value
+            scale = np.float32(1) / np.sqrt(total)
+            for c in range(size):
+                grid[y, x, c] *= scale
+    return grid
+
+
+@kernel(error_model="numpy", fastmath={"reassoc", "contract"})
+def is_most_similar_here(grid, points_img, descriptors, stride, radius):
+    """For each point: is the descriptor most like its own, of those within `radius` grid steps to each side, within one step of it?"""
+    rows, columns, size = grid.shape
+    found = np.zeros(len(points_img), np.bool_)
+    for k in range(len(points_img)):
+        column = int(np.floor((points_img[k, 0] + np.float32(0.5)) / stride))
+        row = int(np.floor((points_img[k, 1] + np.float32(0.5)) / stride))
+        here, around = np.float32(-2), np.float32(-2)
+        for y in range(max(row - radius, 0), min(row + radius, rows - 1) + 1):
+            for x in range(max(column - radius, 0), min(column + radius, columns - 1) + 1):
+                similarity = np.float32(0)
+                for c in range(size):
+                    similarity += grid[y, x, c] * descriptors[k, c]
+                if abs(y - row) <= 1 and abs(x - column) <= 1:
+                    here = max(here, similarity)
+                else:
+                    around = max(around, similarity)
+        found[k] = here > around
+    return found

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32
+from jaxtyping import Float, Float32, Int, Int32
 
 from topoloc.bounds import AtLeast, Between
 from topoloc.features.features import Features, Matches
@@ -102,10 +102,11 @@ def _find(
     )
 
 
-def visible_pixels(local_map: LocalMap, cam_from_world: Rigid3, camera: Camera) -> Float[np.ndarray, "v 2"]:
-    """Where the map points that lie in the camera's view must be seen."""
+def visible_points(local_map: LocalMap, cam_from_world: Rigid3, camera: Camera) -> tuple[Int[np.ndarray, " v"], Float[np.ndarray, "v 2"]]:
+    """The map points that lie in the camera's view, by their rows, and where they must be seen."""
     pixels = _pixels_in_view(cam_from_world.apply(local_map.points_world), camera)
-    return pixels[np.isfinite(pixels[:, 0])]
+    rows = np.flatnonzero(np.isfinite(pixels[:, 0]))
+    return rows, pixels[rows]
 
 
 def _pixels_in_view(points_cam: Float[np.ndarray, "n 3"], camera: Camera) -> Float[np.ndarray, "n 2"]:

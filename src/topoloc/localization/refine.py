@@ -10,14 +10,14 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from topoloc.features.matching import match_pooled
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.belief import Hypothesis
 from topoloc.localization.evidence import Evidence, doubt_of, even_share_of, log_odds_of, spread_of
-from topoloc.localization.guided import count_by_chance, match_guided, visible_pixels
+from topoloc.localization.guided import count_by_chance, match_guided, visible_points
 from topoloc.localization.map_facts.correlated_errors import inflation
 from topoloc.localization.map_facts.repetition import copies, folded
 from topoloc.localization.pose_fit import PoseFit, fit_pose
@@ -25,6 +25,7 @@ from topoloc.localization.search import Proposal, Search, Tried
 from topoloc.localization.walls.propose_walls import WallProposal, refine_wall, weigh_wall
 
 _MOST_SAID, _FEW_MATCHES = 3.0, 30.0  # odds, in logarithms, that one kind adds to another's; matches with which it is heard by half
+_NUM_COMPARED = 512  # of the points in view that are compared with dense descriptors
 _HOPELESS = -3.0  # odds, in logarithms, that nothing can mend
 
 
@@ -125,7 +126,7 @@ def _counted(search: Search, final: PoseFit, covariance: Float[np.ndarray, "6 6"
     assert pose is not None
     depths = pose.cam_from_world.apply(final.local_map.points_world[final.matches.train_idx[pose.inliers]])[:, 2]
     found_img = final.features.points_img[final.matches.query_idx[pose.inliers]].astype(np.float64)
-    visible_img = visible_pixels(final.local_map, pose.cam_from_world, camera)
+    visible, visible_img = visible_points(final.local_map, pose.cam_from_world, camera)
     return Evidence(
         num_matches=0,
         num_inliers=0,
@@ -133,9 +134,21 @@ def _counted(search: Search, final: PoseFit, covariance: Float[np.ndarray, "6 6"
         num_visible=len(visible_img),
         num_by_chance=0,
         spread=spread_of(found_img, camera.width, camera.height),
-        even_share=even_share_of(found_img, visible_img, camera.width, camera.height),
+        even_share=_even_share(final, visible, visible_img, found_img),
         doubt=doubt_of(covariance, float(np.median(depths)), search.config.evidence),
     )
+
+
+def _even_share(
+    final: PoseFit, visible: Int[np.ndarray, " v"], visible_img: Float[np.ndarray, "v 2"], found_img: Float[np.ndarray, "f 2"]
+) -> float:
+    """`Evidence.even_share`: of the points that key points were found for, or that dense descriptors agree with where there are such."""
+    camera, dense = final.camera, final.features.dense
+    if dense is not None and len(visible) > 0:
+        asked = np.unique(np.linspace(0, len(visible) - 1, _NUM_COMPARED).astype(int))
+        visible_img = visible_img[asked]
+        found_img = visible_img[dense.agrees(visible_img, final.local_map.descriptors[visible[asked]])]
+    return even_share_of(found_img, visible_img, camera.width, camera.height)
 
 
 def _with_unguided(search: Search, evidence: Evidence, unguided: PoseFit, final: PoseFit) -> Evidence:

@@ -24,7 +24,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.belief import Hypothesis
 from topoloc.localization.evidence import Evidence, doubt_of, even_share_of, log_odds_of, spread_of
-from topoloc.localization.guided import visible_pixels
+from topoloc.localization.guided import visible_points
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.map_facts.correlated_errors import inflation
 from topoloc.localization.pose_fit import PoseFit
@@ -147,7 +147,7 @@ def weigh_wall(proposal: WallProposal, final: PoseFit, found: SideMatches) -> Hy
     covariance = inflated * pose.covariance
     depths = pose.cam_from_world.apply(found.local_map.points_world[found.matches.train_idx[pose.inliers]])[:, 2]
     points_img = found.features.points_img[found.matches.query_idx[pose.inliers]].astype(np.float64)
-    visible_img = visible_pixels(found.local_map, pose.cam_from_world, camera)
+    visible_img = visible_points(found.local_map, pose.cam_from_world, camera)[1]
     evidence = Evidence(
         num_matches=len(proposal.fit.matches),
         num_inliers=proposal.num_agreeing,

@@ -12,7 +12,7 @@ from topoloc.features.side_views import SideView
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.guided import GuidedConfig, count_by_chance, match_guided, visible_pixels
+from topoloc.localization.guided import GuidedConfig, count_by_chance, match_guided, visible_points
 from topoloc.localization.local_map import LocalMap
 
 _CELL_PX = 8
@@ -110,7 +110,7 @@ def nearest_sides(
 
 
 def _num_visible_cells(view: SideView, local_map: LocalMap, side_from_world: Rigid3) -> int:
-    columns, rows = np.rint(visible_pixels(local_map, side_from_world, view.camera)).astype(int).T
+    columns, rows = np.rint(visible_points(local_map, side_from_world, view.camera)[1]).astype(int).T
     columns, rows = np.clip(columns, 0, view.camera.width - 1), np.clip(rows, 0, view.camera.height - 1)
     inside = view.inside[rows, columns]
     cells = (rows[inside] // _CELL_PX) * view.camera.width + columns[inside] // _CELL_PX
