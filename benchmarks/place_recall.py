@@ -4,8 +4,8 @@
 
 MAPPED and ASKED are recordings with truth (parts of one, `street1@0::2`, do as well): surf-vlad by each kind is learnt from all pictures of
 MAPPED, each being a node, and each picture of ASKED is put to it, also without the network's cells (`VLAD alone`). A hit is a mapped
-picture within `--reach` metres and 20 degrees; pictures of ASKED without one are left out. Walks are folders of `gardenspoint`, where pictures of
-equal numbers show the same place, but for a frame or two: a hit is the very frame, and, counted apart, one within two.
+picture within `--reach` metres and 20 degrees; pictures of ASKED without one are left out. Walks are folders of `gardenspoint`, where
+pictures of equal numbers show the same place, but for a frame or two: a hit is the very frame, and, counted apart, one within two.
 """
 
 from __future__ import annotations
