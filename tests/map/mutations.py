@@ -65,6 +65,7 @@ def mutate(source: Path, target: Path, seed: int) -> str:
     if rng.random() < 0.1:
         return _flip(target, rng)
     with closing(sqlite3.connect(target, isolation_level=None)) as database:
+        database.text_factory = _text_of
         if rng.random() < 0.08:
             script = SCRIPTS[rng.integers(len(SCRIPTS))]
             try:
@@ -80,7 +81,7 @@ def mutate(source: Path, target: Path, seed: int) -> str:
 
 def forge(database: sqlite3.Connection) -> None:
     """All checksums, counts and the digest as a careful deceiver would have them."""
-    database.text_factory = lambda data: data.decode("utf-8", "surrogateescape")
+    database.text_factory = _text_of
     counts = {table: database.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0] for table in TABLES if table != "map"}
     database.execute("UPDATE map SET value = ? WHERE key = 'counts'", (str(counts).replace("'", '"'),))
     found: dict[str, list[bytes]] = {}
@@ -91,6 +92,10 @@ def forge(database: sqlite3.Connection) -> None:
             database.execute(f"UPDATE {table} SET checksum = ? WHERE rowid = ?", (checksum_of(table, row[1:]), row[0]))
     digest = digest_of(found)
     database.execute("UPDATE map SET value = ?, checksum = ? WHERE key = 'digest'", (digest, checksum_of("map", ("digest", digest))))
+
+
+def _text_of(data: bytes) -> str:
+    return data.decode("utf-8", "surrogateescape")
 
 
 def _flip(path: Path, rng: Rng) -> str:
@@ -135,7 +140,7 @@ def _floats(database: sqlite3.Connection, rng: Rng) -> str:
     value = [np.nan, np.inf, -1e30, 1e6, 1e-30, -1.0, 0.0][rng.integers(7)]
     if column in POINTS and rng.random() < 0.8:
         dtype, width = POINTS[column]
-        with suppress(zlib.error, ValueError), np.errstate(over="ignore"):
+        with suppress(zlib.error, ValueError), np.errstate(over="ignore", invalid="ignore"):
             planes = np.frombuffer(zlib.decompress(row[1]), np.uint8).reshape(width, np.dtype(dtype).itemsize, -1)
             array = np.frombuffer(planes.transpose(2, 0, 1).tobytes(), dtype).reshape(-1, width).copy()
             array[rng.integers(len(array)), rng.integers(width)] = np.array(value).astype(dtype)
