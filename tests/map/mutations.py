@@ -7,16 +7,19 @@ import shutil
 import sqlite3
 import struct
 import zipfile
+import zlib
 from collections.abc import Callable
 from contextlib import closing, suppress
 from pathlib import Path
 
 import numpy as np
 
+from topoloc.map.points import array_packed
 from topoloc.map.schema import ORDER, TABLES, checksum_of
 from topoloc.map.writing import digest_of
 
 Rng = np.random.Generator
+POINTS = {"points_img": ("<f4", 2), "shapes": ("<f4", 3), "descriptors": ("i1", 64), "points_cam": ("<f4", 3), "sqrt_covs": ("<f2", 6)}
 NUMBERS = [-1, 0, 1, 2, 7, 255, 4096, 10**6, 2**31 - 1, 2**31, 2**53, 2**63 - 1, -(2**63)]
 TEXTS = [
     "",
@@ -49,7 +52,8 @@ SCRIPTS = [
     "ALTER TABLE map RENAME COLUMN value TO worth",
     "DROP TABLE coarse_models",
     "PRAGMA user_version = 1",
-    "PRAGMA user_version = 3",
+    "PRAGMA user_version = 2",
+    "PRAGMA user_version = 4",
     "PRAGMA journal_mode = WAL",
 ]
 
@@ -61,6 +65,7 @@ def mutate(source: Path, target: Path, seed: int) -> str:
     if rng.random() < 0.1:
         return _flip(target, rng)
     with closing(sqlite3.connect(target, isolation_level=None)) as database:
+        database.text_factory = _text_of
         if rng.random() < 0.08:
             script = SCRIPTS[rng.integers(len(SCRIPTS))]
             try:
@@ -76,7 +81,7 @@ def mutate(source: Path, target: Path, seed: int) -> str:
 
 def forge(database: sqlite3.Connection) -> None:
     """All checksums, counts and the digest as a careful deceiver would have them."""
-    database.text_factory = lambda data: data.decode("utf-8", "surrogateescape")
+    database.text_factory = _text_of
     counts = {table: database.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0] for table in TABLES if table != "map"}
     database.execute("UPDATE map SET value = ? WHERE key = 'counts'", (str(counts).replace("'", '"'),))
     found: dict[str, list[bytes]] = {}
@@ -87,6 +92,10 @@ def forge(database: sqlite3.Connection) -> None:
             database.execute(f"UPDATE {table} SET checksum = ? WHERE rowid = ?", (checksum_of(table, row[1:]), row[0]))
     digest = digest_of(found)
     database.execute("UPDATE map SET value = ?, checksum = ? WHERE key = 'digest'", (digest, checksum_of("map", ("digest", digest))))
+
+
+def _text_of(data: bytes) -> str:
+    return data.decode("utf-8", "surrogateescape")
 
 
 def _flip(path: Path, rng: Rng) -> str:
@@ -129,6 +138,14 @@ def _floats(database: sqlite3.Connection, rng: Rng) -> str:
     if row is None or not isinstance(row[1], bytes) or len(row[1]) < 8:
         return "nothing"
     value = [np.nan, np.inf, -1e30, 1e6, 1e-30, -1.0, 0.0][rng.integers(7)]
+    if column in POINTS and rng.random() < 0.8:
+        dtype, width = POINTS[column]
+        with suppress(zlib.error, ValueError), np.errstate(over="ignore", invalid="ignore"):
+            planes = np.frombuffer(zlib.decompress(row[1]), np.uint8).reshape(width, np.dtype(dtype).itemsize, -1)
+            array = np.frombuffer(planes.transpose(2, 0, 1).tobytes(), dtype).reshape(-1, width).copy()
+            array[rng.integers(len(array)), rng.integers(width)] = np.array(value).astype(dtype)
+            _try(database, f"UPDATE {table} SET {column} = ? WHERE rowid = ?", array_packed(array), row[0])
+            return f"a number {value} packed in {table}.{column}"
     data = struct.pack("<f", value) if rng.random() < 0.5 else struct.pack("<d", value)
     place = int(rng.integers(0, len(row[1]) // 8)) * 8
     changed = bytearray(row[1])
@@ -147,12 +164,16 @@ def _agreed(database: sqlite3.Connection, rng: Rng) -> str:
     """Sizes that agree with each other and with nothing else: of points, of descriptors."""
     prefix = "side_" if rng.random() < 0.3 else ""
     size = int(rng.choice([0, 1, 2, 63, 65, 128]))
-    _try(database, f"UPDATE {prefix}node_points SET descriptor_size = {size}, descriptors = zeroblob(num_points * {size})")
-    if rng.random() < 0.5:
-        names = {"points_img": 8, "shapes": 12, "descriptors": size or 64, "points_cam": 12, "sqrt_covs": 12}
+    is_one = rng.random() < 0.5
+    if is_one:
         _try(database, f"UPDATE {prefix}nodes SET num_points = 1")
-        blobs = ", ".join(f"{name} = substr({name}, 1, {width})" for name, width in names.items())
-        _try(database, f"UPDATE {prefix}node_points SET num_points = 1, {blobs}")
+    for rowid, num_points in database.execute(f"SELECT rowid, num_points FROM {prefix}node_points").fetchall():
+        n = 1 if is_one or not isinstance(num_points, int) or not 0 <= num_points <= 1000 else num_points
+        shapes = {name: (dtype, size if name == "descriptors" else width) for name, (dtype, width) in POINTS.items()}
+        blobs = [array_packed(np.ones((n, width), dtype)) for dtype, width in shapes.values()]
+        changes = ", ".join(f"{name} = ?" for name in shapes)
+        statement = f"UPDATE {prefix}node_points SET descriptor_size = ?, num_points = ?, {changes} WHERE rowid = ?"
+        _try(database, statement, size, n, *blobs, rowid)
     return f"{prefix}descriptors of size {size}"
 
 

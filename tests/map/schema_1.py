@@ -8,12 +8,11 @@ from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
-
 from topoloc.map.entries import TopoNode
+from topoloc.map.points import arrays_of
 from topoloc.map.schema import APPLICATION_ID, SCHEMA_1, SIDE
 from topoloc.map.topomap import TopoMetricMap
-from topoloc.map.writing import _arrays_bytes, _pose_bytes, _quantised
+from topoloc.map.writing import _arrays_bytes, _pose_bytes
 
 
 def write_schema_1(topomap: TopoMetricMap, path: Path) -> Path:
@@ -51,7 +50,5 @@ def _insert(database: sqlite3.Connection, node: TopoNode, prefix: str) -> None:
     (camera_id,) = database.execute("SELECT camera_id FROM cameras WHERE json = ?", (camera,)).fetchone()
     row = (s.node_id, s.recording, s.name, s.t_ns, camera_id, _pose_bytes(s.world_from_cam), len(f))
     database.execute(f"INSERT INTO {prefix}nodes VALUES (?, ?, ?, ?, ?, ?, ?)", row)
-    shapes = np.stack([f.sizes_px, f.angles, f.responses], axis=1).astype("<f4")
-    blobs = (f.points_img, shapes, _quantised(node, 200.0), node.points_cam, node.point_sqrt_covs.astype("<f2"))
-    row = (s.node_id, f.descriptors.shape[1], *(blob.tobytes() for blob in blobs))
+    row = (s.node_id, f.descriptors.shape[1], *(array.tobytes() for array in arrays_of(node, "surf")))
     database.execute(f"INSERT INTO {prefix}node_points VALUES (?, ?, ?, ?, ?, ?, ?)", row)

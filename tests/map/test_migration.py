@@ -1,4 +1,4 @@
-"""Maps of schema 1 open, answer as they always did, and are saved as schema 2."""
+"""Maps of older schemas open, answer as they always did, and are saved as those of today."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from schema_1 import write_schema_1
+from schema_2 import write_schema_2
 
 from built_corridor import WIDE, built_corridor, seen_ahead
 from topoloc.errors import MapError
@@ -25,7 +26,7 @@ def answers(topomap: TopoMetricMap) -> list[tuple[bytes, int]]:
     return [(result.world_from_cam.matrix().tobytes(), result.node_id) for result in results if isinstance(result, Localization)]
 
 
-def test_schema_1_answers_the_same_bytes_and_is_saved_as_schema_2(tmp_path: Path):
+def test_schema_1_answers_the_same_bytes_and_is_saved_as_schema_3(tmp_path: Path):
     built_corridor().save(tmp_path / "new.topo")
     old = TopoMetricMap.load(write_schema_1(built_corridor(), tmp_path / "old.topo"))
     new = TopoMetricMap.load(tmp_path / "new.topo")
@@ -41,6 +42,19 @@ def test_schema_1_answers_the_same_bytes_and_is_saved_as_schema_2(tmp_path: Path
     saved.save(tmp_path / "again.topo")
     assert (tmp_path / "again.topo").read_bytes() == (tmp_path / "saved.topo").read_bytes()
     assert damages(tmp_path / "saved.topo") == []
+
+
+def test_schema_2_answers_the_same_bytes_and_is_saved_as_schema_3(tmp_path: Path):
+    built_corridor().save(tmp_path / "new.topo")
+    path = write_schema_2(built_corridor(), tmp_path / "old.topo")
+    assert damages(path) == []
+    old, new = TopoMetricMap.load(path), TopoMetricMap.load(tmp_path / "new.topo")
+    assert old.file is not None
+    assert old.file.version == 2
+    assert answers(old) == answers(new)
+    old.save(tmp_path / "saved.topo")
+    assert (tmp_path / "saved.topo").read_bytes() == (tmp_path / "new.topo").read_bytes()
+    assert path.stat().st_size > 1.2 * (tmp_path / "new.topo").stat().st_size
 
 
 def test_schema_1_without_side_tables_is_a_map_without_sides(tmp_path: Path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,15 +13,16 @@ from test_place_vectors import NO_FEATURES, silent
 
 from built_room import unseen_views
 from topoloc.errors import MapError, TrainingError
+from topoloc.places.backbones import Backbone
 from topoloc.places.cnn_fc import CnnFc
 from topoloc.places.coarse import CoarseModel, open_coarse
 from topoloc.places.network_config import PictureConfig
 from topoloc.places.network_pictures import decode_picture
-from topoloc_training import cnn_fc, training
+from topoloc_training import cnn_fc, frozen_maps, training
 from topoloc_training.classifier_config import AugmentationConfig, CnnFcConfig, TrainingConfig
 from topoloc_training.cnn_fc import calibrated_temperature, soft_labels
 from topoloc_training.training_set import TrainingSet
-from topoloc_training.weights import read_weights
+from topoloc_training.weights import Weights, read_weights
 
 TINY = PictureConfig(64, 48)
 
@@ -85,7 +87,7 @@ def test_a_checkpoint_of_another_training_or_a_broken_one_is_refused(room_set: T
 
 
 def test_a_loss_that_is_not_finite_ends_with_the_last_good_state(room_set: TrainingSet, monkeypatch: pytest.MonkeyPatch):
-    augment = cnn_fc.augment
+    augment = frozen_maps.augment
     calls = 0
 
     def spoilt(pictures: torch.Tensor, *args: object) -> torch.Tensor:
@@ -93,7 +95,7 @@ def test_a_loss_that_is_not_finite_ends_with_the_last_good_state(room_set: Train
         calls += 1
         return augment(pictures, *args) * (torch.nan if calls > after else 1.0)  # pyright: ignore[reportArgumentType]
 
-    monkeypatch.setattr(cnn_fc, "augment", spoilt)
+    monkeypatch.setattr(frozen_maps, "augment", spoilt)
     after = 4  # two batches an epoch
     model = train(room_set, config(6))
     assert model.settings["trained"]["stopped_by"] == "the loss was not finite in epoch 3"
@@ -126,6 +128,44 @@ def test_weights_from_elsewhere_are_where_it_begins(two_images: TrainingSet, ran
     kept = torch.from_numpy(model.arrays["network.backbone.features.0.weight"])
     assert torch.equal(kept, weights.tensors["features.0.weight"].half())
     assert model.settings["weights"]["sha256"] == weights.sha256
+
+
+def learned(model: CoarseModel, weights: Weights) -> set[int]:
+    """Layers of the backbone whose weights are no longer those of the file."""
+    names = [name for name in weights.tensors if name.startswith("features.")]
+    changed = [name for name in names if not np.array_equal(model.arrays[f"network.backbone.{name}"], weights.tensors[name].half().numpy())]
+    return {int(name.split(".")[1]) for name in changed}
+
+
+def test_the_last_layers_learn_and_those_before_keep_their_weights(
+    room_set: TrainingSet, random_file: Path, monkeypatch: pytest.MonkeyPatch
+):
+    weights = read_weights(random_file, "squeezenet1_1")
+    few = replace(config(1), num_tuned=2, num_copies=3)
+    assert learned(cnn_fc.train(room_set, "squeezenet1_1", weights, few, silent), weights) == {11, 12}
+    assert learned(cnn_fc.train(room_set, "squeezenet1_1", weights, replace(few, num_tuned=0), silent), weights) == set()
+    monkeypatch.setattr(frozen_maps, "MAX_BYTES", 0)  # no room for a single copy: varied anew whenever shown
+    assert learned(cnn_fc.train(room_set, "squeezenet1_1", weights, few, silent), weights) == {11, 12}
+
+
+def test_copies_are_made_once_and_as_many_as_there_is_room_for(room_set: TrainingSet, random_file: Path, monkeypatch: pytest.MonkeyPatch):
+    weights, shown, made = read_weights(random_file, "squeezenet1_1"), 0, frozen_maps.augment
+
+    def counted(pictures: torch.Tensor, *args: Any) -> torch.Tensor:
+        nonlocal shown
+        shown += len(pictures)
+        return made(pictures, *args)
+
+    monkeypatch.setattr(frozen_maps, "augment", counted)
+    cnn_fc.train(room_set, "squeezenet1_1", weights, replace(config(4), num_copies=3), silent)
+    assert shown == 3 * len(room_set.jpegs)
+    shown = 0
+    one = frozen_maps.plain_maps(
+        torch.nn.Sequential(*list(Backbone("squeezenet1_1").features)[:11]), torch.zeros(1, 48, 64, 3, dtype=torch.uint8)
+    ).nbytes
+    monkeypatch.setattr(frozen_maps, "MAX_BYTES", int(2.5 * one * len(room_set.jpegs)))
+    cnn_fc.train(room_set, "squeezenet1_1", weights, replace(config(4), num_copies=3), silent)
+    assert shown == 2 * len(room_set.jpegs)
 
 
 def test_a_model_that_lacks_a_part_is_damaged(two_images: TrainingSet):

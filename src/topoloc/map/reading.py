@@ -13,17 +13,17 @@ import numpy as np
 
 from topoloc.bounds import settings_from, value_from
 from topoloc.errors import MapError
-from topoloc.features.features import Features
 from topoloc.features.kinds import find_kind
 from topoloc.geometry.camera import Camera
 from topoloc.map.config import CONFIG_VERSION, MapConfig, config_from_text
 from topoloc.map.contents import MapContents, NextIds
 from topoloc.map.entries import Edge, NodeSummary, PlaceImage, Repetitions, SharedErrors, SideNodes, TopoNode
 from topoloc.map.file import MapFile
+from topoloc.map.points import points_from
 from topoloc.map.schema import ORDER, SIDE
 from topoloc.map.sessions import Edit, Session
 from topoloc.map.sums import LandmarkSums, sums_from
-from topoloc.map.validation import MAX_POINTS, Damage, array_from, arrays_from, camera_from, count_within, json_of, pose_from
+from topoloc.map.validation import MAX_POINTS, Damage, arrays_from, camera_from, count_within, json_of, pose_from
 from topoloc.places.coarse import CoarseModel
 
 T = TypeVar("T")
@@ -188,32 +188,13 @@ def _node_at(file: MapFile, kind: str, prefix: str, is_default: bool, row: int) 
         node_id, what = summary.node_id, f"{prefix}node {summary.node_id}"
         points = _found(file.row(f"{prefix}node_points", node_id=node_id, kind=kind), f"the points of {what}")
         template = b"" if prefix else _found(file.row("node_templates", node_id=node_id), f"the template of {what}")["jpeg"]
-        n, size = count_within(points["num_points"], 0, MAX_POINTS, f"the points of {what}"), find_kind(kind).descriptor_size
+        features, points_cam, sqrt_covs, stored = points_from(points, kind, file.version, what)
+        n = len(features)
         if is_default and summary.num_points != n:
             raise Damage(f"node {node_id} has {n} points")
-        if points["descriptor_size"] != size:
-            raise Damage(f"the points of {what} are not described as {kind} is")
         summary = summary if summary.num_points == n else replace(summary, num_points=n)
-        stored = array_from(points["descriptors"], "i1", (n, size), what)
-        sizes, angles, responses = np.ascontiguousarray(array_from(points["shapes"], "<f4", (n, 3), what).T)
-        points_img = array_from(points["points_img"], "<f4", (n, 2), what)
-        return TopoNode(
-            summary,
-            _camera_of(file, prefix, node_id),
-            Features(points_img, sizes, angles, responses, unit_descriptors(stored)),
-            array_from(points["points_cam"], "<f4", (n, 3), what),
-            array_from(points["sqrt_covs"], "<f2", (n, 6), what).astype(np.float32),
-            template,
-            () if prefix else _StoredSums(file, node_id, kind, n),
-            stored,
-        )
-
-
-def unit_descriptors(stored: np.ndarray) -> np.ndarray:
-    """Descriptors (n, d) of length 1 from the file's signed bytes."""
-    descriptors = stored.astype(np.float32)
-    descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-6)
-    return descriptors
+        sums = () if prefix else _StoredSums(file, node_id, kind, n)
+        return TopoNode(summary, _camera_of(file, prefix, node_id), features, points_cam, sqrt_covs, template, sums, stored)
 
 
 def _camera_of(file: MapFile, prefix: str, node_id: int) -> Camera:

@@ -8,7 +8,7 @@ from hashlib import blake2b
 from typing import Any
 
 APPLICATION_ID = 0x544F504F  # "TOPO", in the database's header
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 SIDE = "side_"
 
 Columns = dict[str, str]

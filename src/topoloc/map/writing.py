@@ -1,7 +1,6 @@
 """The map file written: one SQLite database (see docs/map-format.md), at once or not at all; `reading.py` opens it.
 
-A node costs about 120 bytes a point and a small JPEG: descriptors are kept as signed bytes, covariances as half floats
-of their square root, pixels and positions as single floats, the sessions' sums packed.
+A node costs about 100 bytes a point and a small JPEG: `points.py` and `sums.py` say how points, and what sessions know of them, are kept.
 """
 
 from __future__ import annotations
@@ -18,20 +17,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int8
 
 from topoloc.errors import MapError
-from topoloc.features.kinds import find_kind
 from topoloc.geometry.rigid import Rigid3
 from topoloc.map.config import config_to_text
 from topoloc.map.contents import MapContents, NextIds
 from topoloc.map.entries import TopoNode
-from topoloc.map.reading import unit_descriptors
+from topoloc.map.points import array_packed, arrays_of
 from topoloc.map.schema import APPLICATION_ID, ORDER, SCHEMA_VERSION, SIDE, TABLES, checksum_of, creation_of
 from topoloc.map.sessions import Session, sessions_named
 from topoloc.map.sums import sums_bytes
 from topoloc.places.coarse import CoarseModel
 from topoloc.sequences.atomic import replaced_file
+
+_PAGE_BYTES = 1024
+"""A row leaves half of its last page empty, and a node has about eight; with larger pages a node takes 1 to 5 kB more."""
 
 
 def save_map(topomap: MapContents, path: Path) -> None:
@@ -61,7 +61,7 @@ class _Writer:
 
     def write(self, topomap: MapContents) -> None:
         # the file is nobody's until it is renamed: no journal is needed to undo what is half done
-        for pragma in ("page_size = 4096", "journal_mode = OFF", "synchronous = OFF", f"application_id = {APPLICATION_ID}"):
+        for pragma in (f"page_size = {_PAGE_BYTES}", "journal_mode = OFF", "synchronous = OFF", f"application_id = {APPLICATION_ID}"):
             self._database.execute(f"PRAGMA {pragma}")
         self._database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
         self._database.execute("BEGIN")
@@ -146,10 +146,8 @@ class _Writer:
 
     def _insert_points(self, node: TopoNode, kind: str, prefix: str = "") -> None:
         f, node_id = node.features, node.summary.node_id
-        shapes = np.stack([f.sizes_px, f.angles, f.responses], axis=1).astype("<f4")
-        descriptors = _quantised(node, find_kind(kind).descriptor_scale)
-        blobs = (f.points_img.astype("<f4"), shapes, descriptors, node.points_cam.astype("<f4"), node.point_sqrt_covs.astype("<f2"))
-        self._insert(f"{prefix}node_points", node_id, kind, len(f), f.descriptors.shape[1], *(blob.tobytes() for blob in blobs))
+        blobs = [array_packed(array) for array in arrays_of(node, kind)]
+        self._insert(f"{prefix}node_points", node_id, kind, len(f), f.descriptors.shape[1], *blobs)
         if not prefix:
             for sums in node.sums:
                 self._insert("landmark_sums", node_id, kind, sums.session_id, len(sums.rows), sums_bytes(sums))
@@ -170,14 +168,6 @@ def digest_of(checksums: Mapping[str, Sequence[bytes]]) -> str:
     for table in TABLES:
         digest.update(f"{table} {len(checksums[table])}\n".encode() + b"".join(checksums[table]))
     return digest.hexdigest()
-
-
-def _quantised(node: TopoNode, scale: float) -> Int8[np.ndarray, "n d"]:
-    """The descriptors as signed bytes; of a node that was read from a file, those that it was read from."""
-    descriptors, stored = node.features.descriptors, node.stored_descriptors
-    if stored is not None and stored.shape == descriptors.shape and np.array_equal(unit_descriptors(stored), descriptors):
-        return stored
-    return np.clip(np.rint(descriptors * scale), -127, 127).astype(np.int8)
 
 
 def _session_text(session: Session) -> str:

@@ -40,13 +40,16 @@ class Backbone(nn.Module):
     def __init__(self, name: BackboneName, num_outputs: int | None = NUM_IMAGENET_CLASSES, depth: int | None = None) -> None:
         super().__init__()
         self.name: BackboneName = name
-        self.features = _features(name)[:depth]
+        self.features = nn.Sequential(*list(_features(name))[:depth])
         self.num_channels = max(_num_channels(layer) for layer in self.features.children())  # they never decrease
         self.classifier = None if num_outputs is None else _classifier(name, num_outputs)
 
-    def forward(self, images: Tensor) -> Tensor:
-        """Outputs (n, num_outputs) of normalised images (n, 3, h, w); without classifier feature maps (n, c, h', w')."""
-        maps = self.features(images)
+    def forward(self, images: Tensor, first: int = 0) -> Tensor:
+        """Outputs (n, num_outputs) of normalised images (n, 3, h, w); without classifier feature maps (n, c, h', w').
+
+        With `first`, `images` are what the layers of `features` before that one have made of them.
+        """
+        maps = self.features[first:](images)
         if self.classifier is None:
             return maps
         if not has_wide_classifier(self.name):

@@ -35,8 +35,9 @@ class NodeClassifier(nn.Module):
         self.backbone = Backbone(backbone, num_outputs=num_nodes if wide else None)
         self.head = nn.Identity() if wide else _cell_head(self.backbone.num_channels, num_nodes)
 
-    def forward(self, images: Tensor) -> Tensor:
-        return self.head(self.backbone(images))
+    def forward(self, images: Tensor, first: int = 0) -> Tensor:
+        """As that of `Backbone`."""
+        return self.head(self.backbone(images, first))
 
 
 class CnnFc:

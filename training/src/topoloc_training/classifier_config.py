@@ -59,8 +59,13 @@ class AugmentationConfig:
 class CnnFcConfig(ClassifierNetwork):
     """Settings of cnn-fc: a network whose outputs are the nodes."""
 
-    training: TrainingConfig = field(default_factory=TrainingConfig)
+    training: TrainingConfig = field(default_factory=lambda: TrainingConfig(max_epochs=40))
     augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
+    num_tuned: Annotated[int, Between(0, 100)] = 2
+    """Layers of the backbone that learn, the last ones with weights; those before stay as they begin. A network that begins at random
+    learns as a whole."""
+    num_copies: Annotated[int, Between(1, 10_000)] = 8
+    """Varied copies of each picture that the layers that do not learn see, once; fewer where what they make of them would exceed 1 GB."""
     label_spread: Annotated[float, AtLeast(0)] = 1.0
     """An image belongs to its nearest node and, by a bell curve of D_total - D_nearest over this share of D_thresh, to those
     about as near; 0 is the paper's single label."""

@@ -11,16 +11,15 @@ from jaxtyping import Float32
 from torch import Generator, Tensor, nn
 
 from topoloc.errors import TrainingError
-from topoloc.places.backbones import normalize_pictures
 from topoloc.places.cnn_fc import NAME, NodeClassifier
 from topoloc.places.coarse import CoarseModel
 from topoloc.places.inference import BATCH_SIZE, in_channels_last
 from topoloc.places.network_config import BackboneName
 from topoloc.places.network_pictures import network_pictures
-from topoloc_training.augmentation import augment
 from topoloc_training.classifier_config import CnnFcConfig
+from topoloc_training.frozen_maps import FrozenMaps, plain_maps
 from topoloc_training.stored_weights import rounded_to_half, to_arrays
-from topoloc_training.training import Task, fit, hold_out
+from topoloc_training.training import Task, deterministic, fit, hold_out
 from topoloc_training.training_set import Progress, TrainingSet, decode_pictures
 from topoloc_training.weights import Weights, describe
 
@@ -45,33 +44,31 @@ def train(
     network = NodeClassifier(backbone, training_set.num_nodes)
     in_channels_last(network)
     pretrained = [] if weights is None else _load(network, weights)
+    trunk = _freeze(network, len(network.backbone.features) if weights is None else config.num_tuned)
     images, shape = decode_pictures(training_set)
     pictures = torch.from_numpy(network_pictures(images, shape, config.picture))
     targets = torch.from_numpy(soft_labels(training_set, config.label_spread))
     held_out = hold_out(training_set.node_ids, config.training.held_out, config.training.seed)
-    judged = np.flatnonzero(held_out) if held_out.any() else np.arange(len(held_out))
+    rows, judged = np.flatnonzero(~held_out), np.flatnonzero(held_out) if held_out.any() else np.arange(len(held_out))
+    with deterministic(config.training):
+        shown, plain = FrozenMaps(trunk, pictures, rows, config, progress), plain_maps(trunk, pictures[judged])
 
     def loss(rows: Tensor, generator: Generator) -> Tensor:
-        outputs = network(augment(pictures[rows], config.augmentation, generator))
+        outputs = network(shown.drawn(rows, generator), len(trunk))
         return nn.functional.cross_entropy(outputs.float(), targets[rows])
 
     def score() -> float:
-        return float(nn.functional.cross_entropy(_outputs(network, pictures[judged]), targets[judged]))
+        return float(nn.functional.cross_entropy(_outputs(network, plain, len(trunk)), targets[judged]))
 
-    rows = np.flatnonzero(~held_out)
     counts = np.bincount(training_set.node_ids[rows], minlength=training_set.num_nodes)
     balance = 1.0 / counts[training_set.node_ids[rows]]  # every node is shown as often as every other
     done = fit(Task(network, loss, score, rows, balance, pretrained, NAME), config.training, progress, checkpoint)
     rounded_to_half(network)
     labels = torch.from_numpy(training_set.node_ids[judged])
-    temperature = calibrated_temperature(_outputs(network, pictures[judged]), labels) if held_out.any() else 1.0
+    temperature = calibrated_temperature(_outputs(network, plain, len(trunk)), labels) if held_out.any() else 1.0
     facts = {"backbone": backbone, "weights": describe(weights), "config": asdict(config), "picture_shape": [shape.width, shape.height]}
-    trained = {
-        "epochs": len(done.scores),
-        "best_epoch": done.best_epoch,
-        "stopped_by": done.stopped_by,
-        "num_held_out": int(held_out.sum()),
-    }
+    ended = {"epochs": len(done.scores), "best_epoch": done.best_epoch, "stopped_by": done.stopped_by}
+    trained = ended | {"num_held_out": int(held_out.sum())}
     settings = facts | {"trained": trained, "num_nodes": training_set.num_nodes, "temperature": temperature}
     return CoarseModel(NAME, settings, to_arrays(network))
 
@@ -100,10 +97,20 @@ def calibrated_temperature(outputs: Tensor, labels: Tensor) -> float:
     return float(np.exp(0.5 * (low + high)))
 
 
-def _outputs(network: nn.Module, pictures: Tensor) -> Tensor:
+def _outputs(network: NodeClassifier, maps: Tensor, num_frozen: int) -> Tensor:
+    """Of what the first layers, as many as are frozen, made of pictures."""
     network.eval()
     with torch.inference_mode():
-        return torch.cat([network(normalize_pictures(batch)).float() for batch in pictures.split(BATCH_SIZE)])
+        return torch.cat([network(batch.float(), num_frozen).float() for batch in maps.split(BATCH_SIZE)])
+
+
+def _freeze(network: NodeClassifier, num_tuned: int) -> nn.Sequential:
+    """The layers of the backbone before the last `num_tuned` that have weights: they do not learn, and are as the map will keep them."""
+    layers = list(network.backbone.features)
+    learning = [len(layers), *(k for k in reversed(range(len(layers))) if any(True for _ in layers[k].parameters()))]
+    trunk = nn.Sequential(*layers[: learning[num_tuned] if num_tuned < len(learning) - 1 else 0])
+    rounded_to_half(trunk.requires_grad_(False))
+    return trunk
 
 
 def _load(network: NodeClassifier, weights: Weights) -> list[nn.Parameter]:

@@ -69,7 +69,7 @@ def fit(task: Task, config: TrainingConfig, progress: Progress, checkpoint: Path
     state = _State(task, config)
     if checkpoint is not None and checkpoint.exists():
         state.load(checkpoint)
-    with _deterministic(config):
+    with deterministic(config):
         while not state.finished:
             fault = _train_epoch(task, config, state, progress)
             if fault:
@@ -195,7 +195,7 @@ def _train_epoch(task: Task, config: TrainingConfig, state: _State, progress: Pr
 
 
 @contextmanager
-def _deterministic(config: TrainingConfig) -> Iterator[None]:
+def deterministic(config: TrainingConfig) -> Iterator[None]:
     """The same sums in the same order on every run; what the caller had set is put back."""
     deterministic, rng_state = torch.are_deterministic_algorithms_enabled(), torch.get_rng_state()
     try:
