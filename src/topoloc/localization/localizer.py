@@ -21,7 +21,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.answer import Answered, answer
 from topoloc.localization.asked_kind import AskedKind, kinds_to_ask
-from topoloc.localization.belief import Belief
+from topoloc.localization.belief import Belief, is_same_pose
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.fitted_weights import FittedWeights
 from topoloc.localization.propose import propose, propose_more
@@ -112,13 +112,32 @@ class Localizer:
             result, named = answer(search)
             is_settled = search.is_clear or search.following is None or prior is not None
             if search.is_stopped or (isinstance(result, Localization) and is_settled):
-                return result, named
+                doubted = self._doubted(searches[0], search, result) if prior is None else None
+                return doubted or (result, named)
         if len(searches) > 1 and not named and prior is None:
             of_first = self._second_look(searches[0], searches[-1])
             if of_first[1]:
                 return of_first
         assert result is not None
         return result, named
+
+    def _doubted(self, first: Search, last: Search, result: Localization | NotLocalized) -> tuple[NotLocalized, list[Answered]] | None:
+        """The first kind's verdict where it leaves open what the last kind answers; None where the answer stands.
+
+        A pose that two kinds find and that is clear by neither, in a light in which both see, may be a twin of a place that the map's nodes
+        do not show. What the first kind has beside its nodes, the walls above all, then has its say.
+        """
+        if first is last or first.is_stopped or last.is_stopped or last.is_clear or not isinstance(result, Localization):
+            return None
+        pose, weights = last.belief.ranked(last.weights.rivals)[0], first.weights.rivals
+        seen = first.belief.best(weights)
+        if seen is None or seen.probability < self.config.evidence.min_probability:
+            return None
+        if not is_same_pose(seen.fit, pose.fit, self.config.evidence):
+            return None
+        _follow_up(first, propose_more(first))
+        of_first, named = answer(first)
+        return (of_first, named) if isinstance(of_first, NotLocalized) else None
 
     def _second_look(self, first: Search, last: Search) -> tuple[Localization | NotLocalized, list[Answered]]:
         """What the first kind of features finds by all that it has, where the others found nothing; they are heard on it."""
