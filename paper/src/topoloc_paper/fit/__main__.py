@@ -98,7 +98,7 @@ def fit(kind: str, poses: list[TriedPose], step: int, by_recording: bool) -> Fit
         kind,
         corpus_of(poses, strength, num_hard, num_walls, by_recording),
         datetime.date.today().isoformat(),
-        f"python -m topoloc_paper.fit --kind {kind} --rendered FOLDER --step {step} --out FILE",
+        f"python -m topoloc_paper.fit --kind {kind} --rendered FOLDER --step {step}{' --by-recording' if by_recording else ''} --out FILE",
         round(calibration_error(log_odds, is_right), 4),
         evidence,
         rivals,
