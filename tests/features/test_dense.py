@@ -34,7 +34,7 @@ def test_points_agree_where_they_are_seen_whatever_the_length_of_the_descriptors
 @pytest.mark.parametrize(("steps", "share"), [(1, 1.0), (2, 0.0), (4, 0.0)])
 def test_one_grid_step_is_forgiven_and_no_more(steps: int, share: float):
     planes, points = _scene(), _points(200)
-    descriptors = _of_points(planes, points + [steps * STRIDE, 0.0])
+    descriptors = _of_points(planes, points + np.array([steps * STRIDE, 0.0]))
     assert DenseDescriptors(planes, STRIDE).agrees(points, descriptors).mean() == share
 
 

@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
 import pytest
+from made_hypotheses import made_hypothesis
 
 from built_room import room_of_two_kinds, unseen_views
 from room_stream import room_stream
 from tiny_network import write_network
 from tiny_world import CAMERA
 from topoloc.errors import FeatureKindError, WeightsError
+from topoloc.features.dense import DenseDescriptors
 from topoloc.features.features import Features
 from topoloc.features.kinds import KINDS, FeatureConfig
 from topoloc.geometry.alignment import translation_error
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.building import build_map
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.localization.search import Trace
+from topoloc.localization.search import Proposal, Search, Trace
 from topoloc.map.build import BuildConfig
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.open import open_sequence
@@ -92,8 +95,46 @@ def test_the_second_begins_with_the_poses_that_the_first_left_open(topomap: Topo
     trace = Trace()
     assert _is_right(Localizer(topomap).localize(PICTURE, CAMERA, trace=trace))
     sizes = [tried.first.features.descriptors.shape[1] for tried in trace.tried]
-    assert sizes == sorted(sizes)  # of SURF, 64, before SIFT, 128
+    assert [size for size, _ in groupby(sizes)] == [64, 128, 64]  # SURF, then SIFT, then SURF again on what neither finds clear
     assert "other features" in {tried.source for tried in trace.tried}
+
+
+@pytest.mark.parametrize("has_twin", [False, True])
+def test_what_both_find_and_neither_clearly_the_first_may_leave_open(
+    topomap: TopoMetricMap, changed: Callable[..., list[int]], monkeypatch: pytest.MonkeyPatch, has_twin: bool
+):
+    for kind in ("surf", "sift"):
+        changed(kind, lambda features: features.select(np.arange(0, len(features), 12)))
+    monkeypatch.setattr(Search, "is_clear", property(lambda search: False))
+    asked = list[Search]()
+
+    def walls(search: Search) -> Iterator[Proposal]:
+        if search.following is not None:
+            asked.append(search)
+            (best,) = search.belief.ranked(search.weights.rivals)
+            twin = [made_hypothesis(best.log_odds, x=9.0, walls=True)] if has_twin else []
+            for one in twin:
+                search.belief = search.belief.given(one, search.config.evidence, search.weights.rivals)
+        return iter(())
+
+    monkeypatch.setattr("topoloc.localization.localizer.propose_more", walls)
+    result = Localizer(topomap).localize(PICTURE, CAMERA)
+    assert len(asked) == 1
+    assert isinstance(result, NotLocalized) and result.reason == "ambiguous" if has_twin else _is_right(result)
+
+
+@pytest.mark.parametrize("agrees", [True, False])
+def test_dense_descriptors_decide_what_is_found_of_what_must_be_in_view(
+    topomap: TopoMetricMap, changed: Callable[..., list[int]], monkeypatch: pytest.MonkeyPatch, agrees: bool
+):
+    changed("surf", _useless)
+    monkeypatch.setattr(DenseDescriptors, "agrees", lambda dense, points_img, descriptors: np.full(len(points_img), agrees))
+    changed("sift", lambda features: replace(features, dense=DenseDescriptors(np.zeros((128, 2, 2), np.float32), 4.0)))
+    trace = Trace()
+    result = Localizer(topomap).localize(PICTURE, CAMERA, trace=trace)
+    assert _is_right(result) if agrees else isinstance(result, NotLocalized)
+    if agrees:
+        assert max(tried.hypothesis.evidence.even_share for tried in trace.tried if tried.hypothesis is not None) > 0.6
 
 
 def test_what_is_not_the_place_is_refused_by_both(topomap: TopoMetricMap, changed: Callable[..., list[int]]):
