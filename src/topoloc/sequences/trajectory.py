@@ -184,7 +184,7 @@ def _numbers(path: Path, rows: _Rows, columns: Iterable[int]) -> Float[np.ndarra
             for column in wanted:
                 _number(path, line, tokens[column])
         raise
-    _check(np.isfinite(numbers).all(axis=1), "NaN or infinite numbers", path, rows)
+    _check(np.asarray(np.isfinite(numbers).all(axis=1)), "NaN or infinite numbers", path, rows)
     return numbers
 
 
