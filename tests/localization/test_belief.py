@@ -190,6 +190,14 @@ def test_walls_are_believed_where_nodes_know_nothing(of_nodes: list[Hypothesis])
     assert CONFIG.min_probability <= result.probability <= 1.0 / (1.0 + math.exp(-1.5))
 
 
+@pytest.mark.parametrize(("log_odds", "is_answered"), [(2.0, False), (WEIGHTS.evidence.clear_log_odds + 0.1, True)])
+def test_a_pose_that_is_not_clear_must_lead_those_elsewhere_by_what_its_kind_asks(log_odds: float, is_answered: bool):
+    search = believed([made_hypothesis(log_odds, even_share=0.3), made_hypothesis(log_odds - 3.0, x=9.0)])
+    assert isinstance(answer(search)[0], Localization)
+    strict = replace(WEIGHTS, rivals=replace(WEIGHTS.rivals, unclear_lead=4.0))
+    assert isinstance(answer(replace(search, weights=strict))[0], Localization) == is_answered
+
+
 def test_of_walls_and_nodes_the_one_with_much_more_for_it_is_believed():
     behind = 3.0 - MIN_LEAD - 0.1
     assert _along(_answered(made_hypothesis(behind), made_hypothesis(3.0, x=-9.0, walls=True))) == pytest.approx(-9.0)

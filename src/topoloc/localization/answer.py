@@ -31,7 +31,8 @@ def answer(search: Search) -> tuple[Localization | NotLocalized, list[Answered]]
     best, leads = ranked[0], [_lead(search, ranked[0], other) for other in ranked[1:]]
     others = math.exp(-best.log_odds) + sum(math.exp(-one) for one in leads)
     probability = precision_of(best.evidence) / (1.0 + others)
-    if min(leads, default=math.inf) >= MIN_LEAD and probability >= min_probability:
+    is_leading = all(by >= _least_lead(search, best, other) for by, other in zip(leads, ranked[1:], strict=True))
+    if is_leading and probability >= min_probability:
         named = _answered(search, best, probability)
         return named[0], [named]
     return _ambiguity(search, ranked, leads, others)
@@ -41,10 +42,18 @@ def _lead(search: Search, best: Hypothesis, other: Hypothesis) -> float:
     """By how much the best hypothesis leads. One that is not clear must lead those elsewhere by its odds, too: where a wrong place of the
     map has nearly as much for it, a place that is not in the map may as well."""
     by_all = lead(best, other, search.weights.rivals)
-    is_clear = best.log_odds > search.weights.evidence.clear_log_odds
+    return min(by_all, best.log_odds - other.log_odds) if _is_unclear_beside(search, best, other) else by_all
+
+
+def _least_lead(search: Search, best: Hypothesis, other: Hypothesis) -> float:
+    return search.weights.rivals.unclear_lead if _is_unclear_beside(search, best, other) else MIN_LEAD
+
+
+def _is_unclear_beside(search: Search, best: Hypothesis, other: Hypothesis) -> bool:
+    """Is the best hypothesis not clear, and the other one elsewhere?"""
     apart, config = best.world_from_cam.inverse() @ other.world_from_cam, search.config.evidence
     is_elsewhere = np.linalg.norm(apart.translation) > 2.0 * config.max_translation or apart.angle() > math.radians(_ELSEWHERE_DEG)
-    return min(by_all, best.log_odds - other.log_odds) if is_elsewhere and not is_clear else by_all
+    return bool(is_elsewhere) and best.log_odds <= search.weights.evidence.clear_log_odds
 
 
 def _answered(search: Search, best: Hypothesis, probability: float) -> Answered:

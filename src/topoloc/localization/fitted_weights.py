@@ -48,11 +48,15 @@ class EvidenceWeights:
 
 @dataclass(frozen=True)
 class RivalWeights:
-    """How much the odds, the even share found and the doubt count between two poses of one picture (`belief.py`), in logarithms."""
+    """How much the odds, the even share found and the doubt count between two poses of one picture (`belief.py`), in logarithms.
+
+    unclear_lead: by how much, in logarithms of odds, a pose that is not clear must lead each one elsewhere.
+    """
 
     odds: float
     even_share: float
     doubt: float
+    unclear_lead: float
 
 
 @dataclass(frozen=True)

@@ -122,7 +122,7 @@ def test_shared_errors_put_95_percent_inside():
 
 def test_pairs_are_of_one_picture_and_too_few_of_them_change_nothing():
     strong, weak = Evidence(150, 90, 300, 900, 20, 0.8, 0.1, 0.3), Evidence(150, 60, 250, 900, 20, 0.7, 0.3, 0.05)
-    before = RivalWeights(0.3, 6.0, -3.0)
+    before = RivalWeights(0.3, 6.0, -3.0, 2.0)
     poses = [pose for k in range(MIN_HARD_PAIRS) for pose in (_pose(RIGHT, strong, k), _pose(WRONG, weak, k))]
     differences, is_hard = pairs_of(poses, TRUE)
     assert len(differences) == MIN_HARD_PAIRS

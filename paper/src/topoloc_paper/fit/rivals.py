@@ -6,6 +6,8 @@ where the wrong pose comes near to being believed on its own; the weights are fi
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import minimize
@@ -36,7 +38,8 @@ def fit_rivals(poses: list[TriedPose], weights: EvidenceWeights, before: RivalWe
 
     # neither odds nor even share may count against a pose, nor doubt for it
     fitted = minimize(loss, np.array([0.1, 0.1, -0.1]), bounds=[(0.0, None), (0.0, None), (None, 0.0)], method="L-BFGS-B").x
-    return RivalWeights(*(float(w) for w in np.round(fitted, 2))), num_hard
+    odds, even_share, doubt = (float(w) for w in np.round(fitted, 2))
+    return replace(before, odds=odds, even_share=even_share, doubt=doubt), num_hard
 
 
 def pairs_of(poses: list[TriedPose], weights: EvidenceWeights) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
