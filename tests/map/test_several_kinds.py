@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sqlite3
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -64,8 +66,9 @@ def test_the_first_kind_is_what_it_would_be_alone(of_two: TopoMetricMap, tiny_ma
 
 def test_a_damaged_point_of_the_second_kind_is_found(path: Path):
     content = path.read_bytes()
-    points = TopoMetricMap.load(path).by_kind("sift").nodes[1].points_cam.tobytes()
-    place = content.index(points[:40]) + 20
+    with closing(sqlite3.connect(path)) as database:
+        (packed,) = database.execute("SELECT points_cam FROM node_points WHERE kind = 'sift' ORDER BY node_id LIMIT 1").fetchone()
+    place = content.index(packed[:40]) + 20
     path.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
     assert any("node_points" in damage for damage in damages(path))
 
