@@ -26,6 +26,9 @@ class LookAlikesConfig:
     """Nodes within so many D_thresh of a pose (Eq. 1) belong to it; look-alikes are farther away."""
     max_groups: Annotated[int | None, Between(0, 1000)] = None
     """Parts of the map that are asked on their own, at most; 0 asks none. Unset: what suits the kind of features."""
+    min_inlier_share: Annotated[float, Between(0, 1)] = 0.25
+    """A part whose points agree with the image's strongest features in fewer than this share of what agrees with the believed pose is
+    left at that."""
 
 
 @dataclass(frozen=True)

@@ -43,13 +43,15 @@ _LEAST_FOUND_SHARE = 0.2  # of what is found at a pose, that must be found at on
 def propose(search: Search, prior: Rigid3 | None) -> Iterator[Proposal]:
     """All first poses worth a look, each made when it is asked for; only the first of them where another kind of features is asked next."""
     if prior is not None:
-        yield _pooled(search, "prior", _near(search, prior))
+        rows = [candidate.node_id for candidate in _near(search, prior)]
+        yield _pooled(search, "prior", rows, float(search.config.num_chance_inliers))
         return
     features = search.query.features
     with search.query.clock.stage("coarse"):
         num_ranked = max(search.config.num_candidates, search.config.look_alikes.num_ranked)
         search.ranked = search.map.coarse.rank(search.query.image, features, num_ranked)
-    retrieved = _pooled(search, "retrieval", search.candidates)
+    rows = [candidate.node_id for candidate in search.candidates]
+    retrieved = _pooled(search, "retrieval", rows, float(search.config.num_chance_inliers))
     search.retrieved = retrieved.fit
     yield retrieved
     if search.following is None or search.is_clear:
@@ -76,11 +78,11 @@ def _near(search: Search, world_from_cam: Rigid3) -> list[NodeScore]:
     return search.ranked
 
 
-def _pooled(search: Search, source: Source, candidates: list[NodeScore]) -> Proposal:
-    """The candidates' points together. The strongest features are nearly always enough, or give nothing at all; else all are tried."""
-    config, rows = search.config, [candidate.node_id for candidate in candidates]
+def _pooled(search: Search, source: Source, rows: list[int], least: float) -> Proposal:
+    """These nodes' points together. The strongest features are nearly always enough, or agree in fewer than `least`; else all are tried."""
+    config = search.config
     proposal = _matched(search, source, rows, config.num_first_features)
-    is_open = config.num_chance_inliers <= proposal.fit.num_inliers < config.num_clear_inliers
+    is_open = least <= proposal.fit.num_inliers < config.num_clear_inliers
     if is_open and len(search.query.features) > config.num_first_features:
         proposal = _matched(search, source, rows)
     return proposal
@@ -116,8 +118,20 @@ def _look_alikes(search: Search) -> Iterator[Proposal]:
         near = node_distances(leader, nodes, search.map.lambda_rot) <= reach
         group, left = [row for row in left if near[row]], [row for row in left if not near[row]]
         if set(group) != asked:
-            num_groups += 1
-            yield _matched(search, "look-alikes", group[: search.config.num_candidates])
+            num_groups, least = num_groups + 1, _least_inliers(search)
+            proposal = _pooled(search, "look-alikes", group[: search.config.num_candidates], least)
+            if proposal.fit.num_inliers >= least:
+                yield proposal
+
+
+def _least_inliers(search: Search) -> float:
+    """With how many of the strongest features a part of the map must agree: more than by chance, not far fewer than what is believed."""
+    best, config, least = search.best, search.config, float(search.config.num_chance_inliers)
+    if best is None or best.fit.pose is None or best.probability < config.evidence.min_probability:
+        return least
+    found = best.fit.matches.query_idx[best.fit.pose.inliers]
+    share_of_strongest = np.count_nonzero(found < config.num_first_features) / max(len(found), 1)
+    return max(least, config.look_alikes.min_inlier_share * best.evidence.num_inliers * share_of_strongest)
 
 
 def _viewpoints(search: Search) -> Iterator[Proposal]:
