@@ -17,7 +17,8 @@ from built_room import unseen_views
 from topoloc.cli import main
 from topoloc.cli.localize import Localizer
 from topoloc.geometry.alignment import translation_error
-from topoloc.sequences.trajectory import read_trajectory
+from topoloc.sequences.open import open_sequence
+from topoloc.sequences.trajectory import Trajectory, read_trajectory, write_tum
 
 EVALUATION = {"num_queries", "num_localized", "median_translation_m", "median_rotation_deg", "recall", "topological_accuracy"}
 EVALUATION |= {"false_accepts", "median_times_ms", "map"}
@@ -58,6 +59,18 @@ def test_short_settings_and_a_trajectory_file_reach_the_map(tiny_recording: Path
     assert info["config"]["nodes"]["d_thresh"] == 9.0
     assert info["config"]["nodes"]["lambda_rot"] == 0.5
     assert info["config"]["features"]["kind"] == "sift"
+
+
+def test_inverse_poses_are_named_and_mended(tiny_recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    truth, inverse, target = open_sequence(tiny_recording), tmp_path / "inverse.tum", str(tmp_path / "a.topo")
+    write_tum(inverse, Trajectory([pose.inverse() for pose in truth.poses if pose is not None], truth.t_ns))
+    build = ["build", str(tiny_recording), target, "--features", "surf", "--trajectory", str(inverse)]
+    assert main(build) == 1
+    assert "--poses inverse" in capsys.readouterr().err
+    assert not Path(target).exists()
+    assert main([*build, "--poses", "inverse"]) == 0
+    assert main([*build, "--poses", "unchecked"]) == 0
+    assert main([*build, "--poses", "upside-down"]) == 1
 
 
 def test_localize_writes_what_the_interface_says(room_map: Path, queries: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -7,9 +7,11 @@ from hypothesis import strategies as st
 from tiny_recordings import assert_same_pose, kitti_row, pose, tum_line
 
 from topoloc.errors import TopolocError, TrajectoryError
+from topoloc.geometry.pose_conventions import PoseReading
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.open import open_sequence
-from topoloc.sequences.trajectory import Trajectory, poses_at, read_trajectory, with_trajectory, write_tum
+from topoloc.sequences.recording import Recording, SequenceView
+from topoloc.sequences.trajectory import Trajectory, as_read, frame_poses, poses_at, read_trajectory, with_trajectory, write_tum
 
 SECOND = 1_000_000_000
 
@@ -166,3 +168,32 @@ def test_rotations_of_kitti_rows_are_made_exact(tmp_path: Path, turned: float):
     rotation = read_trajectory(tmp_path / "a.txt").world_from_cam[0].rotation
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-14)
     np.testing.assert_allclose(rotation, pose(1).rotation, atol=2e-3)
+
+
+def test_clocks_that_differ_are_said_and_mended(tmp_path: Path):
+    poses = [Rigid3(np.eye(3), np.array([0.1 * k, 0.0, 0.0])) for k in range(20)]
+    frames = [1_700_000_000_000_000_000 + 100_000_000 * k for k in range(20)]
+    late, in_microseconds = tmp_path / "late.tum", tmp_path / "microseconds.tum"
+    write_tum(late, Trajectory(poses, [time + 5_000_000_000_000 for time in frames]))
+    write_tum(in_microseconds, Trajectory(poses, frames))
+    rows = [line.split() for line in in_microseconds.read_text().splitlines()[1:]]
+    in_microseconds.write_text("\n".join(" ".join([str(int(float(row[0]) * 1e6)), *row[1:]]) for row in rows))
+    for path, option in ((late, "shift=5000"), (in_microseconds, "clock=1000")):
+        with pytest.raises(TrajectoryError, match=f"--poses {option}"):
+            frame_poses(read_trajectory(path), frames, path)
+        found = with_trajectory(recording_of(frames), path, PoseReading.of(option)).poses
+        assert sum(pose is not None for pose in found) >= 18
+        assert all(pose is None or np.allclose(pose.translation, poses[k].translation, atol=0.02) for k, pose in enumerate(found))
+
+
+def test_own_poses_are_read_as_told():
+    poses = [Rigid3(np.eye(3), np.array([0.1 * k, 0.0, 0.0])) for k in range(20)]
+    sequence = SequenceView(recording_of([100_000_000 * k for k in range(20)]), list(range(20)), list(poses))
+    read = as_read(sequence, PoseReading.of("mm,shift=0.2"))
+    assert read.poses[-2:] == [None, None]
+    np.testing.assert_allclose([pose.translation[0] for pose in read.poses[:-2] if pose], [1e-4 * (k + 2) for k in range(18)], atol=1e-12)
+
+
+def recording_of(t_ns: list[int]) -> Recording:
+    """A recording of no pictures."""
+    return Recording("none", Path(), [f"{k}.png" for k in range(len(t_ns))], t_ns, [None] * len(t_ns), None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -10,15 +11,16 @@ import tyro
 
 from topoloc.cli.features_option import BUILD_FEATURES, kinds_to_build
 from topoloc.cli.info import describe_map
-from topoloc.cli.output import File, Format, UsageError, check_outputs, progress_bar, write_json
+from topoloc.cli.output import File, Flag, Format, UsageError, check_outputs, progress_bar, write_json
 from topoloc.cli.settings_file import read_settings, with_option
 from topoloc.errors import RecordingError
-from topoloc.localization.map_facts.building import build_map
+from topoloc.geometry.pose_conventions import PoseReading
+from topoloc.localization.map_facts.building import Trust, build_map
 from topoloc.map.build import BuildConfig, Progress
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import open_sequence
 from topoloc.sequences.recording import SequenceView
-from topoloc.sequences.trajectory import with_trajectory
+from topoloc.sequences.trajectory import as_read, with_trajectory
 from topoloc.slam.slam import SlamConfig, run_slam
 
 
@@ -35,6 +37,14 @@ class Command:
         tyro.conf.arg(metavar="truth|slam|FILE", help_behavior_hint="(default: truth where there is one, else slam)"),
     ] = ()
     """Where poses come from: `truth` (the recording's own), `slam`, or a TUM or KITTI file; given once for all, or once for each."""
+    poses: Annotated[
+        str | None, tyro.conf.arg(metavar="CONVENTION[,CONVENTION]", help_behavior_hint="(default: world_from_cam, metres)")
+    ] = None
+    """How the poses of truth or FILE are written, where they are not world_from_cam in metres of axes right, down, forward: inverse,
+    opengl, flu, frd, unity, unreal, wxyz, transposed, mm, cm, feet, scale=FACTOR, body=X,Y,Z,QX,QY,QZ,QW (body_from_cam), shift=SECONDS,
+    clock=FACTOR. `unchecked`: they are not held against the pictures."""
+    allow_gaps: Flag = False
+    """Map a recording of whose frames fewer than half have a pose."""
     format: Format = None
     """The recordings' format: kitti, euroc, tum, seven_scenes or folder."""
     d_thresh: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="(default: by what is seen)")] = None
@@ -61,7 +71,9 @@ class Command:
         with progress_bar() as progress:
             if poses_from[0] == "slam":
                 sequences = _with_slam(sequences, settings.of(SlamConfig), progress)
-            topomap = build_map(sequences, config, progress, poses_from)
+            _report_gaps(sequences)
+            trust = Trust(poses="unchecked" in (self.poses or "").split(","), gaps=self.allow_gaps or poses_from[0] == "slam")
+            topomap = build_map(sequences, config, progress, poses_from, trust)
         topomap.save(target)
         info = describe_map(topomap, target)
         if self.json != "-":
@@ -95,12 +107,24 @@ class Command:
         if len(trajectories) != len(recordings):
             raise UsageError(f"{len(recordings)} recordings but {len(trajectories)} trajectories")
         if "slam" in trajectories:
+            if self.poses is not None:
+                raise UsageError("--poses says how given poses are written; those of SLAM are ours")
             if set(trajectories) != {"slam"}:
                 raise UsageError("--trajectory slam goes for all recordings or for none: its world is no other's")
             return sequences, list(trajectories)
-        pairs = zip(sequences, trajectories, strict=True)
-        posed = [sequence if trajectory == "truth" else with_trajectory(sequence, Path(trajectory)) for sequence, trajectory in pairs]
+        reading = PoseReading.of(",".join(name for name in (self.poses or "").split(",") if name != "unchecked"))
+        posed = [
+            as_read(sequence, reading) if trajectory == "truth" else with_trajectory(sequence, Path(trajectory), reading)
+            for sequence, trajectory in zip(sequences, trajectories, strict=True)
+        ]
         return posed, list(trajectories)
+
+
+def _report_gaps(sequences: list[StereoSequence]) -> None:
+    for sequence in sequences:
+        num_without = sum(pose is None for pose in sequence.poses)
+        if num_without:
+            print(f"{sequence.name}: {num_without} of {len(sequence)} frames have no pose and are left out", file=sys.stderr)
 
 
 def _with_slam(sequences: list[StereoSequence], config: SlamConfig, progress: Progress) -> list[StereoSequence]:

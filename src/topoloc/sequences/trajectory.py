@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import bisect
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal
 from pathlib import Path
 from typing import overload
@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from topoloc.errors import RecordingError, TrajectoryError
+from topoloc.geometry.pose_conventions import PoseReading
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.atomic import write_text
 from topoloc.sequences.frame import StereoSequence
@@ -27,6 +28,7 @@ from topoloc.sequences.text_rows import NANOSECONDS, parse_times, read_rows
 # Times written with few decimals still mean the frame they were made from.
 _SAME_TIME_NS = 1_000_000
 _ROTATION_TOLERANCE = 1e-2
+_SAME_SPAN = 0.8  # of the time that the frames take, for two clocks to tell of the same
 _Rows = Sequence[tuple[int, list[str]]]
 
 
@@ -108,7 +110,7 @@ def frame_poses(trajectory: Trajectory, t_ns: Sequence[int], path: Path) -> list
     """The pose of each frame: by time, or by row where the trajectory has no times.
 
     Raises:
-        TrajectoryError: rows and frames differ in number, or no frame has a pose; names `path`.
+        TrajectoryError: rows and frames differ in number, or no frame has a pose; names `path`, and where the clocks seem to differ, how.
     """
     if trajectory.t_ns is None:
         if len(trajectory) != len(t_ns):
@@ -117,11 +119,12 @@ def frame_poses(trajectory: Trajectory, t_ns: Sequence[int], path: Path) -> list
     poses = poses_at(trajectory, t_ns)
     if t_ns and all(pose is None for pose in poses):
         span = f"{trajectory.t_ns[0] / 1e9:.3f} to {trajectory.t_ns[-1] / 1e9:.3f} s"
-        raise TrajectoryError(f"{path}: no frame has a pose; it covers {span}, the frames {t_ns[0] / 1e9:.3f} to {t_ns[-1] / 1e9:.3f} s")
+        frames = f"the frames {t_ns[0] / 1e9:.3f} to {t_ns[-1] / 1e9:.3f} s"
+        raise TrajectoryError(f"{path}: no frame has a pose; it covers {span}, {frames}{_clock_hint(trajectory.t_ns, t_ns)}")
     return poses
 
 
-def with_trajectory(sequence: StereoSequence, path: Path) -> StereoSequence:
+def with_trajectory(sequence: StereoSequence, path: Path, reading: PoseReading | None = None) -> StereoSequence:
     """The same recording with the poses of a trajectory file: TUM by time, KITTI rows frame by frame.
 
     Rows for a part of a recording may be those of the part or of the whole.
@@ -129,11 +132,55 @@ def with_trajectory(sequence: StereoSequence, path: Path) -> StereoSequence:
     Raises:
         TrajectoryError: the file is malformed, or fits no frame.
     """
-    trajectory = read_trajectory(path)
+    trajectory, reading = read_trajectory(path), reading or PoseReading()
     if trajectory.t_ns is None and isinstance(sequence, SequenceView) and len(trajectory) == len(sequence.base) != len(sequence):
         rows = frame_poses(trajectory, sequence.base.t_ns, path)
-        return SequenceView(sequence.base, sequence.indices, [rows[index] for index in sequence.indices])
-    return SequenceView(sequence, list(range(len(sequence))), frame_poses(trajectory, sequence.t_ns, path))
+        poses = [rows[index] for index in sequence.indices]
+    else:
+        poses = frame_poses(_on_the_frames_clock(trajectory, reading), sequence.t_ns, path)
+    return _with_poses(sequence, [pose and reading.mend(pose) for pose in poses])
+
+
+def as_read(sequence: StereoSequence, reading: PoseReading) -> StereoSequence:
+    """The same recording, its own poses read so.
+
+    Raises:
+        TrajectoryError: no frame has a pose then.
+    """
+    if reading == PoseReading():
+        return sequence
+    posed = [(pose, t_ns) for pose, t_ns in zip(sequence.poses, sequence.t_ns, strict=True) if pose is not None]
+    poses = sequence.poses
+    if posed and (reading.shift_s or reading.clock != 1.0):
+        trajectory = Trajectory([pose for pose, _ in posed], [t_ns for _, t_ns in posed])
+        poses = frame_poses(_on_the_frames_clock(trajectory, reading), sequence.t_ns, Path(sequence.name))
+    return _with_poses(sequence, [pose and reading.mend(pose) for pose in poses])
+
+
+def _with_poses(sequence: StereoSequence, poses: list[Rigid3 | None]) -> StereoSequence:
+    return SequenceView(sequence, list(range(len(sequence))), poses)
+
+
+def _on_the_frames_clock(trajectory: Trajectory, reading: PoseReading) -> Trajectory:
+    if trajectory.t_ns is None or (reading.clock == 1.0 and reading.shift_s == 0.0):
+        return trajectory
+    shift_ns = round(reading.shift_s * NANOSECONDS)
+    return replace(
+        trajectory, t_ns=[(time if reading.clock == 1.0 else round(time * reading.clock)) - shift_ns for time in trajectory.t_ns]
+    )
+
+
+def _clock_hint(of_poses: Sequence[int], of_frames: Sequence[int]) -> str:
+    """How the clocks of poses and frames seem to differ: by a unit, or by when they began."""
+    for factor in (1e-9, 1e-6, 1e-3, 1e3, 1e6, 1e9):
+        overlap = min(of_poses[-1] * factor, of_frames[-1]) - max(of_poses[0] * factor, of_frames[0])
+        if overlap > _SAME_SPAN * (of_frames[-1] - of_frames[0]):
+            return f"; its times seem to be in another unit: --poses clock={factor:g}"
+    lasts, frames_last = of_poses[-1] - of_poses[0], of_frames[-1] - of_frames[0]
+    if _SAME_SPAN * frames_last < lasts < frames_last / _SAME_SPAN:
+        shift = (of_poses[0] - of_frames[0]) / NANOSECONDS
+        return f"; if both began at the same moment: --poses shift={shift:.9g}"
+    return ""
 
 
 def read_truth(tum: Path, kitti_rows: list[Path], t_ns: list[int]) -> list[Rigid3 | None]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +17,15 @@ from topoloc.localization.open_map import OpenMap
 from topoloc.map import build
 from topoloc.map.topomap import Repetitions, SharedErrors, TopoMetricMap
 from topoloc.sequences.frame import StereoSequence
+from topoloc.slam.pose_checks import check_gaps, check_poses
+
+
+@dataclass(frozen=True)
+class Trust:
+    """What is not checked: `poses` against the pictures, and `gaps`, frames without a pose that are more than half of all."""
+
+    poses: bool = False
+    gaps: bool = False
 
 
 def build_map(
@@ -24,15 +33,17 @@ def build_map(
     config: build.BuildConfig | None = None,
     progress: build.Progress | None = None,
     poses_from: Sequence[str] | None = None,
+    trust: Trust | None = None,
 ) -> TopoMetricMap:
     """Build a topo-metric map from one or several recordings of one place whose poses share one world.
 
     Args:
         poses_from: where the poses of each recording come from (`truth`, `slam`, a file), for the map to remember.
+        trust: what is taken as it comes; by default poses are held against the pictures, but for those that SLAM found in them.
 
     Raises:
         ConfigError: a value of `config` is out of its bounds.
-        TrajectoryError: no frame of a recording has a pose.
+        TrajectoryError: no frame of a recording has a pose, fewer than half have one, or they do not fit the pictures.
         EmptyMapError: no picture gave a usable node.
         FeatureKindError: no features of the kind that `config` names.
         RecordingError, CalibrationError, UnreadableImageError: from reading the recordings.
@@ -40,6 +51,12 @@ def build_map(
     config = config or build.BuildConfig()
     for kind in config.kinds:
         find_kind(kind)
+    sequences, trust = [sequences] if isinstance(sequences, StereoSequence) else sequences, trust or Trust()
+    for k, sequence in enumerate(sequences):
+        if not trust.gaps:
+            check_gaps(sequence)
+        if not trust.poses and (poses_from is None or poses_from[k] != "slam"):
+            check_poses(sequence)
     topomap = build.build_map(sequences, config, progress, poses_from)
     errors = {kind: _correlated_errors(topomap.by_kind(kind)) for kind in topomap.kinds}
     topomap = replace(topomap, shared_errors=errors.pop(topomap.kind), other_shared_errors=errors)

@@ -1,0 +1,152 @@
+"""How trajectories of other programs are written, and how they become ours: world_from_cam, metres, camera axes x right, y down, z forward.
+
+Conventions are named as `--poses` takes them, one or several in turn: ``inverse``, ``wxyz,opengl``, ``mm``, ``scale=0.42``,
+``body=0.1,0,0,0,0,0,1`` (body_from_cam: x, y, z, and the quaternion x, y, z, w), ``shift=0.2`` (seconds by which the poses' clock is
+ahead of the pictures'), ``clock=1e6`` (times of the file, as read, in units of what they should be).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from topoloc.errors import TrajectoryError
+from topoloc.geometry.rigid import Rigid3
+
+Mend = Callable[[Rigid3], Rigid3]
+
+_MIRROR_Y = np.diag([1.0, -1.0, 1.0])
+_FORWARD_LEFT_UP = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # body_from_cam
+_FORWARD_RIGHT_DOWN = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+
+def _scaled(pose: Rigid3, factor: float) -> Rigid3:
+    return Rigid3(pose.rotation, factor * pose.translation)
+
+
+def _turned(pose: Rigid3, body_from_cam: Float[np.ndarray, "3 3"]) -> Rigid3:
+    return Rigid3(pose.rotation @ body_from_cam, pose.translation)
+
+
+def _w_first(pose: Rigid3) -> Rigid3:
+    w, x, y, z = pose.quat_wxyz()
+    return Rigid3.from_quat_wxyz(np.array([x, y, z, w]), pose.translation)  # what was taken for x is w, for y is x, and so on
+
+
+def _mirrored(pose: Rigid3) -> Rigid3:
+    return Rigid3(_MIRROR_Y @ pose.rotation @ _MIRROR_Y, _MIRROR_Y @ pose.translation)
+
+
+_WITH_NUMBERS = ("scale=FACTOR", "body=X,Y,Z,QX,QY,QZ,QW", "shift=SECONDS", "clock=FACTOR")
+UNITS = {"mm": 0.001, "cm": 0.01, "feet": 0.3048}
+"""Metres of each."""
+ROTATIONS: dict[str, Mend] = {
+    "wxyz": _w_first,
+    "transposed": lambda pose: Rigid3(pose.rotation.T.copy(), pose.translation),
+}
+DIRECTIONS: dict[str, Mend] = {"inverse": lambda pose: pose.inverse()}
+AXES: dict[str, Mend] = {
+    "opengl": lambda pose: _turned(pose, np.diag([1.0, -1.0, -1.0])),
+    "flu": lambda pose: _turned(pose, _FORWARD_LEFT_UP),
+    "frd": lambda pose: _turned(pose, _FORWARD_RIGHT_DOWN),
+    "unity": _mirrored,
+    "unreal": lambda pose: _turned(_mirrored(pose), _FORWARD_LEFT_UP),
+}
+MEANINGS = {
+    "mm": "in millimetres",
+    "cm": "in centimetres",
+    "feet": "in feet",
+    "scale": "of another unit than the metre",
+    "wxyz": "with quaternions whose w comes first",
+    "transposed": "with transposed rotations",
+    "inverse": "cam_from_world, the inverse of what is wanted",
+    "opengl": "of camera axes x right, y up, z back (OpenGL, ARKit, nerfstudio)",
+    "flu": "of axes x forward, y left, z up (a ROS body)",
+    "frd": "of axes x forward, y right, z down (aviation)",
+    "unity": "left-handed with x right, y up, z forward (Unity)",
+    "unreal": "left-handed with x forward, y right, z up (Unreal)",
+    "body": "of a body that the camera is mounted on",
+    "shift": "of a clock that is not the pictures'",
+}
+
+
+@dataclass(frozen=True)
+class PoseReading:
+    """How the poses of a file become ours: `conventions` undone in turn. The file's times, as read, times `clock`, are the pictures' plus
+    `shift_s`."""
+
+    conventions: tuple[str, ...] = ()
+    clock: float = 1.0
+    shift_s: float = 0.0
+
+    def mend(self, pose: Rigid3) -> Rigid3:
+        return mended(pose, self.conventions)
+
+    @staticmethod
+    def of(text: str | None) -> PoseReading:
+        """``wxyz,body=1,2,3,0,0,0,1,shift=0.2``: a part that begins with a number belongs to the one before.
+
+        Raises:
+            TrajectoryError: it names no known convention, or numbers are missing.
+        """
+        parts: list[str] = []
+        for part in (text or "").split(","):
+            part = part.strip()
+            if parts and "=" in parts[-1] and part[:1] in set("+-.0123456789"):
+                parts[-1] += "," + part
+            elif part:
+                parts.append(part)
+        times = {name: value for name, _, value in (part.partition("=") for part in parts) if name in ("clock", "shift")}
+        conventions = tuple(part for part in parts if part.partition("=")[0] not in times)
+        for convention in conventions:
+            mend_of(convention)
+        clock = _numbers("clock", times["clock"], 1)[0] if "clock" in times else 1.0
+        if clock <= 0.0:
+            raise TrajectoryError("poses 'clock': the factor must be above 0")
+        return PoseReading(conventions, clock, _numbers("shift", times["shift"], 1)[0] if "shift" in times else 0.0)
+
+
+def mended(pose: Rigid3, conventions: Sequence[str]) -> Rigid3:
+    """One pose, with these conventions undone in turn. Raises TrajectoryError: there is no such convention."""
+    for convention in conventions:
+        pose = mend_of(convention)(pose)
+    return pose
+
+
+def meaning(conventions: Sequence[str]) -> str:
+    """What poses are that need these, in words."""
+    return ", ".join(MEANINGS[convention.partition("=")[0]] for convention in conventions)
+
+
+def mend_of(convention: str) -> Mend:
+    """What undoes a convention, written as `--poses` takes it. Raises TrajectoryError: there is none of that name."""
+    name, _, value = convention.partition("=")
+    if name in ("scale", "body"):
+        numbers = _numbers(convention, value, 1 if name == "scale" else 7)
+        if name == "scale":
+            if numbers[0] <= 0.0:
+                raise TrajectoryError(f"poses {convention!r}: the scale must be above 0")
+            return lambda pose: _scaled(pose, numbers[0])
+        body_from_cam = Rigid3.from_quat_wxyz(np.array([numbers[6], *numbers[3:6]]), np.array(numbers[:3]))
+        return lambda pose: pose @ body_from_cam
+    if name in UNITS and not value:
+        return lambda pose: _scaled(pose, UNITS[name])
+    found = (ROTATIONS | DIRECTIONS | AXES).get(convention)
+    if found is None:
+        known = ", ".join([*UNITS, *ROTATIONS, *DIRECTIONS, *AXES, *_WITH_NUMBERS])
+        raise TrajectoryError(f"poses {convention!r}: not known; known are {known}")
+    return found
+
+
+def _numbers(convention: str, value: str, count: int) -> list[float]:
+    try:
+        numbers = [float(number) for number in value.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count or not all(math.isfinite(number) for number in numbers):
+        raise TrajectoryError(f"poses {convention[:80]!r}: {count} number{'s' if count > 1 else ''} are needed")
+    return numbers

@@ -1,0 +1,105 @@
+"""How the camera moved between pictures of a recording, measured from the pictures alone: what a trajectory can be held against."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import numpy as np
+
+from topoloc.bounds import AtLeast, Between
+from topoloc.features.extraction import extract_features
+from topoloc.features.features import Features
+from topoloc.features.kinds import FeatureConfig
+from topoloc.features.matching import MatchingConfig, match_features
+from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
+from topoloc.geometry.rigid import Rigid3
+from topoloc.sequences.frame import StereoSequence
+from topoloc.sequences.frame_view import FrameView, frame_view
+from topoloc.slam.metric_points import MetricPoints, MetricPointsConfig, locate_points
+
+
+@dataclass(frozen=True)
+class MeasuredStepsConfig:
+    """Between which pictures, and what is asked of a measurement."""
+
+    num_steps: Annotated[int, Between(1, 1000)] = 16
+    """Pictures that a step begins at, spread over the recording."""
+    gaps: tuple[int, ...] = (12, 5, 2, 1)
+    """Frames from a step's first picture to its last; the first gap over which enough is recognised is taken."""
+    min_inliers: Annotated[int, AtLeast(6)] = 40
+    """Points of the first picture that must be recognised in the last."""
+    pose: AbsolutePoseConfig = field(default_factory=AbsolutePoseConfig)
+    features: FeatureConfig = field(default_factory=FeatureConfig)
+    points: MetricPointsConfig = field(default_factory=MetricPointsConfig)
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredStep:
+    """`first_from_last` is the motion between the cameras of two frames; `median_depth` (metres) that of the points it stands on."""
+
+    first: int
+    last: int
+    first_from_last: Rigid3
+    median_depth: float
+
+
+def measure_steps(sequence: StereoSequence, usable: list[int], config: MeasuredStepsConfig) -> list[MeasuredStep]:
+    """Steps spread over the frames `usable` (their rows, increasing), by the left pictures and the depth of each step's first frame.
+
+    A step that cannot be measured, as too little is recognised, is left out.
+
+    Raises:
+        RecordingError, CalibrationError, UnreadableImageError: from reading the recording.
+    """
+    starts = np.unique(np.linspace(0, len(usable) - 1, config.num_steps).astype(int))
+    found = (_measure_from(sequence, usable, int(start), config) for start in starts)
+    return [step for step in found if step is not None]
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    view: FrameView
+    features: Features
+    points: MetricPoints | None
+
+
+def _measure_from(sequence: StereoSequence, usable: list[int], start: int, config: MeasuredStepsConfig) -> MeasuredStep | None:
+    """The step from this frame over the widest gap that can be measured; backwards where the recording ends."""
+    first = _seen(sequence, usable[start], config, is_first=True)
+    for gap in config.gaps:
+        other = start + gap if start + gap < len(usable) else start - gap
+        if other < 0:
+            continue
+        last = _seen(sequence, usable[other], config, is_first=False)
+        step = _motion(first, last, config)
+        if step is not None:
+            motion, depth = step
+            first_from_last = first.view.view_from_cam.inverse() @ motion.inverse() @ last.view.view_from_cam
+            return MeasuredStep(usable[start], usable[other], first_from_last, depth)
+    return None
+
+
+def _seen(sequence: StereoSequence, index: int, config: MeasuredStepsConfig, is_first: bool) -> _Seen:
+    view = frame_view(sequence[index], with_depth=is_first)
+    features = extract_features(view.grey, config.features)
+    if not is_first:
+        return _Seen(view, features, None)
+    located = locate_points(features, view, config.points)
+    rows = np.flatnonzero(located.valid)
+    points = MetricPoints(located.points_cam[rows], located.covariances[rows], located.valid[rows])
+    return _Seen(view, features.select(rows), points)
+
+
+def _motion(first: _Seen, last: _Seen, config: MeasuredStepsConfig) -> tuple[Rigid3, float] | None:
+    """last_from_first of the views, and the median depth of what it stands on."""
+    assert first.points is not None
+    matches = match_features(last.features.descriptors, first.features.descriptors, MatchingConfig())
+    if len(matches) < config.min_inliers:
+        return None
+    points_img = last.features.points_img[matches.query_idx].astype(np.float64)
+    points, covariances = first.points.points_cam[matches.train_idx], first.points.covariances[matches.train_idx]
+    pose = estimate_absolute_pose(points_img, points, last.view.camera, config.pose, point_covariances=covariances)
+    if pose is None or np.count_nonzero(pose.inliers) < config.min_inliers:
+        return None
+    return pose.cam_from_world, float(np.median(points[pose.inliers, 2]))

@@ -1,0 +1,245 @@
+"""Do the poses of a trajectory fit the pictures? If not, which known convention makes them fit?
+
+Steps between pictures are measured from these alone (`measured_steps.py`); a trajectory of the right convention has nearly the same ones.
+Where it has not, the conventions of `geometry/pose_conventions.py` are tried, then a clock that is shifted, then a camera that is mounted
+on the body whose poses these are: hand-eye calibration, body_step @ body_from_cam = body_from_cam @ camera_step (Park and Martin, *Robot
+sensor calibration: solving AX = XB on the Euclidean group*, 1994).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from topoloc.errors import TrajectoryError
+from topoloc.geometry.alignment import nearest_rotation
+from topoloc.geometry.pose_conventions import AXES, DIRECTIONS, ROTATIONS, UNITS, Mend, meaning, mended
+from topoloc.geometry.rigid import Rigid3
+from topoloc.sequences.frame import StereoSequence
+from topoloc.sequences.trajectory import Trajectory, poses_at
+from topoloc.slam.measured_steps import MeasuredStep, MeasuredStepsConfig, measure_steps
+
+_MIN_TELLING = 5
+_MIN_BELIEVED, _MIN_NAMED = 0.5, 0.7  # of the telling steps, that agree with poses that are believed, with a convention that is named
+_MIN_TURN, _TURN, _WAY, _SHARE = math.radians(5.0), math.radians(1.5), 0.02, 0.15  # rad, rad, m, share of the step
+_DEPTH_SHARE = 0.01  # of the depth of what is seen, by which a measured way may be wrong
+_MIN_WAY = 3.0  # times the tolerance
+_UNIT_TOLERANCE = 0.15
+_MIN_SHIFT_S, _MAX_SHIFT_S, _NUM_SHIFTS, _MAX_GAP_S = 0.02, 3.0, 60, 1.0  # shifts tried to each side
+_NOTED_MISS, _FAR_BETTER = 0.3, 0.4
+_MOUNTING_ROUNDS, _LEAST_TURN = 5, 0.05
+_BODY_COUNTS = 4.0  # conventions: a mounting has six numbers to fit by
+
+_Pairs = list[tuple[Rigid3, Rigid3]]
+_Poses = Sequence[Rigid3 | None]
+
+
+@dataclass(frozen=True)
+class PoseVerdict:
+    """`num_telling` steps are long enough to tell, `num_agreeing` of them agree with the poses as they are. `conventions`, as `--poses`
+    takes them, make most of them agree; empty where the poses are believed, or nothing known makes them fit."""
+
+    num_telling: int
+    num_agreeing: int
+    conventions: tuple[str, ...] = ()
+
+    @property
+    def is_believed(self) -> bool:
+        return not self.conventions and (self.num_telling < _MIN_TELLING or self.num_agreeing >= _MIN_BELIEVED * self.num_telling)
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """A way to read the poses; `misses` are those of the steps, in units of what is tolerated."""
+
+    conventions: tuple[str, ...]
+    misses: Float[np.ndarray, " n"]
+
+    @property
+    def num_agreeing(self) -> int:
+        return int(np.count_nonzero(self.misses < 1.0))
+
+    @property
+    def rank(self) -> tuple[float, float]:
+        """The plainer one is taken where two fit about as well."""
+        complexity = sum(_BODY_COUNTS if name.startswith("body") else 1.0 for name in self.conventions)
+        return self.num_agreeing - 0.5 * complexity, -float(np.median(self.misses))
+
+
+def check_gaps(sequence: StereoSequence) -> None:
+    """Hold that at least half of the frames have a pose. Raises TrajectoryError."""
+    num_posed = sum(pose is not None for pose in sequence.poses)
+    if 0 < 2 * num_posed < len(sequence):
+        raise TrajectoryError(
+            f"{sequence.name}: only {num_posed} of {len(sequence)} frames have a pose; --allow-gaps maps these, without the others"
+        )
+
+
+def check_poses(sequence: StereoSequence, config: MeasuredStepsConfig | None = None) -> None:
+    """Hold that the poses of a stereo or RGB-D recording fit its pictures; of single pictures nothing can be said.
+
+    Raises:
+        TrajectoryError: they do not; names the convention that makes them fit, as `--poses` takes it, where one does.
+        RecordingError, CalibrationError, UnreadableImageError: from reading the recording.
+    """
+    posed = [k for k, pose in enumerate(sequence.poses) if pose is not None]
+    if len(posed) < _MIN_TELLING:
+        return
+    start = sequence[posed[0]]
+    if start.camera is None or (start.right is None and start.depth is None):
+        return
+    verdict = judge_poses(measure_steps(sequence, posed, config or MeasuredStepsConfig()), sequence.poses, sequence.t_ns)
+    if verdict.is_believed:
+        return
+    differ = f"{verdict.num_telling - verdict.num_agreeing} of {verdict.num_telling} steps from picture to picture are not the poses'"
+    if verdict.conventions:
+        names = ",".join(verdict.conventions)
+        raise TrajectoryError(f"{sequence.name}: {differ}; they look like poses {meaning(verdict.conventions)}: --poses {names}")
+    raise TrajectoryError(
+        f"{sequence.name}: {differ}, and no known convention explains it: of another recording, or wrongly calibrated?"
+        " --poses unchecked maps it all the same"
+    )
+
+
+def judge_poses(steps: Sequence[MeasuredStep], poses: _Poses, t_ns: Sequence[int]) -> PoseVerdict:
+    """Hold the poses (world_from_cam in metres, one a frame) against the measured steps."""
+    telling = [step for step in steps if _is_telling(step)]
+    telling = [step for step in telling if poses[step.first] is not None and poses[step.last] is not None]
+    if len(telling) < _MIN_TELLING:
+        return PoseVerdict(len(telling), len(telling))
+    as_is = _Reading((), _misses(telling, _steps_of(telling, poses)))
+    verdict = PoseVerdict(len(telling), as_is.num_agreeing)
+    readings = [*_by_convention(telling, poses), *_best_shift(telling, poses, t_ns)]
+    if verdict.is_believed:  # of a way that is nearly straight and level, wrong poses may be nearly right
+        better = [one for one in readings if _is_far_better(one, as_is) and not any("scale" in name for name in one.conventions)]
+        return replace(verdict, conventions=max(better, key=lambda reading: reading.rank).conventions if better else ())
+    best = max([*readings, *_as_body(telling, poses)], key=lambda reading: reading.rank)
+    is_named = best.num_agreeing >= max(_MIN_NAMED * len(telling), as_is.num_agreeing + 1)
+    return replace(verdict, conventions=best.conventions if is_named else ())
+
+
+def _is_telling(step: MeasuredStep) -> bool:
+    way = float(np.linalg.norm(step.first_from_last.translation))
+    return way > _MIN_WAY * (_WAY + _DEPTH_SHARE * step.median_depth) or step.first_from_last.angle() > _MIN_TURN
+
+
+def _steps_of(telling: Sequence[MeasuredStep], poses: _Poses) -> list[Rigid3]:
+    """first_from_last as the poses have it."""
+    pairs = ((poses[step.first], poses[step.last]) for step in telling)
+    return [first.inverse() @ last for first, last in pairs if first is not None and last is not None]
+
+
+def _misses(telling: Sequence[MeasuredStep], steps: Sequence[Rigid3]) -> Float[np.ndarray, " n"]:
+    """By how much each step is not the measured one: 1 is what is tolerated."""
+    misses = []
+    for measured, step in zip(telling, steps, strict=True):
+        apart, way = step.inverse() @ measured.first_from_last, float(np.linalg.norm(measured.first_from_last.translation))
+        tolerated_way = _WAY + _DEPTH_SHARE * measured.median_depth + _SHARE * way
+        tolerated_turn = _TURN + _SHARE * measured.first_from_last.angle()
+        misses.append(max(float(np.linalg.norm(apart.translation)) / tolerated_way, apart.angle() / tolerated_turn))
+    return np.array(misses)
+
+
+def _by_convention(telling: Sequence[MeasuredStep], poses: _Poses) -> Iterator[_Reading]:
+    for conventions in _combined(ROTATIONS, DIRECTIONS, AXES):
+        steps = _steps_of(telling, _read(telling, poses, conventions))
+        unit, factor = _unit_of(telling, steps)
+        steps = [Rigid3(step.rotation, factor * step.translation) for step in steps]
+        yield _Reading((*conventions, *unit), _misses(telling, steps))
+
+
+def _combined(*tables: dict[str, Mend]) -> list[tuple[str, ...]]:
+    """One or no convention of each table."""
+    choices = [[(), *((name,) for name in table)] for table in tables]
+    return [tuple(itertools.chain(*parts)) for parts in itertools.product(*choices)]
+
+
+def _read(telling: Sequence[MeasuredStep], poses: _Poses, conventions: tuple[str, ...]) -> list[Rigid3 | None]:
+    """The poses that the steps need, with these conventions undone."""
+    needed = {step.first for step in telling} | {step.last for step in telling}
+    return [mended(pose, conventions) if pose is not None and k in needed else None for k, pose in enumerate(poses)]
+
+
+def _unit_of(telling: Sequence[MeasuredStep], steps: Sequence[Rigid3]) -> tuple[tuple[str, ...], float]:
+    """The unit that gives the steps their measured lengths, as a convention, and its metres."""
+    measured = np.array([np.linalg.norm(step.first_from_last.translation) for step in telling])
+    lengths = np.array([np.linalg.norm(step.translation) for step in steps])
+    long = lengths > 1e-9
+    if not long.any():
+        return (), 1.0
+    factor = float(np.sum(measured[long]) / np.sum(lengths[long]))
+    for name, metres in {"": 1.0, **UNITS}.items():
+        if abs(math.log(factor / metres)) < _UNIT_TOLERANCE:
+            return (name,) if name else (), metres
+    return (f"scale={factor:.4g}",), factor
+
+
+def _best_shift(telling: Sequence[MeasuredStep], poses: _Poses, t_ns: Sequence[int]) -> list[_Reading]:
+    """The poses at other times than those of the pictures, by the shift that fits best; none where the recording is too short for any."""
+    posed = [k for k, pose in enumerate(poses) if pose is not None]
+    trajectory = Trajectory([pose for pose in poses if pose is not None], [t_ns[k] for k in posed])
+    largest = min(_MAX_SHIFT_S, 0.4e-9 * (t_ns[posed[-1]] - t_ns[posed[0]]))
+    shifts = np.linspace(-largest, largest, 2 * _NUM_SHIFTS + 1)
+    readings = (_shifted(telling, trajectory, t_ns, float(seconds)) for seconds in shifts if abs(seconds) > _MIN_SHIFT_S)
+    return sorted((one for one in readings if one is not None), key=lambda one: float(np.median(one.misses)))[:1]
+
+
+def _shifted(telling: Sequence[MeasuredStep], trajectory: Trajectory, t_ns: Sequence[int], seconds: float) -> _Reading | None:
+    """None where too few steps have poses then."""
+    misses = []
+    for step in telling:
+        times = [t_ns[k] + round(1e9 * seconds) for k in (step.first, step.last)]
+        first, last = poses_at(trajectory, times, _MAX_GAP_S)
+        if first is not None and last is not None:
+            misses.append(float(_misses([step], [first.inverse() @ last])[0]))
+    if len(misses) < max(_MIN_TELLING, len(telling) // 2):
+        return None
+    misses += [float(np.median(misses))] * (len(telling) - len(misses))  # those beyond an end are taken to be as the others
+    return _Reading((f"shift={seconds:.3g}",), np.array(misses))
+
+
+def _is_far_better(other: _Reading, as_is: _Reading) -> bool:
+    """Does another reading explain most of what the steps miss by?"""
+    miss = float(np.median(as_is.misses))
+    return miss > _NOTED_MISS and float(np.median(other.misses)) < _FAR_BETTER * miss
+
+
+def _as_body(telling: Sequence[MeasuredStep], poses: _Poses) -> Iterator[_Reading]:
+    """The poses as those of a body, by the mounting of the camera that fits best."""
+    for conventions in _combined(ROTATIONS, DIRECTIONS):
+        steps = _steps_of(telling, _read(telling, poses, conventions))
+        pairs = kept = list(zip(telling, steps, strict=True))
+        mounting, misses = Rigid3.identity(), np.zeros(len(pairs))
+        for _ in range(_MOUNTING_ROUNDS):  # what the first mountings leave far off may be measured wrongly
+            mounting = _mounting(kept)
+            misses = _misses(telling, [mounting.inverse() @ step @ mounting for step in steps])
+            kept = [pair for pair, miss in zip(pairs, misses, strict=True) if miss <= 1.5 * np.median(misses)]
+        w, x, y, z = mounting.quat_wxyz()
+        numbers = ",".join(f"{number:.4g}" for number in (*mounting.translation, x, y, z, w))
+        yield _Reading((*conventions, f"body={numbers}"), misses)
+
+
+def _mounting(pairs: Sequence[tuple[MeasuredStep, Rigid3]]) -> Rigid3:
+    """body_from_cam of least squares, by turns: its rotation by the steps' axes and ways, its translation by what is left of the ways.
+
+    Along an axis that all steps turn about, the translation cannot be seen, and is left at 0.
+    """
+    rotation, translation = np.eye(3), np.zeros(3)
+    of_axes = sum((np.outer(step.log()[3:], measured.first_from_last.log()[3:]) for measured, step in pairs), np.zeros((3, 3)))
+    for _ in range(_MOUNTING_ROUNDS):
+        correlation = of_axes / _TURN**2
+        for measured, step in pairs:
+            way = step.translation - (translation - step.rotation @ translation)
+            correlation = (
+                correlation + np.outer(way, measured.first_from_last.translation) / (_WAY + _DEPTH_SHARE * measured.median_depth) ** 2
+            )
+        rotation = nearest_rotation(correlation)
+        lefts = np.concatenate([step.rotation - np.eye(3) for _, step in pairs])
+        rights = np.concatenate([rotation @ measured.first_from_last.translation - step.translation for measured, step in pairs])
+        translation = np.linalg.lstsq(lefts, rights, rcond=_LEAST_TURN)[0]
+    return Rigid3(rotation, translation)

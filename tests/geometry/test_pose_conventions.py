@@ -1,0 +1,66 @@
+"""Every convention undoes what it names."""
+
+import numpy as np
+import pytest
+
+from topoloc.errors import TrajectoryError
+from topoloc.geometry.pose_conventions import AXES, MEANINGS, ROTATIONS, UNITS, PoseReading, meaning, mended
+from topoloc.geometry.rigid import Rigid3, exp_so3
+
+POSE = Rigid3(exp_so3(np.array([0.4, -1.1, 0.7])), np.array([1.0, 2.0, -3.0]))
+BODY_FROM_CAM = Rigid3(exp_so3(np.array([-1.2, 0.1, 0.3])), np.array([0.3, -0.1, 0.05]))
+
+
+def assert_same(a: Rigid3, b: Rigid3) -> None:
+    np.testing.assert_allclose(a.matrix(), b.matrix(), atol=1e-9)
+
+
+def with_axes(pose: Rigid3, right: list[float], down: list[float], forward: list[float]) -> Rigid3:
+    """The pose of a body of other axes at the camera, in which the camera's point so."""
+    return Rigid3(pose.rotation @ np.column_stack([right, down, forward]).T, pose.translation)
+
+
+def test_camera_axes_are_turned():
+    assert_same(mended(with_axes(POSE, [1, 0, 0], [0, -1, 0], [0, 0, -1]), ["opengl"]), POSE)
+    assert_same(mended(with_axes(POSE, [0, -1, 0], [0, 0, -1], [1, 0, 0]), ["flu"]), POSE)
+    assert_same(mended(with_axes(POSE, [0, 1, 0], [0, 0, 1], [1, 0, 0]), ["frd"]), POSE)
+
+
+def test_left_handed_worlds_are_mirrored():
+    mirror = np.diag([1.0, -1.0, 1.0])
+
+    def mirrored(pose: Rigid3) -> Rigid3:
+        return Rigid3(mirror @ pose.rotation @ mirror, mirror @ pose.translation)
+
+    assert_same(mended(mirrored(POSE), ["unity"]), POSE)
+    body = mirrored(with_axes(POSE, [0, -1, 0], [0, 0, -1], [1, 0, 0]))
+    assert_same(mended(Rigid3(body.rotation, 100.0 * body.translation), ["unreal", "cm"]), POSE)
+
+
+def test_a_quaternion_read_in_the_wrong_order():
+    w, x, y, z = POSE.quat_wxyz()
+    as_read = Rigid3.from_quat_wxyz(np.array([z, w, x, y]), POSE.translation)  # "w x y z" taken for x, y, z, w
+    assert_same(mended(as_read, ["wxyz"]), POSE)
+
+
+def test_units_bodies_and_combinations():
+    assert_same(mended(Rigid3(POSE.rotation, 1000.0 * POSE.translation), ["mm"]), POSE)
+    assert_same(mended(Rigid3(POSE.rotation, POSE.translation / 0.42), ["scale=0.42"]), POSE)
+    w, x, y, z = BODY_FROM_CAM.quat_wxyz()
+    text = "inverse,body=" + ",".join(str(number) for number in (*BODY_FROM_CAM.translation, x, y, z, w))
+    assert_same(PoseReading.of(text).mend((POSE @ BODY_FROM_CAM.inverse()).inverse()), POSE)
+
+
+def test_what_the_option_says():
+    assert PoseReading.of("wxyz, shift=-0.25,clock=1e6") == PoseReading(("wxyz",), 1e6, -0.25)
+    assert PoseReading.of(None) == PoseReading.of("") == PoseReading()
+    assert set(ROTATIONS) | set(UNITS) | set(AXES) <= set(MEANINGS)
+    assert "millimetres" in meaning(["opengl", "mm"])
+
+
+@pytest.mark.parametrize(
+    "text", ["upside", "scale", "scale=0", "scale=a", "mm=3", "body=1,2", "shift=nan", "clock=-1", "body=0,0,0,0,0,0,0"]
+)
+def test_what_makes_no_sense_is_an_error(text: str):
+    with pytest.raises(TrajectoryError):
+        PoseReading.of(text)

@@ -1,0 +1,128 @@
+"""Trajectories of a wrong convention are named, right ones are not accused."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from topoloc.errors import TrajectoryError
+from topoloc.geometry.pose_conventions import PoseReading
+from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.sequences.open import open_sequence
+from topoloc.sequences.recording import SequenceView
+from topoloc.slam.measured_steps import MeasuredStep, MeasuredStepsConfig, measure_steps
+from topoloc.slam.pose_checks import check_gaps, check_poses, judge_poses
+
+BODY_FROM_CAM = Rigid3(exp_so3(np.array([1.2, -1.1, 0.7])), np.array([0.3, -0.1, 0.5]))
+FLIP, FLU = np.diag([1.0, -1.0, -1.0]), np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+def w_first(pose: Rigid3) -> Rigid3:
+    w, x, y, z = pose.quat_wxyz()
+    return Rigid3.from_quat_wxyz(np.array([z, w, x, y]), pose.translation)
+
+
+# what poses look like that are of another convention, and what is said of them
+WRONG: dict[str, tuple[Callable[[Rigid3], Rigid3], tuple[str, ...]]] = {
+    "inverse": (Rigid3.inverse, ("inverse",)),
+    "opengl": (lambda pose: Rigid3(pose.rotation @ FLIP, pose.translation), ("opengl",)),
+    "inverse opengl": (lambda pose: Rigid3(pose.rotation @ FLIP, pose.translation).inverse(), ("inverse", "opengl")),
+    "wxyz": (w_first, ("wxyz",)),
+    "transposed": (lambda pose: Rigid3(pose.rotation.T.copy(), pose.translation), ("transposed",)),
+    "flu": (lambda pose: Rigid3(pose.rotation @ FLU.T, pose.translation), ("flu",)),
+    "mm": (lambda pose: Rigid3(pose.rotation, 1000.0 * pose.translation), ("mm",)),
+}
+
+
+def walk(num_frames: int) -> list[Rigid3]:
+    """A camera carried by hand: it goes on, sways, and looks around."""
+    k = np.arange(num_frames)
+    ways = np.column_stack([np.sin(0.13 * k), 0.1 * np.sin(0.31 * k), 0.08 * k])
+    turns = np.column_stack([0.15 * np.sin(0.23 * k), 0.5 * np.sin(0.09 * k + 1.0), 0.1 * np.cos(0.17 * k)])
+    world = Rigid3(exp_so3(np.array([0.3, -0.5, 0.9])), np.array([3.0, 2.0, 1.0]))
+    return [world @ Rigid3(exp_so3(turn), way) for turn, way in zip(turns, ways, strict=True)]
+
+
+POSES, T_NS = walk(120), [100_000_000 * k for k in range(120)]
+
+
+def steps_of(poses: list[Rigid3], seed: int) -> list[MeasuredStep]:
+    """Steps as pictures would give them: a few millimetres and a fifth of a degree off, one of them wrong."""
+    rng, steps = np.random.default_rng(seed), []
+    for first in range(0, 105, 7):
+        noise = Rigid3(exp_so3(rng.normal(0.0, 0.003, 3)), rng.normal(0.0, 0.005, 3))
+        steps.append(MeasuredStep(first, first + 10, poses[first].inverse() @ poses[first + 10] @ noise, 3.0))
+    return [*steps[:-1], replace(steps[-1], first_from_last=Rigid3.exp(np.full(6, 0.5)))]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_right_poses_are_believed(seed: int):
+    verdict = judge_poses(steps_of(POSES, seed), POSES, T_NS)
+    assert verdict.is_believed
+    assert verdict.num_telling == len(steps_of(POSES, seed))
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_convention_is_named(name: str):
+    spoil, conventions = WRONG[name]
+    verdict = judge_poses(steps_of(POSES, 0), [spoil(pose) for pose in POSES], T_NS)
+    assert not verdict.is_believed
+    assert verdict.conventions == conventions
+
+
+def test_the_mounting_on_a_body_is_found():
+    verdict = judge_poses(steps_of(POSES, 0), [pose @ BODY_FROM_CAM.inverse() for pose in POSES], T_NS)
+    (convention,) = verdict.conventions
+    mended = PoseReading.of(convention).mend(Rigid3.identity())
+    assert np.linalg.norm(mended.translation - BODY_FROM_CAM.translation) < 0.05
+    assert (mended.inverse() @ BODY_FROM_CAM).angle() < np.radians(2.0)
+
+
+def test_a_shifted_clock_is_found():
+    late = [None] * 6 + list(POSES[:-6])  # frame k has the pose that frame k - 6 had
+    (convention,) = judge_poses(steps_of(POSES, 0), late, T_NS).conventions
+    assert PoseReading.of(convention).shift_s == pytest.approx(0.6, abs=0.1)
+
+
+def test_poses_of_another_place_are_not_explained():
+    rng = np.random.default_rng(1)
+    verdict = judge_poses(steps_of(POSES, 0), [Rigid3.exp(rng.normal(0.0, 1.0, 6)) for _ in POSES], T_NS)
+    assert not verdict.is_believed
+    assert verdict.conventions == ()
+
+
+def test_a_camera_that_stands_still_tells_nothing():
+    still = [MeasuredStep(k, k + 1, Rigid3.identity(), 3.0) for k in range(20)]
+    assert judge_poses(still, [pose.inverse() for pose in POSES], T_NS).is_believed
+
+
+def test_steps_are_measured_from_pictures(tiny_recording: Path):
+    sequence = open_sequence(tiny_recording)
+    posed = list(range(len(sequence)))
+    steps = measure_steps(sequence, posed, MeasuredStepsConfig(num_steps=6))
+    assert len(steps) >= 5
+    for step in steps:
+        first, last = sequence.poses[step.first], sequence.poses[step.last]
+        assert first is not None
+        assert last is not None
+        apart = (first.inverse() @ last).inverse() @ step.first_from_last
+        assert np.linalg.norm(apart.translation) < 0.02
+        assert apart.angle() < np.radians(0.5)
+
+
+def test_a_recording_is_refused_in_one_line(tiny_recording: Path):
+    sequence = open_sequence(tiny_recording)
+    check_poses(sequence)
+    inverse = [pose.inverse() for pose in sequence.poses if pose is not None]
+    with pytest.raises(TrajectoryError, match="--poses inverse"):
+        check_poses(SequenceView(sequence, list(range(len(sequence))), list(inverse)))
+
+
+def test_gaps_of_more_than_half(tiny_recording: Path):
+    sequence = open_sequence(tiny_recording)
+    poses = [pose if k < 5 else None for k, pose in enumerate(sequence.poses)]
+    with pytest.raises(TrajectoryError, match=f"only 5 of {len(sequence)} frames"):
+        check_gaps(SequenceView(sequence, list(range(len(sequence))), poses))
+    check_gaps(sequence)
