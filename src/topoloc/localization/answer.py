@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float
 
 from topoloc.geometry.rigid import covariance_of_inverse
 from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.belief import MIN_LEAD, Hypothesis, lead
-from topoloc.localization.evidence import is_only_imprecise, precision_of
+from topoloc.localization.calibration_doubt import doubt_of_calibration
+from topoloc.localization.evidence import doubt_of, is_only_imprecise, precision_at, precision_of
 from topoloc.localization.pose_fit import SeenPoints
 from topoloc.localization.result import Alternative, Localization, NotLocalized, Reason
 from topoloc.localization.search import Search
@@ -33,9 +36,34 @@ def answer(search: Search) -> tuple[Localization | NotLocalized, list[Answered]]
     probability = precision_of(best.evidence) / (1.0 + others)
     is_leading = all(by >= _least_lead(search, best, other) for by, other in zip(leads, ranked[1:], strict=True))
     if is_leading and probability >= min_probability:
+        return _calibration_checked(search, best, probability)
+    return _ambiguity(search, ranked, leads, others)
+
+
+def _calibration_checked(search: Search, best: Hypothesis, probability: float) -> tuple[Localization | NotLocalized, list[Answered]]:
+    """The answer; a calibration that the picture contradicts costs it precision, which may be all that it has."""
+    with search.query.clock.stage("calibration"):
+        doubt = doubt_of_calibration(search, best.fit)
+    if doubt is None:
         named = _answered(search, best, probability)
         return named[0], [named]
-    return _ambiguity(search, ranked, leads, others)
+    covariance = best.covariance + np.outer(doubt.shift, doubt.shift)
+    evidence = replace(best.evidence, doubt=max(best.evidence.doubt, _doubt_of_shift(search, best, doubt.shift)))
+    paid = replace(best, covariance=covariance, evidence=evidence)
+    probability *= precision_at(evidence.doubt)
+    if probability < search.config.evidence.min_probability:
+        return _refused(search, "too_few_inliers", paid, f"the calibration is doubtful: {doubt}"), []
+    localization, seen = _answered(search, paid, probability)
+    localization = replace(localization, calibration_doubt=doubt)
+    return localization, [(localization, seen)]
+
+
+def _doubt_of_shift(search: Search, best: Hypothesis, shift: Float[np.ndarray, " 6"]) -> float:
+    """`Evidence.doubt`, of a pose that may be off by this left perturbation of cam_from_world."""
+    seen, fit = best.fit.seen_points(1.0), best.fit.pose
+    assert fit is not None
+    depth = float(np.median(fit.cam_from_world.apply(seen.points_world)[:, 2]))
+    return doubt_of(best.covariance + np.outer(shift, shift), depth, search.config.evidence)
 
 
 def _lead(search: Search, best: Hypothesis, other: Hypothesis) -> float:

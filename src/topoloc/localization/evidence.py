@@ -154,7 +154,12 @@ def precision_of(evidence: Evidence) -> float:
 
     A wall alone may leave a pose imprecise though the place is beyond doubt.
     """
-    return 1.0 if evidence.num_distinct is None else math.erf(1.0 / (math.sqrt(2.0) * evidence.doubt))
+    return 1.0 if evidence.num_distinct is None else precision_at(evidence.doubt)
+
+
+def precision_at(doubt: float) -> float:
+    """The probability that an error of so many times what is tolerated (one standard deviation) is tolerable."""
+    return math.erf(1.0 / (math.sqrt(2.0) * doubt))
 
 
 def is_only_imprecise(evidence: Evidence, weights: FittedWeights, config: EvidenceConfig) -> bool:

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.geometry.calibration_check import CalibrationDoubt
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.evidence import Evidence
 from topoloc.places.coarse import NodeScore
@@ -28,7 +29,8 @@ class Localization:
     `probability` is that of the pose being within 0.25 m and 2 degrees, or within 5 % of the distance of what is seen where that is
     less than 0.25 m; weighed from `evidence`, with weights that were fitted to this kind of features: `calibrated` is False where none are,
     and those of another kind stand in. `node_id` is the node that most inliers come from; `times_ms` the milliseconds of each
-    stage; `focal_length_px` the focal length found with the pose, None where the camera was calibrated.
+    stage; `focal_length_px` the focal length found with the pose, None where the camera was calibrated. `calibration_doubt` is what the
+    picture says against its calibration; covariance and probability have paid for it.
     """
 
     world_from_cam: Rigid3
@@ -43,6 +45,7 @@ class Localization:
     focal_length_px: float | None = None
     noise_share: float = 1.0
     calibrated: bool = True
+    calibration_doubt: CalibrationDoubt | None = None
 
     @property
     def localized(self) -> Literal[True]:
@@ -66,6 +69,7 @@ class Localization:
             "node": self.node_id,
             **_evidence_json(self),
             **({} if self.focal_length_px is None else {"focal_length_px": self.focal_length_px}),
+            **({} if self.calibration_doubt is None else {"calibration_doubt": self.calibration_doubt.to_json()}),
         }
 
 

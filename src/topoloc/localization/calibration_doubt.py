@@ -1,0 +1,88 @@
+"""A calibration that the picture contradicts: named, and paid for by the answer's covariance and probability.
+
+A wrong focal length or principal point gives a pose that is wrong, and as sure as any. What is left of the points' errors shows it
+(`geometry/calibration_check.py`); where it does, the points are sought once more around the pose and the camera that it leads to, until
+nothing changes, so that the camera named is the picture's own and not half way there.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+from topoloc.geometry.calibration_check import CalibrationDoubt, PictureCalibration, calibration_of_picture, camera_of_picture
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rough_camera import RoughCamera
+from topoloc.localization.guided import match_guided
+from topoloc.localization.map_facts.correlated_errors import inflation
+from topoloc.localization.pose_fit import PoseFit, fit_pose
+from topoloc.localization.search import Search
+
+_SUSPECT, _NAMED = (3.0, 0.01), (4.0, 0.025)  # sigmas, and share of the focal length or of the picture's width
+_ROUNDS, _SETTLED = 4, 0.003
+
+
+def doubt_of_calibration(search: Search, fit: PoseFit) -> CalibrationDoubt | None:
+    """What the points of an answer say against its calibration; None where they agree with it, or there was none."""
+    if isinstance(fit.lens, RoughCamera) or fit.pose is None:
+        return None
+    found = _measured(search, fit)
+    if found is None or not any(_contradicts(fit, found, fit.camera, *_SUSPECT)):
+        return None
+    calibrated, first = fit.camera, fit.pose.cam_from_world
+    for _ in range(_ROUNDS):
+        around = _around(search, fit, found)
+        again = _measured(search, around)
+        if again is None:  # it leads nowhere: what was seen at first has to do
+            break
+        fit, found = around, again
+        if max(abs(math.log(found.scale)), float(np.abs(found.offset).max())) < _SETTLED:
+            break
+    is_of_focal_length, is_of_centre = _contradicts(fit, found, calibrated, *_NAMED)
+    if not (is_of_focal_length or is_of_centre):
+        return None
+    camera, scale = camera_of_picture(fit.camera, found), search.query.scale
+    sigma = math.sqrt(inflation(fit.num_inliers, search.rho) * found.covariance[0, 0])
+    return CalibrationDoubt(
+        camera.fx * scale,
+        sigma * camera.fx * scale,
+        calibrated.fx * scale,
+        _centre(camera, scale),
+        _centre(calibrated, scale),
+        is_of_focal_length,
+        is_of_centre,
+        (found.cam_from_world @ first.inverse()).log(),
+    )
+
+
+def _measured(search: Search, fit: PoseFit) -> PictureCalibration | None:
+    if fit.pose is None:
+        return None
+    seen = fit.seen_points(1.0)
+    points_img, sigma_px = seen.points_img.astype(np.float64), search.config.pose.key_point_sigma_px
+    return calibration_of_picture(points_img, seen.points_world, seen.covariances, fit.camera, fit.pose.cam_from_world, sigma_px)
+
+
+def _around(search: Search, fit: PoseFit, found: PictureCalibration) -> PoseFit:
+    """The points sought again around the pose and the camera that the picture led to."""
+    camera, cam_from_world, config = camera_of_picture(fit.camera, found), found.cam_from_world, search.config
+    local_map = search.map.local_map(search.map.nearest(cam_from_world.inverse(), config.guided.num_nodes))
+    matches = match_guided(fit.features, local_map, cam_from_world, camera, config.guided)
+    return fit_pose(fit.features, camera, local_map, matches, config.pose, (cam_from_world, camera))
+
+
+def _contradicts(fit: PoseFit, found: PictureCalibration, calibrated: Camera, num_sigmas: float, share: float) -> tuple[bool, bool]:
+    """Are the focal length and the principal point off by more than so many sigmas, and that share (of itself, of the width)?"""
+    camera = camera_of_picture(fit.camera, found)
+    sigmas = np.sqrt(np.diag(found.covariance))
+    stretch = abs(math.log(camera.fx / calibrated.fx))
+    way = np.abs(_centre(camera, 1.0) - _centre(calibrated, 1.0))
+    is_far = (way > num_sigmas * sigmas[1:] * calibrated.fx) & (way > share * calibrated.width)
+    return bool(stretch > num_sigmas * sigmas[0] and stretch > share), bool(is_far.any())
+
+
+def _centre(camera: Camera, scale: float) -> Float[np.ndarray, " 2"]:
+    """The principal point in a picture that is `scale` times as wide."""
+    return (np.array([camera.cx, camera.cy]) + 0.5) * scale - 0.5
