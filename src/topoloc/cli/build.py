@@ -10,16 +10,14 @@ import tyro
 
 from topoloc.cli.features_option import BUILD_FEATURES, kinds_to_build
 from topoloc.cli.info import describe_map
-from topoloc.cli.output import File, Format, UsageError, check_outputs, progress_bar, write_json
+from topoloc.cli.output import CameraOption, File, Format, UsageError, check_outputs, progress_bar, write_json
 from topoloc.cli.settings_file import read_settings, with_option
-from topoloc.errors import RecordingError
 from topoloc.localization.map_facts.building import build_map
-from topoloc.map.build import BuildConfig, Progress
+from topoloc.map.build import BuildConfig
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import open_sequence
-from topoloc.sequences.recording import SequenceView
 from topoloc.sequences.trajectory import with_trajectory
-from topoloc.slam.slam import SlamConfig, run_slam
+from topoloc.slam.slam import SlamConfig, posed_by_slam
 
 
 @dataclass(frozen=True)
@@ -36,7 +34,9 @@ class Command:
     ] = ()
     """Where poses come from: `truth` (the recording's own), `slam`, or a TUM or KITTI file; given once for all, or once for each."""
     format: Format = None
-    """The recordings' format: kitti, euroc, tum, seven_scenes or folder."""
+    """The recordings' format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, video or folder."""
+    camera: CameraOption = None
+    """Calibration of the recordings instead of their own: a camera.json, YAML of OpenCV or Kalibr, or `fx,fy,cx,cy` in pixels."""
     d_thresh: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="(default: by what is seen)")] = None
     """Metres between nodes (D_thresh of the paper's Eq. 1)."""
     lambda_rot: Annotated[
@@ -60,7 +60,7 @@ class Command:
         sequences, poses_from = self._open(recordings)
         with progress_bar() as progress:
             if poses_from[0] == "slam":
-                sequences = _with_slam(sequences, settings.of(SlamConfig), progress)
+                sequences = posed_by_slam(sequences, settings.of(SlamConfig), progress)
             topomap = build_map(sequences, config, progress, poses_from)
         topomap.save(target)
         info = describe_map(topomap, target)
@@ -88,7 +88,7 @@ class Command:
 
     def _open(self, recordings: list[str]) -> tuple[list[StereoSequence], list[str]]:
         """The recordings with their poses, and where those of each come from; with `slam` they are still to be found."""
-        sequences = [open_sequence(path, self.format) for path in recordings]
+        sequences = [open_sequence(path, self.format, self.camera) for path in recordings]
         trajectories = self.trajectory or ("truth" if all(any(sequence.poses) for sequence in sequences) else "slam",)
         if len(trajectories) == 1:
             trajectories *= len(recordings)
@@ -101,15 +101,6 @@ class Command:
         pairs = zip(sequences, trajectories, strict=True)
         posed = [sequence if trajectory == "truth" else with_trajectory(sequence, Path(trajectory)) for sequence, trajectory in pairs]
         return posed, list(trajectories)
-
-
-def _with_slam(sequences: list[StereoSequence], config: SlamConfig, progress: Progress) -> list[StereoSequence]:
-    """The recordings with the poses that SLAM finds. Raises RecordingError where one of them shares no place with the others."""
-    result = run_slam(sequences, config, progress)
-    for sequence, poses in zip(sequences, result.poses, strict=True):
-        if not any(poses):
-            raise RecordingError(f"{sequence.name}: no place of it was recognised in {sequences[0].name}; map it alone")
-    return [SequenceView(sequence, list(range(len(sequence))), poses) for sequence, poses in zip(sequences, result.poses, strict=True)]
 
 
 def _first_bytes(path: Path) -> bytes:

@@ -17,6 +17,7 @@ from topoloc.localization.open_map import OpenMap
 from topoloc.map import build
 from topoloc.map.topomap import Repetitions, SharedErrors, TopoMetricMap
 from topoloc.sequences.frame import StereoSequence
+from topoloc.slam.slam import posed_by_slam
 
 
 def build_map(
@@ -27,12 +28,14 @@ def build_map(
 ) -> TopoMetricMap:
     """Build a topo-metric map from one or several recordings of one place whose poses share one world.
 
+    Where a recording has no poses at all, those of all of them are found by SLAM, as `topoloc build` does.
+
     Args:
-        poses_from: where the poses of each recording come from (`truth`, `slam`, a file), for the map to remember.
+        poses_from: where the poses of each recording come from (`truth`, `slam`, a file), for the map to remember; given, SLAM is not run.
 
     Raises:
         ConfigError: a value of `config` is out of its bounds.
-        TrajectoryError: no frame of a recording has a pose.
+        TrajectoryError: no frame of a recording has a pose, though `poses_from` says where they are from.
         EmptyMapError: no picture gave a usable node.
         FeatureKindError: no features of the kind that `config` names.
         RecordingError, CalibrationError, UnreadableImageError: from reading the recordings.
@@ -40,6 +43,9 @@ def build_map(
     config = config or build.BuildConfig()
     for kind in config.kinds:
         find_kind(kind)
+    sequences = [sequences] if isinstance(sequences, StereoSequence) else list(sequences)
+    if poses_from is None and not all(any(sequence.poses) for sequence in sequences):
+        sequences, poses_from = posed_by_slam(sequences, progress=progress), ["slam"] * len(sequences)
     topomap = build.build_map(sequences, config, progress, poses_from)
     errors = {kind: _correlated_errors(topomap.by_kind(kind)) for kind in topomap.kinds}
     topomap = replace(topomap, shared_errors=errors.pop(topomap.kind), other_shared_errors=errors)
