@@ -42,7 +42,7 @@ def calibration_of(text: str | Path) -> CalibrationOfSize:
         Camera.pinhole(1, 1, fx, fy, cx, cy)  # complains before the first picture is read
         return lambda width, height: CameraFile(camera_of_numbers(fx, fy, cx, cy, width, height))
     if path.suffix.lower() in YAML_SUFFIXES:
-        read_calibration_yaml(path, 1, 1)
+        read_calibration_yaml(path, 1000, 1000)  # complains before the first picture is read
         return lambda width, height: read_calibration_yaml(path, width, height)
     camera_file = read_camera_json(path)
     return lambda width, height: camera_file
@@ -79,6 +79,22 @@ def find_calibration(folder: Path) -> CalibrationOfSize | None:
     if len(found) > 1:
         raise CalibrationError(f"{folder}: several calibrations ({', '.join(path.name for path in found)}); name one with --camera")
     return calibration_of(found[0]) if found else None
+
+
+def completed(given: CalibrationOfSize, folder: Path) -> CalibrationOfSize:
+    """A calibration from outside; what it does not say of a rectified pair's baseline and of depth is as in the recording's folder."""
+
+    def of_size(width: int, height: int) -> CameraFile:
+        calibration = given(width, height)
+        with suppress(CalibrationError):
+            if own := find_calibration(folder):
+                of_folder = own(width, height)
+                pair = of_folder.rig if of_folder.rig is not None and of_folder.rig.is_rectified else None
+                rig = calibration.rig or (StereoRig.rectified(calibration.camera, pair.baseline) if pair else None)
+                return CameraFile(calibration.camera, rig, calibration.depth_factor or of_folder.depth_factor)
+        return calibration
+
+    return of_size
 
 
 def recalibrated(sequence: StereoSequence, calibration: CalibrationOfSize) -> StereoSequence:
@@ -120,5 +136,5 @@ def size_of_first(pictures: Sequence[Path]) -> tuple[int, int]:
     return 0, 0
 
 
-def _near(one: float, other: float, tolerance: float) -> bool:
+def _near(one: float, other: float | int, tolerance: float) -> bool:
     return abs(one - other) <= tolerance * other

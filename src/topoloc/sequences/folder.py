@@ -12,7 +12,7 @@ from pathlib import Path
 
 from topoloc.errors import CalibrationError, RecordingError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.sequences.calibration import CalibrationOfSize, calibration_of, find_calibration, size_of_first
+from topoloc.sequences.calibration import CalibrationOfSize, calibration_of, completed, find_calibration, size_of_first
 from topoloc.sequences.camera_json import FILE_NAME, CameraFile
 from topoloc.sequences.pictures import PICTURE_SUFFIXES
 from topoloc.sequences.recording import DepthPictures, Recording, RightPictures, check_pairs, list_pictures
@@ -47,7 +47,7 @@ def open_folder(path: Path, calibration: CalibrationOfSize | None = None) -> Rec
         calibration = calibration or (calibration_of(beside) if beside.is_file() else None)
         camera = calibration(*size_of_first([path])).camera if calibration else None
         return Recording(path.name, path.parent, [path.name], [0], [None], camera)
-    calibration = calibration or find_calibration(path)
+    calibration = completed(calibration, path) if calibration else find_calibration(path)
     for left, right in _STEREO:
         if (path / left).is_dir() and (path / right).is_dir():
             return _open_stereo(path, left, right, calibration)

@@ -56,7 +56,7 @@ def read_calibration_yaml(path: Path, width: int, height: int) -> CameraFile:
     text = read_yaml(path)
     if _is_kalibr(text):
         return _kalibr(path, text)
-    size = _size(text) or (width, height)
+    size = _size(text) or (float(width), float(height))
     if not yaml_numbers(text, *_LEFT[0]):
         return CameraFile(_opencv_camera(path, text, *_ONLY, size))
     left, right = (_opencv_camera(path, text, *names, size) for names in (_LEFT, _RIGHT))
