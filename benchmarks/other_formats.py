@@ -23,6 +23,7 @@ from topoloc.sequences.frame_view import frame_view
 from topoloc.sequences.open import open_sequence
 from topoloc.sequences.pictures import jpeg_of
 
+COLMAP_UNIT = 2.5  # metres
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -58,6 +59,44 @@ def _depth_mm(frame: StereoFrame) -> np.ndarray:
     return np.where((disparity > 1.0) & (millimetres < 65000), np.rint(millimetres), 0).astype(np.uint16)
 
 
+def write_colmap(sequence: StereoSequence, folder: Path) -> Path:
+    """A model of the left pictures under the recording's poses, in its own unit, which is not the metre; the pictures lie in images/."""
+    import pycolmap  # pyright: ignore[reportMissingImports]
+
+    poses, index_of = sequence.poses, {}
+    for index in range(len(sequence)):
+        if poses[index] is not None:
+            index_of[f"{index:05d}.jpg"] = index
+            _write(folder / "images" / f"{index:05d}.jpg", jpeg_of(sequence[index].image, 95))
+    camera = sequence[0].camera
+    assert camera is not None
+    model, _, _, params = camera.to_colmap()
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model, reader.camera_params = model, ",".join(map(repr, params))
+    database_path, device, names = folder / "database.db", pycolmap.Device.cpu, sorted(index_of)
+    single = pycolmap.CameraMode.SINGLE
+    pycolmap.extract_features(database_path, folder / "images", names, camera_mode=single, reader_options=reader, device=device)
+    pairs = [(names[a], names[a + step]) for step in (1, 2, 3, 5, 8, 12) for a in range(len(names) - step)]
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = str(folder / "pairs.txt")
+    (folder / "pairs.txt").write_text("".join(f"{a} {b}\n" for a, b in pairs))
+    pycolmap.match_image_pairs(database_path, pairing_options=pairing, device=device)
+    known = pycolmap.Reconstruction()
+    with pycolmap.Database.open(database_path) as database:
+        for of_database in database.read_all_cameras():
+            known.add_camera_with_trivial_rig(of_database)
+        for name in names:
+            image, pose = database.read_image_with_name(name), poses[index_of[name]]
+            assert pose is not None
+            bare = pycolmap.Image(name=name, camera_id=image.camera_id, image_id=image.image_id)
+            known.add_image_with_trivial_frame(bare, pycolmap.Rigid3d(pose.inverse().matrix()[:3]))
+    (folder / "sparse").mkdir(exist_ok=True)
+    found = pycolmap.triangulate_points(known, database_path, folder / "images", folder / "sparse")
+    found.transform(pycolmap.Sim3d(1.0 / COLMAP_UNIT, pycolmap.Rotation3d(), np.zeros(3)))
+    found.write(folder / "sparse")
+    return folder / "sparse"
+
+
 def _write(path: Path, data: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(data)
@@ -84,6 +123,10 @@ def main() -> None:
         if name == "nerfstudio":
             shutil.rmtree(options.out / name, ignore_errors=True)
             source = str(write_nerfstudio(sequence, options.out / name))
+        if name == "colmap":
+            shutil.rmtree(options.out / name, ignore_errors=True)
+            source = str(write_colmap(sequence, options.out / name))
+            more = ["--images", str(options.out / name / "images"), "--scale", str(COLMAP_UNIT)]
         target = str(options.out / f"{name}.topo")
         _topoloc("build", source, target, "--features", "surf", *more)
         _topoloc("evaluate", target, options.queries, "--json", str(options.out / f"{name}.json"), *world)

@@ -48,7 +48,8 @@ class DepthPictures:
 class Recording:
     """A StereoSequence on disk. `names` are picture paths relative to `root`; `camera` is that of the left or colour picture.
 
-    `cameras` are those of the frames one by one, where they are not of one camera.
+    `cameras` are those of the frames one by one, where they are not of one camera. Poses of a model of pictures alone are in no metres
+    (`has_scale`).
     """
 
     name: str
@@ -60,6 +61,7 @@ class Recording:
     right: RightPictures | None = None
     depth: DepthPictures | None = None
     cameras: list[Camera] | None = None
+    has_scale: bool = True
 
     def __len__(self) -> int:
         return len(self.names)
@@ -113,6 +115,22 @@ class SequenceView:
     def __getitem__(self, index: int) -> StereoFrame:
         """Read one frame. Raises as the sequence below does."""
         return replace(self.base[self.indices[index]], world_from_cam=self.poses[index])
+
+
+def has_scale(sequence: StereoSequence) -> bool:
+    """Whether the poses are in metres, as far as is known."""
+    while isinstance(sequence, SequenceView):
+        before = sequence.base.poses
+        if any(pose is not before[index] for index, pose in zip(sequence.indices, sequence.poses, strict=True)):
+            return True  # poses from elsewhere
+        sequence = sequence.base
+    return not isinstance(sequence, Recording) or sequence.has_scale
+
+
+def scaled(sequence: StereoSequence, metres: float) -> StereoSequence:
+    """The same recording with poses of which a unit is so many metres."""
+    poses = [None if pose is None else Rigid3(pose.rotation, metres * pose.translation) for pose in sequence.poses]
+    return SequenceView(sequence, list(range(len(sequence))), poses)
 
 
 def single_pictures(sequence: StereoSequence) -> StereoSequence:
