@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import topoloc
+from built_room import unseen_views
 from topoloc.errors import RecordingError
 from topoloc.sequences.open import open_sequence
 
@@ -36,6 +37,20 @@ def test_without_poses_slam_is_run(tiny_recording: Path):
     result = topoloc.Localizer(topomap).localize(recording[5].image, recording[5].camera)
     assert isinstance(result, topoloc.Localization)
     np.testing.assert_allclose(result.world_from_cam.translation, true.translation, atol=0.03)
+
+
+def test_single_pictures_with_poses(tiny_recording: Path):
+    recording = open_sequence(tiny_recording)
+    frames = [replace(recording[index], right=None, rig=None) for index in range(len(recording))]
+    topomap = topoloc.build_map(topoloc.MemorySequence(frames), SURF_ALONE)
+    localizer, errors = topoloc.Localizer(topomap), []
+    for image, world_from_cam in unseen_views():
+        result = localizer.localize(image, frames[0].camera)
+        if isinstance(result, topoloc.Localization):
+            errors.append(np.linalg.norm(result.world_from_cam.translation - world_from_cam.translation))
+    assert len(errors) >= len(unseen_views()) - 1
+    assert np.median(errors) < 0.02
+    assert max(errors) < 0.1
 
 
 def test_single_pictures_without_poses_need_more(tiny_recording: Path):

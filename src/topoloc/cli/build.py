@@ -14,8 +14,10 @@ from topoloc.cli.output import CameraOption, File, Format, UsageError, check_out
 from topoloc.cli.settings_file import read_settings, with_option
 from topoloc.localization.map_facts.building import build_map
 from topoloc.map.build import BuildConfig
+from topoloc.sequences.colmap import aligned
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import open_sequence
+from topoloc.sequences.recording import has_scale, scaled
 from topoloc.sequences.trajectory import with_trajectory
 from topoloc.slam.slam import SlamConfig, posed_by_slam
 
@@ -34,9 +36,13 @@ class Command:
     ] = ()
     """Where poses come from: `truth` (the recording's own), `slam`, or a TUM or KITTI file; given once for all, or once for each."""
     format: Format = None
-    """The recordings' format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, video or folder."""
+    """The recordings' format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap, video or folder."""
     camera: CameraOption = None
     """Calibration of the recordings instead of their own: a camera.json, YAML of OpenCV or Kalibr, or `fx,fy,cx,cy` in pixels."""
+    images: Annotated[str | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="(default: images/ beside the model)")] = None
+    """Pictures of a COLMAP model, where SEQ is one."""
+    scale: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="")] = None
+    """A unit of the recordings' own poses, in metres: of models made of pictures alone, which know no metre."""
     d_thresh: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="(default: by what is seen)")] = None
     """Metres between nodes (D_thresh of the paper's Eq. 1)."""
     lambda_rot: Annotated[
@@ -55,6 +61,8 @@ class Command:
         recordings, target = self._split_paths()
         read = [path for path in (*self.trajectory, self.config) if path not in ("truth", "slam", None)]
         check_outputs([str(target), self.json], inputs=read)
+        if self.scale is not None and not 0.0 < self.scale < float("inf"):
+            raise UsageError(f"--scale must be a positive number, not {self.scale:g}")
         settings = read_settings(self.config)
         config = kinds_to_build(self._with_options(settings.of(BuildConfig)), self.features)
         sequences, poses_from = self._open(recordings)
@@ -88,7 +96,7 @@ class Command:
 
     def _open(self, recordings: list[str]) -> tuple[list[StereoSequence], list[str]]:
         """The recordings with their poses, and where those of each come from; with `slam` they are still to be found."""
-        sequences = [open_sequence(path, self.format, self.camera) for path in recordings]
+        sequences = [open_sequence(path, self.format, self.camera, self.images) for path in recordings]
         trajectories = self.trajectory or ("truth" if all(any(sequence.poses) for sequence in sequences) else "slam",)
         if len(trajectories) == 1:
             trajectories *= len(recordings)
@@ -97,10 +105,18 @@ class Command:
         if "slam" in trajectories:
             if set(trajectories) != {"slam"}:
                 raise UsageError("--trajectory slam goes for all recordings or for none: its world is no other's")
+            if self.scale is not None:
+                raise UsageError("--scale is that of the recordings' own poses, and slam finds others")
             return sequences, list(trajectories)
         pairs = zip(sequences, trajectories, strict=True)
-        posed = [sequence if trajectory == "truth" else with_trajectory(sequence, Path(trajectory)) for sequence, trajectory in pairs]
-        return posed, list(trajectories)
+        return [self._with_poses(sequence, trajectory) for sequence, trajectory in pairs], list(trajectories)
+
+    def _with_poses(self, sequence: StereoSequence, trajectory: str) -> StereoSequence:
+        if trajectory != "truth" and self.scale is not None:
+            raise UsageError("--scale is that of the recordings' own poses, and --trajectory takes others")
+        if trajectory != "truth":
+            return with_trajectory(sequence, Path(trajectory)) if has_scale(sequence) else aligned(sequence, Path(trajectory))
+        return sequence if self.scale is None else scaled(sequence, self.scale)
 
 
 def _first_bytes(path: Path) -> bytes:

@@ -55,7 +55,7 @@ class Command:
     features: ASKED_FEATURES = None
     """Which of the map's features are asked; of several, the next where the one before leaves the pose unclear."""
     format: Format = None
-    """The recordings' format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, video or folder."""
+    """The recordings' format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap, video or folder."""
     camera: CameraOption = None
     """Calibration of the recordings instead of their own: a camera.json, YAML of OpenCV or Kalibr, or `fx,fy,cx,cy` in pixels."""
     json: File = None

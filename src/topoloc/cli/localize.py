@@ -73,7 +73,7 @@ class Command:
     """Calibration of the queries: a camera.json, YAML of OpenCV or Kalibr, `fx,fy,cx,cy` in pixels, `map` for that of the map, `unknown`
     to find the focal length."""
     format: Format = None
-    """The recordings' format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, video or folder."""
+    """The recordings' format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap, video or folder."""
     coarse: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")] = None
     """Coarse localizer that is asked; `topoloc info` names those of the map."""
     features: ASKED_FEATURES = None

@@ -30,7 +30,7 @@ class Command:
     out: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="OUT.tum")]
     """The trajectory to write: t tx ty tz qx qy qz qw, world_from_cam; the world is the camera of the first frame."""
     format: Format = None
-    """The recording's format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, video or folder."""
+    """The recording's format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap, video or folder."""
     camera: CameraOption = None
     """Calibration of the recording instead of its own: a camera.json, YAML of OpenCV or Kalibr, or `fx,fy,cx,cy` in pixels."""
     json: File = None
