@@ -29,7 +29,6 @@ from topoloc.sequences.trajectory import frame_poses, read_trajectory
 LOOKS_FOR = "cameras and images (.bin or .txt) of COLMAP"
 _FILES = ("cameras", "images", "points3D")
 _BELOW = ("sparse/0", "sparse", "0")
-_LEAST_BYTES = {"cameras": 32, "images": 73, "points3D": 51, "rigs": 16, "frames": 24}  # of one record
 _MAX_SECONDS = 10**12
 
 
@@ -128,41 +127,50 @@ def _silent(pycolmap: Any) -> Iterator[None]:
 
 
 def _check_counts(model: Path) -> None:
-    """Hold that no count in binary files is larger than the file has room for: pycolmap would read on past the end without end."""
-    for name, least in _LEAST_BYTES.items():
+    """Hold that binary files have room for what their counts announce: pycolmap would read on past the end without end."""
+    for name, length_of in _RECORDS.items():
         file = model / f"{name}.bin"
         if not file.is_file():
             continue
-        data = file.read_bytes()
-        walk = {"images": _images_fit, "points3D": _points_fit}.get(name)
+        data, at = file.read_bytes(), 8
         try:
             (count,) = struct.unpack_from("<Q", data)
-            fits = count * least <= len(data) and (walk is None or walk(data, count))
+            fits = count <= len(data)
+            for _ in range(count if fits else 0):
+                at += length_of(data, at)
+                if at > len(data):
+                    fits = False
+                    break
         except (struct.error, ValueError):
             fits = False
         if not fits:
             raise RecordingError(f"{file}: damaged, or no model of COLMAP (it ends before what it announces)")
 
 
-def _images_fit(data: bytes, count: int) -> bool:
-    at = 8
-    for _ in range(count):
-        end = data.index(b"\0", at + 64)  # id, quaternion, translation, camera; then the name
-        (num_points,) = struct.unpack_from("<Q", data, end + 1)
-        at = end + 9 + 24 * num_points
-        if at > len(data):
-            return False
-    return True
+def _image_length(data: bytes, at: int) -> int:
+    end = data.index(b"\0", at + 64)  # after number, rotation, position and camera comes the name
+    return end + 9 + 24 * struct.unpack_from("<Q", data, end + 1)[0] - at
 
 
-def _points_fit(data: bytes, count: int) -> bool:
-    at = 8
-    for _ in range(count):
-        (length,) = struct.unpack_from("<Q", data, at + 43)  # id, position, colour, error; then the track
-        at += 51 + 8 * length
-        if at > len(data):
-            return False
-    return True
+def _point_length(data: bytes, at: int) -> int:
+    return 51 + 8 * struct.unpack_from("<Q", data, at + 43)[0]  # number, position, colour and error; then the track
+
+
+def _frame_length(data: bytes, at: int) -> int:
+    return 68 + 16 * struct.unpack_from("<I", data, at + 64)[0]  # two numbers and a pose; then what it consists of
+
+
+def _rig_length(data: bytes, at: int) -> int:
+    (count,) = struct.unpack_from("<I", data, at + 4)
+    if count > len(data):
+        raise ValueError("more sensors than bytes")
+    end = at + (16 if count else 8)
+    for _ in range(max(count, 1) - 1):  # beside the first each sensor may have a pose
+        end += 65 if struct.unpack_from("<B", data, end + 8)[0] else 9
+    return end - at
+
+
+_RECORDS = {"images": _image_length, "points3D": _point_length, "frames": _frame_length, "rigs": _rig_length}
 
 
 def _camera(camera: Any, model: Path) -> Camera:
