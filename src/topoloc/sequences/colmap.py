@@ -110,7 +110,9 @@ def _read(model: Path) -> Any:
         _check_counts(model)
     with _silent(pycolmap):
         try:
-            return pycolmap.Reconstruction(str(model))
+            read = pycolmap.Reconstruction(str(model))
+            "".join(image.name for image in read.images.values())  # one that is no text raises here
+            return read
         except Exception as error:  # ValueError, IndexError, RuntimeError: whatever the files make of its C++
             raise RecordingError(f"{model}: damaged, or no model of COLMAP ({' '.join(str(error).split())[:120]})") from None
 
