@@ -63,6 +63,7 @@ def write_colmap(sequence: StereoSequence, folder: Path) -> Path:
     """A model of the left pictures under the recording's poses, in its own unit, which is not the metre; the pictures lie in images/."""
     import pycolmap  # pyright: ignore[reportMissingImports]
 
+    pycolmap.logging.minloglevel = 2
     poses, index_of = sequence.poses, {}
     for index in range(len(sequence)):
         if poses[index] is not None:

@@ -34,7 +34,10 @@ _LEFT = (
     ("M1", "K1", "cameraMatrix1", "camera_matrix_1", "camera_matrix_left", "left_camera_matrix", "K_left"),
     ("D1", "distCoeffs1", "dist_coeffs_1", "distortion_coefficients_left", "dist_coeffs_left", "left_distortion_coefficients", "D_left"),
 )
-_RIGHT = tuple(tuple(name.replace("1", "2").replace("left", "right") for name in names) for names in _LEFT)
+_RIGHT = (
+    tuple(name.replace("1", "2").replace("left", "right") for name in _LEFT[0]),
+    tuple(name.replace("1", "2").replace("left", "right") for name in _LEFT[1]),
+)
 _ONLY = (("camera_matrix", "cameraMatrix", "K"), ("distortion_coefficients", "distCoeffs", "dist_coeffs", "D"))
 
 
@@ -58,8 +61,8 @@ def read_calibration_yaml(path: Path, width: int, height: int) -> CameraFile:
         return _kalibr(path, text)
     size = _size(text) or (float(width), float(height))
     if not yaml_numbers(text, *_LEFT[0]):
-        return CameraFile(_opencv_camera(path, text, *_ONLY, size))
-    left, right = (_opencv_camera(path, text, *names, size) for names in (_LEFT, _RIGHT))
+        return CameraFile(_opencv_camera(path, text, _ONLY, size))
+    left, right = (_opencv_camera(path, text, names, size) for names in (_LEFT, _RIGHT))
     beside = path.with_name("extrinsics.yml")
     motion = read_yaml(beside) if not yaml_numbers(text, "R") and beside.is_file() else text
     rotation = np.array(needed_numbers(path, motion, 9, "R", "rotation_matrix", "R_right_left")).reshape(3, 3)
@@ -96,7 +99,9 @@ def _kalibr(path: Path, text: str) -> CameraFile:
     return CameraFile(left, rig=_rig(path, left, right, motion[:3]))
 
 
-def _opencv_camera(path: Path, text: str, matrix: Sequence[str], distortion: Sequence[str], size: tuple[float, float]) -> Camera:
+def _opencv_camera(path: Path, text: str, names: tuple[Sequence[str], Sequence[str]], size: tuple[float, float]) -> Camera:
+    """The camera whose matrix and distortion have one of these names."""
+    matrix, distortion = names
     fx, skew, cx, _, fy, cy, *_ = needed_numbers(path, text, 9, *matrix)
     if abs(skew) > 1e-6 * abs(fx):
         raise CalibrationError(f"{path}: {matrix[0]} has a skew of {skew:g}, which no model here knows")
