@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from topoloc.compiled import set_num_threads
     from topoloc.errors import TopolocError
     from topoloc.geometry.camera import Camera
+    from topoloc.geometry.rig import StereoRig
     from topoloc.geometry.rigid import Rigid3
     from topoloc.localization.localizer import Localizer, LocalizerConfig
     from topoloc.localization.map_facts.building import build_map
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     from topoloc.localization.warm_up import warm_up
     from topoloc.map.build import BuildConfig
     from topoloc.map.topomap import TopoMetricMap
+    from topoloc.sequences.frame import DepthImage, StereoFrame
+    from topoloc.sequences.memory_sequence import MemorySequence
     from topoloc.sequences.open import open_sequence
     from topoloc.tracking.stream_result import StreamedPose
     from topoloc.tracking.tracker import Tracker, TrackerConfig
@@ -30,11 +33,15 @@ __all__ = [
     "Alternative",
     "BuildConfig",
     "Camera",
+    "DepthImage",
     "Localization",
     "Localizer",
     "LocalizerConfig",
+    "MemorySequence",
     "NotLocalized",
     "Rigid3",
+    "StereoFrame",
+    "StereoRig",
     "StreamedPose",
     "TopoMetricMap",
     "TopolocError",
@@ -52,11 +59,15 @@ _MODULES = {
     "Alternative": "topoloc.localization.result",
     "BuildConfig": "topoloc.map.build",
     "Camera": "topoloc.geometry.camera",
+    "DepthImage": "topoloc.sequences.frame",
     "Localization": "topoloc.localization.result",
     "Localizer": "topoloc.localization.localizer",
     "LocalizerConfig": "topoloc.localization.localizer",
+    "MemorySequence": "topoloc.sequences.memory_sequence",
     "NotLocalized": "topoloc.localization.result",
     "Rigid3": "topoloc.geometry.rigid",
+    "StereoFrame": "topoloc.sequences.frame",
+    "StereoRig": "topoloc.geometry.rig",
     "StreamedPose": "topoloc.tracking.stream_result",
     "TopoMetricMap": "topoloc.map.topomap",
     "TopolocError": "topoloc.errors",

@@ -214,7 +214,9 @@ def test_a_picture_of_nothing_known_is_not_localized(
     picture: np.ndarray, room_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     assert cv2.imwrite(str(tmp_path / "query.png"), picture)
-    assert main(["localize", str(room_map), str(tmp_path / "query.png"), "--camera", "260,260,159.5,119.5", "--json", "-"]) == 0
+    height, width = picture.shape[:2]
+    camera = f"260,260,{(width - 1) / 2},{(height - 1) / 2}"
+    assert main(["localize", str(room_map), str(tmp_path / "query.png"), "--camera", camera, "--json", "-"]) == 0
     printed = capsys.readouterr()
     line = json.loads(printed.out)
     assert set(line) == EVIDENCE | {"reason"}

@@ -8,6 +8,8 @@ from topoloc.errors import TrajectoryError
 from topoloc.geometry.alignment import (
     align_points,
     align_poses,
+    align_scaled_poses,
+    align_similarity,
     align_trajectories,
     rotation_error,
     translation_error,
@@ -76,6 +78,27 @@ def test_long_trajectories_are_aligned_by_their_positions():
     by_poses = align_poses(world_a_from_cams, world_b_from_cams)
     np.testing.assert_allclose(by_positions.matrix(), world_a_from_world_b.matrix(), atol=1e-9)
     assert rotation_error(by_poses, world_a_from_world_b) < 1e-4
+
+
+@given(rigids, st.floats(1e-3, 1e3))
+def test_a_similarity_is_found_again(a_from_b, scale):
+    points_b = np.random.default_rng(0).normal(size=(20, 3))
+    found_scale, found = align_similarity(a_from_b.apply(scale * points_b), points_b)
+    assert found_scale == pytest.approx(scale, rel=1e-9)
+    np.testing.assert_allclose(found.rotation, a_from_b.rotation, atol=1e-9)
+    np.testing.assert_allclose(found.translation, a_from_b.translation, atol=1e-6 * max(1.0, scale))
+
+
+def test_a_straight_way_is_scaled_and_turned_by_its_orientations():
+    rng = np.random.default_rng(5)
+    a_from_b = random_rigid(rng)
+    straight = [Rigid3(random_rigid(rng).rotation, np.array([0.1 * k, 0.0, 0.0])) for k in range(6)]
+    metric = [a_from_b @ Rigid3(pose.rotation, 3.0 * pose.translation) for pose in straight]
+    scale, found = align_scaled_poses(metric, straight)
+    assert scale == pytest.approx(3.0)
+    np.testing.assert_allclose(found.matrix(), a_from_b.matrix(), atol=1e-6)
+    with pytest.raises(TrajectoryError, match="fix no scale"):
+        align_scaled_poses(metric, [straight[0]] * 6)
 
 
 def test_trajectories_of_different_lengths_are_refused():

@@ -11,17 +11,17 @@ import tyro
 
 from topoloc.cli.features_option import BUILD_FEATURES, kinds_to_build
 from topoloc.cli.info import describe_map
-from topoloc.cli.output import File, Flag, Format, UsageError, check_outputs, progress_bar, write_json
+from topoloc.cli.output import CameraOption, File, Flag, Format, UsageError, check_outputs, progress_bar, write_json
 from topoloc.cli.settings_file import read_settings, with_option
-from topoloc.errors import RecordingError
 from topoloc.geometry.pose_conventions import PoseReading
 from topoloc.localization.map_facts.building import Trust, build_map
-from topoloc.map.build import BuildConfig, Progress
+from topoloc.map.build import BuildConfig
+from topoloc.sequences.colmap import aligned
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import open_sequence
-from topoloc.sequences.recording import SequenceView
+from topoloc.sequences.recording import has_scale, scaled
 from topoloc.sequences.trajectory import as_read, with_trajectory
-from topoloc.slam.slam import SlamConfig, run_slam
+from topoloc.slam.slam import SlamConfig, posed_by_slam
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,13 @@ class Command:
     allow_gaps: Flag = False
     """Map a recording of whose frames fewer than half have a pose."""
     format: Format = None
-    """The recordings' format: kitti, euroc, tum, seven_scenes or folder."""
+    """The recordings' format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap, video or folder."""
+    camera: CameraOption = None
+    """Calibration of the recordings instead of their own: a camera.json, YAML of OpenCV or Kalibr, or `fx,fy,cx,cy` in pixels."""
+    images: Annotated[str | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="(default: images/ beside the model)")] = None
+    """Pictures of a COLMAP model, where SEQ is one."""
+    scale: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="")] = None
+    """A unit of the recordings' own poses, in metres: of models made of pictures alone, which know no metre."""
     d_thresh: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="(default: by what is seen)")] = None
     """Metres between nodes (D_thresh of the paper's Eq. 1)."""
     lambda_rot: Annotated[
@@ -65,12 +71,14 @@ class Command:
         recordings, target = self._split_paths()
         read = [path for path in (*self.trajectory, self.config) if path not in ("truth", "slam", None)]
         check_outputs([str(target), self.json], inputs=read)
+        if self.scale is not None and not 0.0 < self.scale < float("inf"):
+            raise UsageError(f"--scale must be a positive number, not {self.scale:g}")
         settings = read_settings(self.config)
         config = kinds_to_build(self._with_options(settings.of(BuildConfig)), self.features)
         sequences, poses_from = self._open(recordings)
         with progress_bar() as progress:
             if poses_from[0] == "slam":
-                sequences = _with_slam(sequences, settings.of(SlamConfig), progress)
+                sequences = posed_by_slam(sequences, settings.of(SlamConfig), progress)
             _report_gaps(sequences)
             trust = Trust(poses="unchecked" in (self.poses or "").split(","), gaps=self.allow_gaps or poses_from[0] == "slam")
             topomap = build_map(sequences, config, progress, poses_from, trust)
@@ -100,7 +108,7 @@ class Command:
 
     def _open(self, recordings: list[str]) -> tuple[list[StereoSequence], list[str]]:
         """The recordings with their poses, and where those of each come from; with `slam` they are still to be found."""
-        sequences = [open_sequence(path, self.format) for path in recordings]
+        sequences = [open_sequence(path, self.format, self.camera, self.images) for path in recordings]
         trajectories = self.trajectory or ("truth" if all(any(sequence.poses) for sequence in sequences) else "slam",)
         if len(trajectories) == 1:
             trajectories *= len(recordings)
@@ -111,13 +119,20 @@ class Command:
                 raise UsageError("--poses says how given poses are written; those of SLAM are ours")
             if set(trajectories) != {"slam"}:
                 raise UsageError("--trajectory slam goes for all recordings or for none: its world is no other's")
+            if self.scale is not None:
+                raise UsageError("--scale is that of the recordings' own poses, and slam finds others")
             return sequences, list(trajectories)
+        pairs = zip(sequences, trajectories, strict=True)
+        return [self._with_poses(sequence, trajectory) for sequence, trajectory in pairs], list(trajectories)
+
+    def _with_poses(self, sequence: StereoSequence, trajectory: str) -> StereoSequence:
         reading = PoseReading.of(",".join(name for name in (self.poses or "").split(",") if name != "unchecked"))
-        posed = [
-            as_read(sequence, reading) if trajectory == "truth" else with_trajectory(sequence, Path(trajectory), reading)
-            for sequence, trajectory in zip(sequences, trajectories, strict=True)
-        ]
-        return posed, list(trajectories)
+        if trajectory != "truth" and self.scale is not None:
+            raise UsageError("--scale is that of the recordings' own poses, and --trajectory takes others")
+        if trajectory != "truth":
+            has_metres = has_scale(sequence)
+            return with_trajectory(sequence, Path(trajectory), reading) if has_metres else aligned(sequence, Path(trajectory))
+        return as_read(sequence if self.scale is None else scaled(sequence, self.scale), reading)
 
 
 def _report_gaps(sequences: list[StereoSequence]) -> None:
@@ -125,15 +140,6 @@ def _report_gaps(sequences: list[StereoSequence]) -> None:
         num_without = sum(pose is None for pose in sequence.poses)
         if num_without:
             print(f"{sequence.name}: {num_without} of {len(sequence)} frames have no pose and are left out", file=sys.stderr)
-
-
-def _with_slam(sequences: list[StereoSequence], config: SlamConfig, progress: Progress) -> list[StereoSequence]:
-    """The recordings with the poses that SLAM finds. Raises RecordingError where one of them shares no place with the others."""
-    result = run_slam(sequences, config, progress)
-    for sequence, poses in zip(sequences, result.poses, strict=True):
-        if not any(poses):
-            raise RecordingError(f"{sequence.name}: no place of it was recognised in {sequences[0].name}; map it alone")
-    return [SequenceView(sequence, list(range(len(sequence))), poses) for sequence, poses in zip(sequences, result.poses, strict=True)]
 
 
 def _first_bytes(path: Path) -> bytes:

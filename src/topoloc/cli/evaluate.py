@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ import tyro
 from topoloc.cli.features_option import ASKED_FEATURES, localizer_of
 from topoloc.cli.info import describe_map
 from topoloc.cli.output import (
+    CameraOption,
     File,
     Format,
     UsageError,
@@ -32,8 +32,8 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import LocalizerConfig
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.frame import StereoSequence
+from topoloc.sequences.json_file import read_json
 from topoloc.sequences.open import open_sequence
-from topoloc.sequences.text_rows import read_text
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,9 @@ class Command:
     features: ASKED_FEATURES = None
     """Which of the map's features are asked; of several, the next where the one before leaves the pose unclear."""
     format: Format = None
-    """The recordings' format: kitti, euroc, tum, seven_scenes or folder."""
+    """The recordings' format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap, video or folder."""
+    camera: CameraOption = None
+    """Calibration of the recordings instead of their own: a camera.json, YAML of OpenCV or Kalibr, or `fx,fy,cx,cy` in pixels."""
     json: File = None
     """Write the evaluation as JSON to this file (- for standard output)."""
     report: File = None
@@ -72,8 +74,8 @@ class Command:
         topomap = TopoMetricMap.load(self.map)
         info = describe_map(topomap, Path(self.map))
         map_from_truth = _read_rigid(Path(self.map_from_truth)) if self.map_from_truth else None
-        sequences = [open_sequence(path, self.format) for path in self.sequences]
-        others = [open_sequence(path, self.format) for path in self.elsewhere]
+        sequences = [open_sequence(path, self.format, self.camera) for path in self.sequences]
+        others = [open_sequence(path, self.format, self.camera) for path in self.elsewhere]
         localizer = localizer_of(topomap, config, self.features)
         labels = _labels([*self.sequences, *self.elsewhere], [*sequences, *others])
         answers: list[Answer] = []
@@ -101,15 +103,12 @@ def _labels(paths: Sequence[str], sequences: Sequence[StereoSequence]) -> list[s
 
 def _read_rigid(path: Path) -> Rigid3:
     """A 4x4 matrix, alone or as the only matrix of a JSON object."""
-    try:
-        data: Any = json.loads(read_text(path, TrajectoryError))
-    except ValueError as error:
-        raise TrajectoryError(f"{path}: not JSON ({error})") from None
+    data = read_json(path, TrajectoryError)
     matrices = [value for value in data.values() if isinstance(value, list)] if isinstance(data, dict) else [data]
     try:
         (matrix,) = matrices
         return Rigid3.from_matrix(np.array(matrix, dtype=np.float64))
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         raise TrajectoryError(f"{path}: one 4x4 matrix is needed") from None
     except TrajectoryError as error:
         raise TrajectoryError(f"{path}: {error}") from None

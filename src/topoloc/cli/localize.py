@@ -22,7 +22,7 @@ from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.result import NotLocalized
 from topoloc.map.topomap import TopoMetricMap
-from topoloc.sequences.camera_json import read_camera_json
+from topoloc.sequences.calibration import calibration_of
 from topoloc.sequences.frame import StereoFrame, StereoSequence
 from topoloc.sequences.open import find_format, open_sequence
 from topoloc.sequences.recording import single_pictures
@@ -70,9 +70,10 @@ class Command:
     camera: Annotated[
         str | None, tyro.conf.arg(metavar="FILE|fx,fy,cx,cy|map|unknown", help_behavior_hint="(default: that of the recording)")
     ] = None
-    """Calibration of the queries: a camera.json, `fx,fy,cx,cy` in pixels, `map` for that of the map, `unknown` to find the focal length."""
+    """Calibration of the queries: a camera.json, YAML of OpenCV or Kalibr, `fx,fy,cx,cy` in pixels, `map` for that of the map, `unknown`
+    to find the focal length."""
     format: Format = None
-    """The recordings' format: kitti, euroc, tum, seven_scenes, video or folder."""
+    """The recordings' format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap, video or folder."""
     coarse: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")] = None
     """Coarse localizer that is asked; `topoloc info` names those of the map."""
     features: ASKED_FEATURES = None
@@ -163,9 +164,13 @@ def _answers(
         for i, frame_name in enumerate(query.sequence.names):
             name = frame_name if len(queries) == 1 else query.path if len(query.sequence) == 1 else f"{query.path}/{frame_name}"
             try:
-                yield _answer(name, query, i, localizer, tracker, camera_of_size)
+                answer = _answer(name, query, i, localizer, tracker, camera_of_size)
             except (QueryError, CalibrationError) as error:
-                raise type(error)(f"{name}: {error}") from error
+                if query.is_stream or len(queries) == len(query.sequence) == 1:
+                    raise type(error)(f"{name}: {error}") from error
+                # One picture of another shape than its camera; the rest are asked.
+                answer = QueryAnswer(name, query.sequence.t_ns[i], NotLocalized("unreadable", detail=f"{name}: {error}"))
+            yield answer
 
 
 def _answer(
@@ -203,15 +208,8 @@ def _camera_of_size(text: str, topomap: TopoMetricMap) -> CameraOfSize:
         return _rescaled(topomap.nodes[0].camera)
     if text == "unknown":
         return RoughCamera.unknown
-    if "," in text and not Path(text).exists():
-        try:
-            fx, fy, cx, cy = map(float, text.split(","))
-        except ValueError:
-            raise CalibrationError(f"--camera {text}: neither a file nor four numbers fx,fy,cx,cy") from None
-        Camera.pinhole(1, 1, fx, fy, cx, cy)  # complains before the first picture is read
-        return lambda width, height: Camera.pinhole(width, height, fx, fy, cx, cy)
-    camera = read_camera_json(Path(text)).camera
-    return lambda width, height: camera
+    calibration = calibration_of(text)
+    return lambda width, height: calibration(width, height).camera
 
 
 def _rescaled(camera: Camera) -> CameraOfSize:

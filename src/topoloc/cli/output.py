@@ -21,6 +21,8 @@ Flag = Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(help_behavior
 File = Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
 # The format of the recordings.
 Format = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: recognised)")]
+# The calibration of the recordings.
+CameraOption = Annotated[str | None, tyro.conf.arg(metavar="FILE|fx,fy,cx,cy", help_behavior_hint="(default: that of the recording)")]
 _COLUMNS = ("recording", "localized", "median error", "in 5 cm, 5 deg", "in 25 cm, 2 deg", "false accepts", "ms")
 
 

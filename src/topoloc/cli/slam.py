@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from topoloc.cli.output import File, Format, check_outputs, print_facts, progress_bar, write_json
+from topoloc.cli.output import CameraOption, File, Format, check_outputs, print_facts, progress_bar, write_json
 from topoloc.cli.settings_file import read_settings
 from topoloc.geometry.alignment import absolute_trajectory_errors, relative_drift
 from topoloc.geometry.rigid import Rigid3
@@ -30,7 +30,9 @@ class Command:
     out: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="OUT.tum")]
     """The trajectory to write: t tx ty tz qx qy qz qw, world_from_cam; the world is the camera of the first frame."""
     format: Format = None
-    """The recording's format: kitti, euroc, tum, seven_scenes or folder."""
+    """The recording's format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap, video or folder."""
+    camera: CameraOption = None
+    """Calibration of the recording instead of its own: a camera.json, YAML of OpenCV or Kalibr, or `fx,fy,cx,cy` in pixels."""
     json: File = None
     """Write what is printed to this file, too (- for standard output)."""
     config: File = None
@@ -39,7 +41,7 @@ class Command:
     def run(self) -> int:
         check_outputs([self.out, self.json], inputs=[self.config] if self.config else [])
         config = read_settings(self.config).of(SlamConfig)
-        sequence = open_sequence(self.sequence, self.format)
+        sequence = open_sequence(self.sequence, self.format, self.camera)
         start = time.perf_counter()
         with progress_bar() as progress:
             result = run_slam(sequence, config, progress)

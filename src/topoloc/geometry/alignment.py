@@ -45,6 +45,41 @@ def align_points(points_a: Float[np.ndarray, "n 3"], points_b: Float[np.ndarray,
     return Rigid3(rotation, centre_a - rotation @ centre_b)
 
 
+def align_similarity(points_a: Float[np.ndarray, "n 3"], points_b: Float[np.ndarray, "n 3"]) -> tuple[float, Rigid3]:
+    """The scale s and a_from_b for which points_a and ``a_from_b.apply(s * points_b)`` are nearest (Umeyama, 1991).
+
+    Raises:
+        TrajectoryError: as `align_points`.
+    """
+    rotation = align_points(points_a, points_b).rotation
+    centre_a, centre_b = points_a.mean(axis=0), points_b.mean(axis=0)
+    turned = (points_b - centre_b) @ rotation.T
+    scale = float(np.sum((points_a - centre_a) * turned) / np.sum(turned**2))
+    return scale, Rigid3(rotation, centre_a - scale * rotation @ centre_b)
+
+
+def align_scaled_poses(world_a_from_cams: Sequence[Rigid3], world_b_from_cams: Sequence[Rigid3]) -> tuple[float, Rigid3]:
+    """The scale s and world_a_from_world_b that bring poses of a world without a scale (b) into one of metres (a).
+
+    By the positions alone (`align_similarity`); where these lie on one line, orientations say how it is turned (`align_poses`).
+
+    Raises:
+        TrajectoryError: different lengths, values that are not finite, or positions all in one place, which fix no scale.
+    """
+    _check_lengths(world_a_from_cams, world_b_from_cams)
+    positions_a, positions_b = _positions(world_a_from_cams), _positions(world_b_from_cams)
+    try:
+        return align_similarity(positions_a, positions_b)
+    except TrajectoryError:
+        spreads = [
+            float(np.linalg.norm(positions - positions.mean(axis=0))) if len(positions) else 0.0 for positions in (positions_a, positions_b)
+        ]
+        if not min(spreads) > _MIN_SPREAD or not np.isfinite(spreads).all():
+            raise TrajectoryError(f"{len(positions_a)} poses all in one place, or not finite, fix no scale") from None
+    scale = spreads[0] / spreads[1]
+    return scale, align_poses(world_a_from_cams, [Rigid3(pose.rotation, scale * pose.translation) for pose in world_b_from_cams])
+
+
 def align_trajectories(world_a_from_cams: Sequence[Rigid3], world_b_from_cams: Sequence[Rigid3]) -> Rigid3:
     """world_a_from_world_b by the positions alone, as in the usual absolute trajectory error.
 

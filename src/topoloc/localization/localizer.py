@@ -25,7 +25,7 @@ from topoloc.localization.belief import Belief, is_same_pose
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.fitted_weights import FittedWeights
 from topoloc.localization.propose import propose, propose_more
-from topoloc.localization.query import Query, check_size, reduced_image
+from topoloc.localization.query import Query, check_size, reduced_image, unknown_camera
 from topoloc.localization.refine import hypothesis_of, say_on
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Proposal, Search, Trace
@@ -90,10 +90,9 @@ class Localizer:
             trace: collects all that is tried.
 
         Raises:
-            QueryError: the camera is of another image size.
+            QueryError: the image is no picture of 8 bits, or the camera is of another image size.
         """
-        height, width = image.shape[:2]
-        lens = RoughCamera.unknown(width, height) if camera is None else camera
+        lens = camera or unknown_camera(image)
         return self.localize_near(image, lens, prior, max_ms, trace)[0]
 
     def localize_near(

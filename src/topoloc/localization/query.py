@@ -23,6 +23,7 @@ from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rough_camera import RoughCamera, usual_camera
 from topoloc.places.coarse import Image
+from topoloc.sequences.frame_checks import picture_problem
 from topoloc.sequences.pictures import grey_image
 
 
@@ -82,10 +83,19 @@ class Query:
 
 
 def check_size(image: Image, camera: Camera | RoughCamera) -> None:
-    """Raises QueryError where the camera is of another image size."""
+    """Raises QueryError where the image is no picture of 8 bits, or the camera is of another image size."""
+    if problem := picture_problem(image):
+        raise QueryError(problem)
     height, width = image.shape[:2]
     if (camera.width, camera.height) != (width, height):
         raise QueryError(f"the image is {width}x{height}, its camera {camera.width}x{camera.height}")
+
+
+def unknown_camera(image: Image) -> RoughCamera:
+    """The camera of a picture of which nothing is known. Raises QueryError where the image is no picture of 8 bits."""
+    if problem := picture_problem(image):
+        raise QueryError(problem)
+    return RoughCamera.unknown(image.shape[1], image.shape[0])
 
 
 def reduced_image(

@@ -10,62 +10,30 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
 from topoloc.bounds import check_bounds
-from topoloc.errors import EmptyMapError, TrajectoryError
-from topoloc.features.extraction import extract_features
+from topoloc.errors import EmptyMapError
 from topoloc.features.features import Features
 from topoloc.features.kinds import find_kind
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.rigid import Rigid3
 from topoloc.map.config import MapConfig
 from topoloc.map.entries import Edge, NodeSummary, PlaceImage, TopoNode
 from topoloc.map.landmarks import Observations, observe_points, refine_points, session_sums
+from topoloc.map.mapping_frames import MappingFrame, MappingImage, PointLocator, mapping_image, posed_frames, small_jpeg
 from topoloc.map.nodes import NodeConfig, NodePoses, node_distances, place_nodes
 from topoloc.map.schema import SCHEMA_VERSION
-from topoloc.map.sessions import Edit, Light, Session, light_of, mean_light, path_of, poses_source_of, today
+from topoloc.map.sessions import Edit, Light, Session, mean_light, path_of, poses_source_of, today
 from topoloc.map.side_nodes import describe_sides, gather_sides, nodes_with_sides
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.coarse import CoarseModel
 from topoloc.places.vlad import SurfVlad, VladConfig, learn_words, placed, vlad
-from topoloc.sequences.frame import Image, StereoSequence
-from topoloc.sequences.frame_view import FrameView, frame_view
-from topoloc.sequences.pictures import jpeg_of
-from topoloc.slam.metric_points import keypoint_sigmas, locate_points
+from topoloc.sequences.frame import StereoSequence
+from topoloc.slam.metric_points import keypoint_sigmas
 
 BuildConfig = MapConfig
 Progress = Callable[[str, int, int], None]
 """Called with a stage's name, steps done and steps in all."""
-
-
-@dataclass(frozen=True, eq=False)
-class _MappingFrame:
-    """A frame with a pose, not yet read."""
-
-    sequence: StereoSequence
-    session_id: int
-    index: int
-    name: str
-    t_ns: int
-    world_from_cam: Rigid3
-
-    def view(self, with_depth: bool = True) -> FrameView:
-        return frame_view(self.sequence[self.index], with_depth)
-
-
-@dataclass(frozen=True, eq=False)
-class _MappingImage:
-    """What the map needs of a frame once its pixels are let go: its features, by their kinds. The pose is that of `camera`, which
-    rectification may have turned."""
-
-    camera: Camera
-    world_from_cam: Rigid3
-    features: dict[str, Features]
-    place_jpeg: bytes
-    light: Light
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,13 +48,14 @@ class _DraftPoints:
 
 @dataclass(frozen=True, eq=False)
 class _NodeDraft:
-    """A node in the making, its points by their kinds of features."""
+    """A node in the making, its points by their kinds of features; `sources` are the frames that these were first measured in."""
 
-    frame: _MappingFrame
-    image: _MappingImage
+    frame: MappingFrame
+    image: MappingImage
     template_jpeg: bytes
     points: dict[str, _DraftPoints]
     sides: list[TopoNode]
+    sources: list[MappingFrame]
 
 
 def build_map(
@@ -112,9 +81,10 @@ def build_map(
     config = replace(config, other_kinds=tuple(config.kinds[1:]))
     progress = progress or (lambda stage, done, total: None)
     sequences = [sequences] if isinstance(sequences, StereoSequence) else sequences
-    frames = [frame for session_id, sequence in enumerate(sequences) for frame in _posed_frames(sequence, session_id)]
-    node_config = _resolve_node_config(frames, config)
-    drafts = _draft_nodes(frames, node_config, config, progress)
+    frames = [frame for session_id, sequence in enumerate(sequences) for frame in posed_frames(sequence, session_id)]
+    locator = PointLocator(frames, config)
+    node_config = _resolve_node_config(frames, locator, config)
+    drafts = _draft_nodes(frames, locator, node_config, config, progress)
     place_images, lights, coarse = _visit_all_images(frames, drafts, node_config, config, progress)
     of_kind = {kind: [_finish_node(node_id, draft, kind, config) for node_id, draft in enumerate(drafts)] for kind in config.kinds}
     nodes = of_kind.pop(config.features.kind)
@@ -138,7 +108,7 @@ def build_map(
 def _session(
     session_id: int,
     sequence: StereoSequence,
-    frames: list[_MappingFrame],
+    frames: list[MappingFrame],
     lights: list[Light],
     poses_from: str,
     drafts: list[_NodeDraft],
@@ -151,23 +121,15 @@ def _session(
     return Session(session_id, sequence.name, path_of(sequence), poses_from, min(t_ns), max(t_ns), camera, light)
 
 
-def _posed_frames(sequence: StereoSequence, session_id: int) -> list[_MappingFrame]:
-    described = enumerate(zip(sequence.names, sequence.t_ns, sequence.poses, strict=True))
-    frames = [_MappingFrame(sequence, session_id, i, name, t_ns, pose) for i, (name, t_ns, pose) in described if pose is not None]
-    if not frames:
-        raise TrajectoryError(f"{sequence.name}: no frame has a pose; give a trajectory (TUM or KITTI rows) of this recording")
-    return frames
-
-
-def _resolve_node_config(frames: list[_MappingFrame], config: BuildConfig) -> NodeConfig:
+def _resolve_node_config(frames: list[MappingFrame], locator: PointLocator, config: BuildConfig) -> NodeConfig:
     """D_thresh from the scene, where the user named none."""
     if config.nodes.d_thresh is not None:
         return config.nodes.resolved(0.0)
     samples = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, 7).astype(int))]
     depths = []
     for frame in samples:
-        view = frame.view()
-        located = locate_points(extract_features(view.grey, config.features), view, config.points)
+        view, first = frame.view(), replace(config, other_kinds=())
+        located = locator.locate(frame, view, mapping_image(frame, view, first))[0][config.features.kind]
         depths.append(located.points_cam[located.valid, 2])
     all_depths = np.concatenate(depths)
     if len(all_depths) == 0:
@@ -175,7 +137,9 @@ def _resolve_node_config(frames: list[_MappingFrame], config: BuildConfig) -> No
     return config.nodes.resolved(float(np.median(all_depths)))
 
 
-def _draft_nodes(frames: list[_MappingFrame], node_config: NodeConfig, config: BuildConfig, progress: Progress) -> list[_NodeDraft]:
+def _draft_nodes(
+    frames: list[MappingFrame], locator: PointLocator, node_config: NodeConfig, config: BuildConfig, progress: Progress
+) -> list[_NodeDraft]:
     """The trajectory discretised by Eq. 1; a picture with too few points (dark, blurred, blank) becomes no node."""
     frame_idx = place_nodes([frame.world_from_cam for frame in frames], node_config)
     kind = find_kind(config.features.kind)
@@ -183,7 +147,7 @@ def _draft_nodes(frames: list[_MappingFrame], node_config: NodeConfig, config: B
     with_sides = nodes_with_sides([frames[i].world_from_cam for i in frame_idx], node_config, config.sides) if has_sides else set()
     drafts: list[_NodeDraft] = []
     for done, i in enumerate(frame_idx):
-        draft = _draft_node(frames[i], done in with_sides, config)
+        draft = _draft_node(frames[i], locator, done in with_sides, config)
         if len(draft.points[kind.name].features) >= config.min_node_points:
             drafts.append(draft)
         progress("nodes", done + 1, len(frame_idx))
@@ -192,29 +156,22 @@ def _draft_nodes(frames: list[_MappingFrame], node_config: NodeConfig, config: B
     return drafts
 
 
-def _draft_node(frame: _MappingFrame, with_sides: bool, config: BuildConfig) -> _NodeDraft:
+def _draft_node(frame: MappingFrame, locator: PointLocator, with_sides: bool, config: BuildConfig) -> _NodeDraft:
     view = frame.view()
-    image = _mapping_image(frame, view, config)
+    image = locator.image(frame, view)
+    located, sources = locator.locate(frame, view, image)
     points = {}
     for kind, features in image.features.items():
-        located = locate_points(features, view, config.points)
-        rows = np.flatnonzero(located.valid)
-        points[kind] = _DraftPoints(features.select(rows), located.points_cam[rows], located.covariances[rows], [])
-    template_jpeg = _encode_jpeg(view.picture, config.template_side_px, quality=75)
+        rows = np.flatnonzero(located[kind].valid)
+        points[kind] = _DraftPoints(features.select(rows), located[kind].points_cam[rows], located[kind].covariances[rows], [])
+    template_jpeg = small_jpeg(view.picture, config.template_side_px, quality=75)
     summary = NodeSummary(-1, frame.sequence.name, frame.name, frame.t_ns, image.world_from_cam, 0, frame.session_id)
-    sides = describe_sides(summary, view, config.features, config.points, config.sides) if with_sides else []
-    return _NodeDraft(frame, image, template_jpeg, points, sides)
-
-
-def _mapping_image(frame: _MappingFrame, view: FrameView, config: BuildConfig) -> _MappingImage:
-    jpeg = _encode_jpeg(view.picture, config.place_side_px, quality=60)
-    world_from_view = frame.world_from_cam @ view.view_from_cam.inverse()
-    features = {kind: extract_features(view.grey, config.features_of(kind)) for kind in config.kinds}
-    return _MappingImage(view.camera, world_from_view, features, jpeg, light_of(view.picture))
+    sides = describe_sides(summary, view, config.features, config.points, config.sides) if with_sides and not sources else []
+    return _NodeDraft(frame, image, template_jpeg, points, sides, [frame, *sources])
 
 
 def _visit_all_images(
-    frames: list[_MappingFrame], drafts: list[_NodeDraft], node_config: NodeConfig, config: BuildConfig, progress: Progress
+    frames: list[MappingFrame], drafts: list[_NodeDraft], node_config: NodeConfig, config: BuildConfig, progress: Progress
 ) -> tuple[list[PlaceImage], list[Light], list[CoarseModel]]:
     """Label every mapping image with its nearest node, let it observe the points of the nodes around, and teach the
     coarse localizer of each kind of features with it; its light is measured on the way."""
@@ -225,10 +182,10 @@ def _visit_all_images(
     images: list[PlaceImage] = []
     lights, vlads, cells = [], {kind: [] for kind in config.kinds}, {kind: [] for kind in config.kinds}
     for done, frame in enumerate(frames):
-        image = drafted.get(frame) or _mapping_image(frame, frame.view(with_depth=False), config)
+        image = drafted.get(frame) or mapping_image(frame, frame.view(with_depth=False), config)
         nearest = np.argsort(node_distances(image.world_from_cam, node_poses, node_config.lambda_rot), kind="stable")
         for node_id in nearest[: config.landmarks.nodes_per_image]:
-            if drafts[node_id].frame is not frame:
+            if frame not in drafts[node_id].sources:
                 _observe(drafts[node_id], image, frame.session_id, config)
         for kind, features in image.features.items():
             vlads[kind].append(vlad(_placed(features, image, config.vlad_of(kind)), words[kind]))
@@ -248,11 +205,11 @@ def _words(drafts: list[_NodeDraft], kind: str, config: BuildConfig) -> Float32[
     return learn_words(np.concatenate(placed_features), config.vlad)
 
 
-def _placed(features: Features, image: _MappingImage, config: VladConfig) -> np.ndarray:
+def _placed(features: Features, image: MappingImage, config: VladConfig) -> np.ndarray:
     return placed(features, image.camera.width, image.camera.height, config)
 
 
-def _observe(draft: _NodeDraft, image: _MappingImage, session_id: int, config: BuildConfig) -> None:
+def _observe(draft: _NodeDraft, image: MappingImage, session_id: int, config: BuildConfig) -> None:
     cam_from_node = image.world_from_cam.inverse() @ draft.image.world_from_cam
     for kind, features in image.features.items():
         points, sigmas_px = draft.points[kind], keypoint_sigmas(features, config.points)
@@ -279,21 +236,13 @@ def _finish_node(node_id: int, draft: _NodeDraft, kind: str, config: BuildConfig
     )
 
 
-def _edges_along(frames: list[_MappingFrame], node_ids: list[int]) -> list[Edge]:
+def _edges_along(frames: list[MappingFrame], node_ids: list[int]) -> list[Edge]:
     """An edge wherever a recording went from one node to another."""
     steps = pairwise(zip(frames, node_ids, strict=True))
     edges = {(source, target) for (a, source), (b, target) in steps if a.sequence is b.sequence and source != target}
     return [Edge(source, target) for source, target in sorted(edges)]
 
 
-def _trajectory_length(frames: list[_MappingFrame]) -> float:
+def _trajectory_length(frames: list[MappingFrame]) -> float:
     steps = [b.world_from_cam.translation - a.world_from_cam.translation for a, b in pairwise(frames) if a.sequence is b.sequence]
     return float(sum(np.linalg.norm(step) for step in steps))
-
-
-def _encode_jpeg(picture: Image, side_px: int, quality: int) -> bytes:
-    """The picture as JPEG, its shorter side at most `side_px`."""
-    scale = side_px / min(picture.shape[:2])
-    if scale < 1.0:
-        picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return jpeg_of(picture, quality)

@@ -15,6 +15,7 @@ from topoloc.map.side_nodes import SideNodesConfig
 from topoloc.map.validation import json_of
 from topoloc.places.vlad import VladConfig
 from topoloc.slam.metric_points import MetricPointsConfig
+from topoloc.slam.motion_points import MotionPointsConfig
 
 CONFIG_VERSION = 1
 """Of the JSON in the map file; one more whenever a key comes to mean something else."""
@@ -30,6 +31,7 @@ class MapConfig:
     """Further kinds of features that the same nodes are described with: a query asks them where the first one leaves its pose unclear.
     Unset: beside SURF the learned ones whose network is here, if any is."""
     points: MetricPointsConfig = field(default_factory=MetricPointsConfig)
+    motion: MotionPointsConfig = field(default_factory=MotionPointsConfig)
     landmarks: LandmarkConfig = field(default_factory=LandmarkConfig)
     vlad: VladConfig = field(default_factory=VladConfig)
     sides: SideNodesConfig = field(default_factory=SideNodesConfig)

@@ -6,7 +6,6 @@ of one camera. Truth is ``state_groundtruth_estimate0`` (or ``mocap0``): poses o
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,20 +16,14 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.recording import Recording, RightPictures
-from topoloc.sequences.text_rows import read_file_list, read_text
+from topoloc.sequences.stereo_yaml import kalibr_camera
+from topoloc.sequences.text_rows import read_file_list
 from topoloc.sequences.trajectory import poses_at, read_asl_poses
+from topoloc.sequences.yaml_numbers import needed_numbers, read_yaml
 
 LOOKS_FOR = "mav0/ with cam0/data.csv, or cam0/data.csv"
 MAX_TRUTH_GAP = 0.05
 _TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0")
-_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
-# COLMAP's model of each of Kalibr's distortions, with the number of its coefficients.
-_DISTORTIONS = {
-    "radial-tangential": ("OPENCV", 4),
-    "radtan": ("OPENCV", 4),
-    "equidistant": ("OPENCV_FISHEYE", 4),
-    "none": ("PINHOLE", 0),
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,24 +70,14 @@ def open_euroc(path: Path) -> Recording:
 def read_sensor(path: Path) -> Sensor:
     """Camera and mounting of a sensor.yaml.
 
-    The files come with OpenCV's header or without it and in several styles of YAML, so only the numbers after the needed keys are read.
-
     Raises:
         CalibrationError: missing, a key or number is missing, or a model that is not known.
     """
-    text = re.sub(r"#.*", "", read_text(path, CalibrationError, "no calibration here"))
-    distortion = _word(text, "distortion_model", "none")
-    if _word(text, "camera_model", "pinhole") != "pinhole" or distortion not in _DISTORTIONS:
-        known = ", ".join(_DISTORTIONS)
-        raise CalibrationError(f"{path}: distortion_model {distortion} is not one of {known}, or camera_model is not pinhole")
-    model, num_coefficients = _DISTORTIONS[distortion]
-    width, height = _numbers(path, text, "resolution", 2)
-    intrinsics = _numbers(path, text, "intrinsics", 4)
-    coefficients = _numbers(path, text, "distortion_coefficients", num_coefficients) if num_coefficients else []
+    text = read_yaml(path)
+    camera = kalibr_camera(path, text)
     try:
-        camera = Camera(model, int(width), int(height), tuple(intrinsics + coefficients))
-        return Sensor(camera, Rigid3.from_matrix(np.array(_numbers(path, text, "T_BS", 16)).reshape(4, 4)))
-    except (CalibrationError, TrajectoryError, ValueError, OverflowError) as error:
+        return Sensor(camera, Rigid3.from_matrix(np.array(needed_numbers(path, text, 16, "T_BS")).reshape(4, 4)))
+    except TrajectoryError as error:
         raise CalibrationError(f"{path}: {error}") from None
 
 
@@ -103,21 +86,6 @@ def _rig(mav: Path, left: Sensor, right: Sensor) -> StereoRig:
         return StereoRig(left.camera, right.camera, right.body_from_cam.inverse() @ left.body_from_cam)
     except CalibrationError as error:
         raise CalibrationError(f"{mav / 'cam1' / 'sensor.yaml'}: with that of cam0, {error}") from None
-
-
-def _word(text: str, key: str, default: str) -> str:
-    found = re.search(rf"^\s*{key}:\s*[\"']?([\w-]+)", text, re.MULTILINE)
-    return found[1] if found else default
-
-
-def _numbers(path: Path, text: str, key: str, count: int) -> list[float]:
-    """The first `count` numbers after a key, before the next key that is not `cols`, `rows`, `dt` or `data`."""
-    found = re.search(rf"^[ \t]*{key}:(.*?)(?=^[ \t]*(?!(?:cols|rows|dt|data)\b)[A-Za-z_]\w*:|\Z)", text, re.MULTILINE | re.DOTALL)
-    values = re.sub(r"\b(?:cols|rows|dt):.*", "", found[1]) if found else ""
-    numbers = [float(number) for number in _NUMBER.findall(values)]
-    if len(numbers) < count:
-        raise CalibrationError(f"{path}: {key} with {count} numbers is missing")
-    return numbers[:count]
 
 
 def _read_csv(path: Path) -> dict[int, Path]:

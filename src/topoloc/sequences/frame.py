@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -21,7 +21,7 @@ class DepthImage:
 
     depth: Float32[np.ndarray, "h w"]
     camera: Camera
-    cam_from_depth: Rigid3
+    cam_from_depth: Rigid3 = field(default_factory=Rigid3.identity)
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,14 +42,14 @@ def frame_view(frame: StereoFrame, with_depth: bool = True) -> FrameView:
 
     Raises:
         CalibrationError: the frame has no camera.
-        RecordingError: the frame has neither a right picture nor depth.
+        RecordingError: the frame has neither a right picture nor depth, which are asked for.
     """
     if frame.camera is None:
         raise CalibrationError(f"{frame.name}: no calibration; put a camera.json into the recording's folder")
     if frame.right is not None and frame.rig is not None:
         return _stereo_view(frame.image, frame.right if with_depth else None, frame.rig)
-    if frame.depth is not None:
-        depth = registered_depth(frame.depth, frame.camera) if with_depth else None
+    if frame.depth is not None or not with_depth:
+        depth = registered_depth(frame.depth, frame.camera) if with_depth and frame.depth is not None else None
         return FrameView(frame.image, grey_image(frame.image), frame.camera, Rigid3.identity(), depth=depth)
     raise RecordingError(f"{frame.name}: stereo pairs or depth images are needed, this recording has single pictures only")
 

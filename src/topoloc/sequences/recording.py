@@ -11,8 +11,9 @@ from topoloc.errors import RecordingError, UnreadableImageError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
+from topoloc.sequences.depth_pictures import read_depth_picture, resized_depth
 from topoloc.sequences.frame import DepthImage, Image, StereoFrame, StereoSequence
-from topoloc.sequences.pictures import PICTURE_SUFFIXES, exif_focal_length, read_depth, read_image
+from topoloc.sequences.pictures import PICTURE_SUFFIXES, exif_focal_length, read_image
 
 # Recordings without times are taken to be of this rate.
 DEFAULT_RATE_HZ = 10
@@ -32,17 +33,24 @@ class RightPictures:
 
 @dataclass(frozen=True, eq=False)
 class DepthPictures:
-    """The depth picture of each frame: its scale (file units a metre), its camera, and where that camera sits."""
+    """The depth picture of each frame: its scale (file units a metre), its camera, and where that camera sits.
+
+    Without a camera it shows what the frame's own picture shows, in pixels of any size.
+    """
 
     paths: list[Path]
     units_per_metre: float
-    camera: Camera
+    camera: Camera | None
     cam_from_depth: Rigid3
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A StereoSequence on disk. `names` are picture paths relative to `root`; `camera` is that of the left or colour picture."""
+    """A StereoSequence on disk. `names` are picture paths relative to `root`; `camera` is that of the left or colour picture.
+
+    `cameras` are those of the frames one by one, where they are not of one camera. Poses of a model of pictures alone are in no metres
+    (`has_scale`).
+    """
 
     name: str
     root: Path
@@ -52,6 +60,8 @@ class Recording:
     camera: Camera | None
     right: RightPictures | None = None
     depth: DepthPictures | None = None
+    cameras: list[Camera] | None = None
+    has_scale: bool = True
 
     def __len__(self) -> int:
         return len(self.names)
@@ -64,17 +74,16 @@ class Recording:
             UnreadableImageError: a picture is missing, broken, or of another size than its camera.
         """
         path = self.root / self.names[index]
-        image = _read_as(path, self.camera)
-        frame = StereoFrame(self.names[index], self.t_ns[index], image, self.camera, world_from_cam=self.poses[index])
-        if self.camera is None:
+        camera = self.camera if self.cameras is None else self.cameras[index]
+        image = _read_as(path, camera)
+        frame = StereoFrame(self.names[index], self.t_ns[index], image, camera, world_from_cam=self.poses[index])
+        if camera is None:
             frame = replace(frame, noted_focal=exif_focal_length(path, image.shape[1], image.shape[0]))
         if self.right is not None:
             right = _read_as(self.right.paths[index], self.right.rig.right)
             return replace(frame, right=right, rig=self.right.rig)
         if self.depth is not None:
-            depth = read_depth(self.depth.paths[index], self.depth.units_per_metre)
-            _check_size(self.depth.paths[index], depth.shape, self.depth.camera)
-            return replace(frame, depth=DepthImage(depth, self.depth.camera, self.depth.cam_from_depth))
+            return replace(frame, depth=_depth_image(self.depth, index, camera))
         return frame
 
 
@@ -106,6 +115,22 @@ class SequenceView:
     def __getitem__(self, index: int) -> StereoFrame:
         """Read one frame. Raises as the sequence below does."""
         return replace(self.base[self.indices[index]], world_from_cam=self.poses[index])
+
+
+def has_scale(sequence: StereoSequence) -> bool:
+    """Whether the poses are in metres, as far as is known."""
+    while isinstance(sequence, SequenceView):
+        before = sequence.base.poses
+        if any(pose is not before[index] for index, pose in zip(sequence.indices, sequence.poses, strict=True)):
+            return True  # poses from elsewhere
+        sequence = sequence.base
+    return not isinstance(sequence, Recording) or sequence.has_scale
+
+
+def scaled(sequence: StereoSequence, metres: float) -> StereoSequence:
+    """The same recording with poses of which a unit is so many metres."""
+    poses = [None if pose is None else Rigid3(pose.rotation, metres * pose.translation) for pose in sequence.poses]
+    return SequenceView(sequence, list(range(len(sequence))), poses)
 
 
 def single_pictures(sequence: StereoSequence) -> StereoSequence:
@@ -192,6 +217,17 @@ def check_pairs(left: Sequence[Path], right: Sequence[Path]) -> None:
 def times_by_rate(num_frames: int, rate_hz: int = DEFAULT_RATE_HZ) -> list[int]:
     """Times in nanoseconds of frames at a steady rate from 0."""
     return [index * 1_000_000_000 // rate_hz for index in range(num_frames)]
+
+
+def _depth_image(depth: DepthPictures, index: int, camera: Camera | None) -> DepthImage:
+    """The depth of a frame whose own picture is seen by `camera`."""
+    path = depth.paths[index]
+    metres = read_depth_picture(path, depth.units_per_metre)
+    if depth.camera is not None:
+        _check_size(path, metres.shape, depth.camera)
+        return DepthImage(metres, depth.camera, depth.cam_from_depth)
+    assert camera is not None, "depth that is the picture's own is of a picture with a camera"
+    return DepthImage(resized_depth(path, metres, camera), camera, depth.cam_from_depth)
 
 
 def _read_as(path: Path, camera: Camera | None) -> Image:

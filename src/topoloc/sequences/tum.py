@@ -14,6 +14,7 @@ import numpy as np
 from topoloc.errors import CalibrationError, RecordingError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.sequences.calibration import CalibrationOfSize, size_of_first
 from topoloc.sequences.camera_json import FILE_NAME, CameraFile, read_camera_json
 from topoloc.sequences.recording import DepthPictures, Recording
 from topoloc.sequences.text_rows import read_file_list
@@ -34,16 +35,19 @@ def recognises(path: Path) -> bool:
     return (path / "rgb.txt").is_file() and (path / "depth.txt").is_file()
 
 
-def open_tum(path: Path) -> Recording:
+def open_tum(path: Path, calibration: CalibrationOfSize | None = None) -> Recording:
     """Open a recording; a colour picture without depth within 20 ms is left out.
+
+    Args:
+        calibration: instead of the folder's.
 
     Raises:
         RecordingError: a list is missing or malformed, or no colour picture has depth.
         CalibrationError: neither a camera.json nor a freiburg in the folder's name.
         TrajectoryError: the truth is malformed or fits no frame.
     """
-    calibration = _calibration(path)
     colour_times, colour = read_file_list(path / "rgb.txt", RecordingError)
+    camera_file = calibration(*size_of_first([path / name for name in colour])) if calibration else _calibration(path)
     depth_times, depth = read_file_list(path / "depth.txt", RecordingError)
     nearest = _nearest(np.array(colour_times), np.array(depth_times))
     kept = [row for row, other in enumerate(nearest) if abs(colour_times[row] - depth_times[other]) <= MAX_DEPTH_DELAY * 1e9]
@@ -53,11 +57,11 @@ def open_tum(path: Path) -> Recording:
     poses = read_truth(path / "groundtruth.txt", [], t_ns)
     pictures = DepthPictures(
         [path / depth[nearest[row]] for row in kept],
-        calibration.depth_factor or DEPTH_FACTOR,
-        calibration.camera,
+        camera_file.depth_factor or DEPTH_FACTOR,
+        camera_file.camera,
         Rigid3.identity(),
     )
-    return Recording(path.resolve().name, path, [colour[row] for row in kept], t_ns, poses, calibration.camera, depth=pictures)
+    return Recording(path.resolve().name, path, [colour[row] for row in kept], t_ns, poses, camera_file.camera, depth=pictures)
 
 
 def _calibration(path: Path) -> CameraFile:

@@ -18,6 +18,7 @@ from topoloc.bounds import check_bounds
 from topoloc.errors import RecordingError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.frame import StereoFrame, StereoSequence
+from topoloc.sequences.recording import SequenceView
 from topoloc.slam.global_map import GlobalMapConfig, adjust_all, close_loops, join_submaps
 from topoloc.slam.input_checks import InputCheckConfig, InputChecks
 from topoloc.slam.keyframes import FramePose, KeyFrame, Landmarks
@@ -97,6 +98,21 @@ def run_slam(
         disparity_bias_px=[keyframes[0].bias.value_px],
         right_residuals_px=np.concatenate(residuals) if residuals else np.zeros(0),
     )
+
+
+def posed_by_slam(
+    sequences: Sequence[StereoSequence], config: SlamConfig | None = None, progress: Progress | None = None
+) -> list[StereoSequence]:
+    """The recordings with the poses that `run_slam` finds.
+
+    Raises:
+        RecordingError: one of them shares no place with the others; and as `run_slam`.
+    """
+    result = run_slam(sequences, config, progress)
+    for sequence, poses in zip(sequences, result.poses, strict=True):
+        if not any(poses):
+            raise RecordingError(f"{sequence.name}: no place of it was recognised in {sequences[0].name}; map it alone")
+    return [SequenceView(sequence, list(range(len(sequence))), poses) for sequence, poses in zip(sequences, result.poses, strict=True)]
 
 
 def _track(sequence: StereoSequence, odometry: Odometry, checks: InputChecks, progress: Progress) -> list[FramePose | None]:

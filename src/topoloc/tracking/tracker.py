@@ -25,9 +25,10 @@ from topoloc.errors import QueryError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.query import StageClock
+from topoloc.localization.query import StageClock, check_size
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.places.coarse import Image
+from topoloc.sequences.frame_checks import time_problem
 from topoloc.sequences.pictures import grey_image
 from topoloc.tracking.following import Followed, FollowingConfig, PointFollower
 from topoloc.tracking.motion import MotionState, update_motion
@@ -100,10 +101,10 @@ class Tracker:
             odom_from_cam: its pose by external odometry, in any frame that does not move; only its change from picture to picture counts.
 
         Raises:
-            QueryError: the clock goes backwards or stands still; the camera is of another image size.
+            QueryError: the clock goes backwards, stands still or is not in integer nanoseconds; the image is no picture of 8 bits; the
+                camera is of another image size.
         """
-        if (camera.height, camera.width) != image.shape[:2]:
-            raise QueryError(f"the image is {image.shape[1]}x{image.shape[0]}, its camera {camera.width}x{camera.height}")
+        check_size(image, camera)
         is_same = self._image is not None and np.array_equal(self._image, image)
         self._advance(t_ns, may_stand_still=is_same)
         if is_same and self._answer is not None:
@@ -132,6 +133,8 @@ class Tracker:
         return self._decided(self._without_pose(result, t_ns))
 
     def _advance(self, t_ns: int, may_stand_still: bool = False) -> None:
+        if problem := time_problem(t_ns):
+            raise QueryError(problem)
         if self._t_ns is not None and (t_ns < self._t_ns or (t_ns == self._t_ns and not may_stand_still)):
             what = "stands still" if t_ns == self._t_ns else "goes backwards"
             raise QueryError(f"the clock of the stream {what}: {t_ns / 1e9:.6f} s comes after {self._t_ns / 1e9:.6f} s")

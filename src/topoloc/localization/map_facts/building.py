@@ -18,6 +18,7 @@ from topoloc.map import build
 from topoloc.map.topomap import Repetitions, SharedErrors, TopoMetricMap
 from topoloc.sequences.frame import StereoSequence
 from topoloc.slam.pose_checks import check_gaps, check_poses
+from topoloc.slam.slam import posed_by_slam
 
 
 @dataclass(frozen=True)
@@ -37,13 +38,15 @@ def build_map(
 ) -> TopoMetricMap:
     """Build a topo-metric map from one or several recordings of one place whose poses share one world.
 
+    Where a recording has no poses at all, those of all of them are found by SLAM, as `topoloc build` does.
+
     Args:
-        poses_from: where the poses of each recording come from (`truth`, `slam`, a file), for the map to remember.
+        poses_from: where the poses of each recording come from (`truth`, `slam`, a file), for the map to remember; given, SLAM is not run.
         trust: what is taken as it comes; by default poses are held against the pictures, but for those that SLAM found in them.
 
     Raises:
         ConfigError: a value of `config` is out of its bounds.
-        TrajectoryError: no frame of a recording has a pose, fewer than half have one, or they do not fit the pictures.
+        TrajectoryError: fewer than half of a recording's frames have a pose, or the poses do not fit the pictures.
         EmptyMapError: no picture gave a usable node.
         FeatureKindError: no features of the kind that `config` names.
         RecordingError, CalibrationError, UnreadableImageError: from reading the recordings.
@@ -51,11 +54,14 @@ def build_map(
     config = config or build.BuildConfig()
     for kind in config.kinds:
         find_kind(kind)
-    sequences, trust = [sequences] if isinstance(sequences, StereoSequence) else sequences, trust or Trust()
+    sequences, trust = [sequences] if isinstance(sequences, StereoSequence) else list(sequences), trust or Trust()
+    if poses_from is None and not all(any(sequence.poses) for sequence in sequences):
+        sequences, poses_from = posed_by_slam(sequences, progress=progress), ["slam"] * len(sequences)
     for k, sequence in enumerate(sequences):
-        if not trust.gaps:
+        is_slams = poses_from is not None and poses_from[k] == "slam"
+        if not (trust.gaps or is_slams):
             check_gaps(sequence)
-        if not trust.poses and (poses_from is None or poses_from[k] != "slam"):
+        if not (trust.poses or is_slams):
             check_poses(sequence)
     topomap = build.build_map(sequences, config, progress, poses_from)
     errors = {kind: _correlated_errors(topomap.by_kind(kind)) for kind in topomap.kinds}
