@@ -10,13 +10,12 @@ import tyro
 
 from topoloc.cli.features_option import BUILD_FEATURES, kinds_to_build
 from topoloc.cli.info import describe_map
-from topoloc.cli.output import File, Format, UsageError, check_outputs, progress_bar, write_json
+from topoloc.cli.output import Calibration, File, Format, Topics, UsageError, check_outputs, open_recording, progress_bar, write_json
 from topoloc.cli.settings_file import read_settings, with_option
 from topoloc.errors import RecordingError
 from topoloc.localization.map_facts.building import build_map
 from topoloc.map.build import BuildConfig, Progress
 from topoloc.sequences.frame import StereoSequence
-from topoloc.sequences.open import open_sequence
 from topoloc.sequences.recording import SequenceView
 from topoloc.sequences.trajectory import with_trajectory
 from topoloc.slam.slam import SlamConfig, run_slam
@@ -36,7 +35,11 @@ class Command:
     ] = ()
     """Where poses come from: `truth` (the recording's own), `slam`, or a TUM or KITTI file; given once for all, or once for each."""
     format: Format = None
-    """The recordings' format: kitti, euroc, tum, seven_scenes or folder."""
+    """The recordings' format: kitti, euroc, tum, seven_scenes, rosbag, mcap, zed or folder."""
+    topics: Topics = None
+    """Of a bag, which topic is what: left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom."""
+    calibration: Calibration = None
+    """Of side-by-side video, Stereolabs' SN*.conf."""
     d_thresh: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="(default: by what is seen)")] = None
     """Metres between nodes (D_thresh of the paper's Eq. 1)."""
     lambda_rot: Annotated[
@@ -88,7 +91,7 @@ class Command:
 
     def _open(self, recordings: list[str]) -> tuple[list[StereoSequence], list[str]]:
         """The recordings with their poses, and where those of each come from; with `slam` they are still to be found."""
-        sequences = [open_sequence(path, self.format) for path in recordings]
+        sequences = [open_recording(path, self.format, self.topics, self.calibration) for path in recordings]
         trajectories = self.trajectory or ("truth" if all(any(sequence.poses) for sequence in sequences) else "slam",)
         if len(trajectories) == 1:
             trajectories *= len(recordings)

@@ -14,10 +14,13 @@ import tyro
 from topoloc.cli.features_option import ASKED_FEATURES, localizer_of
 from topoloc.cli.info import describe_map
 from topoloc.cli.output import (
+    Calibration,
     File,
     Format,
+    Topics,
     UsageError,
     check_outputs,
+    open_recording,
     print_facts,
     print_recordings,
     progress_bar,
@@ -32,7 +35,6 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import LocalizerConfig
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.frame import StereoSequence
-from topoloc.sequences.open import open_sequence
 from topoloc.sequences.text_rows import read_text
 
 
@@ -55,7 +57,11 @@ class Command:
     features: ASKED_FEATURES = None
     """Which of the map's features are asked; of several, the next where the one before leaves the pose unclear."""
     format: Format = None
-    """The recordings' format: kitti, euroc, tum, seven_scenes or folder."""
+    """The recordings' format: kitti, euroc, tum, seven_scenes, rosbag, mcap, zed or folder."""
+    topics: Topics = None
+    """Of a bag, which topic is what: left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom."""
+    calibration: Calibration = None
+    """Of side-by-side video, Stereolabs' SN*.conf."""
     json: File = None
     """Write the evaluation as JSON to this file (- for standard output)."""
     report: File = None
@@ -72,8 +78,8 @@ class Command:
         topomap = TopoMetricMap.load(self.map)
         info = describe_map(topomap, Path(self.map))
         map_from_truth = _read_rigid(Path(self.map_from_truth)) if self.map_from_truth else None
-        sequences = [open_sequence(path, self.format) for path in self.sequences]
-        others = [open_sequence(path, self.format) for path in self.elsewhere]
+        sequences = [open_recording(path, self.format, self.topics, self.calibration) for path in self.sequences]
+        others = [open_recording(path, self.format, self.topics, self.calibration) for path in self.elsewhere]
         localizer = localizer_of(topomap, config, self.features)
         labels = _labels([*self.sequences, *self.elsewhere], [*sequences, *others])
         answers: list[Answer] = []

@@ -12,7 +12,19 @@ from typing import Annotated
 import tyro
 
 from topoloc.cli.features_option import ASKED_FEATURES, localizer_of
-from topoloc.cli.output import File, Flag, Format, UsageError, check_outputs, interruptible, progress_bar, write_text
+from topoloc.cli.output import (
+    Calibration,
+    File,
+    Flag,
+    Format,
+    Topics,
+    UsageError,
+    check_outputs,
+    interruptible,
+    open_recording,
+    progress_bar,
+    write_text,
+)
 from topoloc.cli.query_answers import QueryAnswer, answer_line, exit_status, stream_summary, trajectory_of
 from topoloc.cli.settings_file import read_settings, with_option
 from topoloc.errors import CalibrationError, QueryError, TopolocError, UnreadableImageError
@@ -24,7 +36,7 @@ from topoloc.localization.result import NotLocalized
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.camera_json import read_camera_json
 from topoloc.sequences.frame import StereoFrame, StereoSequence
-from topoloc.sequences.open import find_format, open_sequence
+from topoloc.sequences.open import find_format
 from topoloc.sequences.recording import single_pictures
 from topoloc.sequences.trajectory import frame_poses, read_trajectory, write_tum
 from topoloc.tracking.tracker import Tracker, TrackerConfig
@@ -72,7 +84,11 @@ class Command:
     ] = None
     """Calibration of the queries: a camera.json, `fx,fy,cx,cy` in pixels, `map` for that of the map, `unknown` to find the focal length."""
     format: Format = None
-    """The recordings' format: kitti, euroc, tum, seven_scenes, video or folder."""
+    """The recordings' format: kitti, euroc, tum, seven_scenes, rosbag, mcap, zed, video or folder."""
+    topics: Topics = None
+    """Of a bag, which topic is what: left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom."""
+    calibration: Calibration = None
+    """Of side-by-side video, Stereolabs' SN*.conf."""
     coarse: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")] = None
     """Coarse localizer that is asked; `topoloc info` names those of the map."""
     features: ASKED_FEATURES = None
@@ -130,7 +146,7 @@ class Command:
     def _open(self, path: str) -> _Query:
         """Recordings and videos are streams; pictures, and folders of them, are single unless they are said not to be."""
         is_stream = self.streams.stream or (not self.streams.single and find_format(path, self.format) != "folder")
-        sequence = single_pictures(open_sequence(path, self.format))
+        sequence = single_pictures(open_recording(path, self.format, self.topics, self.calibration))
         is_stream = is_stream and len(sequence) > 1
         odometry = None
         if self.streams.odometry is not None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from topoloc.errors import RecordingError, UnknownFormatError
 from topoloc.sequences import euroc, folder, kitti, seven_scenes, tum, video
+from topoloc.sequences.bags import bag_recording
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.recording import parse_selection, sequence_subset
 
@@ -18,7 +19,8 @@ class SequenceFormat:
 
     looks_for: str
     recognises: Callable[[Path], bool]
-    open: Callable[[Path], StereoSequence]
+    open: Callable[..., StereoSequence]
+    takes: tuple[str, ...] = ()  # keywords of `open_sequence` that go to `open`
 
 
 # In the order in which they are asked; the plain folder takes what is left.
@@ -27,26 +29,40 @@ FORMATS = {
     "tum": SequenceFormat(tum.LOOKS_FOR, tum.recognises, tum.open_tum),
     "seven_scenes": SequenceFormat(seven_scenes.LOOKS_FOR, seven_scenes.recognises, seven_scenes.open_seven_scenes),
     "kitti": SequenceFormat(kitti.LOOKS_FOR, kitti.recognises, kitti.open_kitti),
+    "rosbag": SequenceFormat(bag_recording.LOOKS_FOR, bag_recording.recognises, bag_recording.open_bag, ("topics",)),
+    "mcap": SequenceFormat(bag_recording.LOOKS_FOR_MCAP, bag_recording.recognises_mcap, bag_recording.open_bag, ("topics",)),
     "video": SequenceFormat(video.LOOKS_FOR, video.recognises, video.open_video),
     "folder": SequenceFormat(folder.LOOKS_FOR, folder.recognises, folder.open_folder),
 }
 
 
-def open_sequence(path: str | Path, format: str | None = None) -> StereoSequence:
+def open_sequence(
+    path: str | Path,
+    format: str | None = None,
+    *,
+    topics: str | Mapping[str, str] | None = None,
+    calibration: str | Path | None = None,
+) -> StereoSequence:
     """Open a recording, or some frames of it. Pictures are read frame by frame, when asked for.
 
     Args:
         path: a folder, a video, or one picture file. A part is chosen by a suffix: ``PATH@START:STOP:STEP`` as Python slices,
             several of them by commas (``@0:10,50:60``); ``PATH@0-59/100`` are the frames whose number modulo 100 is 0 to 59.
         format: one of `FORMATS`; recognised where None.
+        topics: of bags, which topic is what: ``left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom``, or a dictionary of these.
+        calibration: of side-by-side video, Stereolabs' ``SN*.conf``, where it does not lie beside.
 
     Raises:
         UnknownFormatError: `format` is none of these, or no format recognises the folder.
-        RecordingError: nothing is there, nothing is chosen, or the recording is broken; CalibrationError is one of these.
+        RecordingError: nothing is there, the format takes no `topics` or `calibration`, nothing is chosen, or the recording is broken; CalibrationError is one of these.
         TrajectoryError: the recording's truth is malformed or fits no frame.
     """
     folder, selection = _split_selection(str(path))
-    sequence = FORMATS[find_format(path, format)].open(folder)
+    name = find_format(path, format)
+    given = {key: value for key, value in (("topics", topics), ("calibration", calibration)) if value is not None}
+    if unused := [key for key in given if key not in FORMATS[name].takes]:
+        raise RecordingError(f"{path}: a recording of format {name} takes no {unused[0]}")
+    sequence = FORMATS[name].open(folder, **given)
     if selection is None:
         return sequence
     indices = parse_selection(selection, len(sequence))

@@ -1,0 +1,78 @@
+"""ROS 2 bags in SQLite (``.db3``): one row a message. Of a database that was cut off, the rows before are read.
+
+Beginnings of messages are read through SQLite's incremental blobs, which leaves the pages of a picture where they are.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from topoloc.errors import RecordingError
+from topoloc.sequences.bags.message_file import MessageRef, Topic, damaged
+
+MAGIC = b"SQLite format 3\0"
+_ROW = -2  # in place of a chunk's number
+
+
+@dataclass(eq=False)
+class SqliteFile:
+    """A ROS 2 bag's database."""
+
+    path: Path
+    topics: dict[str, Topic] = field(default_factory=dict)
+    fault: str | None = None
+    _numbers: dict[str, list[int]] = field(default_factory=dict)
+    _database: sqlite3.Connection = field(init=False)
+
+    def __post_init__(self) -> None:
+        uri = f"{self.path.resolve().as_uri()}?mode=ro"
+        try:
+            self._database = sqlite3.connect(uri, uri=True, check_same_thread=False)
+            self._database.text_factory = lambda data: data.decode(errors="replace")
+            self._check_whole()
+            rows = self._database.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
+        except sqlite3.Error as error:
+            raise RecordingError(f"{self.path}: not a ROS 2 bag, or damaged at its beginning ({error})") from None
+        for number, name, kind, encoding in rows:
+            if isinstance(number, int) and all(isinstance(text, str) for text in (name, kind, encoding)):
+                self.topics.setdefault(name, Topic(name, kind, encoding))
+                self._numbers.setdefault(name, []).append(number)
+
+    def messages(self, topic: str) -> list[MessageRef]:
+        """The messages of a topic, in the order in which they were written."""
+        refs: list[MessageRef] = []
+        for number in self._numbers[topic]:
+            try:
+                for row, t_ns in self._database.execute("SELECT id, timestamp FROM messages WHERE topic_id = ?", (number,)):
+                    if isinstance(t_ns, int):
+                        refs.append(MessageRef(t_ns, _ROW, row))
+            except sqlite3.Error as error:
+                self.fault = self.fault or f"damaged ({error})"
+        refs.sort()
+        while self.fault and refs and not self._is_whole(refs[-1]):
+            refs.pop()
+        return refs
+
+    def read(self, ref: MessageRef, most: int | None = None) -> bytes:
+        """The bytes of a message, or the first `most` of them. Raises RecordingError."""
+        try:
+            with self._database.blobopen("messages", "data", ref.offset, readonly=True) as blob:
+                return blob.read(-1 if most is None else most)
+        except (sqlite3.Error, ValueError):
+            raise damaged(self.path.name, ref) from None
+
+    def _is_whole(self, ref: MessageRef) -> bool:
+        try:
+            return bool(self.read(ref))
+        except RecordingError:
+            return False
+
+    def _check_whole(self) -> None:
+        """Notes where the database says that it has more pages than the file."""
+        (num_pages,), (page_size,) = (self._database.execute(f"PRAGMA {name}").fetchone() for name in ("page_count", "page_size"))
+        header = self.path.open("rb").read(32)
+        num_pages = max(num_pages, int.from_bytes(header[28:32], "big"))
+        if num_pages * page_size > self.path.stat().st_size:
+            self.fault = f"cut off after {self.path.stat().st_size / 1e6:.3f} MB"
