@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from topoloc.errors import RecordingError, UnknownFormatError
-from topoloc.sequences import euroc, folder, kitti, seven_scenes, tum, video
+from topoloc.sequences import euroc, folder, kitti, seven_scenes, tum, video, zed
 from topoloc.sequences.bags import bag_recording
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.recording import parse_selection, sequence_subset
@@ -31,6 +31,7 @@ FORMATS = {
     "kitti": SequenceFormat(kitti.LOOKS_FOR, kitti.recognises, kitti.open_kitti),
     "rosbag": SequenceFormat(bag_recording.LOOKS_FOR, bag_recording.recognises, bag_recording.open_bag, ("topics",)),
     "mcap": SequenceFormat(bag_recording.LOOKS_FOR_MCAP, bag_recording.recognises_mcap, bag_recording.open_bag, ("topics",)),
+    "zed": SequenceFormat(zed.LOOKS_FOR, zed.recognises, zed.open_zed, ("calibration",)),
     "video": SequenceFormat(video.LOOKS_FOR, video.recognises, video.open_video),
     "folder": SequenceFormat(folder.LOOKS_FOR, folder.recognises, folder.open_folder),
 }
@@ -54,11 +55,13 @@ def open_sequence(
 
     Raises:
         UnknownFormatError: `format` is none of these, or no format recognises the folder.
-        RecordingError: nothing is there, the format takes no `topics` or `calibration`, nothing is chosen, or the recording is broken; CalibrationError is one of these.
+        RecordingError: nothing is there, the format takes no `topics` or `calibration`, nothing is chosen, or the recording is
+            broken; CalibrationError is one of these.
         TrajectoryError: the recording's truth is malformed or fits no frame.
     """
     folder, selection = _split_selection(str(path))
-    name = find_format(path, format)
+    is_side_by_side = calibration is not None and format is None and video.recognises(folder)
+    name = "zed" if is_side_by_side else find_format(path, format)
     given = {key: value for key, value in (("topics", topics), ("calibration", calibration)) if value is not None}
     if unused := [key for key in given if key not in FORMATS[name].takes]:
         raise RecordingError(f"{path}: a recording of format {name} takes no {unused[0]}")

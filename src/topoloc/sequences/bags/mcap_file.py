@@ -99,7 +99,7 @@ class McapFile:
         indexed: set[int] = set()
         position = 0
         try:
-            for opcode, position, length in self._records(WHOLE_FILE):  # noqa: B007
+            for opcode, position, length in self._records(WHOLE_FILE):
                 if opcode == Opcode.CHUNK:
                     self._note_chunk(position, length)
                 elif opcode == Opcode.MESSAGE_INDEX and self._bytes.chunks:
@@ -115,7 +115,7 @@ class McapFile:
             self.fault = f"cut off or damaged after {position / 1e6:.3f} MB"
         return indexed
 
-    def _walk(self, chunk: int, *notes) -> None:  # noqa: ANN002
+    def _walk(self, chunk: int, *notes) -> None:
         """Goes through the records of one chunk, as far as it is whole."""
         try:
             for record in self._records(chunk):

@@ -22,7 +22,7 @@ class Topic:
 
 
 class MessageRef(NamedTuple):
-    """Where a message lies: the chunk's number (-1: in none) and the place in it, or the row of a table. `log_t_ns`: when it was written."""
+    """Where a message lies: the chunk's number (-1: in none) and the place in it, or a table's row. `log_t_ns`: when it was written."""
 
     log_t_ns: int
     chunk: int

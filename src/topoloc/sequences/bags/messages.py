@@ -37,7 +37,7 @@ _HEAD_BYTES = 32
 
 @dataclass(frozen=True)
 class TimedTransform:
-    """`child` as seen from `parent` at a time: translation in metres, quaternion x y z w. Where `child` is empty it is not said whose it is."""
+    """`child` as seen from `parent` at a time: translation in metres, quaternion x y z w. An empty `child` is one that nobody named."""
 
     t_ns: int
     parent: str
@@ -133,7 +133,8 @@ def _transform(part: Any) -> TimedTransform:
     position = inner.position if hasattr(inner, "position") else inner.translation
     rotation = inner.orientation if hasattr(inner, "orientation") else inner.rotation
     translation = (float(position.x), float(position.y), float(position.z))
-    return TimedTransform(stamp, parent, child, translation, tuple(float(getattr(rotation, axis)) for axis in "xyzw"))
+    quat_xyzw = (float(rotation.x), float(rotation.y), float(rotation.z), float(rotation.w))
+    return TimedTransform(stamp, parent, child, translation, quat_xyzw)
 
 
 @cache
