@@ -158,16 +158,17 @@ def _opened(bag: Bag, roles: Roles) -> BagRecording:
 
 def _timed(bag: Bag, name: str) -> tuple[list[int], Pictures]:
     """The messages of a topic by their own times, in order; damaged ones are left out, and said."""
-    topic, by_time, num_damaged = bag.topics[name], {}, 0
+    topic, num_damaged = bag.topics[name], 0
+    stamped: list[tuple[int | None, MessageRef]] = []
     for ref in sorted(bag.messages(name), key=lambda ref: (ref.file, ref.chunk, ref.offset)):  # as they lie: a chunk is unpacked once
         try:
-            stamp = stamp_of_head(topic, bag.read(ref, head_size(topic)))
+            stamped.append((stamp_of_head(topic, bag.read(ref, head_size(topic))), ref))
         except RecordingError:
             num_damaged += 1
-            continue
-        by_time[stamp if stamp is not None else ref.log_t_ns] = ref
     if num_damaged:
         bag.notes.append(f"{bag.path}: {num_damaged} messages of {name} are damaged and left out")
+    is_stamped = sum(not stamp for stamp, _ in stamped) <= 1  # a driver that sets no times writes 0 into each
+    by_time = {stamp if is_stamped and stamp is not None else ref.log_t_ns: ref for stamp, ref in stamped}
     if not by_time:
         raise RecordingError(f"{bag.path}: no whole message of {name}")
     t_ns = sorted(by_time)

@@ -54,6 +54,14 @@ class ChunkedBytes:
         weakref.finalize(self, os.close, self._descriptor)
         self.size = os.fstat(self._descriptor).st_size
 
+    def add(self, chunk: Chunk) -> None:
+        """Adds a chunk; of one that was cut off, what is left and can be unpacked."""
+        left = self.size - chunk.start
+        if chunk.is_packed and chunk.num_packed > left:
+            content = _unpacked(self.read(WHOLE_FILE, chunk.start, left), chunk.compression, min(chunk.num_bytes, MAX_CHUNK_BYTES))
+            chunk = Chunk(chunk.start, left, len(content), chunk.compression)
+        self.chunks.append(chunk)
+
     def end_of(self, chunk: int) -> int:
         """How many bytes there are to read in a chunk, or in the file: of an open chunk that was cut off, those that are left."""
         if chunk == WHOLE_FILE:

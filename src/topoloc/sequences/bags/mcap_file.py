@@ -140,10 +140,7 @@ class McapFile:
         compression = header[_CHUNK.size + 4 : after].decode()
         if after + 8 + num_packed > length:
             raise CutShortError
-        chunk = Chunk(position + after + 8, num_packed, num_bytes, compression)
-        if chunk.is_packed and chunk.start + num_packed > self._bytes.size:
-            raise CutShortError
-        self._bytes.chunks.append(chunk)
+        self._bytes.add(Chunk(position + after + 8, num_packed, num_bytes, compression))
 
     def _note_message(self, chunk: int, opcode: int, position: int, length: int) -> None:
         if opcode == Opcode.MESSAGE and length >= _MESSAGE.size:

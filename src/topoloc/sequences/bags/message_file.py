@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from topoloc.errors import RecordingError
 
@@ -30,6 +30,7 @@ class MessageRef(NamedTuple):
     file: int = 0
 
 
+@runtime_checkable
 class MessageFile(Protocol):
     """A file of messages, opened: its index is in memory, its messages are not."""
 

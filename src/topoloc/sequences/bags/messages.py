@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import struct
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -33,6 +34,7 @@ POSES = frozenset(
 )
 _NANOSECONDS = 1_000_000_000
 _HEAD_BYTES = 32
+_FAR, _ROTATION_TOLERANCE = 1e9, 1e-2  # metres that nobody goes; how far a quaternion's length may be from 1
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,7 @@ def stamp_of_head(topic: Topic, head: bytes) -> int | None:
     except Exception:  # as in `decode`
         return None
     t_ns = seconds * _NANOSECONDS + nanoseconds
-    return t_ns if 0 < t_ns < 1 << 63 else None
+    return t_ns if 0 <= t_ns < 1 << 63 else None
 
 
 def stamp_ns(stamp: Any) -> int:
@@ -134,6 +136,8 @@ def _transform(part: Any) -> TimedTransform:
     rotation = inner.orientation if hasattr(inner, "orientation") else inner.rotation
     translation = (float(position.x), float(position.y), float(position.z))
     quat_xyzw = (float(rotation.x), float(rotation.y), float(rotation.z), float(rotation.w))
+    if not all(abs(value) < _FAR for value in translation) or not abs(math.hypot(*quat_xyzw) - 1.0) <= _ROTATION_TOLERANCE:
+        raise ValueError
     return TimedTransform(stamp, parent, child, translation, quat_xyzw)
 
 

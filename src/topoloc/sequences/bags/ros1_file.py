@@ -135,10 +135,7 @@ class Ros1File:
             return
 
     def _note_chunk(self, record: _Record) -> None:
-        chunk = Chunk(record.start, record.length, record.number(b"size"), record.fields[b"compression"].decode())
-        if chunk.is_packed and chunk.start + chunk.num_packed > self._bytes.size:
-            raise CutShortError
-        self._bytes.chunks.append(chunk)
+        self._bytes.add(Chunk(record.start, record.length, record.number(b"size"), record.fields[b"compression"].decode()))
 
     def _note_message(self, chunk: int, record: _Record) -> None:
         if record.op == _MESSAGE:

@@ -31,7 +31,10 @@ class SqliteFile:
         try:
             self._database = sqlite3.connect(uri, uri=True, check_same_thread=False)
             self._database.text_factory = lambda data: data.decode(errors="replace")
-            self._check_whole()
+            self._database.execute("PRAGMA trusted_schema = OFF")
+            if self._is_cut():
+                # SQLite refuses a file that is shorter than its header says, but for this switch; nothing is written.
+                self._database.execute("PRAGMA writable_schema = ON")
             rows = self._database.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
         except sqlite3.Error as error:
             raise RecordingError(f"{self.path}: not a ROS 2 bag, or damaged at its beginning ({error})") from None
@@ -69,10 +72,12 @@ class SqliteFile:
         except RecordingError:
             return False
 
-    def _check_whole(self) -> None:
-        """Notes where the database says that it has more pages than the file."""
-        (num_pages,), (page_size,) = (self._database.execute(f"PRAGMA {name}").fetchone() for name in ("page_count", "page_size"))
-        header = self.path.open("rb").read(32)
-        num_pages = max(num_pages, int.from_bytes(header[28:32], "big"))
-        if num_pages * page_size > self.path.stat().st_size:
-            self.fault = f"cut off after {self.path.stat().st_size / 1e6:.3f} MB"
+    def _is_cut(self) -> bool:
+        """Whether the database says in its header that it has more pages than the file, which is then noted."""
+        with self.path.open("rb") as file:
+            header = file.read(32)
+        page_size, size = int.from_bytes(header[16:18], "big"), self.path.stat().st_size
+        is_cut = int.from_bytes(header[28:32], "big") * (65536 if page_size == 1 else page_size) > size
+        if is_cut:
+            self.fault = f"cut off after {size / 1e6:.3f} MB"
+        return is_cut
