@@ -6,7 +6,6 @@ import base64
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.sequences.frame import StereoSequence
+from topoloc.sequences.frame import StereoFrame, StereoSequence
 
 LEFT, RIGHT = "/left/image_rect", "/right/image_rect"
 KINDS = ("ros1", "ros1-lz4", "ros2", "ros2-mcap", "mcap-zstd")
@@ -138,13 +137,6 @@ def as_pose(pose: Rigid3) -> dict[str, Any]:
     return {"position": {"x": tx, "y": ty, "z": tz}, "orientation": {"x": x, "y": y, "z": z, "w": w}}
 
 
-@dataclass
-class Poses:
-    """How the poses of a recording are written."""
-
-    write: Callable[[Write, int, Rigid3], None]
-
-
 def by_tf(write: Write, t_ns: int, world_from_cam: Rigid3) -> None:
     """A body that moves, and a camera fixed to it."""
     body_from_cam = Rigid3.exp(np.array([0.1, -0.2, 0.05, 0.3, 1.2, -0.4]))
@@ -184,45 +176,43 @@ def write_stereo_bag(
     return path
 
 
-def write_foxglove(path: Path, sequence: StereoSequence, encoding: str, classes: dict[str, Any] | None = None) -> Path:
+FOXGLOVE = {"CompressedImage": "/camera/image", "CameraCalibration": "/camera/calibration", "PoseInFrame": "/pose"}
+
+
+def write_foxglove(path: Path, sequence: StereoSequence, classes: dict[str, Any] | None = None) -> Path:
     """The left pictures of a recording by Foxglove's schemas, as JSON, or as protobuf by the message `classes`."""
     with path.open("wb") as file:
         writer = McapWriter(file)
         writer.start()
+        channels = {}
+        for name, topic in FOXGLOVE.items():
+            schema = ("jsonschema", b"{}") if classes is None else ("protobuf", classes[name].file_set)
+            number = writer.register_schema(f"foxglove.{name}", *schema)
+            channels[name] = writer.register_channel(topic, "json" if classes is None else "protobuf", number)
         for index in range(len(sequence)):
-            frame = sequence[index]
-            assert frame.camera is not None
-            assert frame.world_from_cam is not None
-            sec, nsec = divmod(frame.t_ns, 1_000_000_000)
-            png = cv2.imencode(".png", frame.image)[1].tobytes()
-            camera = frame.camera
-            fields = {
-                "CompressedImage": {"frame_id": "camera", "data": png, "format": "png"},
-                "CameraCalibration": {"frame_id": "camera", "width": camera.width, "height": camera.height, "distortion_model": "plumb_bob"}
-                | {"D": [0.0] * 5, "K": camera.matrix().ravel().tolist(), "R": np.eye(3).ravel().tolist()}
-                | {"P": np.column_stack([camera.matrix(), np.zeros(3)]).ravel().tolist()},
-                "PoseInFrame": {"frame_id": "map", "pose": as_pose(frame.world_from_cam)},
-            }
-            for name, topic in (
-                ("CompressedImage", "/camera/image"),
-                ("CameraCalibration", "/camera/calibration"),
-                ("PoseInFrame", "/pose"),
-            ):
-                _add_foxglove(writer, topic, name, frame.t_ns, (sec, nsec), fields[name], (classes or {}).get(name))
+            t_ns = sequence.t_ns[index]
+            for name, fields in _foxglove_fields(sequence[index]).items():
+                data = _as_json(fields, t_ns) if classes is None else classes[name].written(fields, t_ns)
+                writer.add_message(channels[name], t_ns, data, t_ns)
         writer.finish()
     return path
 
 
-def _add_foxglove(writer: Any, topic: str, name: str, t_ns: int, stamp: tuple[int, int], fields: dict[str, Any], made: Any) -> None:
-    channels = writer.__dict__.setdefault("channels_of_tests", {})
-    if topic not in channels:
-        encoding, schema = ("jsonschema", b"{}") if made is None else ("protobuf", made.file_set)
-        number = writer.register_schema(f"foxglove.{name}", encoding, schema)
-        channels[topic] = writer.register_channel(topic, "json" if made is None else "protobuf", number)
-    if made is None:
-        data = fields | {"timestamp": {"sec": stamp[0], "nsec": stamp[1]}}
-        text = json.dumps({key: base64.b64encode(its).decode() if isinstance(its, bytes) else its for key, its in data.items()})
-        payload = text.encode()
-    else:
-        payload = made.message(fields | {"timestamp": {"seconds": stamp[0], "nanos": stamp[1]}}).SerializeToString()
-    writer.add_message(channels[topic], t_ns, payload, t_ns)
+def _foxglove_fields(frame: StereoFrame) -> dict[str, dict[str, Any]]:
+    assert frame.camera is not None
+    assert frame.world_from_cam is not None
+    camera, k = frame.camera, frame.camera.matrix()
+    matrices = {"D": [0.0] * 5, "K": k.ravel().tolist(), "R": np.eye(3).ravel().tolist()}
+    matrices["P"] = np.column_stack([k, np.zeros(3)]).ravel().tolist()
+    size = {"frame_id": "camera", "width": camera.width, "height": camera.height, "distortion_model": "plumb_bob"}
+    return {
+        "CompressedImage": {"frame_id": "camera", "data": cv2.imencode(".png", frame.image)[1].tobytes(), "format": "png"},
+        "CameraCalibration": size | matrices,
+        "PoseInFrame": {"frame_id": "map", "pose": as_pose(frame.world_from_cam)},
+    }
+
+
+def _as_json(fields: dict[str, Any], t_ns: int) -> bytes:
+    sec, nsec = divmod(t_ns, 1_000_000_000)
+    data = fields | {"timestamp": {"sec": sec, "nsec": nsec}}
+    return json.dumps({key: base64.b64encode(its).decode() if isinstance(its, bytes) else its for key, its in data.items()}).encode()
