@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import os
 import resource
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_writing import KINDS, LEFT, RIGHT, Write, bag_writer, by_odometry, by_pose, by_tf, image, info, write_stereo_bag
+from bag_writing import KINDS, LEFT, RIGHT, Write, bag_writer, by_odometry, by_pose, by_tf, image, info, transform, write_stereo_bag
 
-from topoloc.errors import CalibrationError, RecordingError, TrajectoryError, UnreadableImageError
+from topoloc.errors import CalibrationError, MissingExtraError, RecordingError, TrajectoryError, UnreadableImageError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.bags import bag as bag_module
+from topoloc.sequences.bags import messages
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import find_format, open_sequence
 from topoloc.sequences.recording import notes_of, single_pictures
@@ -134,8 +136,6 @@ def test_depth_with_its_own_camera(tmp_path: Path):
             write("/camera/color/camera_info", "sensor_msgs/msg/CameraInfo", t_ns, info(CAMERA, t_ns, frame="color"))
             write("/camera/depth/image_rect_raw", "sensor_msgs/msg/Image", t_ns, image(depth, t_ns + 4_000_000, "16UC1", "depth"))
             write("/camera/depth/camera_info", "sensor_msgs/msg/CameraInfo", t_ns, info(CAMERA, t_ns, frame="depth"))
-            from bag_writing import transform
-
             write("/tf_static", "tf2_msgs/msg/TFMessage", t_ns, {"transforms": [transform(cam_from_depth, t_ns, "color", "depth")]})
     sequence = open_sequence(tmp_path / "rgbd.bag")
     frame = sequence[2]
@@ -206,6 +206,17 @@ def test_a_picture_of_another_size_than_its_camera(tmp_path: Path):
         write("/camera_info", "sensor_msgs/msg/CameraInfo", 10**18, info(CAMERA, 10**18))
     with pytest.raises(UnreadableImageError, match="32x24 pixels, but its camera is of 64x48"):
         open_sequence(tmp_path / "bag")[0]
+
+
+@pytest.mark.parametrize(("kind", "library"), [("ros1", "rosbags"), ("ros2", "rosbags"), ("ros2-mcap", "mcap")])
+def test_without_the_extra_it_is_named(kind: str, library: str, bag_of: BagOf, monkeypatch: pytest.MonkeyPatch):
+    path = bag_of(kind)
+    messages._typestore.cache_clear()
+    for name in [name for name in sys.modules if name.split(".")[0] == library or name.endswith(".mcap_file")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(MissingExtraError, match=r"need the extra bags: pip install 'topoloc\[bags\]'"):
+        open_sequence(path)
 
 
 @pytest.mark.parametrize("kind", ["ros1", "ros2", "ros2-mcap"])

@@ -63,7 +63,7 @@ def decode(topic: Topic, data: bytes) -> Any:
             return json.loads(data, object_hook=lambda fields: SimpleNamespace(**fields))
         if topic.encoding == "protobuf":
             return _protobuf_class(topic.type, topic.schema).FromString(data)
-    except RecordingError:
+    except (RecordingError, ModuleNotFoundError):
         raise
     except Exception as error:  # whatever the decoders raise of damaged bytes, of which there is no list
         raise RecordingError(f"{topic.name}: no whole message of type {topic.type} ({type(error).__name__})") from None
@@ -89,6 +89,8 @@ def stamp_of_head(topic: Topic, head: bytes) -> int | None:
             return stamp_ns(decode(topic, head).timestamp)
         else:
             return None
+    except ModuleNotFoundError:
+        raise
     except Exception:  # as in `decode`
         return None
     t_ns = seconds * _NANOSECONDS + nanoseconds
