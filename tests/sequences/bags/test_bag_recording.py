@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 from bag_writing import KINDS, LEFT, RIGHT, Write, bag_writer, by_odometry, by_pose, by_tf, image, info, transform, write_stereo_bag
 
+from built_room import built_room
 from topoloc.errors import CalibrationError, MissingExtraError, RecordingError, TrajectoryError, UnreadableImageError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.bags import bag as bag_module
 from topoloc.sequences.bags import messages
 from topoloc.sequences.frame import StereoSequence
@@ -121,6 +123,35 @@ def test_poses_between_those_of_the_bag_are_interpolated(tmp_path: Path):
     sequence = open_sequence(tmp_path / "bag")
     assert [None if pose is None else pytest.approx(pose.translation[0]) for pose in sequence.poses] == [0.0, 1.0, 2.0, None]
     assert sequence[0].camera == CAMERA
+
+
+def test_where_tf_does_not_reach_the_camera_odometry_does(walk: StereoSequence, tmp_path: Path):
+    def poses(write: Write, t_ns: int, world_from_cam: Rigid3) -> None:
+        by_odometry(write, t_ns, world_from_cam)
+        write("/tf", "tf2_msgs/msg/TFMessage", t_ns, {"transforms": [transform(world_from_cam, t_ns, "map", "another_robot")]})
+
+    path = write_stereo_bag(tmp_path / "two", "ros2", walk, poses)
+    assert_same(walk, open_sequence(path))
+    with pytest.raises(TrajectoryError, match="no pose of left_optical at the times of the pictures in tf"):
+        open_sequence(path, topics="pose=tf")
+
+
+def test_poses_of_another_time_are_none(walk: StereoSequence, tmp_path: Path):
+    path = write_stereo_bag(tmp_path / "late", "ros2", walk, lambda write, t_ns, pose: by_odometry(write, t_ns + 10**12, pose))
+    sequence = open_sequence(path)
+    assert sequence.poses == [None] * len(walk)
+    assert notes_of(sequence) == [
+        f"{path}: no pose of left_optical at the times of the pictures in /odom; the recording is taken as one without poses"
+    ]
+
+
+def test_the_map_of_a_bag_is_that_of_its_recording(tiny_recording: Path, room_map: Path, tmp_path: Path):
+    path = write_stereo_bag(tmp_path / "room.bag", "ros1", open_sequence(tiny_recording))
+    built, expected = built_room(path), TopoMetricMap.load(room_map)
+    assert len(built.nodes) == len(expected.nodes)
+    for node, other in zip(built.nodes, expected.nodes, strict=True):
+        np.testing.assert_allclose(node.summary.world_from_cam.matrix(), other.summary.world_from_cam.matrix(), atol=1e-9)
+        np.testing.assert_array_equal(node.points_cam, other.points_cam)
 
 
 def test_depth_with_its_own_camera(tmp_path: Path):

@@ -46,7 +46,7 @@ CASES = {
             odometry=[f"{ZED}/odom"],
             tf=["/tf", "/tf_static"],
         ),
-        {"left": f"{ZED}/left/image_rect_color", "right": f"{ZED}/right/image_rect_color", "pose": "tf"}
+        {"left": f"{ZED}/left/image_rect_color", "right": f"{ZED}/right/image_rect_color", "poses": ("tf", f"{ZED}/odom")}
         | {"left_info": f"{ZED}/left/camera_info", "right_info": f"{ZED}/right/camera_info"},
     ),
     "RealSense": (
@@ -59,9 +59,17 @@ CASES = {
         {"left": "/camera/color/image_raw", "depth": "/camera/aligned_depth_to_color/image_raw"}
         | {"left_info": "/camera/color/camera_info", "depth_info": "/camera/aligned_depth_to_color/camera_info"},
     ),
+    "librealsense": (
+        bag(
+            image=[f"/device_0/sensor_{sensor}/image/data" for sensor in ("0/Depth_0", "1/Color_0")],
+            info=[f"/device_0/sensor_{sensor}/info/camera_info" for sensor in ("0/Depth_0", "1/Color_0")],
+        ),
+        {"left": "/device_0/sensor_1/Color_0/image/data", "depth": "/device_0/sensor_0/Depth_0/image/data"}
+        | {"left_info": "/device_0/sensor_1/Color_0/info/camera_info", "depth_info": "/device_0/sensor_0/Depth_0/info/camera_info"},
+    ),
     "EuRoC": (
         bag(image=["/cam0/image_raw", "/cam1/image_raw"], imu=["/imu0"], pose=["/vicon/pose"]),
-        {"left": "/cam0/image_raw", "right": "/cam1/image_raw", "pose": "/vicon/pose"},
+        {"left": "/cam0/image_raw", "right": "/cam1/image_raw", "poses": ("/vicon/pose",)},
     ),
     "compressed alone": (
         bag(compressed=["/oak/left/image_rect/compressed", "/oak/right/image_rect/compressed"], info=["/oak/left/camera_info"]),
@@ -69,7 +77,7 @@ CASES = {
     ),
     "one camera, truth and odometry": (
         bag(image=["/image_raw"], info=["/camera_info"], odometry=["/odom", "/ground_truth/odom"]),
-        {"left": "/image_raw", "left_info": "/camera_info", "pose": "/ground_truth/odom"},
+        {"left": "/image_raw", "left_info": "/camera_info", "poses": ("/ground_truth/odom", "/odom")},
     ),
 }
 
@@ -89,7 +97,7 @@ def test_several_cameras_are_said():
 def test_what_is_said_counts():
     its = bag(image=["/cam0/image_raw", "/cam1/image_raw", "/depth"], info=["/k"], odometry=["/odom"])
     said = {"left": "/cam0/image_raw", "depth": "/depth", "left_info": "/k", "pose": "/odom", "pose_frame": "imu"}
-    assert choose_topics(its, said) == Roles("/cam0/image_raw", None, "/depth", "/k", None, None, "/odom", "imu", True)
+    assert choose_topics(its, said) == Roles("/cam0/image_raw", None, "/depth", "/k", None, None, ("/odom",), "imu", True)
     with pytest.raises(RecordingError, match="/odom is nav_msgs/msg/Odometry, which cannot be left_info"):
         choose_topics(its, said | {"left_info": "/odom"})
     with pytest.raises(RecordingError, match="left must be, too"):

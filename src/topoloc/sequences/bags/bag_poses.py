@@ -36,39 +36,43 @@ def camera_poses(bag: Bag, roles: Roles, camera_frame: str, tree: FrameTree, t_n
     Raises:
         TrajectoryError: what was asked for (`--topics pose=`) gives no frame a pose, or the TUM file is malformed.
     """
-    if roles.pose is None:
+    if not roles.poses:
         beside = bag.path / "truth.tum" if bag.path.is_dir() else bag.path.with_suffix(".tum")
         return read_truth(Path(beside), [], t_ns)
-    is_tf = roles.pose == TF
-    poses = _poses_of_tf(bag, roles, camera_frame, tree, t_ns) if is_tf else _poses_of_topic(bag, roles, camera_frame, tree, t_ns)
-    if not any(pose is not None for pose in poses):
-        said = f"{bag.path}: {'TF' if is_tf else roles.pose} has no pose of {camera_frame or 'the camera'} at the times of the pictures"
-        if roles.is_pose_said:
-            raise TrajectoryError(said)
-        bag.notes.append(f"{said}; the recording is taken as one without poses")
-    return poses
+    for source in roles.poses:
+        num_notes = len(bag.notes)
+        if source == TF:
+            poses = _poses_of_tf(roles, camera_frame, tree, t_ns)
+        else:
+            poses = _poses_of_topic(bag, source, roles.pose_frame, camera_frame, tree, t_ns)
+        if any(pose is not None for pose in poses):
+            return poses
+        del bag.notes[num_notes:]
+    said = f"{bag.path}: no pose of {camera_frame or 'the camera'} at the times of the pictures in {' or '.join(roles.poses)}"
+    if roles.is_pose_said:
+        raise TrajectoryError(said)
+    bag.notes.append(f"{said}; the recording is taken as one without poses")
+    return [None] * len(t_ns)
 
 
-def _poses_of_tf(bag: Bag, roles: Roles, camera_frame: str, tree: FrameTree, t_ns: list[int]) -> list[Rigid3 | None]:
+def _poses_of_tf(roles: Roles, camera_frame: str, tree: FrameTree, t_ns: list[int]) -> list[Rigid3 | None]:
     frame = roles.pose_frame or camera_frame
     return tree.poses(frame, t_ns) if tree.moves(frame) else [None] * len(t_ns)
 
 
-def _poses_of_topic(bag: Bag, roles: Roles, camera_frame: str, tree: FrameTree, t_ns: list[int]) -> list[Rigid3 | None]:
-    assert roles.pose is not None
-    transforms = _transforms(bag, roles.pose)
+def _poses_of_topic(bag: Bag, name: str, frame: str | None, camera_frame: str, tree: FrameTree, t_ns: list[int]) -> list[Rigid3 | None]:
+    """Poses of a topic, which are those of `frame`, or else of what its messages name, brought to the camera."""
+    transforms = _transforms(bag, name)
     if not transforms:
         return [None] * len(t_ns)
-    whose = roles.pose_frame or transforms[0].child
+    whose = frame or transforms[0].child
     body_from_cam = tree.fixed_between(whose, camera_frame) if whose else None
     if body_from_cam is None:
         body_from_cam = Rigid3.identity()
-        if whose and roles.pose_frame:
-            raise TrajectoryError(
-                f"{bag.path}: no fixed transform from {camera_frame or 'the camera'} to {whose}, which {roles.pose} is of"
-            )
+        if frame:
+            raise TrajectoryError(f"{bag.path}: no fixed transform from {camera_frame or 'the camera'} to {frame}, which {name} is of")
         why = f"no fixed transform from {camera_frame} to {whose}" if whose else "it does not say whose they are (pose_frame=FRAME would)"
-        bag.notes.append(f"{bag.path}: poses of {roles.pose} are taken for the camera's: {why}")
+        bag.notes.append(f"{bag.path}: poses of {name} are taken for the camera's: {why}")
     world_from_bodies = poses_at(trajectory_of(transforms), t_ns)
     return [pose @ body_from_cam if pose is not None else None for pose in world_from_bodies]
 

@@ -20,7 +20,7 @@ from topoloc.sequences.bags.camera_info import CameraInfo, camera_info
 from topoloc.sequences.bags.frame_tree import FrameTree
 from topoloc.sequences.bags.message_file import MessageRef, Topic
 from topoloc.sequences.bags.messages import decode, frame_id, head_size, stamp_of_head
-from topoloc.sequences.bags.topics import Roles, choose_topics, parse_topics
+from topoloc.sequences.bags.topics import Roles, choose_topics, is_registered, parse_topics
 from topoloc.sequences.camera_json import FILE_NAME, read_camera_json
 from topoloc.sequences.frame import DepthImage, Image, StereoFrame
 from topoloc.sequences.recording import nearest_rows
@@ -242,11 +242,13 @@ def _depth_camera(bag: Bag, roles: Roles, camera: Camera, frame: str, tree: Fram
     info = _read_info(bag, roles.depth_info)
     if info is None:
         return camera, Rigid3.identity()
-    cam_from_depth = tree.fixed_between(frame, info.frame)
+    cam_from_depth = tree.fixed_between(frame, info.frame) if frame and info.frame else None
     if cam_from_depth is None:
         cam_from_depth = Rigid3.identity()
-        if frame != info.frame:
-            bag.notes.append(f"{bag.path}: no transform from {info.frame} to {frame}: depth is taken as seen from the picture's camera")
+        if not is_registered(roles.depth or ""):
+            bag.notes.append(
+                f"{bag.path}: no fixed transform from that of {roles.depth} to the camera of the pictures: taken for the same place"
+            )
     return info.camera("rect" in (roles.depth or "")), cam_from_depth
 
 

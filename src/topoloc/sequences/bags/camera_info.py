@@ -18,6 +18,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.bags.messages import frame_id
 
 _NO_DISTORTION = ("", "none", "plumb_bob", "rational_polynomial")
+_MAX_BASELINE = 1000.0  # metres; of the largest rigs there are, and beyond what a damaged number may be
 _FISHEYE = ("equidistant", "fisheye", "kannala_brandt4", "kannala_brandt")
 
 
@@ -63,6 +64,8 @@ class CameraInfo:
         shift = right._shift() - self._shift()
         if not np.isfinite(shift) or shift == 0.0:
             return None
+        if abs(shift) > _MAX_BASELINE:
+            raise CalibrationError(f"{right.topic}: P puts the right camera {abs(shift):.3g} m away")
         if shift > 0.0:
             raise CalibrationError(f"{right.topic}: P puts the right camera {shift:.3g} m to the left; are left and right swapped?")
         rect_right_from_rect_left = Rigid3(np.eye(3), np.array([shift, 0.0, 0.0]))
@@ -78,7 +81,7 @@ class CameraInfo:
 
     def _shift(self) -> float:
         """Where the rectified camera is, along x, as P = K [I | t] has it; NaN without a P."""
-        return float(self.projection[0, 3] / self.projection[0, 0]) if self.projection[0, 0] > 0.0 else float("nan")
+        return float(self.projection[0, 3]) / float(self.projection[0, 0]) if self.projection[0, 0] > 0.0 else float("nan")
 
     def _made(self, model: str, matrix: np.ndarray, coefficients: list[float]) -> Camera:
         params = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *coefficients)

@@ -104,7 +104,7 @@ class McapFile:
                     self._note_chunk(position, length)
                 elif opcode == Opcode.MESSAGE_INDEX and self._bytes.chunks:
                     channel, size = struct.unpack("<HI", self._bytes.read(WHOLE_FILE, position, 6))
-                    size = min(size, length - 6) // _INDEX_ENTRY.itemsize * _INDEX_ENTRY.itemsize
+                    size = max(min(size, length - 6), 0) // _INDEX_ENTRY.itemsize * _INDEX_ENTRY.itemsize
                     self._indexes.setdefault(channel, []).append((len(self._bytes.chunks) - 1, position + 6, size))
                     indexed.add(len(self._bytes.chunks) - 1)
                 elif opcode == Opcode.MESSAGE:

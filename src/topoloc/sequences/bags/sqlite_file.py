@@ -14,6 +14,7 @@ from topoloc.sequences.bags.message_file import MessageRef, Topic, damaged
 
 MAGIC = b"SQLite format 3\0"
 _ROW = -2  # in place of a chunk's number
+_BROKEN = (sqlite3.Error, UnicodeDecodeError)  # the second of an error's text, which quotes what is damaged
 
 
 @dataclass(eq=False)
@@ -36,7 +37,7 @@ class SqliteFile:
                 # SQLite refuses a file that is shorter than its header says, but for this switch; nothing is written.
                 self._database.execute("PRAGMA writable_schema = ON")
             rows = self._database.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
-        except sqlite3.Error as error:
+        except _BROKEN as error:
             raise RecordingError(f"{self.path}: not a ROS 2 bag, or damaged at its beginning ({error})") from None
         for number, name, kind, encoding in rows:
             if isinstance(number, int) and all(isinstance(text, str) for text in (name, kind, encoding)):
@@ -51,7 +52,7 @@ class SqliteFile:
                 for row, t_ns in self._database.execute("SELECT id, timestamp FROM messages WHERE topic_id = ?", (number,)):
                     if isinstance(t_ns, int):
                         refs.append(MessageRef(t_ns, _ROW, row))
-            except sqlite3.Error as error:
+            except _BROKEN as error:
                 self.fault = self.fault or f"damaged ({error})"
         refs.sort()
         while self.fault and refs and not self._is_whole(refs[-1]):
@@ -63,7 +64,7 @@ class SqliteFile:
         try:
             with self._database.blobopen("messages", "data", ref.offset, readonly=True) as blob:
                 return blob.read(-1 if most is None else most)
-        except (sqlite3.Error, ValueError):
+        except (ValueError, *_BROKEN):
             raise damaged(self.path.name, ref) from None
 
     def _is_whole(self, ref: MessageRef) -> bool:

@@ -14,7 +14,15 @@ ROLES = ("left", "right", "depth", "left_info", "right_info", "depth_info", "pos
 _ALSO = {"image": "left", "mono": "left", "color": "left", "camera_info": "left_info", "info": "left_info"}
 _NONE, TF = "none", "tf"
 # What tells the topic of a left picture from that of the right one.
-_SIDES = (("left", "right"), ("infra1", "infra2"), ("cam0", "cam1"), ("camera0", "camera1"), ("cam_0", "cam_1"), ("image_0", "image_1"))
+_SIDES = (
+    ("left", "right"),
+    ("infra1", "infra2"),
+    ("cam0", "cam1"),
+    ("camera0", "camera1"),
+    ("cam_0", "cam_1"),
+    ("image_0", "image_1"),
+    ("Infrared_1", "Infrared_2"),
+)
 _DEPTH, _NO_PICTURE = ("depth",), ("disparity", "confidence", "mask", "segmentation", "thermal")
 _REGISTERED, _COLOUR, _TRUTH = ("aligned", "registered"), ("color", "colour", "rgb"), ("truth", "gt", "mocap", "vicon", "optitrack")
 _TRANSPORTS = ("/compressedDepth", "/compressed")
@@ -22,7 +30,7 @@ _TRANSPORTS = ("/compressedDepth", "/compressed")
 
 @dataclass(frozen=True)
 class Roles:
-    """The topic of each role, where there is one. `pose` may be `tf`; `pose_frame` is the frame that its poses are of."""
+    """The topic of each role, where there is one. `poses` are tried in order and may be `tf`; `pose_frame` is the frame that they are of."""
 
     left: str = ""
     right: str | None = None
@@ -30,7 +38,7 @@ class Roles:
     left_info: str | None = None
     right_info: str | None = None
     depth_info: str | None = None
-    pose: str | None = None
+    poses: tuple[str, ...] = ()
     pose_frame: str | None = None
     is_pose_said: bool = False
 
@@ -68,11 +76,12 @@ def choose_topics(bag: Bag, said: Mapping[str, str]) -> Roles:
         if role in said:
             _check(bag, said[role], role, CALIBRATIONS)
         roles = replace(roles, **{role: said.get(role) or _calibration_of(bag, of)})
-    pose = said["pose"] if "pose" in said else _guessed_pose(bag)
+    pose = said.get("pose")
+    poses = _guessed_poses(bag) if pose is None else () if pose == _NONE else (pose,)
     if pose not in (None, _NONE, TF):
         _check(bag, pose, "pose", POSES | TRANSFORMS)
-    pose = TF if pose in bag.topics and bag.topics[pose].type in TRANSFORMS else None if pose == _NONE else pose
-    return replace(roles, pose=pose, pose_frame=said.get("pose_frame"), is_pose_said="pose" in said)
+        poses = (TF,) if bag.topics[pose].type in TRANSFORMS else poses
+    return replace(roles, poses=poses, pose_frame=said.get("pose_frame"), is_pose_said=pose is not None)
 
 
 def _check(bag: Bag, name: str | None, role: str, kinds: frozenset[str]) -> None:
@@ -98,7 +107,7 @@ def _guessed_pictures(bag: Bag, said: Mapping[str, str]) -> Roles:
     pairs = [(name, right) for name in pictures if (right := _right_of(bag, name))]
     if pairs:
         return Roles(*pairs[0])
-    depths = sorted((name for name in names if _has(name, _DEPTH)), key=lambda name: (not _has(name, _REGISTERED), _rank(bag, name)))
+    depths = sorted((name for name in names if _has(name, _DEPTH)), key=lambda name: (not is_registered(name), _rank(bag, name)))
     if not pictures:
         return Roles()
     if len(pictures) > 1:
@@ -129,20 +138,25 @@ def _calibration_of(bag: Bag, picture: str | None) -> str | None:
         return None
     base = next((picture.removesuffix(end) for end in _TRANSPORTS if picture.endswith(end)), picture)
     parent = base.rpartition("/")[0]
-    for place in (parent, base):
+    for place in (parent, base, f"{parent.rpartition('/')[0]}/info"):  # the last is how librealsense records
         for name in (f"{place}/camera_info", f"{place}/calibration"):
             if name in bag.topics and bag.topics[name].type in CALIBRATIONS:
                 return name
     return None
 
 
-def _guessed_pose(bag: Bag) -> str | None:
-    """Truth by its name, else TF, else odometry, else a pose."""
+def _guessed_poses(bag: Bag) -> tuple[str, ...]:
+    """Truth by its name, then TF, then odometry, then other poses."""
     poses = sorted(name for name, topic in bag.topics.items() if topic.type in POSES)
     truth = [name for name in poses if _has(name, _TRUTH)]
     odometry = [name for name in poses if bag.topics[name].type == "nav_msgs/msg/Odometry"]
     has_tf = any(topic.type in TRANSFORMS and "static" not in name for name, topic in bag.topics.items())
-    return (truth or ([TF] if has_tf else []) or odometry or poses or [None])[0]
+    return tuple(dict.fromkeys([*truth, *([TF] if has_tf else []), *odometry, *poses]))
+
+
+def is_registered(depth: str) -> bool:
+    """Whether the name of a topic of depth says that it is of the colour camera's pixels."""
+    return _has(depth, _REGISTERED)
 
 
 def _has(name: str, words: tuple[str, ...]) -> bool:
