@@ -10,7 +10,7 @@ import pytest
 from topoloc.errors import RecordingError
 from topoloc.sequences.bags.bag import Bag
 from topoloc.sequences.bags.message_file import Topic
-from topoloc.sequences.bags.topics import Roles, choose_topics, parse_topics
+from topoloc.sequences.bags.topics import Roles, choose_topics, is_rectified, parse_topics
 
 IMAGE, COMPRESSED, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"
 ODOMETRY, POSE, TF = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "tf2_msgs/msg/TFMessage"
@@ -86,6 +86,13 @@ CASES = {
 def test_what_drivers_record(name: str):
     its, expected = CASES[name]
     assert roles_of(its) == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"), [("/left/image_rect", True), ("/a/rectified", True), ("/direct/image_raw", False), ("/a/image", False)]
+)
+def test_rectified_by_name(name: str, expected: bool):
+    assert is_rectified(name) == expected
 
 
 def test_several_cameras_are_said():

@@ -20,7 +20,7 @@ from topoloc.sequences.bags.camera_info import CameraInfo, camera_info
 from topoloc.sequences.bags.frame_tree import FrameTree
 from topoloc.sequences.bags.message_file import MessageRef, Topic
 from topoloc.sequences.bags.messages import decode, frame_id, head_size, stamp_of_head
-from topoloc.sequences.bags.topics import Roles, choose_topics, is_registered, parse_topics
+from topoloc.sequences.bags.topics import Roles, choose_topics, is_rectified, is_registered, parse_topics
 from topoloc.sequences.camera_json import FILE_NAME, read_camera_json
 from topoloc.sequences.frame import DepthImage, Image, StereoFrame
 from topoloc.sequences.recording import nearest_rows
@@ -139,9 +139,8 @@ def open_bag(path: Path, topics: str | Mapping[str, str] | None = None) -> BagRe
 def _opened(bag: Bag, roles: Roles) -> BagRecording:
     t_ns, left = _timed(bag, roles.left)
     tree, info = read_frames(bag), _read_info(bag, roles.left_info)
-    frame = info.frame if info is not None else _frame_of(bag, left)
-    is_rectified = "rect" in roles.left
-    camera = info.camera(is_rectified) if info is not None else _camera_beside(bag)[0]
+    frame = (info.frame if info is not None else "") or _frame_of(bag, left)
+    camera = info.camera(is_rectified(roles.left)) if info is not None else _camera_beside(bag)[0]
     right, depth = None, None
     if roles.right is not None:
         rig = _rig(bag, roles, info, tree)
@@ -216,13 +215,12 @@ def _rig(bag: Bag, roles: Roles, left: CameraInfo | None, tree: FrameTree) -> St
     """By P of both calibrations; else by the transform between their frames; else by a camera.json with a baseline."""
     right = _read_info(bag, roles.right_info)
     if left is not None and right is not None:
-        is_rectified = "rect" in roles.left
-        rig = left.rig(right, is_rectified)
+        rig = left.rig(right, is_rectified(roles.left))
         if rig is not None:
             return rig
         right_from_left = tree.fixed_between(right.frame, left.frame) if left.frame != right.frame else None
         if right_from_left is not None:
-            if is_rectified:
+            if is_rectified(roles.left):
                 return StereoRig.rectified(left.camera(True), float(np.linalg.norm(right_from_left.translation)))
             return StereoRig(left.camera(False), right.camera(False), right_from_left)
     camera, baseline = _camera_beside(bag)
@@ -249,7 +247,7 @@ def _depth_camera(bag: Bag, roles: Roles, camera: Camera, frame: str, tree: Fram
             bag.notes.append(
                 f"{bag.path}: no fixed transform from that of {roles.depth} to the camera of the pictures: taken for the same place"
             )
-    return info.camera("rect" in (roles.depth or "")), cam_from_depth
+    return info.camera(is_rectified(roles.depth or "")), cam_from_depth
 
 
 def _camera_beside(bag: Bag) -> tuple[Camera | None, float | None]:

@@ -18,6 +18,7 @@ from topoloc.sequences.bags.message_file import CutShortError
 
 WHOLE_FILE = -1
 MAX_CHUNK_BYTES = 1 << 29
+_BEGINNING = 1 << 17
 _KEPT_BYTES = 1 << 26  # of unpacked chunks; pictures of a pair lie in neighbouring ones
 
 
@@ -44,6 +45,7 @@ class ChunkedBytes:
     size: int = 0
     _descriptor: int = -1
     _unpacked: OrderedDict[int, bytes] = field(default_factory=OrderedDict, repr=False)
+    _num_kept: int = 0
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     def __post_init__(self) -> None:
@@ -74,7 +76,7 @@ class ChunkedBytes:
         if offset < 0 or length < 0 or offset + length > self.end_of(chunk):
             raise CutShortError
         if chunk != WHOLE_FILE and self.chunks[chunk].is_packed:
-            return self._unpack(chunk)[offset : offset + length]
+            return self._unpack(chunk, offset + length)[offset : offset + length]
         start = 0 if chunk == WHOLE_FILE else self.chunks[chunk].start
         try:
             data = os.pread(self._descriptor, length, start + offset)
@@ -84,21 +86,32 @@ class ChunkedBytes:
             raise CutShortError
         return data
 
-    def _unpack(self, chunk: int) -> bytes:
+    def _unpack(self, chunk: int, end: int) -> bytes:
+        """At least the first `end` bytes of a chunk. Where few are needed, as for a message's time, the others stay packed."""
         with self._lock:
-            if chunk in self._unpacked:
-                self._unpacked.move_to_end(chunk)
-                return self._unpacked[chunk]
-            its = self.chunks[chunk]
-            if its.num_bytes > MAX_CHUNK_BYTES:
-                raise CutShortError
-            content = _unpacked(self.read(WHOLE_FILE, its.start, its.num_packed), its.compression, its.num_bytes)
-            if len(content) != its.num_bytes:
-                raise CutShortError
+            content = self._unpacked.pop(chunk, b"")
+            self._num_kept -= len(content)
+            if len(content) < end <= _BEGINNING:
+                content = self._beginning(self.chunks[chunk])
+            if len(content) < end:
+                content = self._whole(self.chunks[chunk])
             self._unpacked[chunk] = content
-            while len(self._unpacked) > 1 and sum(map(len, self._unpacked.values())) > _KEPT_BYTES:
-                self._unpacked.popitem(last=False)
+            self._num_kept += len(content)
+            while len(self._unpacked) > 1 and self._num_kept > _KEPT_BYTES:
+                self._num_kept -= len(self._unpacked.popitem(last=False)[1])
             return content
+
+    def _beginning(self, its: Chunk) -> bytes:
+        packed = self.read(WHOLE_FILE, its.start, min(its.num_packed, 2 * _BEGINNING))
+        return _unpacked(packed, its.compression, min(its.num_bytes, _BEGINNING))
+
+    def _whole(self, its: Chunk) -> bytes:
+        if its.num_bytes > MAX_CHUNK_BYTES:
+            raise CutShortError
+        content = _unpacked(self.read(WHOLE_FILE, its.start, its.num_packed), its.compression, its.num_bytes)
+        if len(content) != its.num_bytes:
+            raise CutShortError
+        return content
 
 
 def _unpacked(packed: bytes, compression: str, num_bytes: int) -> bytes:

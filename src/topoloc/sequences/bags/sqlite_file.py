@@ -38,7 +38,8 @@ class SqliteFile:
                 self._database.execute("PRAGMA writable_schema = ON")
             rows = self._database.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
         except _BROKEN as error:
-            raise RecordingError(f"{self.path}: not a ROS 2 bag, or damaged at its beginning ({error})") from None
+            why = " ".join(str(error).split())[:120]
+            raise RecordingError(f"{self.path}: not a ROS 2 bag, or damaged at its beginning ({why})") from None
         for number, name, kind, encoding in rows:
             if isinstance(number, int) and all(isinstance(text, str) for text in (name, kind, encoding)):
                 self.topics.setdefault(name, Topic(name, kind, encoding))
@@ -50,10 +51,10 @@ class SqliteFile:
         for number in self._numbers[topic]:
             try:
                 for row, t_ns in self._database.execute("SELECT id, timestamp FROM messages WHERE topic_id = ?", (number,)):
-                    if isinstance(t_ns, int):
+                    if isinstance(row, int) and isinstance(t_ns, int):
                         refs.append(MessageRef(t_ns, _ROW, row))
             except _BROKEN as error:
-                self.fault = self.fault or f"damaged ({error})"
+                self.fault = self.fault or f"damaged ({' '.join(str(error).split())[:120]})"
         refs.sort()
         while self.fault and refs and not self._is_whole(refs[-1]):
             refs.pop()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -30,7 +31,7 @@ _TRANSPORTS = ("/compressedDepth", "/compressed")
 
 @dataclass(frozen=True)
 class Roles:
-    """The topic of each role, where there is one. `poses` are tried in order and may be `tf`; `pose_frame` is the frame that they are of."""
+    """The topic of each role, where there is one. `poses` are tried in order, and may be `tf`; `pose_frame` is the frame they are of."""
 
     left: str = ""
     right: str | None = None
@@ -121,7 +122,7 @@ def _guessed_pictures(bag: Bag, said: Mapping[str, str]) -> Roles:
 def _rank(bag: Bag, name: str) -> tuple[bool, bool, bool, bool, int, str]:
     """Sorts the better topic first: rectified, calibrated, of a colour camera, not compressed."""
     is_compressed = bag.topics[name].type in COMPRESSED
-    return ("rect" not in name, _calibration_of(bag, name) is None, not _has(name, _COLOUR), is_compressed, len(name), name)
+    return (not is_rectified(name), _calibration_of(bag, name) is None, not _has(name, _COLOUR), is_compressed, len(name), name)
 
 
 def _right_of(bag: Bag, left: str) -> str | None:
@@ -152,6 +153,11 @@ def _guessed_poses(bag: Bag) -> tuple[str, ...]:
     odometry = [name for name in poses if bag.topics[name].type == "nav_msgs/msg/Odometry"]
     has_tf = any(topic.type in TRANSFORMS and "static" not in name for name, topic in bag.topics.items())
     return tuple(dict.fromkeys([*truth, *([TF] if has_tf else []), *odometry, *poses]))
+
+
+def is_rectified(topic: str) -> bool:
+    """Whether the name of a topic says that its pictures are rectified (image_rect, but not direct)."""
+    return re.search(r"(?<![a-z])rect", topic.lower()) is not None
 
 
 def is_registered(depth: str) -> bool:
