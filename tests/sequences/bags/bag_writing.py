@@ -66,7 +66,7 @@ def bag_writer(path: Path, kind: str) -> Iterator[Write]:
         writer = Ros2Writer(path, version=9, storage_plugin=plugin)
     with writer:
 
-        def write(topic: str, type_name: str, t_ns: int, fields: dict[str, Any]) -> None:
+        def write(topic: str, type_name: str, t_ns: int, fields: dict[str, Any], /) -> None:
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, type_name, typestore=store)
             made = message(store, type_name, fields)
@@ -84,7 +84,7 @@ def _mcap_writer(path: Path) -> Iterator[Write]:
         writer.start(profile="ros2")
         channels: dict[str, int] = {}
 
-        def write(topic: str, type_name: str, t_ns: int, fields: dict[str, Any]) -> None:
+        def write(topic: str, type_name: str, t_ns: int, fields: dict[str, Any], /) -> None:
             if topic not in channels:
                 text = ROS2.generate_msgdef(type_name, ros_version=2)[0].encode()
                 channels[topic] = writer.register_channel(topic, "cdr", writer.register_schema(type_name, "ros2msg", text))

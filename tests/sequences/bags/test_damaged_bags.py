@@ -70,6 +70,16 @@ def test_a_folder_packed_as_a_whole(tmp_path: Path):
         open_sequence(tmp_path)
 
 
+def test_a_topic_whose_name_is_damaged_is_not_shown(file_of: FileOf):
+    path = file_of("ros1")
+    path.write_bytes(
+        path.read_bytes().replace(b"/left/image_rect", b"/left/imag\n\x07rect").replace(b"/right/image_rect", b"/right/imag\n\x07rect")
+    )
+    with pytest.raises(RecordingError, match=r"no topic of pictures; there are /left/camera_info \(sensor_msgs") as failure:
+        open_sequence(path)
+    assert str(failure.value).isprintable()
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_changed_bytes_raise_errors_of_this_house_alone(kind: str, file_of: FileOf, tmp_path: Path):
     """Bytes changed where structure is: within what is no picture, and lengths most of all."""

@@ -29,7 +29,8 @@ class Bag:
     def __post_init__(self) -> None:
         for file in self.files:
             for name, topic in file.topics.items():
-                self.topics.setdefault(name, topic)
+                if f"{name}{topic.type}{topic.encoding}".isprintable():  # else damaged
+                    self.topics.setdefault(name, topic)
 
     def messages(self, topic: str) -> list[MessageRef]:
         """The messages of a topic in all files, in the order in which they were written."""

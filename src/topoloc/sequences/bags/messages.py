@@ -107,7 +107,12 @@ def stamp_ns(stamp: Any) -> int:
 
 def frame_id(message: Any) -> str:
     """The frame that a message is in."""
-    return str(message.header.frame_id if hasattr(message, "header") else message.frame_id).lstrip("/")
+    return _frame_name(message.header.frame_id if hasattr(message, "header") else message.frame_id)
+
+
+def _frame_name(text: Any) -> str:
+    """Without the slash of older ROS, and without what a line cannot show."""
+    return "".join(letter for letter in str(text) if letter.isprintable()).lstrip("/")
 
 
 def bytes_of(message: Any) -> bytes:
@@ -130,8 +135,8 @@ def transforms_of(topic: Topic, data: bytes) -> list[TimedTransform]:
 
 def _transform(part: Any) -> TimedTransform:
     stamp = stamp_ns(part.header.stamp if hasattr(part, "header") else part.timestamp)
-    parent = part.parent_frame_id.lstrip("/") if hasattr(part, "parent_frame_id") else frame_id(part)
-    child = str(getattr(part, "child_frame_id", "")).lstrip("/")
+    parent = _frame_name(part.parent_frame_id) if hasattr(part, "parent_frame_id") else frame_id(part)
+    child = _frame_name(getattr(part, "child_frame_id", ""))
     inner = getattr(part, "transform", None) or getattr(part, "pose", part)
     inner = getattr(inner, "pose", inner)  # with covariance
     position = inner.position if hasattr(inner, "position") else inner.translation
