@@ -11,14 +11,24 @@ import tyro
 
 from topoloc.cli.features_option import BUILD_FEATURES, kinds_to_build
 from topoloc.cli.info import describe_map
-from topoloc.cli.output import CameraOption, File, Flag, Format, UsageError, check_outputs, progress_bar, write_json
+from topoloc.cli.output import (
+    CameraOption,
+    File,
+    Flag,
+    Format,
+    Topics,
+    UsageError,
+    check_outputs,
+    open_recording,
+    progress_bar,
+    write_json,
+)
 from topoloc.cli.settings_file import read_settings, with_option
 from topoloc.geometry.pose_conventions import PoseReading
 from topoloc.localization.map_facts.building import Trust, build_map
 from topoloc.map.build import BuildConfig
 from topoloc.sequences.colmap import aligned
 from topoloc.sequences.frame import StereoSequence
-from topoloc.sequences.open import open_sequence
 from topoloc.sequences.recording import has_scale, scaled
 from topoloc.sequences.trajectory import as_read, with_trajectory
 from topoloc.slam.slam import SlamConfig, posed_by_slam
@@ -46,13 +56,15 @@ class Command:
     allow_gaps: Flag = False
     """Map a recording of whose frames fewer than half have a pose."""
     format: Format = None
-    """The recordings' format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap, video or folder."""
+    """The recordings' format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap, rosbag, mcap, zed, video or folder."""
     camera: CameraOption = None
-    """Calibration of the recordings instead of their own: a camera.json, YAML of OpenCV or Kalibr, or `fx,fy,cx,cy` in pixels."""
+    """Calibration of the recordings instead of their own: camera.json, OpenCV's or Kalibr's YAML, SN*.conf, or `fx,fy,cx,cy`."""
     images: Annotated[str | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="(default: images/ beside the model)")] = None
     """Pictures of a COLMAP model, where SEQ is one."""
     scale: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="")] = None
     """A unit of the recordings' own poses, in metres: of models made of pictures alone, which know no metre."""
+    topics: Topics = None
+    """Of a bag, which topic is what: left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom."""
     d_thresh: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="(default: by what is seen)")] = None
     """Metres between nodes (D_thresh of the paper's Eq. 1)."""
     lambda_rot: Annotated[
@@ -108,7 +120,7 @@ class Command:
 
     def _open(self, recordings: list[str]) -> tuple[list[StereoSequence], list[str]]:
         """The recordings with their poses, and where those of each come from; with `slam` they are still to be found."""
-        sequences = [open_sequence(path, self.format, self.camera, self.images) for path in recordings]
+        sequences = [open_recording(path, self.format, self.camera, self.topics, self.images) for path in recordings]
         trajectories = self.trajectory or ("truth" if all(any(sequence.poses) for sequence in sequences) else "slam",)
         if len(trajectories) == 1:
             trajectories *= len(recordings)

@@ -16,8 +16,10 @@ from topoloc.cli.output import (
     CameraOption,
     File,
     Format,
+    Topics,
     UsageError,
     check_outputs,
+    open_recording,
     print_facts,
     print_recordings,
     progress_bar,
@@ -33,7 +35,6 @@ from topoloc.localization.localizer import LocalizerConfig
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.json_file import read_json
-from topoloc.sequences.open import open_sequence
 
 
 @dataclass(frozen=True)
@@ -55,9 +56,11 @@ class Command:
     features: ASKED_FEATURES = None
     """Which of the map's features are asked; of several, the next where the one before leaves the pose unclear."""
     format: Format = None
-    """The recordings' format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap, video or folder."""
+    """The recordings' format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap, rosbag, mcap, zed, video or folder."""
     camera: CameraOption = None
-    """Calibration of the recordings instead of their own: a camera.json, YAML of OpenCV or Kalibr, or `fx,fy,cx,cy` in pixels."""
+    """Calibration of the recordings instead of their own: camera.json, OpenCV's or Kalibr's YAML, SN*.conf, or `fx,fy,cx,cy`."""
+    topics: Topics = None
+    """Of a bag, which topic is what: left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom."""
     json: File = None
     """Write the evaluation as JSON to this file (- for standard output)."""
     report: File = None
@@ -74,8 +77,8 @@ class Command:
         topomap = TopoMetricMap.load(self.map)
         info = describe_map(topomap, Path(self.map))
         map_from_truth = _read_rigid(Path(self.map_from_truth)) if self.map_from_truth else None
-        sequences = [open_sequence(path, self.format, self.camera) for path in self.sequences]
-        others = [open_sequence(path, self.format, self.camera) for path in self.elsewhere]
+        sequences = [open_recording(path, self.format, self.camera, self.topics) for path in self.sequences]
+        others = [open_recording(path, self.format, self.camera, self.topics) for path in self.elsewhere]
         localizer = localizer_of(topomap, config, self.features)
         labels = _labels([*self.sequences, *self.elsewhere], [*sequences, *others])
         answers: list[Answer] = []

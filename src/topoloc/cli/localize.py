@@ -12,7 +12,18 @@ from typing import Annotated
 import tyro
 
 from topoloc.cli.features_option import ASKED_FEATURES, localizer_of
-from topoloc.cli.output import File, Flag, Format, UsageError, check_outputs, interruptible, progress_bar, write_text
+from topoloc.cli.output import (
+    File,
+    Flag,
+    Format,
+    Topics,
+    UsageError,
+    check_outputs,
+    interruptible,
+    open_recording,
+    progress_bar,
+    write_text,
+)
 from topoloc.cli.query_answers import QueryAnswer, answer_line, exit_status, stream_summary, trajectory_of
 from topoloc.cli.settings_file import read_settings, with_option
 from topoloc.errors import CalibrationError, QueryError, TopolocError, UnreadableImageError
@@ -24,7 +35,7 @@ from topoloc.localization.result import NotLocalized
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.calibration import calibration_of
 from topoloc.sequences.frame import StereoFrame, StereoSequence
-from topoloc.sequences.open import find_format, open_sequence
+from topoloc.sequences.open import find_format
 from topoloc.sequences.recording import single_pictures
 from topoloc.sequences.trajectory import frame_poses, read_trajectory, write_tum
 from topoloc.tracking.tracker import Tracker, TrackerConfig
@@ -73,7 +84,9 @@ class Command:
     """Calibration of the queries: a camera.json, YAML of OpenCV or Kalibr, `fx,fy,cx,cy` in pixels, `map` for that of the map, `unknown`
     to find the focal length."""
     format: Format = None
-    """The recordings' format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap, video or folder."""
+    """The recordings' format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap, rosbag, mcap, zed, video or folder."""
+    topics: Topics = None
+    """Of a bag, which topic is what: left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom."""
     coarse: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")] = None
     """Coarse localizer that is asked; `topoloc info` names those of the map."""
     features: ASKED_FEATURES = None
@@ -98,7 +111,7 @@ class Command:
         config = with_option(config, "max_ms", self.max_ms, "--max-ms")
         tracking = self._tracking(settings.of(TrackerConfig))
         topomap = TopoMetricMap.load(self.map)
-        camera = None if self.camera is None else _camera_of_size(self.camera, topomap)
+        camera = None if self.camera is None or self._stereo_calibration else _camera_of_size(self.camera, topomap)
         queries = [self._open(path) for path in self.inputs]
         localizer = localizer_of(topomap, config, self.features)
         answers: list[QueryAnswer] = []
@@ -131,7 +144,7 @@ class Command:
     def _open(self, path: str) -> _Query:
         """Recordings and videos are streams; pictures, and folders of them, are single unless they are said not to be."""
         is_stream = self.streams.stream or (not self.streams.single and find_format(path, self.format) != "folder")
-        sequence = single_pictures(open_sequence(path, self.format))
+        sequence = single_pictures(open_recording(path, self.format, self._stereo_calibration, self.topics))
         is_stream = is_stream and len(sequence) > 1
         odometry = None
         if self.streams.odometry is not None:
@@ -139,6 +152,11 @@ class Command:
                 raise UsageError(f"--odometry is for streams, and {path} is none; --stream makes it one")
             odometry = frame_poses(read_trajectory(Path(self.streams.odometry)), sequence.t_ns, Path(self.streams.odometry))
         return _Query(path, sequence, is_stream, odometry or [None] * len(sequence))
+
+    @property
+    def _stereo_calibration(self) -> str | None:
+        """`--camera` where it is a pair's, which its recording is opened with."""
+        return self.camera if self.camera is not None and self.camera.endswith(".conf") else None
 
     def _tracking(self, config: TrackerConfig) -> TrackerConfig:
         config = with_option(config, "max_jump", self.streams.max_jump, "--max-jump")

@@ -14,6 +14,9 @@ import tyro
 
 from topoloc.errors import MissingExtraError, TopolocError
 from topoloc.sequences.atomic import remove_leftovers, write_text
+from topoloc.sequences.frame import StereoSequence
+from topoloc.sequences.open import open_sequence
+from topoloc.sequences.recording import notes_of
 
 # Given or not: no `--no-...`, and no "(default: False)" in the help.
 Flag = Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(help_behavior_hint="")]
@@ -23,7 +26,19 @@ File = Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint=""
 Format = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: recognised)")]
 # The calibration of the recordings.
 CameraOption = Annotated[str | None, tyro.conf.arg(metavar="FILE|fx,fy,cx,cy", help_behavior_hint="(default: that of the recording)")]
+# Which topic of a bag is what.
+Topics = Annotated[str | None, tyro.conf.arg(metavar="ROLE=TOPIC,...", help_behavior_hint="(default: guessed)")]
 _COLUMNS = ("recording", "localized", "median error", "in 5 cm, 5 deg", "in 25 cm, 2 deg", "false accepts", "ms")
+
+
+def open_recording(
+    path: str, format: str | None, camera: str | None = None, topics: str | None = None, images: str | None = None
+) -> StereoSequence:
+    """`open_sequence`; what is to be known of the recording is said in a line each on stderr. Raises as that does."""
+    sequence = open_sequence(path, format, camera, images, topics)
+    for note in notes_of(sequence):
+        print(f"warning: {note}", file=sys.stderr)
+    return sequence
 
 
 class UsageError(TopolocError):

@@ -11,12 +11,11 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from topoloc.cli.output import CameraOption, File, Format, check_outputs, print_facts, progress_bar, write_json
+from topoloc.cli.output import CameraOption, File, Format, Topics, check_outputs, open_recording, print_facts, progress_bar, write_json
 from topoloc.cli.settings_file import read_settings
 from topoloc.geometry.alignment import absolute_trajectory_errors, relative_drift
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.frame import StereoSequence
-from topoloc.sequences.open import open_sequence
 from topoloc.sequences.trajectory import Trajectory, write_tum
 from topoloc.slam.slam import SlamConfig, SlamResult, run_slam
 
@@ -30,9 +29,11 @@ class Command:
     out: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="OUT.tum")]
     """The trajectory to write: t tx ty tz qx qy qz qw, world_from_cam; the world is the camera of the first frame."""
     format: Format = None
-    """The recording's format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap, video or folder."""
+    """The recording's format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap, rosbag, mcap, zed, video or folder."""
     camera: CameraOption = None
-    """Calibration of the recording instead of its own: a camera.json, YAML of OpenCV or Kalibr, or `fx,fy,cx,cy` in pixels."""
+    """Calibration of the recording instead of its own: camera.json, OpenCV's or Kalibr's YAML, SN*.conf, or `fx,fy,cx,cy`."""
+    topics: Topics = None
+    """Of a bag, which topic is what: left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom."""
     json: File = None
     """Write what is printed to this file, too (- for standard output)."""
     config: File = None
@@ -41,7 +42,7 @@ class Command:
     def run(self) -> int:
         check_outputs([self.out, self.json], inputs=[self.config] if self.config else [])
         config = read_settings(self.config).of(SlamConfig)
-        sequence = open_sequence(self.sequence, self.format, self.camera)
+        sequence = open_recording(self.sequence, self.format, self.camera, self.topics)
         start = time.perf_counter()
         with progress_bar() as progress:
             result = run_slam(sequence, config, progress)

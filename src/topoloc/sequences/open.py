@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from topoloc.errors import RecordingError, UnknownFormatError
-from topoloc.sequences import colmap, euroc, folder, kitti, nerfstudio, record3d, seven_scenes, tum, video
-from topoloc.sequences.calibration import CalibrationOfSize, calibration_of, recalibrated
+from topoloc.sequences import colmap, euroc, folder, kitti, nerfstudio, record3d, seven_scenes, tum, video, zed
+from topoloc.sequences.bags import bag_recording
+from topoloc.sequences.calibration import calibration_of, recalibrated
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.recording import parse_selection, sequence_subset
 
@@ -19,29 +20,35 @@ class SequenceFormat:
 
     looks_for: str
     recognises: Callable[[Path], bool]
-    open: Callable[[Path], StereoSequence]
-    open_with: Callable[[Path, CalibrationOfSize], StereoSequence] | None = None
-    """Of formats that may bring no calibration; the others' is replaced once they are open."""
-    open_images: Callable[[Path, Path], StereoSequence] | None = None
-    """Of formats whose pictures may lie elsewhere."""
+    open: Callable[..., StereoSequence]
+    takes: tuple[str, ...] = ()
+    """Keywords that go to `open`: the `topics` of a bag, the folder of a model's `images`, a `calibration` where the format may bring none
+    (where it brings one, that is replaced once the recording is open), or the file of one as it is (`calibration_file`)."""
 
 
 # In the order in which they are asked; the plain folder takes what is left.
 FORMATS = {
     "euroc": SequenceFormat(euroc.LOOKS_FOR, euroc.recognises, euroc.open_euroc),
-    "tum": SequenceFormat(tum.LOOKS_FOR, tum.recognises, tum.open_tum, tum.open_tum),
+    "tum": SequenceFormat(tum.LOOKS_FOR, tum.recognises, tum.open_tum, ("calibration",)),
     "seven_scenes": SequenceFormat(seven_scenes.LOOKS_FOR, seven_scenes.recognises, seven_scenes.open_seven_scenes),
     "nerfstudio": SequenceFormat(nerfstudio.LOOKS_FOR, nerfstudio.recognises, nerfstudio.open_nerfstudio),
     "record3d": SequenceFormat(record3d.LOOKS_FOR, record3d.recognises, record3d.open_record3d),
-    "colmap": SequenceFormat(colmap.LOOKS_FOR, colmap.recognises, colmap.open_colmap, open_images=colmap.open_colmap),
+    "colmap": SequenceFormat(colmap.LOOKS_FOR, colmap.recognises, colmap.open_colmap, ("images",)),
     "kitti": SequenceFormat(kitti.LOOKS_FOR, kitti.recognises, kitti.open_kitti),
+    "rosbag": SequenceFormat(bag_recording.LOOKS_FOR, bag_recording.recognises, bag_recording.open_bag, ("topics",)),
+    "mcap": SequenceFormat(bag_recording.LOOKS_FOR_MCAP, bag_recording.recognises_mcap, bag_recording.open_bag, ("topics",)),
+    "zed": SequenceFormat(zed.LOOKS_FOR, zed.recognises, zed.open_zed, ("calibration_file",)),
     "video": SequenceFormat(video.LOOKS_FOR, video.recognises, video.open_video),
-    "folder": SequenceFormat(folder.LOOKS_FOR, folder.recognises, folder.open_folder, folder.open_folder),
+    "folder": SequenceFormat(folder.LOOKS_FOR, folder.recognises, folder.open_folder, ("calibration",)),
 }
 
 
 def open_sequence(
-    path: str | Path, format: str | None = None, camera: str | Path | None = None, images: str | Path | None = None
+    path: str | Path,
+    format: str | None = None,
+    camera: str | Path | None = None,
+    images: str | Path | None = None,
+    topics: str | Mapping[str, str] | None = None,
 ) -> StereoSequence:
     """Open a recording, or some frames of it. Pictures are read frame by frame, when asked for.
 
@@ -49,16 +56,21 @@ def open_sequence(
         path: a folder, a video, or one picture file. A part is chosen by a suffix: ``PATH@START:STOP:STEP`` as Python slices,
             several of them by commas (``@0:10,50:60``); ``PATH@0-59/100`` are the frames whose number modulo 100 is 0 to 59.
         format: one of `FORMATS`; recognised where None.
-        camera: the calibration instead of the recording's: a camera.json, YAML of OpenCV or Kalibr, or ``"fx,fy,cx,cy"`` in pixels.
+        camera: the calibration instead of the recording's: a camera.json, YAML of OpenCV or Kalibr, Stereolabs' ``SN*.conf``, or
+            ``"fx,fy,cx,cy"`` in pixels.
         images: the folder of the pictures that a model of COLMAP names, where it is not `images` beside the model.
+        topics: of bags, which topic is what: ``left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom``, or a dictionary of these.
 
     Raises:
         UnknownFormatError: `format` is none of these, or no format recognises the folder.
-        RecordingError: nothing is there, nothing is chosen, or the recording is broken; CalibrationError is one of these.
+        RecordingError: nothing is there, the format takes no `topics` or `calibration`, nothing is chosen, or the recording is
+            broken; CalibrationError is one of these.
         TrajectoryError: the recording's truth is malformed or fits no frame.
     """
     folder, selection = _split_selection(str(path))
-    sequence = _open_whole(folder, FORMATS[find_format(path, format)], camera, images)
+    is_side_by_side = format is None and str(camera).endswith(".conf") and video.recognises(folder)
+    name = "zed" if is_side_by_side else find_format(path, format)
+    sequence = _open_whole(folder, name, camera, {"images": images and Path(images), "topics": topics})
     if selection is None:
         return sequence
     indices = parse_selection(selection, len(sequence))
@@ -67,14 +79,17 @@ def open_sequence(
     return sequence_subset(sequence, indices)
 
 
-def _open_whole(folder: Path, of: SequenceFormat, camera: str | Path | None, images: str | Path | None) -> StereoSequence:
-    if images is not None and of.open_images is None:
-        raise RecordingError(f"{folder}: a folder of images goes with a model of COLMAP, and this is none")
-    calibration = None if camera is None else calibration_of(camera)
-    if calibration is not None and of.open_with is not None:
-        return of.open_with(folder, calibration)
-    sequence = of.open_images(folder, Path(images)) if images is not None and of.open_images is not None else of.open(folder)
-    return sequence if calibration is None else recalibrated(sequence, calibration)
+def _open_whole(folder: Path, name: str, camera: str | Path | None, options: Mapping[str, object]) -> StereoSequence:
+    of, given = FORMATS[name], {key: value for key, value in options.items() if value is not None}
+    if unused := [key for key in given if key not in of.takes]:
+        raise RecordingError(f"{folder}: a recording of format {name} takes no {unused[0]}")
+    if camera is None:
+        return of.open(folder, **given)
+    if "calibration_file" in of.takes:
+        return of.open(folder, calibration=camera, **given)
+    if "calibration" in of.takes:
+        return of.open(folder, calibration=calibration_of(camera), **given)
+    return recalibrated(of.open(folder, **given), calibration_of(camera))
 
 
 def find_format(path: str | Path, format: str | None = None) -> str:

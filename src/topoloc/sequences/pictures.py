@@ -14,6 +14,7 @@ import warnings
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +50,19 @@ _TURNED = (5, 6, 7, 8)  # EXIF orientations that lay a picture on its side
 _DAMAGED = (OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, OverflowError, EOFError, struct.error, zlib.error)
 
 
-def read_image(path: Path) -> Image:
+@dataclass(frozen=True)
+class PictureBytes:
+    """An encoded picture that is no file of its own, such as a message's; `name` is what errors call it."""
+
+    name: str
+    data: bytes
+    suffix: str = ""
+
+    def __str__(self) -> str:
+        return self.name
+
+
+def read_image(path: Path | PictureBytes) -> Image:
     """A picture as grey (H, W) or RGB (H, W, 3), uint8; alpha is dropped, 16 bits are scaled down to 8.
 
     Raises:
@@ -70,7 +83,7 @@ def grey_image(image: Image) -> UInt8[np.ndarray, "h w"]:
     return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
 
 
-def read_depth(path: Path, units_per_metre: float) -> Float32[np.ndarray, "h w"]:
+def read_depth(path: Path | PictureBytes, units_per_metre: float) -> Float32[np.ndarray, "h w"]:
     """A 16-bit depth picture in metres; NaN where unknown (0 and 65535 in the file).
 
     Raises:
@@ -133,8 +146,10 @@ def _number(value: Any) -> float:
     return number if math.isfinite(number) else 0.0
 
 
-def _read_bytes(path: Path) -> bytes:
+def _read_bytes(path: Path | PictureBytes) -> bytes:
     try:
+        if isinstance(path, PictureBytes):
+            return path.data
         if not stat.S_ISREG(path.stat().st_mode) and not path.is_dir():  # a FIFO would be waited for
             raise UnreadableImageError(f"{path}: not a file")
         data = path.read_bytes()
@@ -150,7 +165,7 @@ def _read_bytes(path: Path) -> bytes:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[ImageFile.ImageFile]:
+def _opened(path: Path | PictureBytes) -> Iterator[ImageFile.ImageFile]:
     """The picture with its header read. What the body raises of a damaged file comes as UnreadableImageError, too."""
     data = _read_bytes(path)
     try:
@@ -176,7 +191,7 @@ def _opened(path: Path) -> Iterator[ImageFile.ImageFile]:
 
 
 @contextmanager
-def _decoded(path: Path) -> Iterator[Pillow.Image]:
+def _decoded(path: Path | PictureBytes) -> Iterator[Pillow.Image]:
     with _opened(path) as picture:
         picture.load()
         if picture.mode == "P" or picture.getexif().get(ExifTags.Base.Orientation, 1) != 1:
@@ -186,7 +201,7 @@ def _decoded(path: Path) -> Iterator[Pillow.Image]:
             yield picture
 
 
-def _known_types(path: Path) -> tuple[str, ...]:
+def _known_types(path: Path | PictureBytes) -> tuple[str, ...]:
     """What is tried; HEIF only where the name says so, for its decoder is an extra."""
     if path.suffix.lower() not in (".heic", ".heif"):
         return _TYPES

@@ -6,6 +6,9 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
 
 from topoloc.errors import RecordingError, UnreadableImageError
 from topoloc.geometry.camera import Camera
@@ -66,6 +69,10 @@ class Recording:
     def __len__(self) -> int:
         return len(self.names)
 
+    def single(self) -> Recording:
+        """The same recording without its right and depth pictures."""
+        return replace(self, right=None, depth=None)
+
     def __getitem__(self, index: int) -> StereoFrame:
         """Read one frame.
 
@@ -85,6 +92,15 @@ class Recording:
         if self.depth is not None:
             return replace(frame, depth=_depth_image(self.depth, index, camera))
         return frame
+
+
+@runtime_checkable
+class _Paired(Protocol):
+    """A sequence that may have right or depth pictures."""
+
+    def single(self) -> StereoSequence:
+        """The same recording without them."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,11 +151,14 @@ def scaled(sequence: StereoSequence, metres: float) -> StereoSequence:
 
 def single_pictures(sequence: StereoSequence) -> StereoSequence:
     """The same recording without its right and depth pictures, which are then not read either."""
-    if isinstance(sequence, Recording):
-        return replace(sequence, right=None, depth=None)
     if isinstance(sequence, SequenceView):
         return replace(sequence, base=single_pictures(sequence.base))
-    return sequence
+    return sequence.single() if isinstance(sequence, _Paired) else sequence
+
+
+def notes_of(sequence: StereoSequence) -> list[str]:
+    """What a user should know of a recording that could be opened all the same: what was cut off, what was guessed."""
+    return notes_of(sequence.base) if isinstance(sequence, SequenceView) else list(getattr(sequence, "notes", ()))
 
 
 def sequence_subset(sequence: StereoSequence, indices: Sequence[int]) -> StereoSequence:
@@ -212,6 +231,14 @@ def check_pairs(left: Sequence[Path], right: Sequence[Path]) -> None:
     for path, other in zip(left, right, strict=True):
         if re.findall(r"\d+", path.stem)[-1:] != re.findall(r"\d+", other.stem)[-1:]:
             raise RecordingError(f"{path}: its partner in {other.parent.name} is missing (the next there is {other.name})")
+
+
+def nearest_rows(times: np.ndarray, others: np.ndarray) -> list[int]:
+    """The row of the nearest of `others` (increasing) for each time."""
+    after = np.clip(np.searchsorted(others, times), 1, max(len(others) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(others) - 1)
+    return [int(row) for row in np.where(times - others[before] <= others[after] - times, before, after)]
 
 
 def times_by_rate(num_frames: int, rate_hz: int = DEFAULT_RATE_HZ) -> list[int]:

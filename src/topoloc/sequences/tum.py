@@ -16,7 +16,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.calibration import CalibrationOfSize, size_of_first
 from topoloc.sequences.camera_json import FILE_NAME, CameraFile, read_camera_json
-from topoloc.sequences.recording import DepthPictures, Recording
+from topoloc.sequences.recording import DepthPictures, Recording, nearest_rows
 from topoloc.sequences.text_rows import read_file_list
 from topoloc.sequences.trajectory import read_truth
 
@@ -49,7 +49,7 @@ def open_tum(path: Path, calibration: CalibrationOfSize | None = None) -> Record
     colour_times, colour = read_file_list(path / "rgb.txt", RecordingError)
     camera_file = calibration(*size_of_first([path / name for name in colour])) if calibration else _calibration(path)
     depth_times, depth = read_file_list(path / "depth.txt", RecordingError)
-    nearest = _nearest(np.array(colour_times), np.array(depth_times))
+    nearest = nearest_rows(np.array(colour_times), np.array(depth_times))
     kept = [row for row, other in enumerate(nearest) if abs(colour_times[row] - depth_times[other]) <= MAX_DEPTH_DELAY * 1e9]
     if not kept:
         raise RecordingError(f"{path}: none of {len(colour)} colour pictures has one of {len(depth)} depth pictures within 20 ms")
@@ -71,11 +71,3 @@ def _calibration(path: Path) -> CameraFile:
     if number is None:
         raise CalibrationError(f"{path / FILE_NAME}: no calibration here, and the folder's name does not say freiburg1, 2 or 3")
     return CameraFile(_FREIBURG[number[1]])
-
-
-def _nearest(times: np.ndarray, others: np.ndarray) -> list[int]:
-    """The row of the nearest of `others` (increasing) for each time."""
-    after = np.clip(np.searchsorted(others, times), 1, max(len(others) - 1, 1))
-    before = after - 1
-    after = np.minimum(after, len(others) - 1)
-    return [int(row) for row in np.where(times - others[before] <= others[after] - times, before, after)]

@@ -11,7 +11,7 @@ import os
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -103,21 +103,30 @@ def open_video(path: Path) -> Video:
         CalibrationError: camera.json is not usable, or is of another size than the frames.
         TrajectoryError: the truth is malformed or fits no frame.
     """
+    video = uncalibrated_video(path)
+    if not (path.parent / FILE_NAME).is_file():
+        return video
+    camera, (width, height) = read_camera_json(path.parent / FILE_NAME).camera, video.size
+    if (camera.width, camera.height) != video.size:
+        raise CalibrationError(f"{path.parent / FILE_NAME}: of {camera.width}x{camera.height}, but {path.name} is {width}x{height}")
+    return replace(video, camera=camera)
+
+
+def uncalibrated_video(path: Path) -> Video:
+    """The video as it is, whatever calibration lies beside it. Raises as `open_video`."""
+    size, rate = frame_size(path)
+    t_ns = _times(path, rate)
+    poses = read_truth(path.with_suffix(".tum"), [], t_ns)
+    return Video(path.name, path, [f"{index:06d}" for index in range(len(t_ns))], t_ns, poses, None, size)
+
+
+def frame_size(path: Path) -> tuple[tuple[int, int], float]:
+    """Width and height of the first frame, in pixels, and the rate that the container names. Raises RecordingError."""
     capture = _open(path)
     decoded, first = capture.read()
     if not decoded or first is None:
         raise RecordingError(f"{path}: no frame of this video can be decoded")
-    size = (first.shape[1], first.shape[0])
-    rate = capture.get(cv2.CAP_PROP_FPS)
-    capture.release()
-    t_ns = _times(path, rate)
-    camera = None
-    if (path.parent / FILE_NAME).is_file():
-        camera = read_camera_json(path.parent / FILE_NAME).camera
-        if (camera.width, camera.height) != size:
-            raise CalibrationError(f"{path.parent / FILE_NAME}: of {camera.width}x{camera.height}, but {path.name} is {size[0]}x{size[1]}")
-    poses = read_truth(path.with_suffix(".tum"), [], t_ns)
-    return Video(path.name, path, [f"{index:06d}" for index in range(len(t_ns))], t_ns, poses, camera, size)
+    return (first.shape[1], first.shape[0]), capture.get(cv2.CAP_PROP_FPS)
 
 
 def _open(path: Path) -> cv2.VideoCapture:
