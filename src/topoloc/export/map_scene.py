@@ -54,7 +54,10 @@ def scene_of_map(
 def _view(topomap: TopoMetricMap, node: TopoNode, name: str) -> View:
     s, georeference = node.summary, topomap.georeference
     geopose = None if georeference is None else georeference.geopose(s.world_from_cam)
-    return View(name, s.world_from_cam, s.t_ns, node.camera, s.session_id, jpeg=node.template_jpeg, geopose=geopose)
+    picture = _decoded(node.template_jpeg)
+    jpeg_camera = None if picture is None else node.camera.rescaled(picture.shape[1], picture.shape[0])
+    jpeg = node.template_jpeg if picture is not None else b""
+    return View(name, s.world_from_cam, s.t_ns, node.camera, s.session_id, jpeg=jpeg, jpeg_camera=jpeg_camera, geopose=geopose)
 
 
 def _names(topomap: TopoMetricMap) -> list[str]:

@@ -41,7 +41,7 @@ def align_points(points_a: Float[np.ndarray, "n 3"], points_b: Float[np.ndarray,
         if spread[1] <= max(_MIN_SPREAD, _MIN_RELATIVE_SPREAD * spread[0]):
             raise TrajectoryError(f"{len(points)} points on one line (or fewer than three) fix no rotation")
     centre_a, centre_b = points_a.mean(axis=0), points_b.mean(axis=0)
-    rotation = _nearest_rotation((points_a - centre_a).T @ (points_b - centre_b))
+    rotation = nearest_rotation((points_a - centre_a).T @ (points_b - centre_b))
     return Rigid3(rotation, centre_a - rotation @ centre_b)
 
 
@@ -76,7 +76,7 @@ def align_poses(world_a_from_cams: Sequence[Rigid3], world_b_from_cams: Sequence
         correlation += a.rotation @ b.rotation.T / (2.0 * _SIGMA_ROTATION**2)
     if not np.isfinite(correlation).all():
         raise TrajectoryError("trajectories to align hold poses that are not finite")
-    rotation = _nearest_rotation(correlation)
+    rotation = nearest_rotation(correlation)
     return Rigid3(rotation, centre_a - rotation @ centre_b)
 
 
@@ -141,7 +141,7 @@ def relative_drift(true_world_from_cams: Sequence[Rigid3], world_from_cams: Sequ
     return Drift(float(np.mean(translations)), float(np.mean(rotations))) if translations else None
 
 
-def _nearest_rotation(correlation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+def nearest_rotation(correlation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
     """The rotation R of the largest tr(R' C)."""
     u, _, vt = np.linalg.svd(correlation)
     return u * np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.errors import GeoreferenceError
+from topoloc.errors import GeoreferenceError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
 
 SEMI_MAJOR = 6_378_137.0
@@ -58,6 +58,7 @@ class GeoPoint:
         x, y, z = (float(value) for value in ecef)
         across = math.hypot(x, y)
         beta = math.atan2(SEMI_MAJOR * z, _SEMI_MINOR * across)
+        lat = 0.0
         for _ in range(5):
             up = z + _E2 / (1.0 - _E2) * _SEMI_MINOR * math.sin(beta) ** 3
             lat = math.atan2(up, across - _E2 * SEMI_MAJOR * math.cos(beta) ** 3)
@@ -116,6 +117,26 @@ class Georeference:
     enu_from_world: Rigid3
     source: str
     rms_m: float | None = None
+
+    def to_json(self) -> dict[str, object]:
+        """As the map file keeps it."""
+        origin = {"lat": self.origin.lat, "lon": self.origin.lon, "h": self.origin.h}
+        matrix = self.enu_from_world.matrix()[:3].tolist()
+        return {"origin": origin, "enu_from_world": matrix, "source": self.source, "rms_m": self.rms_m}
+
+    @staticmethod
+    def from_json(data: object) -> Georeference:
+        """The form of `to_json`. Raises GeoreferenceError where it is another."""
+        try:
+            origin, rms_m, source = data["origin"], data["rms_m"], data["source"]  # type: ignore[index]
+            lat, lon, h = (float(origin[name]) for name in ("lat", "lon", "h"))
+            enu_from_world = Rigid3.from_matrix(np.array(data["enu_from_world"], np.float64))  # type: ignore[index]
+            rms_m = None if rms_m is None else float(rms_m)
+        except (KeyError, TypeError, ValueError, OverflowError, TrajectoryError):
+            raise GeoreferenceError("no georeference: origin, enu_from_world (3x4), source and rms_m are needed") from None
+        if not isinstance(source, str) or (rms_m is not None and not 0.0 <= rms_m < math.inf):
+            raise GeoreferenceError("no georeference: its source is a text, its rms_m no negative number")
+        return Georeference(GeoPoint(lat, lon, h), enu_from_world, source, rms_m)
 
     def geopoint(self, point_world: Float[np.ndarray, "3"]) -> GeoPoint:
         """Latitude, longitude and height of a point of the world (metres). Raises GeoreferenceError where it is far from the earth."""

@@ -9,6 +9,7 @@ from typing import no_type_check
 from topoloc.geometry.geodesy import Georeference
 from topoloc.map.config import MapConfig
 from topoloc.map.entries import Edge, NodeSummary, PlaceImage, Repetitions, SharedErrors, SideNodes, TopoNode
+from topoloc.map.nodes import digest_of_nodes
 from topoloc.map.sessions import Edit, Session
 from topoloc.places.coarse import CoarseModel
 
@@ -22,6 +23,9 @@ class NextIds:
     place_image: int = 1
     side_node: int = 0
     edit: int = 1
+
+
+_MAP_ID = b"map id"
 
 
 @no_type_check  # at run time: it would read from the file to look at entries' types
@@ -70,3 +74,8 @@ class MapContents:
     def kinds(self) -> list[str]:
         """All kinds of features that the map holds, that of the nodes first."""
         return [self.kind, *sorted(self.other_kinds)]
+
+
+def map_id_of(contents: MapContents) -> str:
+    """The map's id, 16 hexadecimal digits; of one that was not saved yet, or by an older version, what its nodes make of it."""
+    return contents.map_id or digest_of_nodes(contents.summaries, _MAP_ID)

@@ -14,7 +14,7 @@ smoothed pose.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -26,7 +26,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.query import StageClock
-from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.result import Localization, NotLocalized, at_time
 from topoloc.places.coarse import Image
 from topoloc.sequences.pictures import grey_image
 from topoloc.tracking.following import Followed, FollowingConfig, PointFollower
@@ -108,13 +108,14 @@ class Tracker:
         self._advance(t_ns, may_stand_still=is_same)
         if is_same and self._answer is not None:
             last = self._answer
-            return StreamedPose(t_ns, last.state, last.result, last.smoothed, last.smoothed_covariance, is_repeated=True)
+            return StreamedPose(t_ns, last.state, at_time(last.result, t_ns), last.smoothed, last.smoothed_covariance, is_repeated=True)
         self._image = image.copy()  # who reads a camera may read into the same memory again
         if self.config.mode == "paper":
             self._answer = self._by_paper(image, camera, t_ns)
         else:
             grey, grey_camera = reduced(grey_image(image), camera, self.config.max_side_px)
             self._answer = self._by_motion(StreamPicture(image, camera, t_ns, odom_from_cam, grey, grey_camera))
+        self._answer = self._completed(self._answer, camera)
         return self._answer
 
     def miss(self, t_ns: int, result: NotLocalized, odom_from_cam: Rigid3 | None = None) -> StreamedPose:
@@ -126,10 +127,13 @@ class Tracker:
         self._advance(t_ns)
         self._image = None
         if self.config.mode == "paper":
-            return self._copied(result, t_ns)
+            return self._completed(self._copied(result, t_ns))
         self._hypotheses.predict(t_ns, odom_from_cam)
         self._keep_reference()
-        return self._decided(self._without_pose(result, t_ns))
+        return self._completed(self._decided(self._without_pose(result, t_ns)))
+
+    def _completed(self, answer: StreamedPose, camera: Camera | None = None) -> StreamedPose:
+        return replace(answer, result=self.localizer.completed(answer.result, camera, answer.t_ns))
 
     def _advance(self, t_ns: int, may_stand_still: bool = False) -> None:
         if self._t_ns is not None and (t_ns < self._t_ns or (t_ns == self._t_ns and not may_stand_still)):
@@ -279,6 +283,7 @@ class Tracker:
             num_matches=followed.num_found,
             num_inliers=followed.num_agreeing,
             times_ms=clock.times_ms(),
+            provenance=found.provenance,
         )
         return StreamedPose(picture.t_ns, "tracked", result, state.world_from_cam, smoothed_covariance(reference, state))
 
