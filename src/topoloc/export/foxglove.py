@@ -19,6 +19,7 @@ from topoloc.export.scene import Scene, View
 from topoloc.geometry.rigid import Rigid3
 
 MAP_FRAME, CAMERA_FRAME = "map", "camera"
+_CHANNELS = ("red", "green", "blue", "alpha")
 _STEP_NS = 1_000_000_000
 _MODELS = {True: "kannala_brandt", False: "rational_polynomial"}
 
@@ -107,10 +108,7 @@ def _cloud(scene: Scene, t_ns: int) -> Any:
     points = np.zeros(len(scene.points.world), [("xyz", "<f4", 3), ("rgba", "u1", 4)])
     points["xyz"], points["rgba"][:, :3], points["rgba"][:, 3] = scene.points.world, scene.points.rgb, 255
     fields = [PackedElementField(name=name, offset=4 * k, type=PackedElementField.FLOAT32) for k, name in enumerate("xyz")]
-    fields += [
-        PackedElementField(name=name, offset=12 + k, type=PackedElementField.UINT8)
-        for k, name in enumerate(("red", "green", "blue", "alpha"))
-    ]
+    fields += [PackedElementField(name=name, offset=12 + k, type=PackedElementField.UINT8) for k, name in enumerate(_CHANNELS)]
     origin = _pose(Rigid3.identity())
     step = struct.calcsize("<fffBBBB")
     return PointCloud(timestamp=_stamp(t_ns), frame_id=MAP_FRAME, pose=origin, point_stride=step, fields=fields, data=points.tobytes())
