@@ -12,10 +12,11 @@ if TYPE_CHECKING:
     from topoloc.compiled import set_num_threads
     from topoloc.errors import TopolocError
     from topoloc.geometry.camera import Camera
+    from topoloc.geometry.geodesy import GeoPose
     from topoloc.geometry.rigid import Rigid3
     from topoloc.localization.localizer import Localizer, LocalizerConfig
     from topoloc.localization.map_facts.building import build_map
-    from topoloc.localization.result import Alternative, Localization, NotLocalized
+    from topoloc.localization.result import Alternative, Localization, NotLocalized, Provenance
     from topoloc.localization.search import Trace
     from topoloc.localization.warm_up import warm_up
     from topoloc.map.build import BuildConfig
@@ -30,10 +31,12 @@ __all__ = [
     "Alternative",
     "BuildConfig",
     "Camera",
+    "GeoPose",
     "Localization",
     "Localizer",
     "LocalizerConfig",
     "NotLocalized",
+    "Provenance",
     "Rigid3",
     "StreamedPose",
     "TopoMetricMap",
@@ -52,10 +55,12 @@ _MODULES = {
     "Alternative": "topoloc.localization.result",
     "BuildConfig": "topoloc.map.build",
     "Camera": "topoloc.geometry.camera",
+    "GeoPose": "topoloc.geometry.geodesy",
     "Localization": "topoloc.localization.result",
     "Localizer": "topoloc.localization.localizer",
     "LocalizerConfig": "topoloc.localization.localizer",
     "NotLocalized": "topoloc.localization.result",
+    "Provenance": "topoloc.localization.result",
     "Rigid3": "topoloc.geometry.rigid",
     "StreamedPose": "topoloc.tracking.stream_result",
     "TopoMetricMap": "topoloc.map.topomap",

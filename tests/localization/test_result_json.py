@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.resources
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 
 from built_room import built_room, unseen_views
+from schemas import SCHEMA, check_result
 from tiny_world import CAMERA, render, room
 from topoloc.errors import ResultError
 from topoloc.geometry.geodesy import CAM_FROM_BODY, GeoPoint, Georeference
@@ -24,7 +24,6 @@ from topoloc.localization.result import Alternative, Localization, NotLocalized,
 from topoloc.places.coarse import NodeScore
 from topoloc.tracking.tracker import Tracker
 
-SCHEMA = json.loads((importlib.resources.files("topoloc") / "localization" / "result.schema.json").read_text())
 POSE = Rigid3(exp_so3(np.array([0.1, -0.2, 0.3])), np.array([1.0, -2.0, 0.5]))
 PLACE = Georeference(GeoPoint(48.2, 16.37, 170.0), Rigid3(exp_so3(np.array([0.0, 0.0, 0.7])), np.array([3.0, 4.0, 0.0])), "origin")
 PROVENANCE = Provenance("0123456789abcdef", 3, "surf", 1_700_000_000_123_456_789, CAMERA)
@@ -48,12 +47,6 @@ REFUSED = NotLocalized(
 )
 
 
-def check(line: dict[str, Any]) -> None:
-    Draft202012Validator(SCHEMA).validate(line)
-    then_else = SCHEMA["then"]["properties"] if line["localized"] else SCHEMA["else"]["properties"]
-    assert set(line) <= set(SCHEMA["properties"]) | set(then_else), "a key that the schema does not know"
-
-
 def rounded(value: Any) -> Any:
     """A quaternion becomes a matrix and a quaternion again: the last digits may differ."""
     if isinstance(value, dict):
@@ -70,7 +63,7 @@ def test_the_schema_is_one():
 @pytest.mark.parametrize("result", [LOCALIZED, replace(LOCALIZED, geopose=PLACE.geopose(POSE)), REFUSED, NotLocalized("unreadable")])
 def test_what_was_written_comes_again(result: Localization | NotLocalized):
     text = json.dumps(result.to_json("a.png"), allow_nan=False)
-    check(json.loads(text))
+    check_result(json.loads(text))
     again = result_from_json(text)
     assert type(again) is type(result)
     assert again.provenance == result.provenance
@@ -84,19 +77,19 @@ def test_real_results_fit_the_schema(tiny_recording: Path):
     found = localizer.localize(picture, CAMERA, t_ns=5)
     assert isinstance(found, Localization)
     line = found.to_json("a.png")
-    check(line)
+    check_result(line)
     assert line["map"] == localizer.map_id != ""
     assert (line["version"], line["t_ns"], line["features"]) == (1, 5, "surf")
     assert line["camera"] == CAMERA.to_json()
     assert 0.0 < line["position_sigma_m"] < 0.1
     elsewhere = localizer.localize(render(room(1), pose)[0], CAMERA)
     assert isinstance(elsewhere, NotLocalized)
-    check(elsewhere.to_json("b.png"))
+    check_result(elsewhere.to_json("b.png"))
     rough = localizer.localize(picture, None)
     assert isinstance(rough, Localization)
     assert rough.provenance.camera is not None
     assert rough.provenance.camera.fx == rough.focal_length_px
-    check(rough.to_json("c.png"))
+    check_result(rough.to_json("c.png"))
 
 
 def test_streams_fit_the_schema_and_say_their_times(tiny_recording: Path):
@@ -105,11 +98,11 @@ def test_streams_fit_the_schema_and_say_their_times(tiny_recording: Path):
     lines = [tracker.process(picture, CAMERA, 100_000_000 * number).to_json(f"{number}") for number, (picture, _) in enumerate(views)]
     assert "tracked" in {line["state"] for line in lines}
     for number, line in enumerate(lines):
-        check(line)
+        check_result(line)
         assert line["t_ns"] == 100_000_000 * number
         assert line["localized"] == ("geopose" in line)
         assert line["camera"] == CAMERA.to_json()
-    check(tracker.miss(10**9, NotLocalized("unreadable")).to_json("none"))
+    check_result(tracker.miss(10**9, NotLocalized("unreadable")).to_json("none"))
 
 
 def test_a_geopose_leads_back_to_the_pose():

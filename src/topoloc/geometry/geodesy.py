@@ -130,7 +130,10 @@ class Georeference:
         try:
             origin, rms_m, source = data["origin"], data["rms_m"], data["source"]  # type: ignore[index]
             lat, lon, h = (float(origin[name]) for name in ("lat", "lon", "h"))
-            enu_from_world = Rigid3.from_matrix(np.array(data["enu_from_world"], np.float64))  # type: ignore[index]
+            matrix = np.array(data["enu_from_world"], np.float64)  # type: ignore[index]
+            enu_from_world = Rigid3.from_matrix(matrix)
+            if np.abs(enu_from_world.matrix()[:3] - matrix[:3]).max() < 1e-9:  # as it was written, to the last bit
+                enu_from_world = Rigid3(matrix[:3, :3].copy(), matrix[:3, 3].copy())
             rms_m = None if rms_m is None else float(rms_m)
         except (KeyError, TypeError, ValueError, OverflowError, TrajectoryError):
             raise GeoreferenceError("no georeference: origin, enu_from_world (3x4), source and rms_m are needed") from None

@@ -163,7 +163,8 @@ class Alternative:
     @staticmethod
     def from_json(data: Any) -> Alternative:
         """Raises ResultError."""
-        data = checked.object_of(data)
+        if not isinstance(data, Mapping):
+            raise ResultError("no result: an alternative is an object")
         return Alternative(
             checked.rigid(checked.wanted(data, "world_from_cam"), "world_from_cam"),
             checked.number(checked.wanted(data, "probability"), "probability", 0.0, 1.0),
