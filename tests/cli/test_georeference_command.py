@@ -105,6 +105,7 @@ def test_what_does_not_say_where_the_map_lies(own_map: Path, tmp_path: Path, com
     assert "one of --origin" in complaint("georeference", own_map, status=2)
     assert "four numbers" in complaint("georeference", own_map, "--origin", "1,2,3")
     assert "latitude 95" in complaint("georeference", own_map, "--origin", "95,2,3,4")
+    assert "a height of 1e+06 m" in complaint("georeference", own_map, "--origin", "5,2,1e6,4")
     assert "a heading of nan" in complaint("georeference", own_map, "--origin", "5,2,3,nan")
     assert "up is one of" in complaint("georeference", own_map, "--origin", "5,2,3,4", "--up", "w")
     for text, words in (

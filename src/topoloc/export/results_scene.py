@@ -27,8 +27,7 @@ def scene_of_results(path: Path) -> Scene:
             raise ResultError(f"{path}, line {number}: {error}") from None
         if isinstance(result, Localization):
             t_ns, camera = result.provenance.t_ns, result.provenance.camera
-            covariance = result.camera_covariance
-            views.append(View(query, result.world_from_cam, t_ns, camera, covariance=covariance, geopose=result.geopose))
+            views.append(View(query, result.world_from_cam, t_ns, camera, geopose=result.geopose))
     if not views:
         raise ResultError(f"{path}: none of {len(lines)} results has a pose")
     return Scene(path.stem, views, Points.none(), [view.world_from_cam for view in views])

@@ -18,8 +18,7 @@ class View:
     """A picture and where it was taken. `name` is that of its file; `t_ns` is None where it has no time.
 
     Pixel `points_img[k]` of `camera` shows point `point_rows[k]` of the scene, -1 for none. `jpeg` is the picture, encoded, possibly
-    smaller than `camera`, and seen by `jpeg_camera`; empty where it is not at hand. `covariance` (6, 6) is that of the camera in its own
-    axes, metres and radians.
+    smaller than `camera`, and seen by `jpeg_camera`; empty where it is not at hand.
     """
 
     name: str
@@ -31,7 +30,6 @@ class View:
     point_rows: Int[np.ndarray, " m"] = field(default_factory=lambda: np.zeros(0, np.int64))
     jpeg: bytes = b""
     jpeg_camera: Camera | None = None
-    covariance: Float[np.ndarray, "6 6"] | None = None
     geopose: GeoPose | None = None
 
 

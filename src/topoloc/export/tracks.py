@@ -110,7 +110,7 @@ class _KeyPoints:
 
 def _located(labels: Int[np.ndarray, " m"], nodes: list[TopoNode], maps: list[LocalMap]) -> Tracks:
     """Each track's point by least squares: where its nodes have it, by their covariances, and where their key points are."""
-    num_points, key_points = int(labels.max()) + 1, _KeyPoints.of(nodes, labels)
+    num_points, key_points = int(labels.max(initial=-1)) + 1, _KeyPoints.of(nodes, labels)
     prior, pull = np.zeros((num_points, 3, 3)), np.zeros((num_points, 3))
     information = np.linalg.inv(np.concatenate([part.covariances for part in maps]) + _LEAST_SIGMA**2 * np.eye(3))
     np.add.at(prior, labels, information)

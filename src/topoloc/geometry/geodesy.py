@@ -20,7 +20,7 @@ SEMI_MAJOR = 6_378_137.0
 FLATTENING = 1.0 / 298.257223563
 _SEMI_MINOR = SEMI_MAJOR * (1.0 - FLATTENING)
 _E2 = FLATTENING * (2.0 - FLATTENING)
-_MAX_HEIGHT = 100_000.0  # metres; a map of what is higher, or deeper, is a mistake
+_MAX_HEIGHT = 1e8  # metres
 # Axes of a camera as a body (x forward, y left, z up) in its own (x right, y down, z forward), as the OSCP's reference server has them.
 CAM_FROM_BODY = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
@@ -30,7 +30,7 @@ class GeoPoint:
     """A place on WGS-84: degrees, and metres above the ellipsoid.
 
     Raises:
-        GeoreferenceError: not finite, no latitude or longitude, or higher than anybody maps.
+        GeoreferenceError: not finite, no latitude or longitude, or far from the earth.
     """
 
     lat: float

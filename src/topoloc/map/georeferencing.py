@@ -23,6 +23,7 @@ AXES = {f"{sign}{name}": (1.0 if sign == "" else -1.0) * np.eye(3)[k] for k, nam
 _LEVEL_SIGMA, _CAMERA_SIGMA = math.radians(2.0), math.radians(10.0)
 """How far up is from where it should be: of worlds with z up, which somebody levelled, and of those of a camera held by hand."""
 _MIN_LEVEL = math.sin(math.radians(10.0))
+_MAX_HEIGHT = 100_000.0  # metres above the ellipsoid, or below it; a map of what lies there is a mistake
 _LEAST_SIGMA = 0.01  # metres; nobody measures better
 _MAX_ROTATION_SIGMA = math.radians(5.0)
 _MAX_RESIDUAL_SHARE = 0.25
@@ -71,8 +72,9 @@ def georeference_by_view(world_from_cam: Rigid3, origin: GeoPoint, heading_deg: 
     """The picture `world_from_cam` was taken at `origin`, looking to `heading_deg` (degrees clockwise from true north).
 
     Raises:
-        GeoreferenceError: it looks up or down, so that no heading says how the world is turned.
+        GeoreferenceError: it looks up or down, so that no heading says how the world is turned; or nobody was at this height.
     """
+    _check_heights([origin])
     view = world_from_cam.rotation[:, 2]
     level = view - (view @ up.world) * up.world
     if np.linalg.norm(level) < _MIN_LEVEL:
@@ -96,6 +98,7 @@ def fit_georeference(points_world: Float[np.ndarray, "n 3"], places: Sequence[Ge
     """
     if len(points_world) < 3:
         raise GeoreferenceError(f"{len(points_world)} points are known in the map; at least 3 are needed")
+    _check_heights(places)
     origin = places[0]
     enu_from_ecef = origin.ecef_from_enu().inverse()
     points_enu = np.array([enu_from_ecef.apply(place.ecef()) for place in places])
@@ -158,6 +161,12 @@ def _sigma_of(pairs: _Pairs, enu_from_world: Rigid3, weights: Float[np.ndarray, 
     used = weights > 0.0
     squares = float(np.sum(pairs.residuals(enu_from_world)[used] ** 2))
     return max(math.sqrt(squares / max(3 * int(used.sum()) - 6, 1)), _LEAST_SIGMA)
+
+
+def _check_heights(places: Sequence[GeoPoint]) -> None:
+    for place in places:
+        if abs(place.h) > _MAX_HEIGHT:
+            raise GeoreferenceError(f"a height of {place.h:g} m above the ellipsoid")
 
 
 def _check(pairs: _Pairs, enu_from_world: Rigid3, weights: Float[np.ndarray, " n"], sigma: float) -> None:

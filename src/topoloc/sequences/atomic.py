@@ -92,10 +92,10 @@ def _check_replaceable(path: Path, files: Mapping[str, bytes]) -> None:
     """Hold that no file is lost that nobody means to write anew."""
     if path.exists() and not path.is_dir():
         raise TopolocError(f"cannot write {path}: it is no folder")
-    folders = {name.split("/")[0] for name in files if "/" in name}
-    others = [entry.name for entry in os.scandir(path) if entry.name not in files and entry.name not in folders] if path.is_dir() else []
-    if others:
-        raise TopolocError(f"cannot write {path}: this folder holds other things, such as {others[0]}")
+    found = (one.relative_to(path).as_posix() for one in path.rglob("*") if one.is_symlink() or not one.is_dir())
+    other = next((name for name in found if name not in files), None)
+    if other is not None:
+        raise TopolocError(f"cannot write {path}: this folder holds other things, such as {other}")
 
 
 def _target(path: Path) -> Path:
