@@ -176,14 +176,7 @@ def _check(pairs: _Pairs, enu_from_world: Rigid3, weights: Float[np.ndarray, " n
     extent, left = float(np.linalg.norm(offsets, axis=1).max()), f"residuals of {math.sqrt(3.0) * sigma:.2f} m"
     if 2 * int(used.sum()) < len(used):
         raise GeoreferenceError(f"only {int(used.sum())} of {len(used)} points agree with each other: these are not the map's places")
-    squares = float(np.sum(offsets**2))
-    if squares > 0.0:
-        away = (pairs.enu[used] - pairs.enu[used].mean(axis=0)) @ enu_from_world.rotation
-        scale = float(np.sum(away * offsets)) / squares
-        if not 1.0 / _MAX_SCALE < scale < _MAX_SCALE and abs(scale - 1.0) > 4.0 * _LEAST_SIGMA / math.sqrt(squares):
-            is_shape = np.sum((away - scale * offsets) ** 2) < 0.1 * np.sum((away - offsets) ** 2)
-            if is_shape and scale > 0.0:
-                raise GeoreferenceError(f"the places are {scale:.3g} times as far apart as in the map: not the same metres")
+    _check_scale(offsets, (pairs.enu[used] - pairs.enu[used].mean(axis=0)) @ enu_from_world.rotation)
     information = np.sum(offsets**2) * np.eye(3) - offsets.T @ offsets
     information = information / sigma**2
     if pairs.up is not None:
@@ -196,3 +189,11 @@ def _check(pairs: _Pairs, enu_from_world: Rigid3, weights: Float[np.ndarray, " n
         )
     if math.sqrt(3.0) * sigma > _MAX_RESIDUAL_SHARE * extent:
         raise GeoreferenceError(f"{left} over an extent of {extent:.2f} m: these are not the map's places")
+
+
+def _check_scale(offsets: Float[np.ndarray, "n 3"], true_offsets: Float[np.ndarray, "n 3"]) -> None:
+    """Hold that no other length of the metre explains the residuals."""
+    scale = float(np.sum(true_offsets * offsets)) / max(float(np.sum(offsets**2)), 1e-12)
+    is_better = np.sum((true_offsets - scale * offsets) ** 2) < 0.1 * np.sum((true_offsets - offsets) ** 2)
+    if is_better and scale > 0.0 and not 1.0 / _MAX_SCALE < scale < _MAX_SCALE:
+        raise GeoreferenceError(f"the places are {scale:.3g} times as far apart as in the map: not the same metres")

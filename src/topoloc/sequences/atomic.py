@@ -84,8 +84,9 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
             os.rename(before, path)
         raise TopolocError(f"cannot write {path}: {error.strerror}") from error
     finally:
-        for folder in (temporary, before):
-            shutil.rmtree(folder, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
+        if path.is_dir():  # else what was there before is all there is
+            shutil.rmtree(before, ignore_errors=True)
 
 
 def _check_replaceable(path: Path, files: Mapping[str, bytes]) -> None:

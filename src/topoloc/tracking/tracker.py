@@ -107,15 +107,14 @@ class Tracker:
         is_same = self._image is not None and np.array_equal(self._image, image)
         self._advance(t_ns, may_stand_still=is_same)
         if is_same and self._answer is not None:
-            last = self._answer
-            return StreamedPose(t_ns, last.state, at_time(last.result, t_ns), last.smoothed, last.smoothed_covariance, is_repeated=True)
+            return replace(self._answer, t_ns=t_ns, result=at_time(self._answer.result, t_ns), is_repeated=True)
         self._image = image.copy()  # who reads a camera may read into the same memory again
         if self.config.mode == "paper":
-            self._answer = self._by_paper(image, camera, t_ns)
+            answer = self._by_paper(image, camera, t_ns)
         else:
-            grey, grey_camera = reduced(grey_image(image), camera, self.config.max_side_px)
-            self._answer = self._by_motion(StreamPicture(image, camera, t_ns, odom_from_cam, grey, grey_camera))
-        self._answer = self._completed(self._answer, camera)
+            grey = reduced(grey_image(image), camera, self.config.max_side_px)
+            answer = self._by_motion(StreamPicture(image, camera, t_ns, odom_from_cam, *grey))
+        self._answer = self._completed(answer, camera)
         return self._answer
 
     def miss(self, t_ns: int, result: NotLocalized, odom_from_cam: Rigid3 | None = None) -> StreamedPose:
@@ -185,7 +184,7 @@ class Tracker:
         if self._hypotheses.is_decided:
             return answer
         detail, alternatives = "the pictures so far leave open which of these", self._hypotheses.alternatives()
-        result = NotLocalized("ambiguous", times_ms=answer.result.times_ms, detail=detail, alternatives=alternatives)
+        result = NotLocalized("ambiguous", [], 0, 0, answer.result.times_ms, detail, alternatives, answer.result.provenance)
         return StreamedPose(answer.t_ns, "ambiguous", result)
 
     def _follow(self, picture: StreamPicture, predicted: MotionState | None) -> Followed | None:
