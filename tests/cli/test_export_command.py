@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -38,6 +39,9 @@ def test_results_that_are_none(tmp_path: Path, refusals: Path, complaint: Compla
     broken.write_bytes(b"\x00\xff")
     assert "not a text file" in complaint("export", broken, tmp_path / "a.tum")
     assert "no such file" in complaint("export", tmp_path / "gone.jsonl", tmp_path / "a.tum")
+    os.mkfifo(tmp_path / "pipe")
+    assert "is no file" in complaint("export", tmp_path / "pipe", tmp_path / "a.tum")
+    assert "is no file" in complaint("export", tmp_path, tmp_path / "a.tum")
     assert "cannot open map" in complaint("export", tmp_path / "gone.topo", tmp_path / "a.tum")
 
 

@@ -126,3 +126,4 @@ def test_what_does_not_say_where_the_map_lies(own_map: Path, tmp_path: Path, com
     file.write_bytes(b"\x00\xff\xfe")
     assert "not a text file" in complaint("georeference", own_map, "--gnss", file)
     assert "no such file" in complaint("georeference", own_map, "--gnss", tmp_path / "gone.csv")
+    assert ": no file" in complaint("georeference", own_map, "--gnss", tmp_path)

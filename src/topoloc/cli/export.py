@@ -38,6 +38,8 @@ class Command:
         form = find_export_format(Path(self.out), self.format)
         outputs = [self.json] if form.folder is not None else [self.out, self.json]
         check_outputs(outputs, inputs=[self.source])
+        if Path(self.source).exists() and not Path(self.source).is_file():
+            raise TopolocError(f"{self.source} is no file: a map or results are exported")
         if Path(self.out).resolve() == Path(self.source).resolve():
             raise UsageError("OUT is what is to be exported")
         if not Path(self.out).absolute().parent.is_dir():

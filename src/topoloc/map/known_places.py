@@ -96,6 +96,8 @@ def _positions_by_name(topomap: MapContents) -> dict[str, Float[np.ndarray, "3"]
 
 def _rows(path: Path, num_columns: int, first_number: int, wanted: str) -> list[tuple[int, list[str]]]:
     """Line numbers and columns, without a line of titles at the top."""
+    if path.exists() and not path.is_file():
+        raise GeoreferenceError(f"{path}: no file")
     rows = read_rows(path, GeoreferenceError)
     if not all(_is_number(text) for text in rows[0][1][first_number:num_columns]):
         rows = rows[1:]
