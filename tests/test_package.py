@@ -32,6 +32,8 @@ FOREIGN = (
     "google",
     "lz4",
     "zstandard",
+    "mcap_protobuf",
+    "foxglove_schemas_protobuf",
     "scipy",
     "hypothesis",
     "beartype",

@@ -12,11 +12,12 @@ if TYPE_CHECKING:
     from topoloc.compiled import set_num_threads
     from topoloc.errors import TopolocError
     from topoloc.geometry.camera import Camera
+    from topoloc.geometry.geodesy import GeoPose
     from topoloc.geometry.rig import StereoRig
     from topoloc.geometry.rigid import Rigid3
     from topoloc.localization.localizer import Localizer, LocalizerConfig
     from topoloc.localization.map_facts.building import build_map
-    from topoloc.localization.result import Alternative, Localization, NotLocalized
+    from topoloc.localization.result import Alternative, Localization, NotLocalized, Provenance
     from topoloc.localization.search import Trace
     from topoloc.localization.warm_up import warm_up
     from topoloc.map.build import BuildConfig
@@ -34,11 +35,13 @@ __all__ = [
     "BuildConfig",
     "Camera",
     "DepthImage",
+    "GeoPose",
     "Localization",
     "Localizer",
     "LocalizerConfig",
     "MemorySequence",
     "NotLocalized",
+    "Provenance",
     "Rigid3",
     "StereoFrame",
     "StereoRig",
@@ -60,11 +63,13 @@ _MODULES = {
     "BuildConfig": "topoloc.map.build",
     "Camera": "topoloc.geometry.camera",
     "DepthImage": "topoloc.sequences.frame",
+    "GeoPose": "topoloc.geometry.geodesy",
     "Localization": "topoloc.localization.result",
     "Localizer": "topoloc.localization.localizer",
     "LocalizerConfig": "topoloc.localization.localizer",
     "MemorySequence": "topoloc.sequences.memory_sequence",
     "NotLocalized": "topoloc.localization.result",
+    "Provenance": "topoloc.localization.result",
     "Rigid3": "topoloc.geometry.rigid",
     "StereoFrame": "topoloc.sequences.frame",
     "StereoRig": "topoloc.geometry.rig",

@@ -13,6 +13,8 @@ TopolocError
 ├── TrainingError         a training that cannot begin or go on: nothing to learn from, a loss that is not finite
 ├── ConfigError           a setting that is unknown, of the wrong type or out of its bounds; names the key
 ├── QueryError            the call of a query is wrong (no camera, camera of another image size)
+├── ResultError           a result (a JSON line) that is none
+├── GeoreferenceError     no place on earth, or points that do not say where a map lies on it
 ├── FeatureKindError      features of a kind that there is not, or whose fitted weights are damaged
 └── MissingExtraError     an optional dependency is not installed; names the extra
 """
@@ -68,6 +70,14 @@ class ConfigError(TopolocError):
 
 class QueryError(TopolocError):
     """A query that cannot be asked: no camera, or a camera of another image size."""
+
+
+class ResultError(TopolocError):
+    """A JSON line that is no result of a query."""
+
+
+class GeoreferenceError(TopolocError):
+    """A place that is none on earth, or points that do not determine where a map lies."""
 
 
 class FeatureKindError(TopolocError):

@@ -23,6 +23,8 @@ from topoloc.sequences.trajectory import Trajectory, read_trajectory, write_tum
 EVALUATION = {"num_queries", "num_localized", "median_translation_m", "median_rotation_deg", "recall", "topological_accuracy"}
 EVALUATION |= {"false_accepts", "median_times_ms", "map"}
 EVIDENCE = {"query", "localized", "candidates", "num_matches", "num_inliers", "times_ms"}
+PROVENANCE = {"map", "version", "t_ns", "camera", "features"}
+SIGMAS = {"position_sigma_m", "rotation_sigma_deg"}
 STAGES = {"patch_normalization", "features", "coarse", "matching", "pnp", "total"}
 
 
@@ -81,7 +83,7 @@ def test_localize_writes_what_the_interface_says(room_map: Path, queries: Path, 
     lines = _lines(results)
     assert len(printed.out.splitlines()) == len(lines) == len(unseen_views())
     for number, line in enumerate(lines):
-        assert set(line) == EVIDENCE | {"world_from_cam", "covariance", "probability", "node"}
+        assert set(line) == EVIDENCE | PROVENANCE | SIGMAS | {"world_from_cam", "covariance", "probability", "node"}
         assert line["query"] == f"view{number:02d}.png"
         assert np.array(line["covariance"]).shape == (6, 6)
         assert set(line["world_from_cam"]) == {"translation", "quat_wxyz"}
@@ -141,11 +143,11 @@ def test_an_interrupted_run_keeps_what_there_is(
     localize = Localizer.localize
     calls = []
 
-    def until_the_third(self: Localizer, *args: Any) -> Any:
+    def until_the_third(self: Localizer, *args: Any, **settings: Any) -> Any:
         calls.append(args)
         if len(calls) == 3:
             raise KeyboardInterrupt
-        return localize(self, *args)
+        return localize(self, *args, **settings)
 
     monkeypatch.setattr(Localizer, "localize", until_the_third)
     results = tmp_path / "results.jsonl"
@@ -219,7 +221,7 @@ def test_a_picture_of_nothing_known_is_not_localized(
     assert main(["localize", str(room_map), str(tmp_path / "query.png"), "--camera", camera, "--json", "-"]) == 0
     printed = capsys.readouterr()
     line = json.loads(printed.out)
-    assert set(line) == EVIDENCE | {"reason"}
+    assert set(line) == EVIDENCE | PROVENANCE | {"reason", "detail", "alternatives"}
     assert not line["localized"]
     assert line["reason"] in ("too_few_matches", "too_few_inliers", "not_in_map")
     assert printed.err == ""

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from topoloc.errors import TopolocError
-from topoloc.sequences.atomic import remove_leftovers, replaced_file, write_bytes
+from topoloc.sequences.atomic import remove_leftovers, replaced_file, write_bytes, write_folder
 
 WRITER = """
 import sys
@@ -116,3 +116,28 @@ def test_places_that_cannot_be_written_are_errors_of_one_line(tmp_path: Path):
 def test_a_name_as_long_as_a_file_system_takes_can_be_written(tmp_path: Path):
     write_bytes(tmp_path / ("x" * 250), b"data")
     assert (tmp_path / ("x" * 250)).read_bytes() == b"data"
+
+
+def test_a_symbolic_link_is_followed(tmp_path: Path):
+    (tmp_path / "far").mkdir()
+    link = tmp_path / "link"
+    link.symlink_to(tmp_path / "far" / "file")
+    for content in (b"first", b"second"):
+        write_bytes(link, content)
+        assert link.is_symlink()
+        assert (tmp_path / "far" / "file").read_bytes() == content
+    assert [path.name for path in (tmp_path / "far").iterdir()] == ["file"]
+
+
+def test_a_folder_is_written_whole_or_not_at_all(tmp_path: Path):
+    folder = tmp_path / "model"
+    write_folder(folder, {"a.txt": b"1", "images/b.jpg": b"2"})
+    with pytest.raises(TopolocError, match="cannot write"):
+        write_folder(folder, {"a.txt": b"3", "a.txt/b": b"4"})  # a file cannot be a folder
+    assert {path.relative_to(folder).as_posix() for path in folder.rglob("*")} == {"a.txt", "images", "images/b.jpg"}
+    assert (folder / "a.txt").read_bytes() == b"1"
+    (folder / "images" / "mine.jpg").write_bytes(b"5")
+    with pytest.raises(TopolocError, match=r"other things, such as images/mine\.jpg"):
+        write_folder(folder, {"a.txt": b"6", "images/b.jpg": b"7"})
+    assert (folder / "images" / "mine.jpg").read_bytes() == b"5"
+    assert [path.name for path in tmp_path.iterdir()] == ["model"]

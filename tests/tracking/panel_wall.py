@@ -12,6 +12,7 @@ from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import SeenPoints
 from topoloc.localization.result import Alternative, Localization, NotLocalized
 from topoloc.localization.search import Trace
+from topoloc.map.topomap import TopoMetricMap
 from topoloc.tracking.stream_result import StreamedPose
 from topoloc.tracking.tracker import Tracker
 
@@ -33,6 +34,7 @@ class PanelWall(Localizer):
     def __init__(self) -> None:
         self.xs: list[float] = []
         self.num_asked = 0
+        self.topomap, self.map_id = TopoMetricMap([], [], [], [], {}), ""
 
     def localize_near(
         self, image: np.ndarray, camera: Camera | RoughCamera, prior: Rigid3 | None, max_ms: float | None = None, trace: Trace | None = None

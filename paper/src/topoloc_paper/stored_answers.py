@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -11,8 +11,7 @@ import numpy as np
 from topoloc.evaluation.metrics import Answer
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.evidence import Evidence
-from topoloc.localization.result import Alternative, Localization, NotLocalized
-from topoloc.places.coarse import NodeScore
+from topoloc.localization.result import Localization, NotLocalized, result_from_json
 from topoloc.sequences.frame import StereoSequence
 
 
@@ -54,30 +53,10 @@ def _answer_of(row: dict[str, Any], recording: str, pictures: _Pictures | None) 
 
 
 def _result_of(row: dict[str, Any]) -> Localization | NotLocalized:
-    candidates = [NodeScore(int(node_id), float(score)) for node_id, score in row["candidates"]]
-    if not row["localized"]:
-        alternatives = tuple(_alternative_of(named) for named in row.get("alternatives", []))
-        counts = row["num_matches"], row["num_inliers"]
-        return NotLocalized(row["reason"], candidates, *counts, row["times_ms"], row.get("detail", ""), alternatives)
-    return Localization(
-        world_from_cam=_rigid_of(row["world_from_cam"]),
-        covariance=np.array(row["covariance"]),
-        probability=row["probability"],
-        node_id=row["node"],
-        candidates=candidates,
-        num_matches=row["num_matches"],
-        num_inliers=row["num_inliers"],
-        times_ms=row["times_ms"],
-        evidence=Evidence(**row["evidence"]) if "evidence" in row else None,
-    )
-
-
-def _alternative_of(named: dict[str, Any]) -> Alternative:
-    return Alternative(_rigid_of(named["world_from_cam"]), named["probability"], named["node"])
-
-
-def _rigid_of(pose: dict[str, list[float]]) -> Rigid3:
-    return Rigid3.from_quat_wxyz(np.array(pose["quat_wxyz"]), np.array(pose["translation"]))
+    result = result_from_json(row)
+    if isinstance(result, Localization) and "evidence" in row:
+        return replace(result, evidence=Evidence(**row["evidence"]))
+    return result
 
 
 class _Pictures:

@@ -21,12 +21,15 @@ COMMANDS = {
     "localize": ("topoloc.cli.localize", "where were these images taken? 6-DoF poses of images, folders, recordings"),
     "evaluate": ("topoloc.cli.evaluate", "localize a recording with known truth and judge the poses"),
     "info": ("topoloc.cli.info", "what a map file holds"),
+    "export": ("topoloc.cli.export", "a map or results for other programs: COLMAP, nerfstudio, PLY, GeoJSON, MCAP, TUM, KITTI"),
+    "georeference": ("topoloc.cli.georeference", "where on earth a map lies; its results then carry OGC GeoPoses"),
     "weights": ("topoloc.cli.weights", "networks of local features: which are known and here, and how to get others"),
     "config": ("topoloc.cli.config", "all other settings as a TOML file, with defaults and meanings"),
 }
 BROUGHT = {"simulate": "topoloc-worlds", "train": "topoloc-training", "benchmark": "topoloc-paper"}
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
-_IN_HELP = ("demo", "simulate", "slam", "build", "train", "localize", "evaluate", "benchmark", "info", "weights", "config")
+_IN_HELP = ("demo", "simulate", "slam", "build", "train", "localize", "evaluate", "benchmark", "info")
+_IN_HELP += ("export", "georeference", "weights", "config")
 LEAST_ADDRESS_SPACE = 1_600_000_000
 
 

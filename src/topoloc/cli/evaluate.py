@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +30,8 @@ from topoloc.cli.output import (
 from topoloc.cli.settings_file import read_settings, with_option
 from topoloc.errors import TrajectoryError
 from topoloc.evaluation.experiments import answer_elsewhere, answer_queries
-from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION, Answer, summarize
+from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION, Answer, by_recording, length_text, summarize
+from topoloc.evaluation.world_fit import WorldFit, fit_worlds
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import LocalizerConfig
 from topoloc.map.topomap import TopoMetricMap
@@ -51,6 +53,8 @@ class Command:
     """A recording of another place: every pose given for one of its images counts as a false accept."""
     map_from_truth: File = None
     """A JSON file with the 4x4 matrix (metres) that takes the world of the recordings' truth into the map's, where they differ."""
+    fit_map_from_truth: File = None
+    """Where errors are explained by one rigid transform between the two worlds, write that to this file, for --map-from-truth."""
     coarse: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")] = None
     """Coarse localizer that is asked; `topoloc info` names those of the map."""
     features: ASKED_FEATURES = None
@@ -71,7 +75,10 @@ class Command:
     def run(self) -> int:
         if not self.sequences and not self.elsewhere:
             raise UsageError("evaluate takes a map and at least one recording, with truth or --elsewhere")
-        check_outputs([self.json, self.report], inputs=[path for path in (self.map, self.map_from_truth, self.config) if path])
+        if self.fit_map_from_truth and (self.map_from_truth or len(self.sequences) != 1):
+            raise UsageError("--fit-map-from-truth is of one recording, without --map-from-truth")
+        inputs = [path for path in (self.map, self.map_from_truth, self.config) if path]
+        check_outputs([self.json, self.report, self.fit_map_from_truth], inputs)
         config = with_option(read_settings(self.config).of(LocalizerConfig), "coarse", self.coarse, "--coarse")
         write_report = report_writer() if self.report else None
         topomap = TopoMetricMap.load(self.map)
@@ -87,15 +94,38 @@ class Command:
                 answers += answer_queries(localizer, sequence, map_from_truth, progress, label)
             for sequence, label in zip(others, labels[len(sequences) :], strict=True):
                 answers += answer_elsewhere(localizer, sequence, progress, label)
-        evaluation = summarize(answers) | {"map": info}
+        fits = [fit for of_one in by_recording(answers).values() if (fit := fit_worlds(of_one)) is not None]
+        evaluation = summarize(answers) | {"map": info, "world_fits": [fit.to_json() for fit in fits]}
         if self.json != "-":
             _print(evaluation)
+        for fit in fits:
+            print(_offer(fit, self.fit_map_from_truth), file=sys.stderr if self.json == "-" else sys.stdout)
         write_json(self.json, evaluation)
         if write_report and self.report:
             write_report(Path(self.report), evaluation, answers, topomap)
             if self.json != "-":
                 print(f"report: {self.report}")
+        self._write_fit(fits)
         return 0
+
+    def _write_fit(self, fits: Sequence[WorldFit]) -> None:
+        if self.fit_map_from_truth and not fits:
+            raise TrajectoryError(f"{self.fit_map_from_truth} is not written: no rigid transform between two worlds explains the errors")
+        if self.fit_map_from_truth:
+            write_json(self.fit_map_from_truth, {"map_from_truth": fits[0].map_from_truth.matrix().tolist()})
+
+
+def _offer(fit: WorldFit, written: str | None) -> str:
+    """One line: that the worlds differ, what is left of the errors in one world, and how to judge by that."""
+    left = f"{length_text(fit.median_translation_m)} and {fit.median_rotation_deg:.2f} deg"
+    apart = f"{length_text(float(np.linalg.norm(fit.map_from_truth.translation)))}, {np.degrees(fit.map_from_truth.angle()):.1f} deg"
+    how = (
+        f"--map-from-truth {written}" if written else "--fit-map-from-truth FILE writes that transform, --map-from-truth FILE judges by it"
+    )
+    return (
+        f"{fit.recording}: its truth is in another world than the map: one rigid transform ({apart}) explains {fit.num_answers} of "
+        f"{fit.num_localized} answers, median error then {left}; {how}"
+    )
 
 
 def _labels(paths: Sequence[str], sequences: Sequence[StereoSequence]) -> list[str]:

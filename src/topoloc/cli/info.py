@@ -60,12 +60,16 @@ def describe_map(topomap: Any, path: Path) -> dict[str, Any]:
     import numpy as np
 
     from topoloc.map.checking import list_coarse
+    from topoloc.map.contents import map_id_of
 
     if len(topomap.summaries) == 0:
         raise EmptyMapError(f"map {path} has no nodes")
     centres = np.array([s.world_from_cam.translation for s in topomap.summaries])
     return {
         "path": str(path),
+        "map": map_id_of(topomap),
+        "version": topomap.version,
+        "georeference": None if topomap.georeference is None else topomap.georeference.to_json(),
         "bytes": path.stat().st_size,
         "num_nodes": len(topomap.summaries),
         "num_points": sum(s.num_points for s in topomap.summaries),
@@ -95,18 +99,27 @@ def _print(info: dict[str, Any]) -> None:
     print_facts(
         [
             ("map", info["path"]),
+            ("id", f"{info['map']}, version {info['version']}"),
             ("size", f"{info['bytes'] / 1e6:.2f} MB"),
             ("nodes", f"{info['num_nodes']}, {info['num_points']} points with 3-D position"),
             ("side nodes", str(info["num_side_nodes"])),
             ("place images", str(info["num_place_images"])),
             ("mapped", f"{info['length_m']:.1f} m, extent {' x '.join(f'{e:.1f}' for e in info['extent_m'])} m"),
             ("recordings", ", ".join(info["recordings"])),
+            ("on earth", _place_line(info["georeference"])),
             *(("coarse localizer", _coarse_line(facts, info["default_coarse"])) for facts in info["coarse_models"]),
             ("Eq. 1", f"D_thresh {nodes.get('d_thresh', nan):.3g} m, lambda {nodes.get('lambda_rot', nan):.3g} m/rad"),
             ("features", ", ".join(info["kinds"]) + (f", normalization {normalization}" if normalization else "")),
             *([("check", info["check"])] if "check" in info else []),
         ]
     )
+
+
+def _place_line(facts: dict[str, Any] | None) -> str:
+    from topoloc.cli.georeference import place_line
+    from topoloc.geometry.geodesy import Georeference
+
+    return "unknown (topoloc georeference says where)" if facts is None else place_line(Georeference.from_json(facts))
 
 
 def _coarse_line(facts: dict[str, Any], default: str) -> str:

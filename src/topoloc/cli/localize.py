@@ -32,6 +32,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.result import NotLocalized
+from topoloc.map.sessions import path_of
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.calibration import calibration_of
 from topoloc.sequences.frame import StereoFrame, StereoSequence
@@ -46,12 +47,13 @@ CameraOfSize = Callable[[int, int], Camera | RoughCamera]
 
 @dataclass(frozen=True, eq=False)
 class _Query:
-    """An input: its pictures, whether they are a stream, and the pose of each by external odometry."""
+    """An input: its pictures, whether they are a stream, the pose of each by external odometry, and whether their times mean anything."""
 
     path: str
     sequence: StereoSequence
     is_stream: bool
     odom_from_cams: list[Rigid3 | None]
+    has_times: bool
 
 
 @dataclass(frozen=True)
@@ -151,7 +153,8 @@ class Command:
             if not is_stream:
                 raise UsageError(f"--odometry is for streams, and {path} is none; --stream makes it one")
             odometry = frame_poses(read_trajectory(Path(self.streams.odometry)), sequence.t_ns, Path(self.streams.odometry))
-        return _Query(path, sequence, is_stream, odometry or [None] * len(sequence))
+        has_times = is_stream or find_format(path, self.format) != "folder" or _has_times(sequence)
+        return _Query(path, sequence, is_stream, odometry or [None] * len(sequence), has_times)
 
     @property
     def _stereo_calibration(self) -> str | None:
@@ -191,6 +194,12 @@ def _answers(
             yield answer
 
 
+def _has_times(photos: StereoSequence) -> bool:
+    """Photos, and folders of them without times.txt, are read as if they were taken ten a second."""
+    root = path_of(photos)
+    return root is None or (photos.names != [photos.name] and (Path(root) / "times.txt").is_file())
+
+
 def _answer(
     name: str, query: _Query, index: int, localizer: Localizer, tracker: Tracker | None, camera_of_size: CameraOfSize | None
 ) -> QueryAnswer:
@@ -199,11 +208,11 @@ def _answer(
     try:
         frame = query.sequence[index]
     except UnreadableImageError as error:
-        unreadable = NotLocalized("unreadable", detail=str(error))
+        unreadable = localizer.completed(NotLocalized("unreadable", detail=str(error)), t_ns=t_ns if query.has_times else None)
         return QueryAnswer(name, t_ns, unreadable, tracker.miss(t_ns, unreadable, odom_from_cam) if tracker is not None else None)
     camera = _camera_of_frame(frame, camera_of_size)
     if tracker is None:
-        return QueryAnswer(name, t_ns, localizer.localize(frame.image, camera))
+        return QueryAnswer(name, t_ns, localizer.localize(frame.image, camera, t_ns=t_ns if query.has_times else None))
     if isinstance(camera, RoughCamera):
         raise CalibrationError("a stream needs a calibration: --camera FILE, --camera fx,fy,cx,cy or --camera map; or --single")
     streamed = tracker.process(frame.image, camera, t_ns, odom_from_cam)

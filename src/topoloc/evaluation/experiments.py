@@ -92,7 +92,7 @@ def neighbours_of(topomap: TopoMetricMap, distances: Float[np.ndarray, " nodes"]
 def _localize(localizer: Localizer, frame: StereoFrame) -> Localization | NotLocalized:
     if frame.camera is None:
         raise CalibrationError(f"{frame.name}: no calibration; put a camera.json into the recording's folder")
-    return localizer.localize(frame.image, frame.camera)
+    return localizer.localize(frame.image, frame.camera, t_ns=frame.t_ns)
 
 
 def _image_reader(sequence: StereoSequence, index: int) -> Callable[[], Image]:

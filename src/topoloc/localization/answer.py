@@ -14,7 +14,7 @@ from topoloc.localization.belief import MIN_LEAD, Hypothesis, lead
 from topoloc.localization.calibration_doubt import doubt_of_calibration
 from topoloc.localization.evidence import doubt_of, is_only_imprecise, precision_at, precision_of
 from topoloc.localization.pose_fit import SeenPoints
-from topoloc.localization.result import Alternative, Localization, NotLocalized, Reason
+from topoloc.localization.result import Alternative, Localization, NotLocalized, Provenance, Reason
 from topoloc.localization.search import Search
 
 _ELSEWHERE_DEG = 10.0
@@ -100,6 +100,7 @@ def _answered(search: Search, best: Hypothesis, probability: float) -> Answered:
         focal_length_px=best.fit.camera.fx * search.query.scale if is_rough else None,
         noise_share=best.noise_share,
         calibrated=search.weights.is_calibrated,
+        provenance=_provenance(search),
     )
     return localization, best.fit.seen_points(search.query.scale)
 
@@ -124,7 +125,9 @@ def _refusal(search: Search, ranked: list[Hypothesis]) -> NotLocalized:
         first = search.first
         num_matches, num_inliers = (len(first.matches), first.num_inliers) if first is not None else (0, 0)
         reason: Reason = "too_few_matches" if num_matches < search.config.min_matches else "too_few_inliers"
-        return NotLocalized(reason, search.named, num_matches, num_inliers, search.query.clock.times_ms(), _late(search))
+        return NotLocalized(
+            reason, search.named, num_matches, num_inliers, search.query.clock.times_ms(), _late(search), (), _provenance(search)
+        )
     best = ranked[0]
     if is_only_imprecise(best.evidence, search.weights, search.config.evidence):
         metres = float(np.sqrt(np.linalg.eigvalsh(best.covariance[:3, :3])[-1]))
@@ -134,7 +137,14 @@ def _refusal(search: Search, ranked: list[Hypothesis]) -> NotLocalized:
 
 def _refused(search: Search, reason: Reason, best: Hypothesis, detail: str, alternatives: tuple[Alternative, ...] = ()) -> NotLocalized:
     times_ms, detail = search.query.clock.times_ms(), "; ".join(text for text in (detail, _late(search)) if text)
-    return NotLocalized(reason, search.named, len(best.fit.matches), best.fit.num_inliers, times_ms, detail, alternatives)
+    return NotLocalized(
+        reason, search.named, len(best.fit.matches), best.fit.num_inliers, times_ms, detail, alternatives, _provenance(search)
+    )
+
+
+def _provenance(search: Search) -> Provenance:
+    """By which features the answer was come by; the localizer knows the rest."""
+    return Provenance(features=search.map.kind.name)
 
 
 def _late(search: Search) -> str:

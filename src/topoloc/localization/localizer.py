@@ -14,6 +14,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import TypeVar
 
 from topoloc.bounds import check_bounds
 from topoloc.geometry.camera import Camera
@@ -27,13 +28,15 @@ from topoloc.localization.fitted_weights import FittedWeights
 from topoloc.localization.propose import propose, propose_more
 from topoloc.localization.query import Query, check_size, reduced_image, unknown_camera
 from topoloc.localization.refine import hypothesis_of, say_on
-from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.result import Localization, NotLocalized, Provenance, at_time
 from topoloc.localization.search import Proposal, Search, Trace
+from topoloc.map.contents import map_id_of
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.coarse import CoarseLocalizer, Image
 
 __all__ = ["Localizer", "LocalizerConfig"]
 
+R = TypeVar("R", bound=Localization | NotLocalized)
 _LEAST_SECOND = 1.4  # log odds of a pose that only the features asked first found: twins of the true place come to 1.2
 
 
@@ -65,7 +68,7 @@ class Localizer:
     ) -> None:
         config = config or LocalizerConfig()
         check_bounds(config)
-        self.topomap = topomap
+        self.topomap, self.map_id = topomap, map_id_of(topomap)
         kinds, self.left_out = kinds_to_ask(topomap, config.kinds)
         self._kinds = [AskedKind.of(topomap.by_kind(kind), config, coarse, weights if kind == kinds[0] else None) for kind in kinds]
         self.map, self.config, self.weights = self._kinds[0].map, self._kinds[0].config, self._kinds[0].weights
@@ -77,6 +80,7 @@ class Localizer:
         prior: Rigid3 | None = None,
         max_ms: float | None = None,
         trace: Trace | None = None,
+        t_ns: int | None = None,
     ) -> Localization | NotLocalized:
         """Where was this image (grey or RGB, uint8) taken, by a camera of this calibration?
 
@@ -88,12 +92,13 @@ class Localizer:
                 evidence as any other, of matches that the prior did not guide.
             max_ms: after so many milliseconds no further hypothesis is sought, instead of `config.max_ms`.
             trace: collects all that is tried.
+            t_ns: when it was taken, nanoseconds, for the result to say.
 
         Raises:
             QueryError: the image is no picture of 8 bits, or the camera is of another image size.
         """
-        lens = camera or unknown_camera(image)
-        return self.localize_near(image, lens, prior, max_ms, trace)[0]
+        result = self.localize_near(image, camera or unknown_camera(image), prior, max_ms, trace)[0]
+        return result if t_ns is None else at_time(result, t_ns)
 
     def localize_near(
         self,
@@ -105,6 +110,24 @@ class Localizer:
     ) -> tuple[Localization | NotLocalized, list[Answered]]:
         """As `localize`; also each pose that the result names (its own, or its alternatives) with the points that it stands on."""
         check_size(image, camera)
+        result, named = self._answered(image, camera, prior, max_ms, trace)
+        return self.completed(result, camera), [(self.completed(one, camera), seen) for one, seen in named]
+
+    def completed(self, result: R, camera: Camera | RoughCamera | None = None, t_ns: int | None = None) -> R:
+        """The result with the map that it is of, where on earth that is, the picture's camera, and its time (nanoseconds)."""
+        if isinstance(camera, RoughCamera):
+            focal = result.focal_length_px if isinstance(result, Localization) else None
+            camera = None if focal is None else camera.with_focal(focal)
+        of_map = Provenance(self.map_id, self.topomap.version, t_ns=t_ns, camera=camera)
+        provenance = replace(of_map, features=result.provenance.features)
+        if isinstance(result, NotLocalized):
+            return replace(result, provenance=provenance)
+        georeference = self.topomap.georeference
+        return replace(result, provenance=provenance, geopose=georeference.geopose(result.world_from_cam) if georeference else None)
+
+    def _answered(
+        self, image: Image, camera: Camera | RoughCamera, prior: Rigid3 | None, max_ms: float | None, trace: Trace | None
+    ) -> tuple[Localization | NotLocalized, list[Answered]]:
         searches, result, named = self._searches(self._query(image, camera, max_ms), trace), None, list[Answered]()
         for search in searches:
             _follow_up(search, propose(search, prior))

@@ -2,18 +2,56 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.errors import CalibrationError, GeoreferenceError, ResultError
 from topoloc.geometry.calibration_check import CalibrationDoubt
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.geodesy import GeoPose
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization import checked_json as checked
 from topoloc.localization.evidence import Evidence
 from topoloc.places.coarse import NodeScore
 
 Reason = Literal["too_few_matches", "too_few_inliers", "ambiguous", "not_in_map", "jump", "unreadable"]
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What a result comes from: the map by its id, in which version (the number of its last edit), by which kind of `features`; when the
+    picture was taken (nanoseconds), and with which camera. What is not known is None, or empty."""
+
+    map_id: str = ""
+    map_version: int = 0
+    features: str = ""
+    t_ns: int | None = None
+    camera: Camera | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        camera = None if self.camera is None else self.camera.to_json()
+        return {"map": self.map_id, "version": self.map_version, "t_ns": self.t_ns, "camera": camera, "features": self.features}
+
+    @staticmethod
+    def from_json(data: Mapping[str, Any]) -> Provenance:
+        """Of a result's JSON; results of before there was any have none. Raises ResultError."""
+        t_ns, camera = data.get("t_ns"), data.get("camera")
+        if camera is not None and not isinstance(camera, dict):
+            raise ResultError("no result: 'camera' is no object")
+        try:
+            return Provenance(
+                checked.text(data.get("map", ""), "map"),
+                checked.whole(data.get("version", 0), "version"),
+                checked.text(data.get("features", ""), "features"),
+                None if t_ns is None else checked.whole(t_ns, "t_ns", -(2**63)),
+                None if camera is None else Camera.from_json(camera),
+            )
+        except CalibrationError as error:
+            raise ResultError(f"no result: {error}") from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +68,8 @@ class Localization:
     less than 0.25 m; weighed from `evidence`, with weights that were fitted to this kind of features: `calibrated` is False where none are,
     and those of another kind stand in. `node_id` is the node that most inliers come from; `times_ms` the milliseconds of each
     stage; `focal_length_px` the focal length found with the pose, None where the camera was calibrated. `calibration_doubt` is what the
-    picture says against its calibration; covariance and probability have paid for it.
+    picture says against its calibration; covariance and probability have paid for it. `geopose` is the camera's place on
+    earth, of maps that know theirs (`topoloc georeference`).
     """
 
     world_from_cam: Rigid3
@@ -46,10 +85,22 @@ class Localization:
     noise_share: float = 1.0
     calibrated: bool = True
     calibration_doubt: CalibrationDoubt | None = None
+    provenance: Provenance = Provenance()
+    geopose: GeoPose | None = None
 
     @property
     def localized(self) -> Literal[True]:
         return True
+
+    @property
+    def position_sigma_m(self) -> float:
+        """Root mean square of the distance from the true position that `camera_covariance` lets expect, metres."""
+        return float(np.sqrt(np.trace(self.camera_covariance[:3, :3])))
+
+    @property
+    def rotation_sigma_deg(self) -> float:
+        """The same of the angle to the true orientation, degrees."""
+        return float(np.rad2deg(np.sqrt(np.trace(self.camera_covariance[3:, 3:]))))
 
     @property
     def camera_covariance(self) -> Float[np.ndarray, "6 6"]:
@@ -64,13 +115,42 @@ class Localization:
             "localized": True,
             "world_from_cam": _pose_json(self.world_from_cam),
             "covariance": self.covariance.tolist(),
+            "position_sigma_m": self.position_sigma_m,
+            "rotation_sigma_deg": self.rotation_sigma_deg,
             "probability": self.probability,
             **({} if self.calibrated else {"calibrated": False}),
             "node": self.node_id,
             **_evidence_json(self),
             **({} if self.focal_length_px is None else {"focal_length_px": self.focal_length_px}),
             **({} if self.calibration_doubt is None else {"calibration_doubt": self.calibration_doubt.to_json()}),
+            **({} if self.geopose is None else {"geopose": self.geopose.to_json()}),
         }
+
+    @staticmethod
+    def from_json(line: str | bytes | Mapping[str, Any]) -> Localization:
+        """What `to_json` wrote, as text or read already; its query, `evidence`, `noise_share` and `calibration_doubt` are not kept.
+
+        Raises:
+            ResultError: it is no result, or one of an image that was not localized.
+        """
+        data = checked.object_of(line)
+        if checked.wanted(data, "localized") is not True:
+            raise ResultError("the result of an image that was not localized holds no pose (NotLocalized.from_json reads it)")
+        focal, geopose = data.get("focal_length_px"), data.get("geopose")
+        try:
+            return Localization(
+                checked.rigid(checked.wanted(data, "world_from_cam"), "world_from_cam"),
+                checked.covariance(checked.wanted(data, "covariance"), "covariance"),
+                checked.number(checked.wanted(data, "probability"), "probability", 0.0, 1.0),
+                checked.whole(checked.wanted(data, "node"), "node"),
+                **_evidence_from(data),
+                focal_length_px=None if focal is None else checked.number(focal, "focal_length_px", 0.0),
+                calibrated=data.get("calibrated", True) is not False,
+                provenance=Provenance.from_json(data),
+                geopose=None if geopose is None else GeoPose.from_json(geopose),
+            )
+        except GeoreferenceError as error:
+            raise ResultError(f"no result: 'geopose': {error}") from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +163,17 @@ class Alternative:
 
     def to_json(self) -> dict[str, Any]:
         return {"world_from_cam": _pose_json(self.world_from_cam), "probability": self.probability, "node": self.node_id}
+
+    @staticmethod
+    def from_json(data: Any) -> Alternative:
+        """Raises ResultError."""
+        if not isinstance(data, Mapping):
+            raise ResultError("no result: an alternative is an object")
+        return Alternative(
+            checked.rigid(checked.wanted(data, "world_from_cam"), "world_from_cam"),
+            checked.number(checked.wanted(data, "probability"), "probability", 0.0, 1.0),
+            checked.whole(checked.wanted(data, "node"), "node"),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +190,7 @@ class NotLocalized:
     times_ms: dict[str, float] = field(default_factory=dict)
     detail: str = ""
     alternatives: tuple[Alternative, ...] = ()
+    provenance: Provenance = Provenance()
 
     @property
     def localized(self) -> Literal[False]:
@@ -106,9 +198,44 @@ class NotLocalized:
 
     def to_json(self, query: str) -> dict[str, Any]:
         """One line of the result file, see docs/cli.md."""
-        line = {"query": query, "localized": False, "reason": self.reason, **_evidence_json(self)}
-        line |= {"detail": self.detail} if self.detail else {}
-        return line | ({"alternatives": [one.to_json() for one in self.alternatives]} if self.alternatives else {})
+        alternatives = [one.to_json() for one in self.alternatives]
+        refusal = {"query": query, "localized": False, "reason": self.reason, "detail": self.detail, "alternatives": alternatives}
+        return refusal | _evidence_json(self)
+
+    @staticmethod
+    def from_json(line: str | bytes | Mapping[str, Any]) -> NotLocalized:
+        """What `to_json` wrote, as text or read already; its query is not kept.
+
+        Raises:
+            ResultError: it is no result, or one of an image that was localized.
+        """
+        data = checked.object_of(line)
+        if checked.wanted(data, "localized") is not False:
+            raise ResultError("the result of an image that was localized is no refusal (Localization.from_json reads it)")
+        reason = checked.wanted(data, "reason")
+        if reason not in get_args(Reason):
+            raise ResultError(f"no result: the reason is none of {', '.join(get_args(Reason))}")
+        return NotLocalized(
+            reason,
+            **_evidence_from(data),
+            detail=checked.text(data.get("detail", ""), "detail"),
+            alternatives=tuple(Alternative.from_json(one) for one in checked.items(data.get("alternatives", []), "alternatives")),
+            provenance=Provenance.from_json(data),
+        )
+
+
+R = TypeVar("R", bound=Localization | NotLocalized)
+
+
+def result_from_json(line: str | bytes | Mapping[str, Any]) -> Localization | NotLocalized:
+    """Either of the two. Raises ResultError where it is no result."""
+    data = checked.object_of(line)
+    return Localization.from_json(data) if data.get("localized") is True else NotLocalized.from_json(data)
+
+
+def at_time(result: R, t_ns: int) -> R:
+    """The result, with the time of its picture, nanoseconds."""
+    return replace(result, provenance=replace(result.provenance, t_ns=t_ns))
 
 
 def _pose_json(world_from_cam: Rigid3) -> dict[str, list[float]]:
@@ -121,4 +248,20 @@ def _evidence_json(result: Localization | NotLocalized) -> dict[str, Any]:
         "num_matches": result.num_matches,
         "num_inliers": result.num_inliers,
         "times_ms": {stage: round(ms, 3) for stage, ms in result.times_ms.items()},
+        **result.provenance.to_json(),
+    }
+
+
+def _evidence_from(data: Mapping[str, Any]) -> dict[str, Any]:
+    pairs = [checked.items(pair, "candidates") for pair in checked.items(checked.wanted(data, "candidates"), "candidates")]
+    if any(len(pair) != 2 for pair in pairs):
+        raise ResultError("no result: 'candidates' are pairs of a node and its score")
+    times_ms = checked.wanted(data, "times_ms")
+    if not isinstance(times_ms, Mapping):
+        raise ResultError("no result: 'times_ms' are milliseconds by the names of stages")
+    return {
+        "candidates": [NodeScore(checked.whole(node_id, "candidates"), checked.number(score, "candidates")) for node_id, score in pairs],
+        "num_matches": checked.whole(checked.wanted(data, "num_matches"), "num_matches"),
+        "num_inliers": checked.whole(checked.wanted(data, "num_inliers"), "num_inliers"),
+        "times_ms": {str(stage): checked.number(ms, "times_ms") for stage, ms in times_ms.items()},
     }

@@ -6,8 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import no_type_check
 
+from topoloc.geometry.geodesy import Georeference
 from topoloc.map.config import MapConfig
 from topoloc.map.entries import Edge, NodeSummary, PlaceImage, Repetitions, SharedErrors, SideNodes, TopoNode
+from topoloc.map.nodes import digest_of_nodes
 from topoloc.map.sessions import Edit, Session
 from topoloc.places.coarse import CoarseModel
 
@@ -23,6 +25,9 @@ class NextIds:
     edit: int = 1
 
 
+_MAP_ID = b"map id"
+
+
 @no_type_check  # at run time: it would read from the file to look at entries' types
 @dataclass(frozen=True, eq=False)
 class MapContents:
@@ -30,6 +35,8 @@ class MapContents:
     was built with, `length_m` the metres of trajectory that were mapped. `default_coarse` names the coarse localizer that answers
     where the user names none. `shared_errors` and `repetitions` are None where nobody has measured
     them, `sides` where no mapping picture is wide enough to show the walls along the way. `edits` begins with the build.
+    `map_id` stays what it is whatever becomes of the map; None until it is saved, and in older files. `georeference` says where on earth
+    the map's world lies, where that is known.
     `other_kinds` are the same nodes with points of further kinds of features, by the kind's name, and `other_shared_errors` what
     `shared_errors` are of these.
     """
@@ -50,6 +57,8 @@ class MapContents:
     next_ids: NextIds = NextIds()
     other_kinds: Mapping[str, Sequence[TopoNode]] = field(default_factory=dict)
     other_shared_errors: Mapping[str, SharedErrors] = field(default_factory=dict)
+    map_id: str | None = None
+    georeference: Georeference | None = None
 
     @property
     def kind(self) -> str:
@@ -57,6 +66,16 @@ class MapContents:
         return self.config.features.kind
 
     @property
+    def version(self) -> int:
+        """The number of its last edit: 1 as it was built, 0 where it has no history."""
+        return max((edit.edit_id for edit in self.edits), default=0)
+
+    @property
     def kinds(self) -> list[str]:
         """All kinds of features that the map holds, that of the nodes first."""
         return [self.kind, *sorted(self.other_kinds)]
+
+
+def map_id_of(contents: MapContents) -> str:
+    """The map's id, 16 hexadecimal digits; of one that was not saved yet, or by an older version, what its nodes make of it."""
+    return contents.map_id or digest_of_nodes(contents.summaries, _MAP_ID)

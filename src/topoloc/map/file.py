@@ -17,7 +17,7 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
-from topoloc.errors import CalibrationError, ConfigError, FeatureKindError, MapError, MapVersionError
+from topoloc.errors import CalibrationError, ConfigError, FeatureKindError, GeoreferenceError, MapError, MapVersionError
 from topoloc.map.schema import (
     APPLICATION_ID,
     ORDER,
@@ -114,7 +114,7 @@ class MapFile:
                 yield
         except (sqlite3.ProgrammingError, sqlite3.InterfaceError):  # a call of ours that is wrong
             raise
-        except (sqlite3.Error, zlib.error, Damage, ConfigError, FeatureKindError, CalibrationError) as error:
+        except (sqlite3.Error, zlib.error, Damage, ConfigError, FeatureKindError, CalibrationError, GeoreferenceError) as error:
             raise MapError(f"map {self.path} is damaged: {' '.join(str(error).split())[:300]}") from error
 
     def rows(self, table: str, columns: Sequence[str] | None = None) -> list[dict[str, Any]]:

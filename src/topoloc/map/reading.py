@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -15,6 +16,7 @@ from topoloc.bounds import settings_from, value_from
 from topoloc.errors import MapError
 from topoloc.features.kinds import find_kind
 from topoloc.geometry.camera import Camera
+from topoloc.geometry.geodesy import Georeference
 from topoloc.map.config import CONFIG_VERSION, MapConfig, config_from_text
 from topoloc.map.contents import MapContents, NextIds
 from topoloc.map.entries import Edge, NodeSummary, PlaceImage, Repetitions, SharedErrors, SideNodes, TopoNode
@@ -82,6 +84,8 @@ def _contents_of(file: MapFile) -> MapContents:
         sessions=list(_sessions_of(file).values()),
         edits=[Edit(*row.values()) for row in file.rows("edits")],
         next_ids=settings_from(NextIds, json_of(facts.get("next_ids", "{}")), "next_ids"),
+        map_id=_map_id_of(facts),
+        georeference=Georeference.from_json(json_of(facts["georeference"])) if "georeference" in facts else None,
         other_kinds={kind: _stored_nodes(file, kind, is_default=False) for kind in kinds if kind != config.features.kind},
     )
 
@@ -96,6 +100,13 @@ def _kinds_of(facts: Mapping[str, str], config: MapConfig) -> list[str]:
     for kind in kinds:
         find_kind(kind)
     return kinds
+
+
+def _map_id_of(facts: Mapping[str, str]) -> str | None:
+    map_id = facts.get("map_id")
+    if map_id is not None and not re.fullmatch("[0-9a-f]{16}", map_id):
+        raise Damage("map_id: 16 hexadecimal digits are expected")
+    return map_id
 
 
 def _shared_errors_of(facts: Mapping[str, str], key: str) -> SharedErrors | None:

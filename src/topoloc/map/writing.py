@@ -21,7 +21,7 @@ import numpy as np
 from topoloc.errors import MapError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.map.config import config_to_text
-from topoloc.map.contents import MapContents, NextIds
+from topoloc.map.contents import MapContents, NextIds, map_id_of
 from topoloc.map.entries import TopoNode
 from topoloc.map.points import array_packed, arrays_of
 from topoloc.map.schema import APPLICATION_ID, ORDER, SCHEMA_VERSION, SIDE, TABLES, checksum_of, creation_of
@@ -123,6 +123,9 @@ class _Writer:
             "next_ids": json.dumps({name: max(value, getattr(used, name)) for name, value in asdict(topomap.next_ids).items()}),
             "counts": json.dumps({table: len(rows) for table, rows in self._checksums.items() if table != "map"}),
         }
+        facts["map_id"] = map_id_of(topomap)
+        if topomap.georeference is not None:
+            facts["georeference"] = json.dumps(topomap.georeference.to_json())
         if topomap.shared_errors is not None:
             facts["shared_errors"] = json.dumps(asdict(topomap.shared_errors))
         for kind, errors in topomap.other_shared_errors.items():

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import os
 import secrets
-from collections.abc import Iterator
+import shutil
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from hashlib import blake2b
 from pathlib import Path
@@ -43,6 +44,7 @@ def replaced_file(path: Path) -> Iterator[Path]:
     Raises:
         OSError: the folder or the file cannot be written.
     """
+    path = _target(path)
     remove_leftovers(path)
     temporary, lock = _own_file(path)
     try:
@@ -56,8 +58,55 @@ def replaced_file(path: Path) -> Iterator[Path]:
         os.close(lock)
 
 
+def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
+    """Write a folder with these files (names may have folders), all of it or nothing.
+
+    A folder that is there already is replaced if it holds no files but such as are written now.
+
+    Raises:
+        TopolocError: it holds others, or cannot be written.
+    """
+    path = _target(path)
+    temporary = path.with_name(f"{_prefix(path)}{secrets.token_hex(8)}.folder")
+    before = temporary.with_suffix(".before")
+    try:
+        _check_replaceable(path, files)
+        for name, data in files.items():
+            (temporary / name).parent.mkdir(parents=True, exist_ok=True)
+            (temporary / name).write_bytes(data)
+            _sync(temporary / name)
+        if path.is_dir():
+            os.rename(path, before)
+        os.rename(temporary, path)
+        _sync(path.parent)
+    except OSError as error:
+        if before.is_dir() and not path.exists():
+            os.rename(before, path)
+        raise TopolocError(f"cannot write {path}: {error.strerror}") from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+        if path.is_dir():  # else what was there before is all there is
+            shutil.rmtree(before, ignore_errors=True)
+
+
+def _check_replaceable(path: Path, files: Mapping[str, bytes]) -> None:
+    """Hold that no file is lost that nobody means to write anew."""
+    if path.exists() and not path.is_dir():
+        raise TopolocError(f"cannot write {path}: it is no folder")
+    found = (one.relative_to(path).as_posix() for one in path.rglob("*") if one.is_symlink() or not one.is_dir())
+    other = next((name for name in found if name not in files), None)
+    if other is not None:
+        raise TopolocError(f"cannot write {path}: this folder holds other things, such as {other}")
+
+
+def _target(path: Path) -> Path:
+    """Where a symbolic link leads: that file is replaced, not the link."""
+    return Path(os.path.realpath(path)) if path.is_symlink() else path
+
+
 def remove_leftovers(path: Path) -> None:
     """Remove what writers of `path` left beside it that were killed; what a living process writes stays."""
+    path = _target(path)
     prefix = _prefix(path)
     try:
         names = [entry.name for entry in os.scandir(path.parent) if entry.name.startswith(prefix)]

@@ -88,11 +88,23 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
     """
     if trajectory.t_ns is None:
         raise TrajectoryError(f"{path}: a TUM file needs times, and these poses have none")
+    write_text(path, tum_text(trajectory))
+
+
+def tum_text(trajectory: Trajectory) -> str:
+    """A TUM file's lines, of a trajectory with times."""
+    assert trajectory.t_ns is not None
     lines = ["# t tx ty tz qx qy qz qw (s, m; world_from_cam)"]
     for t_ns, pose in zip(trajectory.t_ns, trajectory.world_from_cam, strict=True):
         w, x, y, z = pose.quat_wxyz()
         lines.append(" ".join([f"{Decimal(t_ns).scaleb(-9):.9f}", *(f"{value:.12g}" for value in (*pose.translation, x, y, z, w))]))
-    write_text(path, "\n".join(lines) + "\n")
+    return "\n".join(lines) + "\n"
+
+
+def kitti_text(trajectory: Trajectory) -> str:
+    """A line a pose: the upper 3x4 of its matrix, row by row."""
+    rows = (pose.matrix()[:3].ravel().tolist() for pose in trajectory.world_from_cam)
+    return "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows)
 
 
 def poses_at(trajectory: Trajectory, t_ns: Sequence[int], max_gap: float = 0.2) -> list[Rigid3 | None]:

@@ -114,4 +114,4 @@ def _is_among(world_from_cam: Rigid3, found: list[Found]) -> bool:
 
 def refused(found: Localization) -> NotLocalized:
     """A pose that the motion does not allow for."""
-    return NotLocalized("jump", found.candidates, found.num_matches, found.num_inliers, found.times_ms)
+    return NotLocalized("jump", found.candidates, found.num_matches, found.num_inliers, found.times_ms, provenance=found.provenance)

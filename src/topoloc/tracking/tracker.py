@@ -14,7 +14,7 @@ smoothed pose.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -26,7 +26,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.query import StageClock, check_size
-from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.result import Localization, NotLocalized, at_time
 from topoloc.places.coarse import Image
 from topoloc.sequences.frame_checks import time_problem
 from topoloc.sequences.pictures import grey_image
@@ -108,14 +108,14 @@ class Tracker:
         is_same = self._image is not None and np.array_equal(self._image, image)
         self._advance(t_ns, may_stand_still=is_same)
         if is_same and self._answer is not None:
-            last = self._answer
-            return StreamedPose(t_ns, last.state, last.result, last.smoothed, last.smoothed_covariance, is_repeated=True)
+            return replace(self._answer, t_ns=t_ns, result=at_time(self._answer.result, t_ns), is_repeated=True)
         self._image = image.copy()  # who reads a camera may read into the same memory again
         if self.config.mode == "paper":
-            self._answer = self._by_paper(image, camera, t_ns)
+            answer = self._by_paper(image, camera, t_ns)
         else:
-            grey, grey_camera = reduced(grey_image(image), camera, self.config.max_side_px)
-            self._answer = self._by_motion(StreamPicture(image, camera, t_ns, odom_from_cam, grey, grey_camera))
+            grey = reduced(grey_image(image), camera, self.config.max_side_px)
+            answer = self._by_motion(StreamPicture(image, camera, t_ns, odom_from_cam, *grey))
+        self._answer = self._completed(answer, camera)
         return self._answer
 
     def miss(self, t_ns: int, result: NotLocalized, odom_from_cam: Rigid3 | None = None) -> StreamedPose:
@@ -127,10 +127,13 @@ class Tracker:
         self._advance(t_ns)
         self._image = None
         if self.config.mode == "paper":
-            return self._copied(result, t_ns)
+            return self._completed(self._copied(result, t_ns))
         self._hypotheses.predict(t_ns, odom_from_cam)
         self._keep_reference()
-        return self._decided(self._without_pose(result, t_ns))
+        return self._completed(self._decided(self._without_pose(result, t_ns)))
+
+    def _completed(self, answer: StreamedPose, camera: Camera | None = None) -> StreamedPose:
+        return replace(answer, result=self.localizer.completed(answer.result, camera, answer.t_ns))
 
     def _advance(self, t_ns: int, may_stand_still: bool = False) -> None:
         if problem := time_problem(t_ns):
@@ -184,7 +187,7 @@ class Tracker:
         if self._hypotheses.is_decided:
             return answer
         detail, alternatives = "the pictures so far leave open which of these", self._hypotheses.alternatives()
-        result = NotLocalized("ambiguous", times_ms=answer.result.times_ms, detail=detail, alternatives=alternatives)
+        result = NotLocalized("ambiguous", [], 0, 0, answer.result.times_ms, detail, alternatives, answer.result.provenance)
         return StreamedPose(answer.t_ns, "ambiguous", result)
 
     def _follow(self, picture: StreamPicture, predicted: MotionState | None) -> Followed | None:
@@ -282,6 +285,7 @@ class Tracker:
             num_matches=followed.num_found,
             num_inliers=followed.num_agreeing,
             times_ms=clock.times_ms(),
+            provenance=found.provenance,
         )
         return StreamedPose(picture.t_ns, "tracked", result, state.world_from_cam, smoothed_covariance(reference, state))
 

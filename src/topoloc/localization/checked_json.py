@@ -1,0 +1,92 @@
+"""Values out of JSON that may come from anywhere: of the type that is expected and within bounds, or a ResultError that names the key."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from topoloc.errors import ResultError, TrajectoryError
+from topoloc.geometry.rigid import Rigid3
+
+MAX_ITEMS = 10_000
+
+
+def object_of(line: str | bytes | Mapping[str, Any]) -> Mapping[str, Any]:
+    """A JSON line as what it says, or as what was read of it already."""
+    data: Any = line
+    if isinstance(line, str | bytes):
+        try:
+            data = json.loads(line)
+        except (ValueError, RecursionError) as error:
+            raise ResultError(f"no result: not JSON ({' '.join(str(error).split())[:100]})") from None
+    if not isinstance(data, Mapping):
+        raise ResultError(f"no result: a JSON object is expected, not {type(data).__name__}")
+    return data
+
+
+def wanted(data: Mapping[str, Any], key: str) -> Any:
+    """What stands under a key that must be there."""
+    if key not in data:
+        raise ResultError(f"no result: {key!r} is missing")
+    return data[key]
+
+
+def number(value: Any, key: str, least: float = -math.inf, most: float = math.inf) -> float:
+    """A finite number within bounds."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most or abs(value) > 1e300:  # NaN fails
+        raise ResultError(f"no result: {key!r} is no number{_within(least, most)}")
+    return float(value)
+
+
+def whole(value: Any, key: str, least: int = 0, most: int = 2**63 - 1) -> int:
+    """An integer within bounds."""
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+        raise ResultError(f"no result: {key!r} is no integer{_within(float(least), float(most))}")
+    return value
+
+
+def text(value: Any, key: str) -> str:
+    if not isinstance(value, str):
+        raise ResultError(f"no result: {key!r} is no text")
+    return value
+
+
+def items(value: Any, key: str) -> list[Any]:
+    """A list of a length that results have."""
+    if not isinstance(value, list | tuple) or len(value) > MAX_ITEMS:
+        raise ResultError(f"no result: {key!r} is no list of at most {MAX_ITEMS}")
+    return list(value)
+
+
+def rigid(value: Any, key: str) -> Rigid3:
+    """``{"translation": [x, y, z], "quat_wxyz": [w, x, y, z]}``."""
+    data = value if isinstance(value, Mapping) else {}
+    quat_wxyz = [number(one, f"{key}.quat_wxyz") for one in items(data.get("quat_wxyz"), f"{key}.quat_wxyz")]
+    translation = [number(one, f"{key}.translation") for one in items(data.get("translation"), f"{key}.translation")]
+    if len(quat_wxyz) != 4 or len(translation) != 3 or not abs(math.hypot(*quat_wxyz) - 1.0) < 1e-3:
+        raise ResultError(f"no result: {key!r} needs a translation of 3 numbers and a unit quat_wxyz of 4")
+    try:
+        return Rigid3.from_quat_wxyz(np.array(quat_wxyz), np.array(translation))
+    except TrajectoryError as error:
+        raise ResultError(f"no result: {key!r}: {error}") from None
+
+
+def covariance(value: Any, key: str) -> Float[np.ndarray, "6 6"]:
+    """6x6, symmetric, no variance negative."""
+    rows = [[number(one, key) for one in items(row, key)] for row in items(value, key)]
+    if len(rows) != 6 or any(len(row) != 6 for row in rows):
+        raise ResultError(f"no result: {key!r} is no 6x6 matrix")
+    matrix = np.array(rows)
+    diagonal = np.diag(matrix)
+    if (diagonal < 0.0).any() or (np.abs(matrix - matrix.T) > 1e-6 * np.sqrt(np.outer(diagonal, diagonal)) + 1e-300).any():
+        raise ResultError(f"no result: {key!r} is not symmetric, or has a negative variance")
+    return matrix
+
+
+def _within(least: float, most: float) -> str:
+    return "" if math.isinf(least) and math.isinf(most) else f" from {least:g} to {most:g}"
