@@ -143,7 +143,7 @@ def test_ctrl_c_in_mid_build(recording: Path, tmp_path: Path, complaint: Complai
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("topoloc.map.build.extract_features", interrupted)
+    monkeypatch.setattr("topoloc.map.mapping_frames.extract_features", interrupted)
     assert complaint("build", recording, target) == "error: interrupted; every file is as it was or whole\n"
 
 

@@ -83,7 +83,7 @@ def depth_of(array: Any) -> topoloc.DepthImage:
 )
 def test_what_is_refused(frame: Callable[[], Any], says: str):
     with pytest.raises(RecordingError, match=f"memory, frame 1.*{says}") as raised:
-        topoloc.MemorySequence([stereo(0) if isinstance(frame(), str) else changed(rgbd(0), t_ns=-1), frame()])
+        topoloc.MemorySequence(one for one in (changed(rgbd(0), t_ns=-1), frame()))  # the tests' own checks look into lists
     assert "\n" not in str(raised.value)
 
 

@@ -217,7 +217,7 @@ class TestCameraOption:
             ("20,20,7.5,5.5", "are those of a picture of about 16x12 pixels; this one has 32x24"),
             ("40,40,11.5,15.5", "are those of a picture turned by 90 degrees, of about 24x32; this one has 32x24"),
             ("40,40,500,11.5", "are those of a picture of about 1001x24 pixels"),
-            ("40,40,15.5", "neither a camera's file nor four numbers"),
+            ("40,40,15.5", "neither a file nor four numbers"),
             ("40,40,nan,11.5", "not finite"),
             ("-40,40,15.5,11.5", "positive"),
         ],

@@ -38,7 +38,7 @@ def calibration_of(text: str | Path) -> CalibrationOfSize:
         try:
             fx, fy, cx, cy = map(float, str(text).split(","))
         except ValueError:
-            raise CalibrationError(f"{str(text)[:80]}: neither a camera's file nor four numbers fx,fy,cx,cy") from None
+            raise CalibrationError(f"{str(text)[:80]}: neither a file nor four numbers fx,fy,cx,cy") from None
         Camera.pinhole(1, 1, fx, fy, cx, cy)  # complains before the first picture is read
         return lambda width, height: CameraFile(camera_of_numbers(fx, fy, cx, cy, width, height))
     if path.suffix.lower() in YAML_SUFFIXES:

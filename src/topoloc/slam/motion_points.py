@@ -26,7 +26,7 @@ from topoloc.slam.metric_points import MetricPoints
 class MotionPointsConfig:
     """How features of single pictures with poses get their 3-D position."""
 
-    steps: tuple[float, ...] = (1.0, 2.0, 4.0, 7.0, 12.0, 20.0, 34.0, 55.0)
+    steps: Annotated[tuple[float, ...], Above(0)] = (1.0, 2.0, 4.0, 7.0, 12.0, 20.0, 34.0, 55.0)
     """Distances of the other pictures, in those of consecutive ones (median)."""
     max_turn: Annotated[float, Between(0, 3.2)] = 0.6
     """Angle between the views of two pictures, radians; beyond it hardly anything matches."""
