@@ -20,6 +20,7 @@ COMMANDS = {
     "build": ("topoloc.cli.build", "map a place: a stereo or RGB-D recording becomes one map file"),
     "localize": ("topoloc.cli.localize", "where were these images taken? 6-DoF poses of images, folders, recordings"),
     "evaluate": ("topoloc.cli.evaluate", "localize a recording with known truth and judge the poses"),
+    "explain": ("topoloc.cli.explain", "why a picture got its answer, or none, and what would help"),
     "info": ("topoloc.cli.info", "what a map file holds"),
     "export": ("topoloc.cli.export", "a map or results for other programs: COLMAP, nerfstudio, PLY, GeoJSON, MCAP, TUM, KITTI"),
     "georeference": ("topoloc.cli.georeference", "where on earth a map lies; its results then carry OGC GeoPoses"),
@@ -28,7 +29,7 @@ COMMANDS = {
 }
 BROUGHT = {"simulate": "topoloc-worlds", "train": "topoloc-training", "benchmark": "topoloc-paper"}
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
-_IN_HELP = ("demo", "simulate", "slam", "build", "train", "localize", "evaluate", "benchmark", "info")
+_IN_HELP = ("demo", "simulate", "slam", "build", "train", "localize", "evaluate", "explain", "benchmark", "info")
 _IN_HELP += ("export", "georeference", "weights", "config")
 LEAST_ADDRESS_SPACE = 1_600_000_000
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
@@ -25,24 +25,22 @@ from topoloc.cli.output import (
     write_text,
 )
 from topoloc.cli.query_answers import QueryAnswer, answer_line, exit_status, stream_summary, trajectory_of
+from topoloc.cli.query_camera import CameraOfSize, camera_of_frame, named_camera
 from topoloc.cli.settings_file import read_settings, with_option
 from topoloc.errors import CalibrationError, QueryError, TopolocError, UnreadableImageError
-from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.result import NotLocalized
 from topoloc.map.sessions import path_of
 from topoloc.map.topomap import TopoMetricMap
-from topoloc.sequences.calibration import calibration_of
-from topoloc.sequences.frame import StereoFrame, StereoSequence
+from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import find_format
 from topoloc.sequences.recording import single_pictures
 from topoloc.sequences.trajectory import frame_poses, read_trajectory, write_tum
 from topoloc.tracking.tracker import Tracker, TrackerConfig
 
 # The camera of a picture of this width and height (pixels).
-CameraOfSize = Callable[[int, int], Camera | RoughCamera]
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +111,7 @@ class Command:
         config = with_option(config, "max_ms", self.max_ms, "--max-ms")
         tracking = self._tracking(settings.of(TrackerConfig))
         topomap = TopoMetricMap.load(self.map)
-        camera = None if self.camera is None or self._stereo_calibration else _camera_of_size(self.camera, topomap)
+        camera = None if self.camera is None or self._stereo_calibration else named_camera(self.camera, topomap)
         queries = [self._open(path) for path in self.inputs]
         localizer = localizer_of(topomap, config, self.features)
         answers: list[QueryAnswer] = []
@@ -210,39 +208,10 @@ def _answer(
     except UnreadableImageError as error:
         unreadable = localizer.completed(NotLocalized("unreadable", detail=str(error)), t_ns=t_ns if query.has_times else None)
         return QueryAnswer(name, t_ns, unreadable, tracker.miss(t_ns, unreadable, odom_from_cam) if tracker is not None else None)
-    camera = _camera_of_frame(frame, camera_of_size)
+    camera = camera_of_frame(frame, camera_of_size)
     if tracker is None:
         return QueryAnswer(name, t_ns, localizer.localize(frame.image, camera, t_ns=t_ns if query.has_times else None))
     if isinstance(camera, RoughCamera):
         raise CalibrationError("a stream needs a calibration: --camera FILE, --camera fx,fy,cx,cy or --camera map; or --single")
     streamed = tracker.process(frame.image, camera, t_ns, odom_from_cam)
     return QueryAnswer(name, t_ns, streamed.result, streamed)
-
-
-def _camera_of_frame(frame: StereoFrame, camera_of_size: CameraOfSize | None) -> Camera | RoughCamera:
-    """What `--camera` says, else the recording; else what the picture's file says of its focal length, or nothing."""
-    height, width = frame.image.shape[:2]
-    if camera_of_size is not None:
-        return camera_of_size(width, height)
-    if frame.camera is not None:
-        return frame.camera
-    return RoughCamera.unknown(width, height) if frame.noted_focal is None else RoughCamera.noted(width, height, frame.noted_focal)
-
-
-def _camera_of_size(text: str, topomap: TopoMetricMap) -> CameraOfSize:
-    """What `--camera` says. Raises CalibrationError."""
-    if text == "map":
-        return _rescaled(topomap.nodes[0].camera)
-    if text == "unknown":
-        return RoughCamera.unknown
-    calibration = calibration_of(text)
-    return lambda width, height: calibration(width, height).camera
-
-
-def _rescaled(camera: Camera) -> CameraOfSize:
-    def of_size(width: int, height: int) -> Camera:
-        if abs(width * camera.height - height * camera.width) > max(camera.width, camera.height):  # more than a pixel's rounding
-            raise QueryError(f"the image is {width}x{height}, the map's camera {camera.width}x{camera.height}: not of one shape")
-        return camera.rescaled(width, height)
-
-    return of_size

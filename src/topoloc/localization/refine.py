@@ -43,7 +43,8 @@ def hypothesis_of(search: Search, proposal: Proposal) -> Hypothesis | None:
         search.first = proposal.fit if final is None or final.pose is None else final
     if search.trace is not None:
         milliseconds = search.query.clock.times_ms()["total"]
-        search.trace.tried.append(Tried(proposal.source, proposal.fit, final, hypothesis, milliseconds))
+        kind = search.query.feature_config.kind
+        search.trace.tried.append(Tried(proposal.source, proposal.fit, final, hypothesis, milliseconds, kind))
     return hypothesis
 
 

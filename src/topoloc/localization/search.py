@@ -20,7 +20,7 @@ class Tried:
     """A first pose and what became of it.
 
     `refined` is the pose found around the first one (None: the first was not followed up), `hypothesis` that with its evidence (None:
-    too little was found for any), `milliseconds` the time since the query began.
+    too little was found for any), `milliseconds` the time since the query began, `features` the kind that was asked.
     """
 
     source: str
@@ -28,6 +28,7 @@ class Tried:
     refined: PoseFit | None
     hypothesis: Hypothesis | None
     milliseconds: float
+    features: str
 
 
 @dataclass(eq=False)

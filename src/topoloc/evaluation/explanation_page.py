@@ -1,0 +1,116 @@
+"""An explanation as one self-contained page."""
+
+from __future__ import annotations
+
+import base64
+from html import escape
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+
+from topoloc.evaluation.explanation import Explanation, TriedPose
+from topoloc.evaluation.match_pictures import JPEG_QUALITY, NodeMatches, draw_pair
+from topoloc.localization.result import Localization
+from topoloc.map.topomap import TopoMetricMap
+from topoloc.places.network_pictures import decode_picture
+from topoloc.sequences.atomic import write_text
+from topoloc.sequences.frame import Image
+from topoloc.sequences.pictures import jpeg_of
+
+_POSES = "Of each first pose: points were sought where the map expects them, and weighed. Found counts those of all that must be in view."
+_MAX_SHOWN = 3
+_COLUMNS = ("tried", "features", "near node", "first inliers", "found", "by chance", "unguided", "probability", "what became of it")
+
+
+def write_explanation(path: Path, name: str, image: Image, explanation: Explanation, topomap: TopoMetricMap) -> None:
+    """Write the page, at once or not at all. Raises TopolocError where the file cannot be written."""
+    style = resources.files("topoloc.evaluation").joinpath("report.css").read_text(encoding="utf-8")
+    head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
+    title = escape(f"Why {name} {'is here' if explanation.result.localized else 'was not localized'}")
+    header = f'<header><div class="page"><h1>{title}</h1><p>{escape(verdict(explanation))}</p></div></header>'
+    advice = "".join(f"<li>{escape(line)}</li>" for line in explanation.advice) or "<li>Nothing is amiss.</li>"
+    sections = (
+        f'<section style="margin-top:-48px"><h2>What would help</h2><ul>{advice}</ul></section>'
+        f"<section><h2>What it was compared with</h2><p>{_shown_words(explanation)}</p>{_pairs(image, explanation, topomap)}</section>"
+        f'<section><h2>What was tried</h2><p>{_POSES}</p><div class="wide">{_table(explanation)}</div></section>'
+    )
+    write_text(
+        path,
+        f'<!DOCTYPE html>\n<html lang="en"><head>{head}\n<title>{title}</title>\n<style>\n{style}</style></head><body>\n'
+        f'{header}\n<div class="page">{sections}<footer>Written by topoloc.</footer></div></body></html>\n',
+    )
+
+
+def verdict(explanation: Explanation) -> str:
+    """The result in one sentence."""
+    result = explanation.result
+    if not isinstance(result, Localization):
+        return f"Not localized: {result.reason.replace('_', ' ')}. {len(explanation.poses)} poses were looked into."
+    x, y, z = result.world_from_cam.translation
+    sigmas = f"{100.0 * result.position_sigma_m:.1f} cm, {result.rotation_sigma_deg:.2f} deg"
+    return (
+        f"At ({x:.2f}, {y:.2f}, {z:.2f}) m near node {result.node_id}, probability {result.probability:.2f}, standard deviations {sigmas}."
+    )
+
+
+def _ranked(explanation: Explanation) -> list[TriedPose]:
+    """The poses that are shown, the likeliest first, each node once."""
+    with_pose = [pose for pose in explanation.poses if pose.fit.pose is not None and pose.fit.node_id >= 0]
+    with_pose.sort(key=lambda pose: (pose.probability or 0.0, pose.fit.num_inliers), reverse=True)
+    return list({pose.fit.node_id: pose for pose in reversed(with_pose)}.values())[::-1][:_MAX_SHOWN]
+
+
+def _shown_words(explanation: Explanation) -> str:
+    if not _ranked(explanation):
+        return "No pose came of any part of the map; beside it stands the node that looks most like it."
+    return "Left the picture, right the node of the map. Lines join what the pose explains."
+
+
+def _pairs(image: Image, explanation: Explanation, topomap: TopoMetricMap) -> str:
+    articles = [_article(image, pose, topomap) for pose in _ranked(explanation)]
+    if not articles and explanation.result.candidates:
+        node = topomap.nodes[topomap.row_of(explanation.result.candidates[0].node_id)]
+        pair = draw_pair(image, decode_picture(node.template_jpeg))
+        articles = [_figure(pair, f"left the picture, right node {node.summary.node_id}")]
+    return '<div class="queries">' + "".join(articles) + "</div>"
+
+
+def _article(image: Image, pose: TriedPose, topomap: TopoMetricMap) -> str:
+    node, fit = topomap.nodes[topomap.row_of(pose.fit.node_id)], pose.fit
+    assert fit.pose is not None
+    rows = np.flatnonzero(fit.pose.inliers)
+    scale = image.shape[1] / fit.camera.width
+    query = (fit.features.points_img[fit.matches.query_idx[rows]].astype(np.float64) + 0.5) * scale - 0.5
+    points = fit.local_map.points_world[fit.matches.train_idx[rows]]
+    seen = node.camera.img_from_cam(node.summary.world_from_cam.inverse().apply(points))
+    inside = np.isfinite(seen).all(axis=1) & (seen >= 0).all(axis=1) & (seen < [node.camera.width, node.camera.height]).all(axis=1)
+    matches = NodeMatches(query[inside], seen[inside], np.full(int(inside.sum()), pose.verdict == "the answer"))
+    pair = draw_pair(image, decode_picture(node.template_jpeg), matches, node.camera)
+    kind = "good" if pose.verdict == "the answer" else "bad"
+    facts = f'<div class="facts"><b>node {node.summary.node_id}, {len(rows)} inliers</b><p class="{kind}">{escape(pose.verdict)}</p></div>'
+    return f"<article>{_figure(pair, f'left the picture, right node {node.summary.node_id}')}{facts}</article>"
+
+
+def _figure(pair: Image, caption: str) -> str:
+    data = base64.b64encode(jpeg_of(pair, JPEG_QUALITY)).decode("ascii")
+    return f'<figure><img alt="{caption}" src="data:image/jpeg;base64,{data}"><figcaption>{caption}</figcaption></figure>'
+
+
+def _table(explanation: Explanation) -> str:
+    rows = ["".join(f"<th>{name}</th>" for name in _COLUMNS)]
+    for pose in explanation.poses:
+        rows.append("".join(f"<td>{escape(cell)}</td>" for cell in row_of(pose)))
+    return '<table class="tried">' + "".join(f"<tr>{row}</tr>" for row in rows) + "</table>"
+
+
+def row_of(pose: TriedPose) -> tuple[str, ...]:
+    """What `_COLUMNS` name, as text."""
+    evidence = pose.tried.hypothesis.evidence if pose.tried.hypothesis is not None else None
+    node = str(pose.fit.node_id) if pose.fit.node_id >= 0 else ""
+    first = f"{pose.tried.first.num_inliers} of {len(pose.tried.first.matches)}"
+    if evidence is None:
+        return pose.tried.source, pose.tried.features, node, first, "", "", "", "", pose.verdict
+    found, unguided = f"{evidence.num_found} of {evidence.num_visible}", f"{evidence.num_inliers} of {evidence.num_matches}"
+    probability = "" if pose.probability is None else f"{pose.probability:.2f}"
+    return pose.tried.source, pose.tried.features, node, first, found, str(evidence.num_by_chance), unguided, probability, pose.verdict
