@@ -56,7 +56,7 @@ def believed(hypotheses: list[Hypothesis], config: LocalizerConfig | None = None
     query = Query(np.zeros((CAMERA.height, CAMERA.width), np.uint8), CAMERA, 1.0, FeatureConfig())
     resolved = (config or LocalizerConfig()).for_kind(SURF)
     not_open = object.__new__(OpenMap)
-    not_open.node_ids = list(range(10))
+    not_open.node_ids, not_open.kind = list(range(10)), SURF
     search = Search(query, not_open, resolved, WEIGHTS, rho=0.0, ranked=CANDIDATES)
     for hypothesis in hypotheses:
         search.belief = search.belief.given(hypothesis, resolved.evidence, WEIGHTS.rivals)

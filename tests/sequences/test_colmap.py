@@ -76,7 +76,7 @@ def test_pictures_that_lie_elsewhere(model: Make, tmp_path: Path):
     with pytest.raises(RecordingError, match="name their folder with --images"):
         open_sequence(root)
     assert open_sequence(root, images=tmp_path / "photos")[0].image.shape == (HEIGHT, WIDTH)
-    with pytest.raises(RecordingError, match="goes with a model of COLMAP"):
+    with pytest.raises(RecordingError, match="takes no images"):
         open_sequence(tmp_path / "photos", images=tmp_path / "photos")
     (tmp_path / "photos" / "a1.png").unlink()
     with pytest.raises(UnreadableImageError, match=r"a1\.png"):

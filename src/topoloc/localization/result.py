@@ -84,9 +84,9 @@ class Localization:
     focal_length_px: float | None = None
     noise_share: float = 1.0
     calibrated: bool = True
-    calibration_doubt: CalibrationDoubt | None = None
     provenance: Provenance = Provenance()
     geopose: GeoPose | None = None
+    calibration_doubt: CalibrationDoubt | None = None
 
     @property
     def localized(self) -> Literal[True]:
