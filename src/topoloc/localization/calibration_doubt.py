@@ -20,7 +20,7 @@ from topoloc.localization.map_facts.correlated_errors import inflation
 from topoloc.localization.pose_fit import PoseFit, fit_pose
 from topoloc.localization.search import Search
 
-_SUSPECT, _NAMED = (3.0, 0.01), (4.0, 0.025)  # sigmas, and share of the focal length or of the picture's width
+_SUSPECT, _NAMED = (3.0, 0.01), (5.0, 0.035)  # sigmas, and share of the focal length or of the picture's width
 _ROUNDS, _SETTLED = 4, 0.003
 
 
