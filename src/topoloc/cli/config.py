@@ -21,7 +21,7 @@ class Command:
     """What `topoloc config` takes."""
 
     command: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="COMMAND", help_behavior_hint="(default: all)")] = None
-    """Only what this command reads: build, slam, localize, evaluate or train."""
+    """Only what this command reads: build, slam, localize, evaluate, explain or train."""
 
     def run(self) -> int:
         from topoloc import __version__

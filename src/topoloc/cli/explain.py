@@ -41,7 +41,7 @@ class Command:
     json: File = None
     """Write what is printed as JSON to this file (- for standard output)."""
     config: File = None
-    """All other settings: a TOML file, as `topoloc config localize` prints it."""
+    """All other settings: a TOML file, as `topoloc config explain` prints it."""
 
     def run(self) -> int:
         check_outputs([self.out, self.json], inputs=[path for path in (self.map, self.config) if path])

@@ -24,7 +24,7 @@ T = TypeVar("T")
 # table of the file: module and class of its configuration, and the commands that it is for; more come with other distributions
 TABLES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "build": ("topoloc.map.build", "BuildConfig", ("build",)),
-    "localize": ("topoloc.localization.localizer", "LocalizerConfig", ("localize", "evaluate")),
+    "localize": ("topoloc.localization.localizer", "LocalizerConfig", ("localize", "evaluate", "explain")),
     "track": ("topoloc.tracking.tracker", "TrackerConfig", ("localize",)),
     "slam": ("topoloc.slam.slam", "SlamConfig", ("slam", "build")),
 }
