@@ -93,6 +93,13 @@ def test_poses_of_another_place_are_not_explained():
     assert verdict.conventions == ()
 
 
+def test_positions_beyond_all_places_are_not_believed():
+    far = [Rigid3(pose.rotation, 1e200 * pose.translation) for pose in POSES]
+    verdict = judge_poses(steps_of(POSES, 0), far, T_NS)
+    assert not verdict.is_believed
+    assert verdict.conventions == ()
+
+
 def test_a_camera_that_stands_still_tells_nothing():
     still = [MeasuredStep(k, k + 1, Rigid3.identity(), 3.0) for k in range(20)]
     assert judge_poses(still, [pose.inverse() for pose in POSES], T_NS).is_believed

@@ -48,7 +48,7 @@ def _calibration_checked(search: Search, best: Hypothesis, probability: float) -
         named = _answered(search, best, probability)
         return named[0], [named]
     covariance = best.covariance + np.outer(doubt.shift, doubt.shift)
-    evidence = replace(best.evidence, doubt=max(best.evidence.doubt, _doubt_of_shift(search, best, doubt.shift)))
+    evidence = replace(best.evidence, doubt=max(best.evidence.doubt, _doubt_with(search, best, covariance)))
     paid = replace(best, covariance=covariance, evidence=evidence)
     probability *= precision_at(evidence.doubt)
     if probability < search.config.evidence.min_probability:
@@ -58,12 +58,12 @@ def _calibration_checked(search: Search, best: Hypothesis, probability: float) -
     return localization, [(localization, seen)]
 
 
-def _doubt_of_shift(search: Search, best: Hypothesis, shift: Float[np.ndarray, " 6"]) -> float:
-    """`Evidence.doubt`, of a pose that may be off by this left perturbation of cam_from_world."""
-    seen, fit = best.fit.seen_points(1.0), best.fit.pose
-    assert fit is not None
-    depth = float(np.median(fit.cam_from_world.apply(seen.points_world)[:, 2]))
-    return doubt_of(best.covariance + np.outer(shift, shift), depth, search.config.evidence)
+def _doubt_with(search: Search, best: Hypothesis, covariance: Float[np.ndarray, "6 6"]) -> float:
+    """`Evidence.doubt` of the hypothesis, were its covariance this one."""
+    assert best.fit.pose is not None
+    seen = best.fit.seen_points(1.0)
+    depth = float(np.median(best.fit.pose.cam_from_world.apply(seen.points_world)[:, 2]))
+    return doubt_of(covariance, depth, search.config.evidence)
 
 
 def _lead(search: Search, best: Hypothesis, other: Hypothesis) -> float:

@@ -30,12 +30,12 @@ _MIN_TURN, _TURN, _WAY, _SHARE = math.radians(5.0), math.radians(1.5), 0.02, 0.1
 _DEPTH_SHARE = 0.01  # of the depth of what is seen, by which a measured way may be wrong
 _MIN_WAY = 3.0  # times the tolerance
 _UNIT_TOLERANCE = 0.15
+_FARTHEST = 1e12  # no place in any unit; squares of much more are no numbers
 _MIN_SHIFT_S, _MAX_SHIFT_S, _NUM_SHIFTS, _MAX_GAP_S = 0.02, 3.0, 60, 1.0  # shifts tried to each side
 _NOTED_MISS, _FAR_BETTER = 0.3, 0.4
 _MOUNTING_ROUNDS, _LEAST_TURN = 5, 0.05
 _BODY_COUNTS = 4.0  # conventions: a mounting has six numbers to fit by
 
-_Pairs = list[tuple[Rigid3, Rigid3]]
 _Poses = Sequence[Rigid3 | None]
 
 
@@ -112,6 +112,8 @@ def judge_poses(steps: Sequence[MeasuredStep], poses: _Poses, t_ns: Sequence[int
     telling = [step for step in telling if poses[step.first] is not None and poses[step.last] is not None]
     if len(telling) < _MIN_TELLING:
         return PoseVerdict(len(telling), len(telling))
+    if any(pose is not None and np.abs(pose.translation).max() > _FARTHEST for pose in poses):
+        return PoseVerdict(len(telling), 0)
     as_is = _Reading((), _misses(telling, _steps_of(telling, poses)))
     verdict = PoseVerdict(len(telling), as_is.num_agreeing)
     readings = [*_by_convention(telling, poses), *_best_shift(telling, poses, t_ns)]
@@ -170,7 +172,7 @@ def _unit_of(telling: Sequence[MeasuredStep], steps: Sequence[Rigid3]) -> tuple[
     measured = np.array([np.linalg.norm(step.first_from_last.translation) for step in telling])
     lengths = np.array([np.linalg.norm(step.translation) for step in steps])
     long = lengths > 1e-9
-    if not long.any():
+    if not long.any() or not measured[long].any():
         return (), 1.0
     factor = float(np.sum(measured[long]) / np.sum(lengths[long]))
     for name, metres in {"": 1.0, **UNITS}.items():
