@@ -64,8 +64,8 @@ def test_one_picture_of_another_shape_in_a_list(room_map: Path, queries: Path, t
 @pytest.mark.parametrize(
     ("options", "status", "says"),
     [
-        (["--scale", "0"], 2, "--scale must be a positive number, not 0"),
-        (["--scale", "nan"], 2, "--scale must be a positive number, not nan"),
+        (["--scale", "0"], 2, "--scale must be a positive number, or IMAGE_A,IMAGE_B=3.2m, not 0"),
+        (["--scale", "nan"], 2, "--scale must be a positive number, or IMAGE_A,IMAGE_B=3.2m, not nan"),
         (["--scale", "2", "--trajectory", "slam"], 2, "slam finds others"),
         (["--images", "."], 1, "takes no images"),
         (["--camera", "nowhere.yaml"], 1, "nowhere.yaml: no calibration here"),

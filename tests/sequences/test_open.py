@@ -8,7 +8,7 @@ from tiny_recordings import assert_same_pose, picture, write
 from topoloc.errors import RecordingError, UnknownFormatError
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import FORMATS, open_sequence
-from topoloc.sequences.recording import parse_selection, sequence_subset
+from topoloc.sequences.recording import natural_key, parse_selection, sequence_subset
 
 
 @pytest.mark.parametrize("name", ["kitti", "euroc", "tum", "seven_scenes"])
@@ -109,3 +109,8 @@ def test_a_subset_keeps_its_order_and_its_bounds(plain: Callable[..., Path]):
         sequence_subset(sequence, [3])
     with pytest.raises(IndexError):
         subset[2]
+
+
+def test_names_are_sorted_by_their_numbers_however_long():
+    names = ["frame10.png", "frame9.png", "frame" + "9" * 5000 + ".png", "frame010b.png", "1.png"]
+    assert sorted(names, key=natural_key) == ["1.png", "frame9.png", "frame10.png", "frame010b.png", "frame" + "9" * 5000 + ".png"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -11,6 +12,8 @@ import numpy as np
 import pytest
 
 from topoloc.errors import MissingExtraError, RecordingError
+from topoloc.sequences.capture.folder_writer import FolderWriter
+from topoloc.sequences.capture.zed_capture import sdk_frames
 from topoloc.sequences.open import find_format, open_sequence
 from topoloc.sequences.recording import single_pictures
 
@@ -23,7 +26,10 @@ class StandInCamera:
     position = 0
 
     def open(self, settings: Any) -> str:
-        return "SUCCESS" if settings.path.endswith("walk.svo2") else "INVALID SVO FILE"
+        return "SUCCESS" if not settings.path or settings.path.endswith("/walk.svo2") else "INVALID SVO FILE"
+
+    def close(self) -> None:
+        self.position = -1
 
     def set_svo_position(self, position: int) -> None:
         self.position = position
@@ -103,3 +109,35 @@ def test_a_file_that_the_sdk_cannot_open(tmp_path: Path):
     path.write_bytes(b"svo")
     with pytest.raises(RecordingError, match="the ZED SDK cannot open it"):
         open_sequence(path)
+
+
+@pytest.mark.usefixtures("sdk")
+def test_a_zed_that_is_plugged_in(tmp_path: Path):
+    frames = sdk_frames(threading.Event())
+    with FolderWriter(tmp_path / "out") as writer:
+        for _ in range(NUM_FRAMES):
+            writer.write(next(frames))
+    with pytest.raises(RecordingError, match="gives no more pictures"):
+        next(frames)
+    read = open_sequence(tmp_path / "out")
+    assert read.t_ns == [10**18 + index * 66_000_000 for index in range(NUM_FRAMES)]
+    last = read[NUM_FRAMES - 1]
+    assert last.right is not None
+    assert last.rig is not None
+    assert last.rig.baseline == pytest.approx(0.12)
+    assert (last.image[0, 0].tolist(), last.right[0, 0].tolist()) == ([3, 2, 1], [103, 2, 1])
+
+
+@pytest.mark.usefixtures("sdk")
+def test_a_plugged_in_zed_is_let_go():
+    stop, num_frames = threading.Event(), 0
+    for _ in sdk_frames(stop):
+        num_frames += 1
+        stop.set()
+    assert num_frames == 1
+
+
+def test_a_zed_without_its_sdk(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "pyzed", None)
+    with pytest.raises(MissingExtraError, match="a ZED needs pyzed"):
+        next(sdk_frames(threading.Event()))

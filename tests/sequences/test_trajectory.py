@@ -9,6 +9,7 @@ from tiny_recordings import assert_same_pose, kitti_row, pose, tum_line
 from topoloc.errors import TopolocError, TrajectoryError
 from topoloc.geometry.pose_conventions import PoseReading
 from topoloc.geometry.rigid import Rigid3
+from topoloc.sequences import trajectory
 from topoloc.sequences.open import open_sequence
 from topoloc.sequences.recording import Recording, SequenceView
 from topoloc.sequences.trajectory import Trajectory, as_read, frame_poses, poses_at, read_trajectory, with_trajectory, write_tum
@@ -197,3 +198,37 @@ def test_own_poses_are_read_as_told():
 def recording_of(t_ns: list[int]) -> Recording:
     """A recording of no pictures."""
     return Recording("none", Path(), [f"{k}.png" for k in range(len(t_ns))], t_ns, [None] * len(t_ns), None)
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ["1403636579.763555584 0 1 2 0 0 0 1", "1403636579.763555585 0 1.5 2e-3 0 0 0.6 0.8"],  # read at once
+        ["# t", "1403636579 0 1 2 0 0 0 1", "", "1403636580\t0 1.5 2e-3 0 0 0.6 0.8 # the last"],
+        ["1403636579763555584 0 1 2 0 0 0 1", "1403636579763555585 0 1.5 2e-3 0 0 0.6 0.8"],  # nanoseconds
+        ["9.5 0 1 2 0 0 0 1", "10.25 0 1.5 2e-3 0 0 0.6 0.8"],  # of several lengths
+        ["0.0 0 1 2 0 0 0 1", "1e0 0 1.5 2e-3 0 0 0.6 0.8"],
+        ["5,0,1,2,0,0,0,1", "6,0,1.5,2e-3,0,0,0.6,0.8"],
+        [" 5 0 1 2 0 0 0 1", " 6 0 1.5 2e-3 0 0 0.6 0.8"],
+    ],
+)
+def test_read_at_once_or_line_by_line_it_is_the_same(tmp_path: Path, lines: list[str]):
+    (tmp_path / "a.tum").write_text("\n".join(lines) + "\n")
+    whole, by_lines = read_trajectory(tmp_path / "a.tum"), trajectory._trajectory_of_rows(tmp_path / "a.tum")
+    assert whole.t_ns == by_lines.t_ns
+    for one, other in zip(whole.world_from_cam, by_lines.world_from_cam, strict=True):
+        assert_same_pose(one, other, 0.0)
+    np.testing.assert_allclose(whole.world_from_cam[1].translation, [0.0, 1.5, 2e-3])
+
+
+def test_exact_times_are_read_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A million lines take seconds only where they are not gone through one by one."""
+    poses = [pose(index) for index in range(5)]
+    write_tum(tmp_path / "a.tum", Trajectory(poses, [1_700_000_000_123_456_789 + index for index in range(5)]))
+    monkeypatch.setattr(trajectory, "_trajectory_of_rows", None)
+    read = read_trajectory(tmp_path / "a.tum")
+    assert read.t_ns == [1_700_000_000_123_456_789 + index for index in range(5)]
+    for one, other in zip(poses, read.world_from_cam, strict=True):
+        assert_same_pose(one, other)
+    assert len(read.world_from_cam[1:4]) == 3
+    assert_same_pose(read.world_from_cam[1:4][-1], poses[3])

@@ -23,6 +23,8 @@ _MAX_POINTS = 256  # evenly among all: their noise is the least of what is unkno
 _CAUCHY_SCALE = 2.3849
 _PRIOR = 0.3  # standard deviation; without any, a wall seen straight leaves the focal length and the distance open together
 _MIN_POINTS = 20
+DOUBT_LENGTHS = ("focal_length_px", "focal_sigma_px", "calibrated_focal_length_px")
+"""The first fields of a `CalibrationDoubt`, which are its JSON's keys as well."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +37,20 @@ class PictureCalibration:
     offset: Float[np.ndarray, " 2"]
     covariance: Float[np.ndarray, "3 3"]
     cam_from_world: Rigid3
+
+
+@dataclass(frozen=True, eq=False)
+class SeenCamera:
+    """What a picture says of its camera beside the calibration, whatever the picture's size.
+
+    `deviation` is the logarithm of the focal length over the calibrated one, and the principal point's way from the calibrated one
+    (calibrated focal lengths; x, y); `covariance` is its noise, of points that are wrong independently. Pictures that show one `place`
+    (a node) share what its points are wrong by.
+    """
+
+    deviation: Float[np.ndarray, " 3"]
+    covariance: Float[np.ndarray, "3 3"]
+    place: int = -1
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +80,11 @@ class CalibrationDoubt:
         return f"the picture says {'; '.join(parts)}"
 
     def to_json(self) -> dict[str, Any]:
+        of = {"focal_length": self.is_of_focal_length, "principal_point": self.is_of_centre}
         return {
-            "focal_length_px": self.focal_length_px,
-            "calibrated_focal_length_px": self.calibrated_focal_length_px,
+            **{key: getattr(self, key) for key in DOUBT_LENGTHS},
+            "of": [name for name, is_said in of.items() if is_said],
+            "shift": self.shift.tolist(),
             "principal_point_px": self.centre_px.tolist(),
             "calibrated_principal_point_px": self.calibrated_centre_px.tolist(),
             "detail": str(self),
@@ -116,6 +134,13 @@ def camera_of_picture(camera: Camera, found: PictureCalibration) -> Camera:
     return replace(
         camera, params=tuple(float(moved.get(name, value)) for name, value in zip(MODELS[camera.model], camera.params, strict=True))
     )
+
+
+def seen_beside(calibrated: Camera, camera: Camera, found: PictureCalibration, place: int) -> SeenCamera:
+    """What was found with `camera`, beside the calibration that the picture came with; both of one picture size."""
+    own = camera_of_picture(camera, found)
+    way = np.array([own.cx - calibrated.cx, own.cy - calibrated.cy]) / calibrated.fx
+    return SeenCamera(np.array([math.log(own.fx / calibrated.fx), *way]), found.covariance, place)
 
 
 def _linearised(

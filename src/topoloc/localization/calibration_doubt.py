@@ -8,44 +8,61 @@ nothing changes, so that the camera named is the picture's own and not half way 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.geometry.calibration_check import CalibrationDoubt, PictureCalibration, calibration_of_picture, camera_of_picture
+from topoloc.geometry.calibration_check import (
+    CalibrationDoubt,
+    PictureCalibration,
+    SeenCamera,
+    calibration_of_picture,
+    camera_of_picture,
+    seen_beside,
+)
+from topoloc.geometry.calibration_verdict import CalibrationVerdict, verdict_of_pictures
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.guided import match_guided
 from topoloc.localization.map_facts.correlated_errors import inflation
 from topoloc.localization.pose_fit import PoseFit, fit_pose
+from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Search
 
 _SUSPECT, _NAMED = (3.0, 0.01), (5.0, 0.035)  # sigmas, and share of the focal length or of the picture's width
 _ROUNDS, _SETTLED = 4, 0.003
 
 
-def doubt_of_calibration(search: Search, fit: PoseFit) -> CalibrationDoubt | None:
-    """What the points of an answer say against its calibration; None where they agree with it, or there was none."""
+def verdicts_of(results: Iterable[Localization | NotLocalized]) -> list[CalibrationVerdict]:
+    """What the pictures of each camera say of it together; nothing of cameras that too few pictures say anything of."""
+    by_camera: dict[Camera, dict[SeenCamera, None]] = {}
+    for result in results:
+        if result.seen_camera is not None and result.provenance.camera is not None:
+            by_camera.setdefault(result.provenance.camera, {})[result.seen_camera] = None  # a picture that comes twice says it once
+    verdicts = (verdict_of_pictures(list(seen), camera) for camera, seen in by_camera.items())
+    return [verdict for verdict in verdicts if verdict is not None]
+
+
+def doubt_of_calibration(search: Search, fit: PoseFit) -> tuple[SeenCamera | None, CalibrationDoubt | None]:
+    """What the points of an answer say of its camera (None: nothing, or there was no calibration), and what of that is said against the
+    calibration (None where they agree)."""
     if isinstance(fit.lens, RoughCamera) or fit.pose is None:
-        return None
+        return None, None
     found = _measured(search, fit)
-    if found is None or not any(_contradicts(fit, found, fit.camera, *_SUSPECT)):
-        return None
-    calibrated, first = fit.camera, fit.pose.cam_from_world
-    for _ in range(_ROUNDS):
-        around = _around(search, fit, found)
-        again = _measured(search, around)
-        if again is None:  # it leads nowhere: what was seen at first has to do
-            break
-        fit, found = around, again
-        if max(abs(math.log(found.scale)), float(np.abs(found.offset).max())) < _SETTLED:
-            break
+    if found is None:
+        return None, None
+    if not any(_contradicts(fit, found, fit.camera, *_SUSPECT)):
+        return seen_beside(fit.camera, fit.camera, found, fit.node_id), None
+    calibrated, first, place = fit.camera, fit.pose.cam_from_world, fit.node_id
+    fit, found = _settled(search, fit, found)
+    seen = seen_beside(calibrated, fit.camera, found, place)
     is_of_focal_length, is_of_centre = _contradicts(fit, found, calibrated, *_NAMED)
     if not (is_of_focal_length or is_of_centre):
-        return None
+        return seen, None
     camera, scale = camera_of_picture(fit.camera, found), search.query.scale
     sigma = math.sqrt(inflation(fit.num_inliers, search.rho) * found.covariance[0, 0])
-    return CalibrationDoubt(
+    return seen, CalibrationDoubt(
         camera.fx * scale,
         sigma * camera.fx * scale,
         calibrated.fx * scale,
@@ -55,6 +72,19 @@ def doubt_of_calibration(search: Search, fit: PoseFit) -> CalibrationDoubt | Non
         is_of_centre,
         (found.cam_from_world @ first.inverse()).log(),
     )
+
+
+def _settled(search: Search, fit: PoseFit, found: PictureCalibration) -> tuple[PoseFit, PictureCalibration]:
+    """The points sought again around what is found, until nothing changes."""
+    for _ in range(_ROUNDS):
+        around = _around(search, fit, found)
+        again = _measured(search, around)
+        if again is None:  # it leads nowhere: what was seen at first has to do
+            break
+        fit, found = around, again
+        if max(abs(math.log(found.scale)), float(np.abs(found.offset).max())) < _SETTLED:
+            break
+    return fit, found
 
 
 def _measured(search: Search, fit: PoseFit) -> PictureCalibration | None:

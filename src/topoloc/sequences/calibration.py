@@ -35,17 +35,22 @@ def calibration_of(text: str | Path) -> CalibrationOfSize:
     """
     path = Path(text)
     if "," in str(text) and not path.exists():
-        try:
-            fx, fy, cx, cy = map(float, str(text).split(","))
-        except ValueError:
-            raise CalibrationError(f"{str(text)[:80]}: neither a file nor four numbers fx,fy,cx,cy") from None
-        Camera.pinhole(1, 1, fx, fy, cx, cy)  # complains before the first picture is read
-        return lambda width, height: CameraFile(camera_of_numbers(fx, fy, cx, cy, width, height))
+        return calibration_of_numbers(str(text))
     if path.suffix.lower() in YAML_SUFFIXES:
         read_calibration_yaml(path, 1000, 1000)  # complains before the first picture is read
         return lambda width, height: read_calibration_yaml(path, width, height)
     camera_file = read_camera_json(path)
     return lambda width, height: camera_file
+
+
+def calibration_of_numbers(text: str) -> CalibrationOfSize:
+    """The pinhole camera of four numbers ``fx,fy,cx,cy`` (pixels). Raises CalibrationError."""
+    try:
+        fx, fy, cx, cy = map(float, text.split(","))
+    except ValueError:
+        raise CalibrationError(f"{text[:80]}: neither a file nor four numbers fx,fy,cx,cy") from None
+    Camera.pinhole(1, 1, fx, fy, cx, cy)  # complains before the first picture is read
+    return lambda width, height: CameraFile(camera_of_numbers(fx, fy, cx, cy, width, height))
 
 
 def camera_of_numbers(fx: float, fy: float, cx: float, cy: float, width: int, height: int) -> Camera:

@@ -64,7 +64,7 @@ def open_colmap(path: Path, images: Path | None = None) -> Recording:
     poses: list[Rigid3 | None] = [_world_from_cam(image, model) for image in posed]
     same = len(set(of_images)) == 1
     of_frames = (None, of_images) if not same else (of_images[0], None)
-    return Recording(path.resolve().name, root, names, _times(names), poses, of_frames[0], cameras=of_frames[1], has_scale=False)
+    return Recording(path.resolve().name, root, names, times_of(names), poses, of_frames[0], cameras=of_frames[1], has_scale=False)
 
 
 def aligned(sequence: StereoSequence, path: Path) -> StereoSequence:
@@ -189,7 +189,7 @@ def _world_from_cam(image: Any, model: Path) -> Rigid3:
         raise TrajectoryError(f"{model}, {image.name}: {error}") from None
 
 
-def _times(names: list[str]) -> list[int]:
+def times_of(names: list[str]) -> list[int]:
     """Nanoseconds: the pictures' names where these are increasing numbers, else their places in the list as seconds."""
     stems = [PurePath(name).stem for name in names]
     if all(len(stem) <= 24 and stem.replace(".", "", 1).isascii() and stem.replace(".", "", 1).isdigit() for stem in stems):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from topoloc.errors import RecordingError, UnknownFormatError
-from topoloc.sequences import colmap, euroc, folder, kitti, nerfstudio, record3d, seven_scenes, tum, video, zed
+from topoloc.sequences import colmap, colmap_database, euroc, folder, kitti, nerfstudio, record3d, seven_scenes, tum, video, zed
 from topoloc.sequences.bags import bag_recording
 from topoloc.sequences.calibration import calibration_of, recalibrated
 from topoloc.sequences.frame import StereoSequence
@@ -34,6 +34,7 @@ FORMATS = {
     "nerfstudio": SequenceFormat(nerfstudio.LOOKS_FOR, nerfstudio.recognises, nerfstudio.open_nerfstudio),
     "record3d": SequenceFormat(record3d.LOOKS_FOR, record3d.recognises, record3d.open_record3d),
     "colmap": SequenceFormat(colmap.LOOKS_FOR, colmap.recognises, colmap.open_colmap, ("images",)),
+    "colmap_database": SequenceFormat(colmap_database.LOOKS_FOR, colmap_database.recognises, colmap_database.open_database, ("images",)),
     "kitti": SequenceFormat(kitti.LOOKS_FOR, kitti.recognises, kitti.open_kitti),
     "rosbag": SequenceFormat(bag_recording.LOOKS_FOR, bag_recording.recognises, bag_recording.open_bag, ("topics",)),
     "mcap": SequenceFormat(bag_recording.LOOKS_FOR_MCAP, bag_recording.recognises_mcap, bag_recording.open_bag, ("topics",)),

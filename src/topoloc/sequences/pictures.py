@@ -104,7 +104,7 @@ def jpeg_of(image: Image, quality: int) -> bytes:
     return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
-def image_size(path: Path) -> tuple[int, int]:
+def image_size(path: Path | PictureBytes) -> tuple[int, int]:
     """Width and height in pixels, from the header.
 
     Raises:
@@ -115,7 +115,7 @@ def image_size(path: Path) -> tuple[int, int]:
         return (height, width) if picture.getexif().get(ExifTags.Base.Orientation) in _TURNED else (width, height)
 
 
-def exif_focal_length(path: Path, width: int, height: int) -> float | None:
+def exif_focal_length(path: Path | PictureBytes, width: int, height: int) -> float | None:
     """Focal length in pixels of a picture of this size, by its EXIF data; None where the file says nothing usable.
 
     The focal length equivalent on 35 mm film counts first (its diagonal stands for the picture's), then the one in millimetres with the

@@ -214,8 +214,9 @@ def list_pictures(folder: Path, suffix: str = "") -> list[Path]:
 
 
 def natural_key(name: str) -> list[tuple[int, str]]:
-    """A sort key by which numbers inside names compare as numbers."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", name)]
+    """A sort key by which numbers inside names compare as numbers, however many digits they have."""
+    parts = re.split(r"([0-9]+)", name)
+    return [(len(number := part.lstrip("0")), number) if part.isdigit() else (-1, part) for part in parts]
 
 
 def check_pairs(left: Sequence[Path], right: Sequence[Path]) -> None:

@@ -65,9 +65,7 @@ class SvoRecording:
         return replace(frame, right=self._view(view.RIGHT), rig=self.rig) if self.with_right else frame
 
     def _view(self, view: Any) -> Image:
-        picture = self.sdk.Mat()
-        self.camera.retrieve_image(picture, view)
-        return cv2.cvtColor(picture.get_data(), cv2.COLOR_BGRA2RGB)
+        return picture_of(self.sdk, self.camera, view)
 
 
 def open_svo(path: Path) -> SvoRecording:
@@ -78,8 +76,8 @@ def open_svo(path: Path) -> SvoRecording:
         RecordingError: the SDK cannot open it, or it has no frame.
     """
     try:
-        import pyzed.sl as sl  # pyright: ignore[reportMissingImports]
-    except ImportError:
+        sl = sdk("an SVO file")
+    except MissingExtraError:
         raise MissingExtraError(
             f"{path}: SVO files need pyzed of Stereolabs' ZED SDK; without it export the rectified pairs on a machine that has it "
             "(its sample svo_export, mode 2) into left/ and right/ with a camera.json"
@@ -99,11 +97,27 @@ def open_svo(path: Path) -> SvoRecording:
     if not t_ns:
         raise RecordingError(f"{path}: no frame of it can be decoded")
     poses = read_truth(path.with_suffix(".tum"), [], t_ns)
-    return SvoRecording(path.name, path, t_ns, poses, _rig(camera), sl, camera)
+    return SvoRecording(path.name, path, t_ns, poses, rig_of(camera), sl, camera)
 
 
-def _rig(camera: Any) -> StereoRig:
-    """Of the rectified pictures, which the SDK gives."""
+def sdk(what: str) -> Any:
+    """Stereolabs' package. Raises MissingExtraError, which says that `what` needs it."""
+    try:
+        import pyzed.sl as sl  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        raise MissingExtraError(f"{what} needs pyzed of Stereolabs' ZED SDK, which is not installed") from None
+    return sl
+
+
+def picture_of(sdk: Any, camera: Any, view: Any) -> Image:
+    """What a camera of the SDK saw last, RGB."""
+    picture = sdk.Mat()
+    camera.retrieve_image(picture, view)
+    return cv2.cvtColor(picture.get_data(), cv2.COLOR_BGRA2RGB)
+
+
+def rig_of(camera: Any) -> StereoRig:
+    """Of the rectified pictures, which the SDK gives; metres."""
     configuration = camera.get_camera_information().camera_configuration
     parameters, size = configuration.calibration_parameters, configuration.resolution
     left = parameters.left_cam

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path, PurePath
+
+import numpy as np
+from jaxtyping import Float
 
 from topoloc.errors import TopolocError
 
@@ -32,12 +36,66 @@ def read_rows(path: Path, error: type[TopolocError]) -> list[tuple[int, list[str
     Raises:
         error: the file is missing, no text, or holds no row; names it.
     """
-    text = read_text(path, error).replace(",", " ")
-    lines = text.splitlines() if "#" not in text else [line.partition("#")[0] for line in text.splitlines()]
-    rows = [(number, columns) for number, line in enumerate(lines, start=1) if (columns := line.split())]
+    rows = [(number, columns) for number, line in enumerate(_lines(path, error), start=1) if (columns := line.split())]
     if not rows:
         raise error(f"{path}: nothing in this file")
     return rows
+
+
+def _lines(path: Path, error: type[TopolocError]) -> list[str]:
+    """The file's lines without comments, commas as spaces."""
+    text = read_text(path, error).replace(",", " ")
+    return text.splitlines() if "#" not in text else [line.partition("#")[0] for line in text.splitlines()]
+
+
+@dataclass(frozen=True, eq=False)
+class PlainTable:
+    """Numbers of lines that have equally many of them, and the lines."""
+
+    numbers: Float[np.ndarray, "n c"]
+    lines: list[str]
+
+
+def read_plain_table(path: Path, error: type[TopolocError]) -> PlainTable | None:
+    """A file of finite numbers alone, equally many a line (comments are left out), read at once; None where it is another.
+
+    Raises:
+        error: the file is missing or no text.
+    """
+    lines = [line for line in _lines(path, error) if line and not line.isspace()]
+    if not lines:
+        return None
+    try:
+        numbers = np.loadtxt(lines, comments=None, ndmin=2)
+    except ValueError:
+        return None
+    return PlainTable(numbers, lines) if len(numbers) == len(lines) and np.isfinite(numbers).all() else None
+
+
+def plain_times(lines: Sequence[str]) -> list[int] | None:
+    """As `parse_times`, of lines whose times are all written alike, such as ``1403636579.763555584``; None of any other."""
+    width = len(lines[0].split(None, 1)[0])
+    try:
+        characters = np.frombuffer("".join([line[: width + 1] for line in lines]).encode("ascii"), np.uint8)
+    except UnicodeEncodeError:
+        return None
+    if characters.size != len(lines) * (width + 1):
+        return None
+    *columns, last = np.ascontiguousarray(characters.reshape(len(lines), -1).T)
+    if not ((last == ord(" ")) | (last == ord("\t"))).all():
+        return None
+    dots = [number for number, column in enumerate(columns) if column[0] == ord(".")]
+    at = dots[0] if dots else width
+    digits = columns[:at] + columns[at + 1 :]
+    if (dots and (columns[at] != ord(".")).any()) or not 1 <= at <= 10 or len(digits) - at > 9:  # ten digits: seconds, no nanoseconds
+        return None
+    t_ns = np.zeros(len(lines), dtype=np.int64)
+    for column in digits:
+        if column.min() < ord("0") or column.max() > ord("9"):
+            return None
+        t_ns = 10 * t_ns + (column - ord("0"))
+    t_ns *= 10 ** (9 - (len(digits) - at))
+    return t_ns.tolist() if (np.diff(t_ns) > 0).all() else None
 
 
 def parse_times(rows: Sequence[tuple[int, list[str]]], path: Path, error: type[TopolocError]) -> list[int]:

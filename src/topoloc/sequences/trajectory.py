@@ -12,23 +12,24 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from pathlib import Path
-from typing import overload
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from topoloc.errors import RecordingError, TrajectoryError
+from topoloc.geometry.lazy_poses import LazyPoses, pose_of_quaternion, poses_of_matrices
 from topoloc.geometry.pose_conventions import PoseReading
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.atomic import write_text
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.recording import SequenceView, times_by_rate
-from topoloc.sequences.text_rows import NANOSECONDS, parse_times, read_rows
+from topoloc.sequences.text_rows import NANOSECONDS, parse_times, plain_times, read_plain_table, read_rows
 
 # Times written with few decimals still mean the frame they were made from.
 _SAME_TIME_NS = 1_000_000
 _ROTATION_TOLERANCE = 1e-2
 _SAME_SPAN = 0.8  # of the time that the frames take, for two clocks to tell of the same
+TUM_HEADER = "# t tx ty tz qx qy qz qw (s, m; world_from_cam)"
 _Rows = Sequence[tuple[int, list[str]]]
 
 
@@ -49,6 +50,23 @@ def read_trajectory(path: Path) -> Trajectory:
     Raises:
         TrajectoryError: missing, empty, a wrong number of columns, NaN, no rotation, or times that do not increase; with the line.
     """
+    return _plain_trajectory(path) or _trajectory_of_rows(path)
+
+
+def _plain_trajectory(path: Path) -> Trajectory | None:
+    """A file of numbers alone, all of them good, read at once; None of any other, which is then read line by line."""
+    table = read_plain_table(path, TrajectoryError)
+    if table is None or table.numbers.shape[1] not in (8, 12):
+        return None
+    if table.numbers.shape[1] == 12:
+        poses, is_rotation = poses_of_matrices(table.numbers, _ROTATION_TOLERANCE)
+        return Trajectory(poses) if is_rotation.all() else None
+    t_ns, rows = plain_times(table.lines), table.numbers[:, 1:]
+    is_good = t_ns is not None and _are_of_unit_length(rows[:, 3:]).all()
+    return Trajectory(LazyPoses(rows, pose_of_quaternion), t_ns) if is_good else None
+
+
+def _trajectory_of_rows(path: Path) -> Trajectory:
     rows = read_rows(path, TrajectoryError)
     num_columns = len(rows[0][1])
     if num_columns not in (8, 12):
@@ -57,12 +75,17 @@ def read_trajectory(path: Path) -> Trajectory:
         if len(tokens) != num_columns:
             raise TrajectoryError(f"{path}, line {line}: {len(tokens)} columns, the lines before have {num_columns}")
     if num_columns == 12:
-        matrices = _numbers(path, rows, range(12)).reshape(-1, 3, 4)
-        rotations, is_rotation = _rotations_near(matrices[:, :, :3])
+        poses, is_rotation = poses_of_matrices(_numbers(path, rows, range(12)), _ROTATION_TOLERANCE)
         _check(is_rotation, "not a rotation", path, rows)
-        return Trajectory(_StackedPoses(rotations, matrices[:, :, 3]))
-    t_ns = parse_times(rows, path, TrajectoryError)
-    return Trajectory(_poses_of_quaternions(path, rows, wxyz=(7, 4, 5, 6)), t_ns)
+        return Trajectory(poses)
+    return _timed_trajectory(path, rows, range(1, 8))
+
+
+def _timed_trajectory(path: Path, rows: _Rows, columns: Iterable[int]) -> Trajectory:
+    """Of rows that begin with a time, and whose other columns are, in this order, x, y, z (metres) and a quaternion (x, y, z, w)."""
+    t_ns, numbers = parse_times(rows, path, TrajectoryError), _numbers(path, rows, columns)
+    _check(_are_of_unit_length(numbers[:, 3:]), "not a rotation", path, rows)
+    return Trajectory(LazyPoses(numbers, pose_of_quaternion), t_ns)
 
 
 def read_asl_poses(path: Path) -> Trajectory:
@@ -75,8 +98,7 @@ def read_asl_poses(path: Path) -> Trajectory:
     for line, tokens in rows:
         if len(tokens) < 8:
             raise TrajectoryError(f"{path}, line {line}: {len(tokens)} columns, a pose has 8")
-    t_ns = parse_times(rows, path, TrajectoryError)
-    return Trajectory(_poses_of_quaternions(path, rows, wxyz=(4, 5, 6, 7)), t_ns)
+    return _timed_trajectory(path, rows, (1, 2, 3, 5, 6, 7, 4))
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
@@ -94,11 +116,14 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
 def tum_text(trajectory: Trajectory) -> str:
     """A TUM file's lines, of a trajectory with times."""
     assert trajectory.t_ns is not None
-    lines = ["# t tx ty tz qx qy qz qw (s, m; world_from_cam)"]
-    for t_ns, pose in zip(trajectory.t_ns, trajectory.world_from_cam, strict=True):
-        w, x, y, z = pose.quat_wxyz()
-        lines.append(" ".join([f"{Decimal(t_ns).scaleb(-9):.9f}", *(f"{value:.12g}" for value in (*pose.translation, x, y, z, w))]))
-    return "\n".join(lines) + "\n"
+    rows = (tum_line(t_ns, pose) for t_ns, pose in zip(trajectory.t_ns, trajectory.world_from_cam, strict=True))
+    return "\n".join([TUM_HEADER, *rows]) + "\n"
+
+
+def tum_line(t_ns: int, world_from_cam: Rigid3) -> str:
+    """One line of a TUM file, without its end."""
+    w, x, y, z = world_from_cam.quat_wxyz()
+    return " ".join([f"{Decimal(t_ns).scaleb(-9):.9f}", *(f"{value:.12g}" for value in (*world_from_cam.translation, x, y, z, w))])
 
 
 def kitti_text(trajectory: Trajectory) -> str:
@@ -254,55 +279,13 @@ def _number(path: Path, line: int, token: str) -> float:
         raise TrajectoryError(f"{path}, line {line}: {token[:40]!r} is not a number") from None
 
 
-def _poses_of_quaternions(path: Path, rows: _Rows, wxyz: Sequence[int]) -> Sequence[Rigid3]:
-    """Poses of rows whose columns 1 to 3 are a position (metres), and these columns a quaternion."""
-    numbers = _numbers(path, rows, (1, 2, 3, *wxyz))
+def _are_of_unit_length(quaternions: Float[np.ndarray, "n 4"]) -> Bool[np.ndarray, " n"]:
+    """But for rounding."""
     with np.errstate(over="ignore", invalid="ignore"):
-        length = np.linalg.norm(numbers[:, 3:], axis=1, keepdims=True)
-        w, x, y, z = (numbers[:, 3:] / np.where(length > 0, length, 1.0)).T
-        rotations = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-            ]
-        ).transpose(2, 0, 1)
-    _check(np.abs(length[:, 0] - 1.0) <= _ROTATION_TOLERANCE, "not a rotation", path, rows)
-    return _StackedPoses(np.ascontiguousarray(rotations), numbers[:, :3])
-
-
-def _rotations_near(matrices: Float[np.ndarray, "n 3 3"]) -> tuple[Float[np.ndarray, "n 3 3"], Bool[np.ndarray, " n"]]:
-    """The rotation nearest to each matrix, and whether it is one but for rounding (Newton's iteration for the polar factor)."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        residual = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-        is_rotation = (residual <= 2.0 * _ROTATION_TOLERANCE) & (np.linalg.det(matrices) > 0.0)
-    rotations = np.where(is_rotation[:, None, None], matrices, np.eye(3))
-    for _ in range(4):
-        rotations = 0.5 * rotations @ (3.0 * np.eye(3) - rotations.transpose(0, 2, 1) @ rotations)
-    return rotations, is_rotation
+        return np.abs(np.sqrt(np.einsum("ni,ni->n", quaternions, quaternions)) - 1.0) <= _ROTATION_TOLERANCE
 
 
 def _check(is_good: Bool[np.ndarray, " n"], fault: str, path: Path, rows: _Rows) -> None:
     if not is_good.all():
         line, tokens = rows[int(np.argmin(is_good))]
         raise TrajectoryError(f"{path}, line {line}: {fault} in {' '.join(tokens)[:120]}")
-
-
-@dataclass(frozen=True, eq=False)
-class _StackedPoses(Sequence[Rigid3]):
-    """Poses made when they are asked for: a file may hold a million, a recording few of them."""
-
-    rotations: Float[np.ndarray, "n 3 3"]
-    translations: Float[np.ndarray, "n 3"]
-
-    def __len__(self) -> int:
-        return len(self.rotations)
-
-    @overload
-    def __getitem__(self, index: int) -> Rigid3: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[Rigid3]: ...
-    def __getitem__(self, index: int | slice) -> Rigid3 | Sequence[Rigid3]:
-        if isinstance(index, slice):
-            return _StackedPoses(self.rotations[index], self.translations[index])
-        return Rigid3(self.rotations[index], self.translations[index])

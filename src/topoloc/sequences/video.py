@@ -130,7 +130,7 @@ def frame_size(path: Path) -> tuple[tuple[int, int], float]:
 
 
 def _open(path: Path) -> cv2.VideoCapture:
-    with _opencv_silent():
+    with opencv_silent():
         capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise RecordingError(f"{path}: not a video, damaged, or of a codec that OpenCV cannot read")
@@ -157,7 +157,7 @@ def _times(path: Path, rate: float) -> list[int]:
 
 
 @contextmanager
-def _opencv_silent() -> Iterator[None]:
+def opencv_silent() -> Iterator[None]:
     """No OpenCV messages on stderr beside the error that says it."""
     logging: Any = getattr(cv2.utils, "logging", cv2)  # OpenCV 4 has these functions in its own name space
     with _LOG_LEVEL_LOCK:

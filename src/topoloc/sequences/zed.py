@@ -102,13 +102,23 @@ def open_zed(path: Path, calibration: str | Path | None = None) -> StereoSequenc
         return open_svo(path)
     video = uncalibrated_video(path)
     width, height = video.size
-    if width % 2 or width < _LEAST_SHAPE * height:
+    if not is_side_by_side(width, height):
         raise RecordingError(f"{path}: {width}x{height} pixels are not two pictures side by side")
     file = _calibration_beside(path) if calibration is None else Path(calibration)
-    rig = _rectified_rig(file) if file.suffix.lower() == ".json" else read_conf(file, (width // 2, height))
+    rig = rig_of_file(file, (width // 2, height))
     if (rig.left.width, rig.left.height) != (width // 2, height):
         raise CalibrationError(f"{file}: of {rig.left.width}x{rig.left.height}, but each half of {path.name} is {width // 2}x{height}")
     return SideBySideVideo(video, rig)
+
+
+def is_side_by_side(width: int, height: int) -> bool:
+    """Whether a picture of so many pixels can be two."""
+    return width % 2 == 0 and width >= _LEAST_SHAPE * height
+
+
+def rig_of_file(path: Path, size: tuple[int, int]) -> StereoRig:
+    """The pair of an SN*.conf for halves of this size, or of a camera.json with a baseline. Raises CalibrationError."""
+    return _rectified_rig(path) if path.suffix.lower() == ".json" else read_conf(path, size)
 
 
 def read_conf(path: Path, size: tuple[int, int]) -> StereoRig:

@@ -5,40 +5,25 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import overload
 
 import numpy as np
 
+from topoloc.geometry.lazy_poses import LazyPoses, pose_of_quaternion
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.bags.messages import TimedTransform
 from topoloc.sequences.trajectory import Trajectory, poses_at
 
 
-@dataclass(frozen=True, eq=False)
-class TransformPoses(Sequence[Rigid3]):
-    """Transforms as poses, made when they are asked for."""
-
-    transforms: list[TimedTransform]
-
-    def __len__(self) -> int:
-        return len(self.transforms)
-
-    @overload
-    def __getitem__(self, index: int) -> Rigid3: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[Rigid3]: ...
-    def __getitem__(self, index: int | slice) -> Rigid3 | Sequence[Rigid3]:
-        if isinstance(index, slice):
-            return TransformPoses(self.transforms[index])
-        its = self.transforms[index]
-        x, y, z, w = its.quat_xyzw
-        return Rigid3.from_quat_wxyz(np.array([w, x, y, z]), np.array(its.translation))
-
-
 def trajectory_of(transforms: list[TimedTransform]) -> Trajectory:
     """In order of time, of equal times the last."""
     by_time = {its.t_ns: its for its in sorted(transforms, key=lambda its: its.t_ns)}
-    return Trajectory(TransformPoses(list(by_time.values())), list(by_time))
+    return Trajectory(poses_of(list(by_time.values())), list(by_time))
+
+
+def poses_of(transforms: Sequence[TimedTransform]) -> Sequence[Rigid3]:
+    """Transforms as poses."""
+    rows = np.array([(*its.translation, *its.quat_xyzw) for its in transforms], dtype=np.float64).reshape(-1, 7)
+    return LazyPoses(rows, pose_of_quaternion)
 
 
 @dataclass(eq=False)
@@ -85,7 +70,7 @@ class FrameTree:
         """last_from_first."""
         pose = Rigid3.identity()
         for child, _ in pairwise(way):
-            pose = TransformPoses(self.transforms[child])[-1] @ pose
+            pose = poses_of(self.transforms[child][-1:])[0] @ pose
         return pose
 
     def _fixed_edges(self, frame: str) -> Iterator[tuple[str, str]]:
@@ -111,5 +96,5 @@ class FrameTree:
     def _at(self, child: str, t_ns: Sequence[int]) -> Sequence[Rigid3 | None]:
         """parent_from_child at each time."""
         if self._is_fixed(child):
-            return [TransformPoses(self.transforms[child])[-1]] * len(t_ns)
+            return [poses_of(self.transforms[child][-1:])[0]] * len(t_ns)
         return poses_at(trajectory_of(self.transforms[child]), t_ns)

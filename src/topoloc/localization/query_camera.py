@@ -25,9 +25,9 @@ def camera_of_frame(frame: StereoFrame, of_size: CameraOfSize | None) -> Camera 
     return RoughCamera.unknown(width, height) if frame.noted_focal is None else RoughCamera.noted(width, height, frame.noted_focal)
 
 
-def named_camera(text: str, topomap: TopoMetricMap) -> CameraOfSize:
-    """What `--camera` says. Raises CalibrationError."""
-    if text == "map":
+def named_camera(text: str, topomap: TopoMetricMap | None) -> CameraOfSize:
+    """What `--camera` says; `map` only where one map is asked. Raises CalibrationError."""
+    if text == "map" and topomap is not None:
         return _rescaled(topomap.nodes[0].camera)
     if text == "unknown":
         return RoughCamera.unknown

@@ -1,0 +1,55 @@
+"""Poses made when they are asked for: a file may hold a million, a recording few of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import overload
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from topoloc.geometry.rigid import Rigid3
+
+
+@dataclass(frozen=True, eq=False)
+class LazyPoses(Sequence[Rigid3]):
+    """A pose a row, which `pose_of` makes of it."""
+
+    rows: Float[np.ndarray, "n c"]
+    pose_of: Callable[[Float[np.ndarray, " c"]], Rigid3]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @overload
+    def __getitem__(self, index: int) -> Rigid3: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Rigid3]: ...
+    def __getitem__(self, index: int | slice) -> Rigid3 | Sequence[Rigid3]:
+        return LazyPoses(self.rows[index], self.pose_of) if isinstance(index, slice) else self.pose_of(self.rows[index])
+
+
+def pose_of_quaternion(row: Float[np.ndarray, "7"]) -> Rigid3:
+    """Of a position (metres) and a quaternion (x, y, z, w), which need not be of unit length. Raises TrajectoryError: it has none."""
+    return Rigid3.from_quat_wxyz(row[[6, 3, 4, 5]], row[:3])
+
+
+def _pose_of_matrix(row: Float[np.ndarray, "12"]) -> Rigid3:
+    """Of the upper 3x4 of a matrix, row by row, whose rotation is one."""
+    matrix = row.reshape(3, 4)
+    return Rigid3(matrix[:, :3].copy(), matrix[:, 3].copy())
+
+
+def poses_of_matrices(numbers: Float[np.ndarray, "n 12"], tolerance: float) -> tuple[LazyPoses, Bool[np.ndarray, " n"]]:
+    """Poses of matrices' upper rows, made exact (Newton's iteration for the polar factor), and whether they are such but for rounding."""
+    matrices = numbers.reshape(-1, 3, 4).copy()
+    given = matrices[:, :, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        residual = np.abs(given @ given.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        is_rotation = (residual <= 2.0 * tolerance) & (np.linalg.det(given) > 0.0)
+    rotations = np.where(is_rotation[:, None, None], given, np.eye(3))
+    for _ in range(4):
+        rotations = 0.5 * rotations @ (3.0 * np.eye(3) - rotations.transpose(0, 2, 1) @ rotations)
+    matrices[:, :, :3] = rotations
+    return LazyPoses(matrices.reshape(-1, 12), _pose_of_matrix), is_rotation
