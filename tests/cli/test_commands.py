@@ -25,6 +25,7 @@ EVALUATION |= {"false_accepts", "median_times_ms", "map"}
 EVIDENCE = {"query", "localized", "candidates", "num_matches", "num_inliers", "times_ms"}
 PROVENANCE = {"map", "version", "t_ns", "camera", "features"}
 SIGMAS = {"position_sigma_m", "rotation_sigma_deg"}
+POSE = {"world_from_cam", "covariance", "probability", "node", "evidence", "noise_share"}
 STAGES = {"patch_normalization", "features", "coarse", "matching", "pnp", "total"}
 
 
@@ -34,7 +35,7 @@ def _lines(path: Path) -> list[dict[str, Any]]:
 
 def _without_times(data: dict[str, Any]) -> dict[str, Any]:
     kept = {key: value for key, value in data.items() if key not in ("times_ms", "median_times_ms", "path")}
-    return kept | {"recordings": [_without_times(part) for part in data["recordings"]]} if "recordings" in data else kept
+    return kept | {name: [_without_times(part) for part in data[name]] for name in ("recordings", "answers") if name in data}
 
 
 def test_build_and_info_agree_and_building_twice_gives_the_same_map(
@@ -83,7 +84,7 @@ def test_localize_writes_what_the_interface_says(room_map: Path, queries: Path, 
     lines = _lines(results)
     assert len(printed.out.splitlines()) == len(lines) == len(unseen_views())
     for number, line in enumerate(lines):
-        assert set(line) == EVIDENCE | PROVENANCE | SIGMAS | {"world_from_cam", "covariance", "probability", "node"}
+        assert set(line) == EVIDENCE | PROVENANCE | SIGMAS | POSE
         assert line["query"] == f"view{number:02d}.png"
         assert np.array(line["covariance"]).shape == (6, 6)
         assert set(line["world_from_cam"]) == {"translation", "quat_wxyz"}
@@ -175,6 +176,7 @@ def test_evaluate_writes_what_the_interface_says(
     assert evaluation["num_queries"] == evaluation["num_localized"] == len(unseen_views())
     assert evaluation["median_translation_m"] < 0.01
     assert evaluation["recall"]["0.05m_5deg"] == 1.0
+    assert len(evaluation["answers"]) == evaluation["num_queries"] + evaluation["num_elsewhere"]
     assert (evaluation["num_elsewhere"], evaluation["false_accepts"]) == (len(unseen_views(1, 4.0)), 0)
     assert _without_times(evaluations[0]) == _without_times(evaluations[1])
     page = (tmp_path / "0.html").read_text()

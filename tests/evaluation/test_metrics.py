@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 from hand_made import answer, elsewhere, lost
 
 from topoloc.evaluation.metrics import summarize
+from topoloc.viewer.result_files import read_results
 
 ANSWERS = [
     answer("a", 0.0, error_m=0.01, error_deg=0.1),
@@ -74,3 +77,16 @@ def test_each_recording_is_judged_alone_too():
         assert {key: value for key, value in row.items() if key != "name"} == {k: v for k, v in alone.items() if k != "recordings"}
     assert (rows[2]["num_queries"], rows[2]["num_elsewhere"], rows[2]["false_accepts"]) == (0, 1, 1)
     assert sum(row["num_queries"] for row in rows) == evaluation["num_queries"]
+
+
+def test_an_answer_is_written_with_its_truth_and_read_again(tmp_path: Path):
+    asked = [answer("a", 0.3, 0.02, 0.5), lost("b", 0.4), elsewhere("c", accepted=False)]
+    (tmp_path / "evaluation.json").write_text(json.dumps({"answers": [one.to_json() for one in asked]}))
+    walk, moon = read_results(tmp_path / "evaluation.json")
+    assert [one["query"] for one in walk.answers] == ["a", "b"]
+    assert [one["query"] for one in moon.answers] == ["c"]
+    a, b = walk.answers
+    apart = np.subtract(a["world_from_cam"]["translation"], a["true_world_from_cam"]["translation"])
+    assert np.linalg.norm(apart) == pytest.approx(0.02)
+    assert b["true_world_from_cam"] is not None
+    assert moon.answers[0]["true_world_from_cam"] is None

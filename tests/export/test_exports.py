@@ -18,9 +18,9 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from topoloc.cli import main
-from topoloc.export.map_scene import scene_of_map
-from topoloc.export.scene import Scene
 from topoloc.map.topomap import TopoMetricMap
+from topoloc.viewer.map_scene import scene_of_map
+from topoloc.viewer.scene import Scene
 
 PLACE = "48.2,16.37,170,30"
 READ_COLMAP = """

@@ -11,10 +11,10 @@ import tyro
 from topoloc.cli.output import File, UsageError, check_outputs, progress_bar, write_json
 from topoloc.errors import TopolocError
 from topoloc.export.formats import ExportFormat, find_export_format, write_scene
-from topoloc.export.map_scene import scene_of_map
-from topoloc.export.results_scene import scene_of_results
-from topoloc.export.scene import Scene
 from topoloc.map.topomap import TopoMetricMap
+from topoloc.viewer.map_scene import scene_of_map
+from topoloc.viewer.results_scene import scene_of_results
+from topoloc.viewer.scene import Scene
 
 
 @dataclass(frozen=True)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.atlas.judged_tile import JudgedTile
 from topoloc.errors import CalibrationError, TrajectoryError
 from topoloc.evaluation.metrics import Answer
 from topoloc.geometry.rigid import Rigid3
@@ -20,8 +22,12 @@ from topoloc.sequences.frame import Image, StereoFrame, StereoSequence
 NEIGHBOUR_SHARE = 1.5
 
 
+Asked = Localizer | JudgedTile
+"""A map, or an atlas that is judged in the world of one tile."""
+
+
 def answer_queries(
-    localizer: Localizer,
+    localizer: Asked,
     sequence: StereoSequence,
     map_from_truth: Rigid3 | None = None,
     progress: Callable[[str, int, int], None] | None = None,
@@ -52,14 +58,15 @@ def answer_queries(
         nearest = localizer.topomap.summaries[int(np.argmin(distances))].node_id
         near = neighbours_of(localizer.topomap, distances)
         result = _localize(localizer, frame)
-        answers.append(Answer(frame.name, result, world_from_cam, nearest, label, _image_reader(sequence, i), frame.camera, near))
+        answer = Answer(frame.name, result, world_from_cam, nearest, label, _image_reader(sequence, i), frame.camera, near)
+        answers.append(_in_answered_world(localizer, answer))
         if progress:
             progress(label, done + 1, len(frames))
     return answers
 
 
 def answer_elsewhere(
-    localizer: Localizer,
+    localizer: Asked,
     sequence: StereoSequence,
     progress: Callable[[str, int, int], None] | None = None,
     label: str | None = None,
@@ -89,7 +96,17 @@ def neighbours_of(topomap: TopoMetricMap, distances: Float[np.ndarray, " nodes"]
     return frozenset(along | {topomap.summaries[int(row)].node_id for row in rows})
 
 
-def _localize(localizer: Localizer, frame: StereoFrame) -> Localization | NotLocalized:
+def _in_answered_world(localizer: Asked, answer: Answer) -> Answer:
+    """Where another tile of an atlas answered: with the truth in that one's world; which of its nodes is nearest is not asked."""
+    if isinstance(localizer, Localizer) or answer.world_from_cam is None or answer.result.provenance.tile in (None, localizer.tile_id):
+        return answer
+    truth = localizer.truth_in_world_of(answer.result, answer.world_from_cam)
+    if truth is None:
+        return replace(answer, is_of_another_world=True, nearest_node_id=None, neighbour_ids=frozenset())
+    return replace(answer, world_from_cam=truth, nearest_node_id=None, neighbour_ids=frozenset())
+
+
+def _localize(localizer: Asked, frame: StereoFrame) -> Localization | NotLocalized:
     if frame.camera is None:
         raise CalibrationError(f"{frame.name}: no calibration; put a camera.json into the recording's folder")
     return localizer.localize(frame.image, frame.camera, t_ns=frame.t_ns)

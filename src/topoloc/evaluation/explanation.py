@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -66,6 +67,23 @@ def explain(localizer: Localizer, image: Image, camera: Camera | RoughCamera | N
     unsaid = Explanation(result, num_features, light_of(image), lights, poses, [])
     advice = list(dict.fromkeys(_advice(unsaid, localizer)))
     return Explanation(result, num_features, unsaid.light, lights, poses, advice)
+
+
+def facts_of(name: str, explanation: Explanation) -> dict[str, Any]:
+    """The result of the picture of this name with all that was tried for it, as JSON."""
+    poses = [
+        {
+            "source": pose.tried.source,
+            "features": pose.tried.features,
+            "node": pose.fit.node_id if pose.fit.node_id >= 0 else None,
+            "num_first_matches": len(pose.tried.first.matches),
+            "num_first_inliers": pose.tried.first.num_inliers,
+            "probability": pose.probability,
+            "verdict": pose.verdict,
+        }
+        for pose in explanation.poses
+    ]
+    return explanation.result.to_json(name) | {"advice": explanation.advice, "num_features": explanation.num_features, "tried": poses}
 
 
 def _tried_pose(tried: Tried, result: Localization | NotLocalized) -> TriedPose:

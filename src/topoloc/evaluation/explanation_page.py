@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import base64
 from html import escape
-from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from topoloc.evaluation.explanation import Explanation, TriedPose
 from topoloc.evaluation.match_pictures import JPEG_QUALITY, NodeMatches, draw_pair
+from topoloc.evaluation.page_shell import page_text
 from topoloc.localization.result import Localization
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.network_pictures import decode_picture
@@ -19,27 +20,26 @@ from topoloc.sequences.frame import Image
 from topoloc.sequences.pictures import jpeg_of
 
 _POSES = "Of each first pose: points were sought where the map expects them, and weighed. Found counts those of all that must be in view."
-_MAX_SHOWN = 3
+_MAX_SHOWN, MAX_MATCHES = 3, 300
 _COLUMNS = ("tried", "features", "near node", "first inliers", "found", "by chance", "unguided", "probability", "what became of it")
 
 
 def write_explanation(path: Path, name: str, image: Image, explanation: Explanation, topomap: TopoMetricMap) -> None:
     """Write the page, at once or not at all. Raises TopolocError where the file cannot be written."""
-    style = resources.files("topoloc.evaluation").joinpath("report.css").read_text(encoding="utf-8")
-    head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
-    title = escape(f"Why {name} {'is here' if explanation.result.localized else 'was not localized'}")
-    header = f'<header><div class="page"><h1>{title}</h1><p>{escape(verdict(explanation))}</p></div></header>'
+    write_text(path, explanation_page(name, image, explanation, topomap))
+
+
+def explanation_page(name: str, image: Image, explanation: Explanation, topomap: TopoMetricMap) -> str:
+    """The page, HTML."""
+    title = f"Why {name} {'is here' if explanation.result.localized else 'was not localized'}"
     advice = "".join(f"<li>{escape(line)}</li>" for line in explanation.advice) or "<li>Nothing is amiss.</li>"
+    table = f'<div class="wide" tabindex="0" role="region" aria-label="What was tried">{_table(explanation)}</div>'
     sections = (
         f'<section style="margin-top:-48px"><h2>What would help</h2><ul>{advice}</ul></section>'
         f"<section><h2>What it was compared with</h2><p>{_shown_words(explanation)}</p>{_pairs(image, explanation, topomap)}</section>"
-        f'<section><h2>What was tried</h2><p>{_POSES}</p><div class="wide">{_table(explanation)}</div></section>'
+        f"<section><h2>What was tried</h2><p>{_POSES}</p>{table}</section>"
     )
-    write_text(
-        path,
-        f'<!DOCTYPE html>\n<html lang="en"><head>{head}\n<title>{title}</title>\n<style>\n{style}</style></head><body>\n'
-        f'{header}\n<div class="page">{sections}<footer>Written by topoloc.</footer></div></body></html>\n',
-    )
+    return page_text(title, verdict(explanation), sections)
 
 
 def verdict(explanation: Explanation) -> str:
@@ -76,7 +76,19 @@ def _pairs(image: Image, explanation: Explanation, topomap: TopoMetricMap) -> st
     return '<div class="queries">' + "".join(articles) + "</div>"
 
 
-def _article(image: Image, pose: TriedPose, topomap: TopoMetricMap) -> str:
+def compared_json(image: Image, explanation: Explanation, topomap: TopoMetricMap) -> list[dict[str, Any]]:
+    """The likeliest poses as the page shows them; rows of `matches` are a pixel of the picture and one of the node's camera."""
+    compared = list[dict[str, Any]]()
+    for pose in _ranked(explanation):
+        node, matches = topomap.nodes[topomap.row_of(pose.fit.node_id)], _matches_of(image, pose, topomap)
+        pixels = np.column_stack([matches.points_query, matches.points_node]).round(1)[:MAX_MATCHES]
+        facts = {"node": pose.fit.node_id, "node_size": [node.camera.width, node.camera.height], "verdict": pose.verdict}
+        compared.append(facts | {"num_inliers": _num_inliers(pose), "matches": pixels.tolist()})
+    return compared
+
+
+def _matches_of(image: Image, pose: TriedPose, topomap: TopoMetricMap) -> NodeMatches:
+    """What the pose explains, as far as its node would see it."""
     node, fit = topomap.nodes[topomap.row_of(pose.fit.node_id)], pose.fit
     assert fit.pose is not None
     rows = np.flatnonzero(fit.pose.inliers)
@@ -85,11 +97,20 @@ def _article(image: Image, pose: TriedPose, topomap: TopoMetricMap) -> str:
     points = fit.local_map.points_world[fit.matches.train_idx[rows]]
     seen = node.camera.img_from_cam(node.summary.world_from_cam.inverse().apply(points))
     inside = np.isfinite(seen).all(axis=1) & (seen >= 0).all(axis=1) & (seen < [node.camera.width, node.camera.height]).all(axis=1)
-    matches = NodeMatches(query[inside], seen[inside], np.full(int(inside.sum()), pose.verdict == "the answer"))
-    pair = draw_pair(image, decode_picture(node.template_jpeg), matches, node.camera)
+    return NodeMatches(query[inside], seen[inside], np.full(int(inside.sum()), pose.verdict == "the answer"))
+
+
+def _num_inliers(pose: TriedPose) -> int:
+    return 0 if pose.fit.pose is None else int(pose.fit.pose.inliers.sum())
+
+
+def _article(image: Image, pose: TriedPose, topomap: TopoMetricMap) -> str:
+    node = topomap.nodes[topomap.row_of(pose.fit.node_id)]
+    pair = draw_pair(image, decode_picture(node.template_jpeg), _matches_of(image, pose, topomap), node.camera)
     kind = "good" if pose.verdict == "the answer" else "bad"
-    facts = f'<div class="facts"><b>node {node.summary.node_id}, {len(rows)} inliers</b><p class="{kind}">{escape(pose.verdict)}</p></div>'
-    return f"<article>{_figure(pair, f'left the picture, right node {node.summary.node_id}')}{facts}</article>"
+    node_id = node.summary.node_id
+    facts = f'<div class="facts"><b>node {node_id}, {_num_inliers(pose)} inliers</b><p class="{kind}">{escape(pose.verdict)}</p></div>'
+    return f"<article>{_figure(pair, f'left the picture, right node {node_id}')}{facts}</article>"
 
 
 def _figure(pair: Image, caption: str) -> str:
@@ -98,10 +119,10 @@ def _figure(pair: Image, caption: str) -> str:
 
 
 def _table(explanation: Explanation) -> str:
-    rows = ["".join(f"<th>{name}</th>" for name in _COLUMNS)]
-    for pose in explanation.poses:
-        rows.append("".join(f"<td>{escape(cell)}</td>" for cell in row_of(pose)))
-    return '<table class="tried">' + "".join(f"<tr>{row}</tr>" for row in rows) + "</table>"
+    head = "".join(f"<th>{name}</th>" for name in _COLUMNS)
+    rows = [zip(_COLUMNS, row_of(pose), strict=True) for pose in explanation.poses]
+    body = "".join("<tr>" + "".join(f'<td data-column="{name}">{escape(cell)}</td>' for name, cell in row) + "</tr>" for row in rows)
+    return f'<table class="tried folds"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
 
 
 def row_of(pose: TriedPose) -> tuple[str, ...]:

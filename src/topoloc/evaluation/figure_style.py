@@ -17,6 +17,8 @@ RECORDING_COLOURS = ("#0f8b8d", "#5b4fc7", "#b5651d", "#2f6db5", "#6a7f10", "#9c
 MAX_MARKS = 2000
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "path",
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
     "font.size": 9.0,
     "text.color": INK,
     "axes.labelcolor": GREY,

@@ -11,7 +11,7 @@ import numpy as np
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.result import Localization, NotLocalized, pose_json
 from topoloc.sequences.frame import Image
 
 # A query counts as recalled when its pose is within both (metres, degrees), of all queries.
@@ -25,7 +25,8 @@ class Answer:
     """A query with its result and its truth, which is None for an image from elsewhere: any pose given for that is false.
 
     `read_image` reads the picture once more, for who wants to look at it: answers hold no pictures. `camera` is what it was taken with.
-    `neighbour_ids` are the nodes that are as good as the nearest one: see `neighbours_of`.
+    `neighbour_ids` are the nodes that are as good as the nearest one: see `neighbours_of`. `is_of_another_world`: the pose is in a world of
+    which the truth says nothing, that of another tile of an atlas, and so it is false.
     """
 
     query: str
@@ -36,18 +37,19 @@ class Answer:
     read_image: Callable[[], Image] | None = None
     camera: Camera | None = None
     neighbour_ids: frozenset[int] = frozenset()
+    is_of_another_world: bool = False
 
     @property
     def translation_m(self) -> float:
-        """Distance from the truth, metres; NaN where there is no pose or no truth."""
-        if isinstance(self.result, NotLocalized) or self.world_from_cam is None:
+        """Distance from the truth, metres; NaN where there is no pose or no truth, or truth says nothing of its world."""
+        if isinstance(self.result, NotLocalized) or self.world_from_cam is None or self.is_of_another_world:
             return float("nan")
         return translation_error(self.result.world_from_cam, self.world_from_cam)
 
     @property
     def rotation_deg(self) -> float:
-        """Angle from the truth, degrees; NaN where there is no pose or no truth."""
-        if isinstance(self.result, NotLocalized) or self.world_from_cam is None:
+        """Angle from the truth, degrees; NaN where there is no pose or no truth, or truth says nothing of its world."""
+        if isinstance(self.result, NotLocalized) or self.world_from_cam is None or self.is_of_another_world:
             return float("nan")
         return float(np.rad2deg(rotation_error(self.result.world_from_cam, self.world_from_cam)))
 
@@ -55,7 +57,14 @@ class Answer:
     def is_false_accept(self) -> bool:
         if isinstance(self.result, NotLocalized):
             return False
-        return self.world_from_cam is None or self.translation_m > MAX_TRANSLATION or self.rotation_deg > MAX_ROTATION_DEG
+        if self.world_from_cam is None or self.is_of_another_world:
+            return True
+        return self.translation_m > MAX_TRANSLATION or self.rotation_deg > MAX_ROTATION_DEG
+
+    def to_json(self) -> dict[str, Any]:
+        """The result's line, with its recording and its truth, which is null for an image from elsewhere."""
+        truth = None if self.world_from_cam is None else pose_json(self.world_from_cam)
+        return self.result.to_json(self.query) | {"recording": self.recording, "true_world_from_cam": truth}
 
 
 def by_recording(answers: Sequence[Answer]) -> dict[str, list[Answer]]:

@@ -5,18 +5,25 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from html import escape
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from topoloc.evaluation.figures import draw_error_curves, draw_errors_along, draw_stage_times
 from topoloc.evaluation.map_figure import draw_map
-from topoloc.evaluation.metrics import Answer
+from topoloc.evaluation.metrics import Answer, by_recording
+from topoloc.evaluation.page_shell import page_text
 from topoloc.evaluation.query_gallery import gallery, typical_queries, worst_queries
 from topoloc.evaluation.report_tables import ReportWords, cards, numbers_tables, recordings_table, what_counts
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.atomic import write_text
+from topoloc.viewer.document import ResultSet, SceneBudget, document_of
+from topoloc.viewer.page import embedded_head, embedded_scene
 
+_SCENE_BUDGET = SceneBudget(max_points=60_000, max_picture_bytes=1_500_000)
+_SCENE = (
+    "Turn it by mouse, finger or arrow keys. Each recording's pictures stand where they were found; of one that is chosen the ellipsoid "
+    "holds its position in 95 of 100 cases, and what is dashed is the truth."
+)
 _MAP = "Seen from above. A tick at a node shows where its camera looked; lines lead from true to estimated positions."
 _CURVES = "The height of a curve is the share of all queries whose error is at most that much; it ends where no more queries have a pose."
 _TYPICAL = (
@@ -47,22 +54,16 @@ def write_report(
 
 
 def _page(evaluation: dict[str, Any], answers: list[Answer], topomap: TopoMetricMap, words: ReportWords) -> str:
-    style = resources.files("topoloc.evaluation").joinpath("report.css").read_text(encoding="utf-8")
-    title = escape(words.title or f"Localization in {Path(evaluation['map']['path']).name}")
     recordings = ", ".join(row["name"] for row in evaluation["recordings"] if row["name"]) or "no recordings"
-    subtitle = escape(words.subtitle or f"Asked about: {recordings}")
-    head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
-    header = f'<header><div class="page"><h1>{title}</h1><p>{subtitle}</p></div></header>'
-    body = "\n".join([cards(evaluation), *_sections(evaluation, answers, topomap, words), "<footer>Written by topoloc.</footer>"])
-    return (
-        f'<!DOCTYPE html>\n<html lang="en"><head>{head}\n<title>{title}</title>\n<style>\n{style}</style></head><body>\n'
-        f'{header}\n<div class="page">{body}</div></body></html>\n'
-    )
+    title = words.title or f"Localization in {Path(evaluation['map']['path']).name}"
+    body = "\n".join([cards(evaluation), *_sections(evaluation, answers, topomap, words)])
+    return page_text(title, words.subtitle or f"Asked about: {recordings}", body, embedded_head())
 
 
 def _sections(evaluation: dict[str, Any], answers: list[Answer], topomap: TopoMetricMap, words: ReportWords) -> Iterator[str]:
     paragraphs = "".join(f'<p class="lead">{escape(paragraph)}</p>' for paragraph in words.paragraphs)
     yield _section("Results", what_counts(evaluation), recordings_table(evaluation, words) + paragraphs)
+    yield _section("The place", _SCENE, embedded_scene(_document(evaluation, answers, topomap)))
     yield _section("The map from above", _MAP, _wide(draw_map(answers, topomap)))
     if evaluation["num_localized"]:
         yield _section("How large are the errors?", _CURVES, f'<div class="halves">{"".join(draw_error_curves(answers))}</div>')
@@ -77,6 +78,12 @@ def _sections(evaluation: dict[str, Any], answers: list[Answer], topomap: TopoMe
     yield _section("All the numbers", "", numbers_tables(evaluation))
     config = escape(json.dumps(evaluation["map"]["config"], indent=1, sort_keys=True))
     yield f"<section><details><summary>The configuration that the map was built with</summary><pre>{config}</pre></details></section>"
+
+
+def _document(evaluation: dict[str, Any], answers: list[Answer], topomap: TopoMetricMap) -> dict[str, Any]:
+    """The map, and the answers of each recording."""
+    sets = [ResultSet(name or "queries", [answer.to_json() for answer in group]) for name, group in by_recording(answers).items()]
+    return document_of(topomap, Path(evaluation["map"]["path"]).name, sets, _SCENE_BUDGET)
 
 
 def _section(title: str, explanation: str, content: str) -> str:

@@ -10,6 +10,8 @@ from typing import Any
 from topoloc.evaluation.figure_style import recording_colours
 from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION, length_text
 
+_COLUMNS = ("localized", "median error", "in 5 cm, 5°", "in 25 cm, 2°", "false accepts", "ms")
+
 
 @dataclass(frozen=True)
 class PublishedResult:
@@ -65,13 +67,12 @@ def recordings_table(evaluation: dict[str, Any], words: ReportWords) -> str:
     """A row for each recording, and below them what others published."""
     names = [row["name"] for row in evaluation["recordings"] if row["num_queries"]]
     colours = recording_colours(names)
-    columns = ("recording", "localized", "median error", "in 5 cm, 5°", "in 25 cm, 2°", "false accepts", "ms")
-    head = "".join(f"<th>{column}</th>" for column in columns)
+    head = "".join(f"<th>{column}</th>" for column in ("recording", *_COLUMNS))
     body = "".join(_recording_row(row, colours, words.about.get(row["name"], "")) for row in evaluation["recordings"])
     for other in words.published:
         median = f"{length_text(other.median_translation_m)}, {other.median_rotation_deg:.2f}°"
-        body += f'<tr class="published"><td>{escape(other.name)}</td><td></td><td>{median}</td><td></td><td></td><td></td><td></td></tr>'
-    return f'<div class="wide"><table class="recordings"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+        body += f'<tr class="published"><td>{escape(other.name)}</td>{_cells(["", median, "", "", "", ""])}</tr>'
+    return f'<div class="wide"><table class="recordings folds"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def numbers_tables(evaluation: dict[str, Any]) -> str:
@@ -122,7 +123,12 @@ def _recording_row(row: dict[str, Any], colours: Mapping[str, str], about: str) 
         cells[1] = f"{length_text(row['median_translation_m'])}, {row['median_rotation_deg']:.2f}°"
     cells.append(f'<span class="{"bad" if false else "good"}">{false}</span> of {num_asked}')
     cells.append(f"{row['median_times_ms']['total']:.0f}" if "total" in row["median_times_ms"] else "")
-    return f"<tr><td>{mark}{name}</td>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
+    return f"<tr><td>{mark}{name}</td>{_cells(cells)}</tr>"
+
+
+def _cells(cells: Sequence[str]) -> str:
+    """With their columns' names, which stand beside them where the screen is too narrow for columns."""
+    return "".join(f'<td data-column="{column}">{cell}</td>' for column, cell in zip(_COLUMNS, cells, strict=True))
 
 
 def _facts(rows: list[tuple[str, str]]) -> str:

@@ -10,8 +10,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from topoloc.errors import TopolocError
-from topoloc.export.scene import Scene, View
 from topoloc.geometry.rigid import Rigid3
+from topoloc.viewer.scene import Scene, View
 
 _HALF_PIXEL = 0.5  # the centre of COLMAP's top-left pixel
 

@@ -10,9 +10,9 @@ from topoloc.errors import TopolocError
 from topoloc.export.colmap import colmap_files
 from topoloc.export.foxglove import mcap_file
 from topoloc.export.nerfstudio import nerfstudio_files
-from topoloc.export.scene import Scene
 from topoloc.export.text_forms import geojson_file, kitti_file, ply_file, tum_file
 from topoloc.sequences.atomic import write_bytes, write_folder
+from topoloc.viewer.scene import Scene
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from topoloc.errors import MissingExtraError
-from topoloc.export.scene import Scene, View
 from topoloc.geometry.rigid import Rigid3
+from topoloc.viewer.scene import Scene, View
 
 MAP_FRAME, CAMERA_FRAME = "map", "camera"
 _CHANNELS = ("red", "green", "blue", "alpha")

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from topoloc.errors import TopolocError
-from topoloc.export.scene import Scene, View
 from topoloc.export.text_forms import ply_file
 from topoloc.geometry.camera import Camera
+from topoloc.viewer.scene import Scene, View
 
 _CAM_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _POINTS = "sparse_pc.ply"

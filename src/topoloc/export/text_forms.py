@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from topoloc.errors import GeoreferenceError, TrajectoryError
-from topoloc.export.scene import Scene, View
 from topoloc.sequences.trajectory import Trajectory, kitti_text, tum_text
+from topoloc.viewer.scene import Scene, View
 
 _CAMERA_RGB = (255, 0, 0)
 
@@ -64,7 +64,7 @@ def geojson_file(scene: Scene) -> bytes:
     for session_id, group in groupby(scene.views, lambda view: view.session_id):
         way = [_coordinates(view) for view in group if view.geopose is not None]
         if len(way) > 1:
-            lines.append(_feature("LineString", way, {"session": session_id}))
+            lines.append(feature("LineString", way, {"session": session_id}))
     return (json.dumps({"type": "FeatureCollection", "features": [*lines, *features]}, indent=1) + "\n").encode()
 
 
@@ -72,10 +72,11 @@ def _point(view: View) -> dict[str, Any]:
     properties: dict[str, Any] = {"name": view.name, "t_ns": view.t_ns, "session": view.session_id}
     if view.geopose is not None:
         properties["quaternion"] = view.geopose.to_json()["quaternion"]
-    return _feature("Point", _coordinates(view), properties)
+    return feature("Point", _coordinates(view), properties)
 
 
-def _feature(kind: str, coordinates: Sequence[Any], properties: dict[str, Any]) -> dict[str, Any]:
+def feature(kind: str, coordinates: Sequence[Any], properties: dict[str, Any]) -> dict[str, Any]:
+    """A feature of GeoJSON: longitude, latitude, height."""
     return {"type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": properties}
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from topoloc.errors import ResultError
-from topoloc.export.scene import Points, Scene, View
 from topoloc.localization import checked_json as checked
 from topoloc.localization.result import Localization, result_from_json
 from topoloc.sequences.text_rows import read_text
+from topoloc.viewer.scene import Points, Scene, View
 
 
 def scene_of_results(path: Path) -> Scene:

@@ -1,4 +1,4 @@
-"""What is exported, whatever its form: pictures with known poses, and the points that they show. Data only."""
+"""What is shown or exported, whatever the form: pictures with known poses, and the points that they show. Data only."""
 
 from __future__ import annotations
 

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from topoloc.errors import MapError
-from topoloc.export.scene import Points, Scene, View
-from topoloc.export.tracks import Tracks, find_tracks
 from topoloc.map.entries import TopoNode
 from topoloc.map.topomap import TopoMetricMap
+from topoloc.viewer.scene import Points, Scene, View
+from topoloc.viewer.tracks import Tracks, find_tracks
 
 
 def scene_of_map(
@@ -34,7 +34,7 @@ def scene_of_map(
     if not rows:
         known = ", ".join(f"{session.session_id} ({session.name})" for session in topomap.sessions)
         raise MapError(f"the map has no session {session_id} with nodes; its sessions: {known}")
-    names = _names(topomap)
+    names = names_of(topomap)
     tracks = find_tracks(topomap, rows, progress) if with_points else None
     views, seen_rgb, start = list[View](), list[np.ndarray](), 0
     for row in rows:
@@ -44,7 +44,7 @@ def scene_of_map(
             pixels = node.features.points_img.astype(np.float64)
             point_rows = tracks.point_rows[start : start + len(pixels)]
             view, start = replace(view, points_img=pixels, point_rows=point_rows), start + len(pixels)
-            seen_rgb.append(_colours(node, pixels))
+            seen_rgb.append(seen_colours(node, pixels))
         views.append(view)
     posed = [image for image in topomap.place_images if session_id is None or image.session_id == session_id]
     points = Points.none() if tracks is None else _points(tracks, np.concatenate(seen_rgb))
@@ -60,7 +60,7 @@ def _view(topomap: TopoMetricMap, node: TopoNode, name: str) -> View:
     return View(name, s.world_from_cam, s.t_ns, node.camera, s.session_id, jpeg=jpeg, jpeg_camera=jpeg_camera, geopose=geopose)
 
 
-def _names(topomap: TopoMetricMap) -> list[str]:
+def names_of(topomap: TopoMetricMap) -> list[str]:
     """Each node's picture; where several sessions call pictures alike, with the session's number before it."""
     names = [summary.name for summary in topomap.summaries]
     if len(set(names)) == len(names):
@@ -79,8 +79,8 @@ def _points(tracks: Tracks, seen_rgb: Float[np.ndarray, "m 3"]) -> Points:
     return Points(tracks.points_world, np.rint(rgb / counts[:, None]).astype(np.uint8), errors / counts)
 
 
-def _colours(node: TopoNode, pixels: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 3"]:
-    """What the node's picture shows there; black where it cannot be read."""
+def seen_colours(node: TopoNode, pixels: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 3"]:
+    """What the node's picture shows at pixels of its camera, RGB, 0 to 255; black where it cannot be read."""
     picture = _decoded(node.template_jpeg)
     if picture is None or len(pixels) == 0:
         return np.zeros((len(pixels), 3))

@@ -9,10 +9,10 @@ import numpy as np
 
 from built_room import built_room
 from topoloc.export.colmap import colmap_files
-from topoloc.export.map_scene import scene_of_map
-from topoloc.export.tracks import MAX_ERROR_PX, find_tracks
 from topoloc.map.entries import TopoNode
 from topoloc.map.topomap import TopoMetricMap
+from topoloc.viewer.map_scene import scene_of_map
+from topoloc.viewer.tracks import MAX_ERROR_PX, find_tracks
 
 
 def without_points(node: TopoNode) -> TopoNode:

@@ -1,0 +1,98 @@
+"""Streams from outside: a request a picture, or a WebSocket."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+from running_service import Running
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+SESSIONS = "/v1/maps/room/sessions"
+
+
+def _pictures(recording: Path) -> list[bytes]:
+    return [path.read_bytes() for path in sorted((recording / "image_0").iterdir())][:4]
+
+
+def _socket_address(service: Running, **params: str) -> str:
+    return str(httpx.URL(service.url.replace("http", "ws") + SESSIONS, params=params))
+
+
+def test_a_stream_by_requests(client: httpx.Client, tiny_recording: Path):
+    begun = client.post(SESSIONS, params={"camera": "map"})
+    assert begun.status_code == 201
+    address = f"{SESSIONS}/{begun.json()['session']}"
+    states = list[str]()
+    for number, picture in enumerate(_pictures(tiny_recording)):
+        params = {"t_ns": str(100_000_000 * number), "name": str(number)}
+        answer = client.post(f"{address}/pictures", params=params, content=picture, headers={"content-type": "image/png"}).json()
+        states.append(answer["state"])
+        assert answer["t_ns"] == 100_000_000 * number
+    assert states[0] == "localized"
+    assert set(states) <= {"localized", "tracked"}
+    backwards = client.post(f"{address}/pictures?t_ns=5", content=_pictures(tiny_recording)[0], headers={"content-type": "image/png"})
+    assert backwards.status_code == 422
+    assert client.delete(address).status_code == 204
+    assert client.delete(address).status_code == 404
+
+
+def test_a_stream_over_a_websocket_survives_a_bad_picture(service: Running, tiny_recording: Path):
+    with connect(_socket_address(service, camera="map"), subprotocols=["topoloc"]) as socket:  # pyright: ignore[reportArgumentType]
+        positions = []
+        for number, picture in enumerate(_pictures(tiny_recording)):
+            socket.send(json.dumps({"t_ns": 100_000_000 * (number + 1)}))
+            socket.send(picture)
+            answer = json.loads(socket.recv(30))
+            positions.append(answer["smoothed"]["translation"])
+            if number == 1:
+                socket.send(b"no picture")
+                assert "not a picture" in json.loads(socket.recv(30))["error"]
+        assert np.ptp(positions, axis=0).max() > 0.05
+
+
+def test_messages_that_make_no_sense_end_the_stream(service: Running):
+    for text in ("[]", "{", '{"fly": 1}', '{"t_ns": -1}'):
+        with connect(_socket_address(service, camera="map")) as socket:
+            socket.send(text)
+            with pytest.raises(ConnectionClosed) as closed:
+                socket.recv(10)
+            assert closed.value.rcvd is not None
+            assert closed.value.rcvd.code == 1008
+            assert closed.value.rcvd.reason
+
+
+def test_a_websocket_is_refused_with_a_status(service: Running):
+    with pytest.raises(InvalidStatus) as refused, connect(_socket_address(service).replace("room", "nowhere")):
+        pass
+    assert refused.value.response.status_code == 404
+    with pytest.raises(InvalidStatus) as refused, connect(_socket_address(service), origin="https://elsewhere.example"):  # pyright: ignore[reportArgumentType]
+        pass
+    assert refused.value.response.status_code == 403
+
+
+def test_streams_end_when_nobody_uses_them_and_there_are_not_too_many(service: Running, client: httpx.Client):
+    sockets = [connect(_socket_address(service)) for _ in range(3)]
+    try:
+        assert client.post(SESSIONS).status_code == 429
+        for socket in sockets:
+            with pytest.raises(ConnectionClosed) as closed:
+                socket.recv(10)
+            assert closed.value.rcvd is not None
+            assert "no picture" in closed.value.rcvd.reason
+    finally:
+        for socket in sockets:
+            socket.close()
+    assert client.post(SESSIONS).status_code == 201
+
+
+def test_a_camera_must_be_known(client: httpx.Client, tiny_recording: Path):
+    session = client.post(SESSIONS).json()["session"]
+    answer = client.post(f"{SESSIONS}/{session}/pictures", content=_pictures(tiny_recording)[0], headers={"content-type": "image/png"})
+    assert answer.status_code == 422
+    assert "calibrated" in answer.json()["error"]
+    client.delete(f"{SESSIONS}/{session}")
