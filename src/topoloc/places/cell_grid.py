@@ -54,6 +54,11 @@ class CellGrid:
         vectors = np.concatenate([_described(part, mean, projection) for part in np.array_split(by_column, -(-len(cells) // 256))])
         return CellGrid(mean, projection, np.rint(_SCALE * vectors).astype(np.int8))
 
+    def with_cells(self, cells: Float32[np.ndarray, "n rows columns c"]) -> CellGrid:
+        """With the cells of further mapping images, less the same mean and by the same projection."""
+        added = _described(np.ascontiguousarray(cells.transpose(0, 2, 1, 3)), self._mean, self._projection)
+        return CellGrid(self._mean, self._projection, np.concatenate([self._stored, np.rint(_SCALE * added).astype(np.int8)]))
+
     def likeness(self, cells: Float32[np.ndarray, "rows columns c"], images: Int[np.ndarray, " k"]) -> Float32[np.ndarray, " k"]:
         """The mean cosine between the cells of a picture and those of each of these mapping images, at the best shift.
 

@@ -79,17 +79,34 @@ class SurfVlad:
 
     def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
         """See `CoarseLocalizer.rank`; of the picture itself only the size is looked at. Features without cells are ranked by VLAD alone."""
-        vector = np.empty(len(self._projection), np.float32)
         height, width = image.shape[:2]
+        vector = self._vector(features, width, height)
+        if self._grid is None or features.cells is None:
+            return self._index.rank_nodes(vector, num_candidates)
+        images, similarities = self._index.nearest(vector)
+        return self._index.rank_images(images, 0.5 * (similarities + self._grid.likeness(features.cells, images)), num_candidates)
+
+    def _vector(self, features: Features, width: int, height: int) -> Float32[np.ndarray, " p"]:
+        vector = np.empty(len(self._projection), np.float32)
         descriptors = placed(features, width, height, self._config)
         if descriptors.shape[1] != self._words.shape[1]:
             raise MapError(f"the map's coarse localizer {self.name!r} is damaged: its words are not those of the map's features")
         multiply_rows(self._projection, vlad(descriptors, self._words) - self._mean, vector)
         vector /= max(float(np.linalg.norm(vector)), 1e-6)
-        if self._grid is None or features.cells is None:
-            return self._index.rank_nodes(vector, num_candidates)
-        images, similarities = self._index.nearest(vector)
-        return self._index.rank_images(images, 0.5 * (similarities + self._grid.likeness(features.cells, images)), num_candidates)
+        return vector
+
+    def with_images(self, pictures: Sequence[tuple[Features, int, int]], node_ids: Int[np.ndarray, " m"]) -> SurfVlad:
+        """With further mapping images, by the vocabulary and the whitening that are there.
+
+        Args:
+            pictures: of each its features, width and height (pixels); where the others have cells, these must, too.
+            node_ids: the node that each belongs to.
+        """
+        vectors = np.stack([self._vector(*picture) for picture in pictures])
+        cells = [features.cells for features, _, _ in pictures if features.cells is not None]
+        grid = self._grid.with_cells(np.stack(cells)) if self._grid is not None and len(cells) == len(pictures) else None
+        all_ids = np.concatenate([self._node_ids, node_ids.astype(self._node_ids.dtype)])
+        return SurfVlad(self._words, self._mean, self._projection, np.concatenate([self._vectors, vectors]), all_ids, self._config, grid)
 
     def to_model(self) -> CoarseModel:
         """What the map file keeps: vectors as half floats, a quarter of a kilobyte to half of one an image."""

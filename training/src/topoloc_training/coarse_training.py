@@ -1,4 +1,4 @@
-"""Teaching a map a learned coarse localizer, from the mapping images that it keeps: no recording is needed; and keeping it in the file."""
+"""Teaching a map a learned coarse localizer, from the mapping images that it keeps: no recording is needed."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ import numpy as np
 from topoloc.bounds import check_bounds
 from topoloc.errors import EmptyMapError, TrainingError
 from topoloc.map.nodes import NodePoses, node_distances
-from topoloc.map.schema import SCHEMA_VERSION
-from topoloc.map.sessions import Edit, today
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.coarse import CoarseModel
 from topoloc.places.network_config import BackboneName
@@ -88,20 +86,3 @@ def training_set_of(topomap: TopoMetricMap) -> TrainingSet:
         d_thresh=d_thresh,
         lambda_rot=lambda_rot,
     )
-
-
-def store_coarse(path: Path, target: Path, model: CoarseModel, make_default: bool) -> None:
-    """Write to `target`, which may be `path`, the map of `path` with this coarse localizer in it: at once or not at all.
-
-    Args:
-        make_default: it answers from now on where the user names none.
-
-    Raises:
-        MapError: `path` is no map, or `target` cannot be written.
-    """
-    with TopoMetricMap.load(path) as topomap:
-        models = {name: topomap.coarse_models[name] for name in topomap.coarse_models} | {model.name: model}
-        number = max([topomap.next_ids.edit, *(edit.edit_id + 1 for edit in topomap.edits)])
-        edits = [*topomap.edits, Edit(number, f"train {model.name}", today(), SCHEMA_VERSION)]
-        default = model.name if make_default else topomap.default_coarse
-        replace(topomap, coarse_models=models, edits=edits, default_coarse=default).save(target)

@@ -16,7 +16,8 @@ from topoloc.map.checking import list_coarse
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.coarse import CoarseModel
 from topoloc.places.network_config import BackboneName
-from topoloc_training.coarse_training import CoarseTrainingConfig, store_coarse, train_coarse
+from topoloc_training.coarse_storing import store_coarse
+from topoloc_training.coarse_training import CoarseTrainingConfig, train_coarse
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,103 @@
+"""An atlas beside the maps that it is made of: what each tile alone localizes, and what the atlas makes of the same pictures.
+
+    python benchmarks/atlas.py ATLAS TILE=RECORDING ... [--alike c1,c2] [--memory-mb 256] [--json FILE]
+
+Each picture is asked of its own tile's map alone and of the atlas, in turns, in one process. `--alike` names tiles of places that share
+things (two fittings of one building): an answer in another of them is counted apart, and held against the recording's truth.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from topoloc.atlas.atlas import Atlas
+from topoloc.atlas.atlas_localizer import AtlasLocalizer
+from topoloc.atlas.open_maps import Maps
+from topoloc.geometry.alignment import translation_error
+from topoloc.localization.localizer import Localizer
+from topoloc.localization.query import Picture
+from topoloc.localization.result import Localization, NotLocalized
+from topoloc.map.memory import set_node_memory
+from topoloc.map.topomap import TopoMetricMap
+from topoloc.sequences.frame import StereoFrame
+from topoloc.sequences.open import open_sequence
+from topoloc.sequences.recording import single_pictures
+from topoloc.tracking.warm_up import warm_up
+
+RIGHT_METRES = 0.5
+
+
+def asked(localizer: AtlasLocalizer, alone: Localizer, tile_id: str, frame: StereoFrame, alike: set[str]) -> dict[str, Any]:
+    """One picture asked of the map alone and of the atlas."""
+    assert frame.camera is not None
+    start = time.process_time()
+    by_map = alone.localize(frame.image, frame.camera)
+    middle = time.process_time()
+    by_atlas = localizer.localize(frame.image, frame.camera)
+    end = time.process_time()
+    ranking = [name for name, _ in localizer.rank(Picture(frame.image, frame.camera))]
+    answer = by_atlas.provenance.tile if isinstance(by_atlas, Localization) else None
+    outcome = "right" if answer == tile_id else "none" if answer is None else "alike" if {answer, tile_id} <= alike else "false"
+    row: dict[str, Any] = {"alone": by_map.localized, "outcome": outcome, "answer": answer, "rank": ranking.index(tile_id) + 1}
+    if isinstance(by_atlas, NotLocalized):
+        row["reason"] = by_atlas.reason
+        row["tiles"] = [one.tile for one in by_atlas.alternatives]
+    elif outcome == "alike" and frame.world_from_cam is not None:
+        row["metres_off"] = translation_error(by_atlas.world_from_cam, frame.world_from_cam)
+    return row | {"name": frame.name, "ms_alone": 1e3 * (middle - start), "ms_atlas": 1e3 * (end - middle)}
+
+
+def line(name: str, rows: list[dict[str, Any]]) -> str:
+    """The figures of a recording, or of all."""
+    outcomes, of_alone = Counter(row["outcome"] for row in rows), [row for row in rows if row["alone"]]
+    kept = sum(row["outcome"] in ("right", "alike") for row in of_alone)
+    alike = [row["metres_off"] for row in rows if "metres_off" in row]
+    ratio = np.median([row["ms_atlas"] for row in rows]) / np.median([row["ms_alone"] for row in rows])
+    each = np.median([row["ms_atlas"] / row["ms_alone"] for row in rows])
+    first = np.mean([row["rank"] == 1 for row in rows])
+    return (
+        f"{name:24} {len(rows):4} pictures; alone {len(of_alone)}, of these {kept} ({100 * kept / max(len(of_alone), 1):.1f} %); "
+        f"right {outcomes['right']}, alike {outcomes['alike']} ({sum(off < RIGHT_METRES for off in alike)} right by truth), "
+        f"false {outcomes['false']}, none {outcomes['none']} ({sum(row.get('reason') == 'ambiguous' for row in rows)} ambiguous); "
+        f"time {ratio:.2f} of the medians, {each:.2f} median; right tile first {100 * first:.0f} %, "
+        f"rank at most {max(row['rank'] for row in rows)}"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("atlas")
+    parser.add_argument("recordings", nargs="+", metavar="TILE=RECORDING")
+    parser.add_argument("--alike", default="")
+    parser.add_argument("--memory-mb", type=int, default=256)
+    parser.add_argument("--json")
+    args = parser.parse_args()
+    warm_up()
+    atlas = Atlas.open(args.atlas)
+    set_node_memory(args.memory_mb * 500_000)
+    localizer = AtlasLocalizer(atlas, Maps([Path(args.atlas)], Localizer, args.memory_mb * 500_000))
+    rows: dict[str, list[dict[str, Any]]] = {}
+    for pair in args.recordings:
+        tile_id, path = pair.split("=", 1)
+        with TopoMetricMap.load(atlas.map_path(atlas.tile(tile_id))) as topomap:
+            sequence, alone = single_pictures(open_sequence(path)), Localizer(topomap)
+            of_one = [asked(localizer, alone, tile_id, sequence[k], set(args.alike.split(","))) for k in range(len(sequence))]
+        rows[pair] = of_one
+        print(line(f"{tile_id} {Path(path).name}", of_one), flush=True)
+    everything = [row for of_one in rows.values() for row in of_one]
+    print(line("all", everything))
+    print(f"most memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
+    if args.json:
+        Path(args.json).write_text(json.dumps(rows, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,197 @@
+"""Tiles added to an atlas and removed from it, by several writers at once.
+
+Files are put first, under names made of their contents; only the manifest is contended for. A writer reads it, makes the next one, and
+commits that if the manifest is still what it read; else it begins anew with the new one. So of two writers neither loses a tile.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from topoloc.atlas.atlas import store_at
+from topoloc.atlas.manifest import TILES, Manifest, StoredFile, Tile, check_tile_id
+from topoloc.atlas.place_vectors import place_vectors, write_vectors
+from topoloc.atlas.store import MANIFEST, Store, sha256_of
+from topoloc.errors import AtlasError, EmptyMapError
+from topoloc.geometry.geodesy import Georeference
+from topoloc.map.contents import map_id_of
+from topoloc.map.topomap import TopoMetricMap
+from topoloc.places.shared_vocabulary import shared_vocabulary
+
+GRACE_S = 3600.0
+"""So long files stay that no manifest names any more: readers may have just read the manifest before."""
+_MAX_TRIES = 1000
+Change = Callable[[Manifest], Mapping[str, Tile]]
+"""From a manifest to the tiles, by their ids, of the next one. May be called several times."""
+
+
+@dataclass(frozen=True)
+class NewTile:
+    """A map that becomes a tile of this id, in this world."""
+
+    tile_id: str
+    path: Path
+    world: str
+
+
+def new_tiles(paths: Sequence[str], tile_id: str | None = None, world: str | None = None) -> list[NewTile]:
+    """Maps by the ids that they get: the names of their files without .topo, or `tile_id`, of one.
+
+    Args:
+        world: what the world is called that all of them, and tiles of the atlas, share; each has its own where this is None.
+
+    Raises:
+        AtlasError: two get one id, or no tile can be called so.
+    """
+    ids = [tile_id or Path(path).name.removesuffix(".topo") for path in paths]
+    tiles = [NewTile(name, Path(path), world or name) for name, path in zip(ids, paths, strict=True)]
+    for tile in tiles:
+        check_tile_id(tile.tile_id)
+        check_tile_id(tile.world)
+        same = [other.path for other in tiles if other.tile_id == tile.tile_id]
+        if len(same) > 1:
+            raise AtlasError(f"two tiles would be called {tile.tile_id}: {same[0]} and {same[1]}")
+    return tiles
+
+
+def create_atlas(where: str, new: Sequence[NewTile]) -> Manifest:
+    """An atlas of these tiles. Raises AtlasError where there is one already, and as `add_tiles`."""
+    store = store_at(where)
+    exists = AtlasError(f"{where} is an atlas already; `topoloc atlas add` adds to it")
+    if store.manifest() is not None:
+        raise exists
+    after = Manifest().with_tiles({tile.tile_id: tile for tile in _put(store, new)}, time.time())
+    if not store.commit(None, after.to_bytes()):
+        raise exists
+    return after
+
+
+def add_tiles(where: str, new: Sequence[NewTile], replaces: bool = False, grace_s: float = GRACE_S) -> Manifest:
+    """The manifest with these tiles, too.
+
+    Args:
+        replaces: tiles of the same ids are replaced, else they are an error.
+
+    Raises:
+        AtlasError: no atlas is there, it has a tile of one of these ids, or it cannot be written.
+        MapError: a map is missing, damaged or empty.
+    """
+    store = store_at(where)
+    _check_free(_read(store), new, replaces)  # before the work begins, and again with each try
+    added = {tile.tile_id: tile for tile in _put(store, new)}
+
+    def with_added(manifest: Manifest) -> Mapping[str, Tile]:
+        _check_free(manifest, new, replaces)
+        return manifest.by_id | added
+
+    after, names = _changed(store, with_added, grace_s), store.ages()
+    for one, tile in zip(new, added.values(), strict=True):
+        if not {tile.map.name, tile.places.name} <= set(names):  # an old file of the same contents, swept just before it was named again
+            tile_of(one, store)
+    return after
+
+
+def remove_tiles(where: str, tile_ids: Sequence[str], grace_s: float = GRACE_S) -> Manifest:
+    """The manifest without these tiles. Raises AtlasError: no atlas is there, it has no such tile, or cannot be written."""
+    store = store_at(where)
+
+    def without(manifest: Manifest) -> Mapping[str, Tile]:
+        missing = [tile_id for tile_id in tile_ids if tile_id not in manifest.by_id]
+        if missing:
+            raise AtlasError(f"the atlas {where} has no tile {missing[0][:80]!r}")
+        return {tile_id: tile for tile_id, tile in manifest.by_id.items() if tile_id not in tile_ids}
+
+    return _changed(store, without, grace_s)
+
+
+def tile_of(new: NewTile, store: Store) -> Tile:
+    """What the manifest says of a map; its files are put into the store. Raises MapError, AtlasError."""
+    sha256 = sha256_of(new.path)
+    with TopoMetricMap.load(new.path) as topomap, tempfile.TemporaryDirectory() as folder:
+        if len(topomap.summaries) == 0:
+            raise EmptyMapError(f"map {new.path} has no nodes")
+        vectors = place_vectors(topomap)
+        versions = {kind: vocabulary.version for kind in vectors if (vocabulary := shared_vocabulary(kind)) is not None}
+        places = Path(folder) / "places.npz"
+        write_vectors(places, vectors)
+        of_places = sha256_of(places)
+        tile = _described(new, topomap, versions)
+        stored = StoredFile(f"{TILES}/{new.tile_id}-{sha256[:12]}.topo", sha256, new.path.stat().st_size)
+        vectors_stored = StoredFile(f"{TILES}/{new.tile_id}-{of_places[:12]}.places", of_places, places.stat().st_size)
+        store.put(vectors_stored.name, places)
+        store.put(stored.name, new.path)
+    return replace(tile, map=stored, places=vectors_stored)
+
+
+def _put(store: Store, new: Sequence[NewTile]) -> list[Tile]:
+    return [tile_of(one, store) for one in new]
+
+
+_UNKNOWN = StoredFile("", "", 0)
+
+
+def _described(new: NewTile, topomap: TopoMetricMap, vocabularies: Mapping[str, str]) -> Tile:
+    """All but the files."""
+    centres = np.array([summary.world_from_cam.translation for summary in topomap.summaries])
+    first_rows = {summary.session_id: row for row, summary in reversed(list(enumerate(topomap.summaries)))}
+    known = topomap.georeference
+    return Tile(
+        new.tile_id,
+        map=_UNKNOWN,
+        places=_UNKNOWN,
+        vocabularies=vocabularies,
+        map_id=map_id_of(topomap),
+        map_version=topomap.version,
+        kinds=tuple(topomap.kinds),
+        num_nodes=len(topomap.summaries),
+        sessions=tuple(sorted({summary.recording for summary in topomap.summaries})),
+        focal_px=max(float(topomap.nodes[row].camera.fx) for row in first_rows.values()),
+        box_world=np.array([centres.min(axis=0), centres.max(axis=0)]),
+        world=new.world,
+        georeference=known,
+        geo_box=None if known is None else _geo_box(known, centres),
+    )
+
+
+def _geo_box(known: Georeference, centres: np.ndarray) -> tuple[float, float, float, float]:
+    places = [known.geopoint(centre) for centre in centres]
+    lats, lons = [place.lat for place in places], [place.lon for place in places]
+    return min(lats), min(lons), max(lats), max(lons)
+
+
+def _read(store: Store) -> Manifest:
+    data = store.manifest()
+    if data is None:
+        raise AtlasError(f"{store.where} is no atlas: it has no {MANIFEST}; `topoloc atlas create` makes one")
+    return Manifest.from_bytes(data, f"{store.where}/{MANIFEST}")
+
+
+def _check_free(manifest: Manifest, new: Sequence[NewTile], replaces: bool) -> None:
+    taken = [tile.tile_id for tile in new if tile.tile_id in manifest.by_id]
+    if taken and not replaces:
+        raise AtlasError(f"the atlas has a tile {taken[0]} already; --replace replaces it, --id gives the new one another id")
+
+
+def _changed(store: Store, change: Change, grace_s: float) -> Manifest:
+    """Read, change and commit until nobody came in between; then remove what nobody names."""
+    for _ in range(_MAX_TRIES):
+        before = store.manifest()
+        if before is None:
+            raise AtlasError(f"{store.where} is no atlas: it has no {MANIFEST}; `topoloc atlas create` makes one")
+        manifest = Manifest.from_bytes(before, f"{store.where}/{MANIFEST}")
+        now, ages = time.time(), store.ages()
+        after = manifest.with_tiles(change(manifest), now)
+        gone = [name for name, when in after.retired.items() if name not in ages or min(now - when, ages[name]) > grace_s]
+        after = replace(after, retired={name: when for name, when in after.retired.items() if name not in gone})
+        if store.commit(before, after.to_bytes()):
+            known = after.files | set(after.retired)
+            for name in (name for name, age in store.ages().items() if name not in known and age > grace_s):
+                store.remove(name)
+            return after
+    raise AtlasError(f"{store.where}: other writers came in between {_MAX_TRIES} times")

@@ -1,0 +1,42 @@
+"""An atlas judged by truth that is given in one tile's world."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from topoloc.atlas.atlas_localizer import AtlasLocalizer
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.rough_camera import RoughCamera
+from topoloc.localization.result import Localization, NotLocalized
+from topoloc.map.topomap import TopoMetricMap
+from topoloc.places.coarse import Image
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedTile:
+    """The whole atlas is asked; `topomap` is the tile's map, whose nodes the truth is compared with."""
+
+    localizer: AtlasLocalizer
+    tile_id: str
+    topomap: TopoMetricMap
+
+    @staticmethod
+    def of(localizer: AtlasLocalizer, tile_id: str) -> JudgedTile:
+        """Raises AtlasError: no such tile, or its map is missing; MapError: it is damaged."""
+        return JudgedTile(localizer, tile_id, TopoMetricMap.load(localizer.atlas.map_path(localizer.atlas.tile(tile_id))))
+
+    def localize(self, image: Image, camera: Camera | RoughCamera | None, t_ns: int | None = None) -> Localization | NotLocalized:
+        """As `AtlasLocalizer.localize`."""
+        return self.localizer.localize(image, camera, t_ns=t_ns)
+
+    def truth_in_world_of(self, result: Localization | NotLocalized, world_from_cam: Rigid3) -> Rigid3 | None:
+        """The true pose in the world of the tile that answered; None where the atlas does not know how that lies to this one, so that no
+        pose there is right."""
+        tile, answered = self.localizer.atlas.tile(self.tile_id), result.provenance.tile
+        other = tile if answered is None else self.localizer.atlas.tile(answered)
+        if tile.world == other.world:
+            return world_from_cam
+        if tile.atlas_from_world is None or other.atlas_from_world is None:
+            return None
+        return other.atlas_from_world.inverse() @ tile.atlas_from_world @ world_from_cam

@@ -1,0 +1,233 @@
+"""What an atlas says of itself in `atlas.json`: its tiles, and where each one's files lie. Data only, read back with every value checked.
+
+Tiles go by ids that never change. Their files have names made of their contents, so that a tile that is replaced is another file and
+whoever has read a manifest goes on with the files that it names. `serial` grows by one with each write.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+from topoloc.errors import AtlasError, GeoreferenceError, TrajectoryError
+from topoloc.geometry.geodesy import GeoPoint, Georeference
+from topoloc.geometry.rigid import Rigid3
+
+FORMAT, FORMAT_VERSION = "topoloc-atlas", 1
+TILES = "tiles"
+MAX_TILES = 1_000_000
+_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
+_FILE = re.compile(rf"{TILES}/[A-Za-z0-9][A-Za-z0-9_.-]{{0,199}}")
+_SHA256, _MAP_ID = re.compile(r"[0-9a-f]{64}"), re.compile(r"[0-9a-f]{16}")
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class StoredFile:
+    """A file of the atlas: its name below it, SHA-256, and bytes."""
+
+    name: str
+    sha256: str
+    num_bytes: int
+
+    def to_json(self) -> dict[str, Any]:
+        return {"file": self.name, "sha256": self.sha256, "bytes": self.num_bytes}
+
+
+@dataclass(frozen=True, eq=False)
+class Tile:
+    """A map of the atlas. `places` are its place vectors (`place_vectors.py`), by vocabularies of these versions, by kind of features.
+
+    `box_world` holds the least and the largest coordinates of its nodes' cameras in the map's own world, metres; `focal_px` the focal
+    length of its finest camera. `georeference` is the map's, `geo_box` the least latitude, longitude and the largest ones, degrees;
+    both None of a map that knows no place on earth. Tiles of one `world` share their coordinates; it is the tile's own id where nobody said
+    so. `atlas_from_world` brings the map's world into the atlas's, where that is known.
+    """
+
+    tile_id: str
+    map: StoredFile
+    places: StoredFile
+    vocabularies: Mapping[str, str]
+    map_id: str
+    map_version: int
+    kinds: tuple[str, ...]
+    num_nodes: int
+    sessions: tuple[str, ...]
+    focal_px: float
+    box_world: Float[np.ndarray, "2 3"]
+    world: str
+    georeference: Georeference | None = None
+    geo_box: tuple[float, float, float, float] | None = None
+    atlas_from_world: Rigid3 | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        known = self.georeference
+        return {
+            "id": self.tile_id,
+            "map": self.map.to_json(),
+            "places": self.places.to_json() | {"vocabularies": dict(self.vocabularies)},
+            "map_id": self.map_id,
+            "map_version": self.map_version,
+            "kinds": list(self.kinds),
+            "num_nodes": self.num_nodes,
+            "sessions": list(self.sessions),
+            "focal_px": self.focal_px,
+            "world": self.world,
+            "box_world": self.box_world.tolist(),
+            "georeference": None if known is None else known.to_json(),
+            "geo_box": None if self.geo_box is None else list(self.geo_box),
+            "atlas_from_world": None if self.atlas_from_world is None else self.atlas_from_world.matrix()[:3].tolist(),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Manifest:
+    """All tiles in the order of their ids. `origin` is the place on earth at which the atlas's own world touches it (east, north, up), None
+    while no tile is georeferenced. `retired` are files that were named before, and when they were given up (seconds of Unix time)."""
+
+    serial: int = 0
+    tiles: tuple[Tile, ...] = ()
+    origin: GeoPoint | None = None
+    retired: Mapping[str, float] = field(default_factory=dict)
+
+    @cached_property
+    def by_id(self) -> dict[str, Tile]:
+        return {tile.tile_id: tile for tile in self.tiles}
+
+    @property
+    def files(self) -> set[str]:
+        """Names of all files that the tiles consist of."""
+        return {stored.name for tile in self.tiles for stored in (tile.map, tile.places)}
+
+    def with_tiles(self, tiles: Mapping[str, Tile], now: float) -> Manifest:
+        """The next one, of these tiles; files that it does not name any more are retired at `now`."""
+        origin = self.origin
+        if origin is None:
+            origin = next((tile.georeference.origin for _, tile in sorted(tiles.items()) if tile.georeference is not None), None)
+        placed = tuple(_in_atlas_world(tiles[tile_id], origin) for tile_id in sorted(tiles))
+        after = Manifest(self.serial + 1, placed, origin)
+        retired = dict.fromkeys(self.files, now) | dict(self.retired)
+        return replace(after, retired={name: when for name, when in sorted(retired.items()) if name not in after.files})
+
+    def to_bytes(self) -> bytes:
+        """As `atlas.json` holds it."""
+        origin = self.origin
+        data = {
+            "format": FORMAT,
+            "version": FORMAT_VERSION,
+            "serial": self.serial,
+            "origin": None if origin is None else {"lat": origin.lat, "lon": origin.lon, "h": origin.h},
+            "tiles": [tile.to_json() for tile in self.tiles],
+            "retired": dict(self.retired),
+        }
+        return (json.dumps(data, indent=1) + "\n").encode("utf-8")
+
+    @staticmethod
+    def from_bytes(data: bytes, where: str) -> Manifest:
+        """The inverse of `to_bytes`. Raises AtlasError, which says `where`, whatever else the bytes are."""
+        try:
+            return _manifest_of(json.loads(data))
+        except (ValueError, TypeError, KeyError, RecursionError, OverflowError, GeoreferenceError, TrajectoryError) as error:
+            what = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else " ".join(str(error).split())[:200]
+            raise AtlasError(f"{where} is no manifest of an atlas, or a damaged one: {what}") from None
+
+
+def check_tile_id(tile_id: str) -> None:
+    """Raises AtlasError where no tile can be called so."""
+    if not _ID.fullmatch(tile_id):
+        raise AtlasError(f"no tile can be called {tile_id[:80]!r}: at most 100 letters, digits, `_`, `-` and `.`, a letter or digit first")
+
+
+def _in_atlas_world(tile: Tile, origin: GeoPoint | None) -> Tile:
+    """A georeferenced tile with its pose in the atlas's world, which is east-north-up at `origin`."""
+    known = tile.georeference
+    if known is None or origin is None:
+        return tile
+    atlas_from_ecef = origin.ecef_from_enu().inverse()
+    return replace(tile, atlas_from_world=atlas_from_ecef @ known.origin.ecef_from_enu() @ known.enu_from_world)
+
+
+def _manifest_of(data: Any) -> Manifest:
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        raise ValueError(f"'format' is not {FORMAT!r}")
+    if data.get("version") != FORMAT_VERSION:
+        raise ValueError(f"version {str(data.get('version'))[:20]} of the format; this topoloc reads version {FORMAT_VERSION}")
+    rows = _of(list, data["tiles"], "tiles")
+    tiles = [_tile_of(_of(dict, row, "a tile")) for row in rows[: MAX_TILES + 1]]
+    if len(tiles) > MAX_TILES or len({tile.tile_id for tile in tiles}) < len(tiles):
+        raise ValueError("too many tiles, or two of one id")
+    origin, retired = data["origin"], _of(dict, data["retired"], "retired")
+    for name in retired:
+        _matching(_FILE, name, "a retired file")
+    place = None if origin is None else GeoPoint(*(_number(origin[name], name) for name in ("lat", "lon", "h")))
+    ordered = tuple(sorted(tiles, key=lambda tile: tile.tile_id))
+    return Manifest(_count(data["serial"], "serial"), ordered, place, {name: _number(when, "retired") for name, when in retired.items()})
+
+
+def _tile_of(row: dict[str, Any]) -> Tile:
+    box = np.array(row["box_world"], np.float64)
+    if box.shape != (2, 3) or not np.isfinite(box).all():
+        raise ValueError("box_world is no two points")
+    geo_box, georeference, pose = row["geo_box"], row["georeference"], row["atlas_from_world"]
+    focal = _number(row["focal_px"], "focal_px")
+    if focal <= 0.0:
+        raise ValueError("focal_px is not above 0")
+    vocabularies = _of(dict, row["places"]["vocabularies"], "vocabularies")
+    corners = None if geo_box is None else [_number(value, "geo_box") for value in _of(list, geo_box, "geo_box")]
+    if corners is not None and len(corners) != 4:
+        raise ValueError("geo_box is no four degrees")
+    return Tile(
+        tile_id=_matching(_ID, row["id"], "id"),
+        map=_file_of(row["map"]),
+        places=_file_of(row["places"]),
+        vocabularies={kind: _of(str, version, "vocabularies") for kind, version in vocabularies.items()},
+        map_id=_matching(_MAP_ID, row["map_id"], "map_id"),
+        map_version=_count(row["map_version"], "map_version"),
+        kinds=tuple(_of(str, kind, "kinds") for kind in _of(list, row["kinds"], "kinds")),
+        num_nodes=_count(row["num_nodes"], "num_nodes"),
+        sessions=tuple(_of(str, name, "sessions") for name in _of(list, row["sessions"], "sessions")),
+        focal_px=focal,
+        box_world=box,
+        world=_matching(_ID, row["world"], "world"),
+        georeference=None if georeference is None else Georeference.from_json(georeference),
+        geo_box=None if corners is None else (corners[0], corners[1], corners[2], corners[3]),
+        atlas_from_world=None if pose is None else Rigid3.from_matrix(np.array(pose, np.float64)),
+    )
+
+
+def _file_of(row: Any) -> StoredFile:
+    name, sha256 = _matching(_FILE, row["file"], "file"), _matching(_SHA256, row["sha256"], "sha256")
+    return StoredFile(name, sha256, _count(row["bytes"], "bytes"))
+
+
+def _of(kind: type[T], value: Any, what: str) -> T:
+    if not isinstance(value, kind):
+        raise ValueError(f"{what} is no {kind.__name__}")
+    return value
+
+
+def _matching(pattern: re.Pattern[str], value: Any, what: str) -> str:
+    if not isinstance(value, str) or not pattern.fullmatch(value):
+        raise ValueError(f"{what} cannot be {str(value)[:80]!r}")
+    return value
+
+
+def _count(value: Any, what: str) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**53:
+        raise ValueError(f"{what} is no count")
+    return value
+
+
+def _number(value: Any, what: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError(f"{what} is no finite number")
+    return float(value)

@@ -1,0 +1,144 @@
+"""What several tiles say of one picture, heard together.
+
+Each tile weighs its own poses and knows nothing of the others. A pose is believed only where it leads every pose of every other tile that
+was asked, by the same evidence and by as much as two poses of one map must be apart (`localization/belief.py`). Else the picture is
+ambiguous, and the alternatives name their tiles. Where the atlas knows how two tiles lie to each other, poses that are the same one are no
+rivals.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from topoloc.atlas.manifest import Tile
+from topoloc.localization.belief import MIN_LEAD
+from topoloc.localization.evidence import log_odds_of
+from topoloc.localization.fitted_weights import FittedWeights, RivalWeights, weights_of
+from topoloc.localization.result import Alternative, Localization, NotLocalized, R
+
+_SAME_METRES, _SAME_DEG = 1.0, 5.0
+_MIN_ALTERNATIVE = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """What a tile said: its result, and each pose that this names. `is_full`: was it asked by all means?"""
+
+    tile: Tile
+    result: Localization | NotLocalized
+    named: tuple[Localization, ...]
+    is_full: bool
+    likeness: float = 0.0
+
+    @property
+    def is_clear(self) -> bool:
+        """Is its pose so well founded that the map itself asked no further?"""
+        result = self.result
+        return isinstance(result, Localization) and _log_odds(result) > _weights(result).evidence.clear_log_odds
+
+
+def joint_result(heard: Sequence[Heard]) -> Localization | NotLocalized:
+    """The answer of several tiles; the first one of a tile speaks for it. Of refusals the one that found most."""
+    vouching = [(one.tile, pose) for one in heard for pose in one.named]
+    found = [one for one in heard if isinstance(one.result, Localization) and one.is_full]
+    if not found:
+        return _refusal(heard)
+    best = max(found, key=lambda one: min((_lead(one.named[0], pose) for _, pose in _rivals_of(one, vouching)), default=math.inf))
+    assert isinstance(best.result, Localization)
+    rivals = _rivals_of(best, vouching)
+    leads = [_lead(best.result, pose) for _, pose in rivals]
+    if all(by >= MIN_LEAD for by in leads):
+        others = (1.0 / best.result.probability) - 1.0 + sum(math.exp(-by) for by in leads)
+        return _of_tile(replace(best.result, probability=1.0 / (1.0 + others)), best.tile)
+    return _ambiguity(best, rivals, leads)
+
+
+def _rivals_of(one: Heard, vouching: Sequence[tuple[Tile, Localization]]) -> list[tuple[Tile, Localization]]:
+    """The poses of other tiles that are not the same as the one of this tile."""
+    return [(tile, pose) for tile, pose in vouching if tile is not one.tile and not _is_same(one.tile, one.named[0], tile, pose)]
+
+
+def _ambiguity(best: Heard, rivals: Sequence[tuple[Tile, Localization]], leads: Sequence[float]) -> NotLocalized:
+    """It is one of these; how probable each is, beside "nowhere"."""
+    assert isinstance(best.result, Localization)
+    others = (1.0 / max(best.result.probability, 1e-6)) - 1.0 + sum(math.exp(-by) for by in leads)
+    shares = [(1.0 / (1.0 + others), best.tile, best.result)]
+    shares += [(math.exp(-by) / (1.0 + others), tile, pose) for by, (tile, pose) in zip(leads, rivals, strict=True)]
+    probable = sorted((one for one in shares if one[0] >= _MIN_ALTERNATIVE * shares[0][0]), key=lambda one: -one[0])
+    alternatives = tuple(
+        Alternative(pose.world_from_cam, probability, pose.node_id, pose.geopose, tile.tile_id) for probability, tile, pose in probable
+    )
+    detail = f"as much like tile {alternatives[1].tile} as like tile {alternatives[0].tile}"
+    result = best.result
+    refusal = NotLocalized(
+        "ambiguous", result.candidates, result.num_matches, result.num_inliers, {}, detail, alternatives, result.provenance
+    )
+    return _of_tile(replace(refusal, seen_camera=result.seen_camera), best.tile)
+
+
+def _refusal(heard: Sequence[Heard]) -> NotLocalized:
+    """That of the tile that knows most of the picture: one that has alternatives, or the most inliers."""
+    refused = [one for one in heard if isinstance(one.result, NotLocalized)]
+    best = max(refused, key=lambda one: (one.is_full, one.result.reason == "ambiguous", one.result.num_inliers, one.likeness))  # pyright: ignore
+    assert isinstance(best.result, NotLocalized)
+    result = best.result
+    alternatives = tuple(replace(one, tile=best.tile.tile_id) for one in result.alternatives)
+    return _of_tile(replace(result, alternatives=alternatives), best.tile)
+
+
+def _of_tile(result: R, tile: Tile) -> R:
+    """With the name of the tile, and the pose in the atlas's world where that is known."""
+    pose = None
+    if isinstance(result, Localization) and tile.atlas_from_world is not None:
+        pose = tile.atlas_from_world @ result.world_from_cam
+    return replace(result, provenance=replace(result.provenance, tile=tile.tile_id, atlas_from_cam=pose))
+
+
+def _lead(a: Localization, b: Localization) -> float:
+    """By how much one pose is likelier than another of another tile, in logarithms of odds: by their strengths, which tell twins apart,
+    where features of one kind speak for both, else by the odds of each."""
+    is_alike = a.provenance.features == b.provenance.features and not (_is_from_walls(a) or _is_from_walls(b))
+    return _strength(a) - _strength(b) if is_alike else _log_odds(a) - _log_odds(b)
+
+
+def _strength(result: Localization) -> float:
+    """As of `belief.lead`."""
+    weights, evidence = _rivals(result), result.evidence
+    if evidence is None or _is_from_walls(result):
+        return _log_odds(result)
+    even, doubt = math.log(evidence.even_share + 0.002), math.log(max(evidence.doubt, 0.01))
+    return weights.odds * _log_odds(result) + weights.even_share * even + weights.doubt * doubt
+
+
+def _log_odds(result: Localization) -> float:
+    """Of the pose against "nowhere"."""
+    if result.evidence is None:
+        return math.log(max(result.probability, 1e-9) / max(1.0 - result.probability, 1e-9))
+    return log_odds_of(result.evidence, _weights(result))
+
+
+def _weights(result: Localization) -> FittedWeights:
+    return weights_of(result.provenance.features)
+
+
+def _rivals(result: Localization) -> RivalWeights:
+    return _weights(result).rivals
+
+
+def _is_from_walls(result: Localization) -> bool:
+    return result.evidence is not None and result.evidence.num_distinct is not None
+
+
+def _is_same(tile: Tile, pose: Localization, other: Tile, other_pose: Localization) -> bool:
+    """Do poses of two tiles say the same, as far as the atlas knows how these lie to each other?"""
+    a, b = pose.world_from_cam, other_pose.world_from_cam
+    if tile.world != other.world:
+        if tile.atlas_from_world is None or other.atlas_from_world is None:
+            return False
+        a, b = tile.atlas_from_world @ a, other.atlas_from_world @ b
+    apart = a.inverse() @ b
+    return float(np.linalg.norm(apart.translation)) < _SAME_METRES and math.degrees(apart.angle()) < _SAME_DEG

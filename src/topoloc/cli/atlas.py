@@ -1,0 +1,114 @@
+"""topoloc atlas create | add | remove | info ATLAS [MAP ...]."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from topoloc.cli.output import File, Flag, UsageError, print_facts, write_json
+
+Names = Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="MAP|TILE ...", help_behavior_hint="")]
+
+
+@dataclass(frozen=True)
+class Command:
+    """What `topoloc atlas` takes."""
+
+    action: Annotated[tyro.conf.Positional[Literal["create", "add", "remove", "info"]], tyro.conf.arg(metavar="ACTION")]
+    """`create`: a new atlas of maps. `add`: more maps. `remove`: tiles by their ids. `info`: what it holds."""
+    atlas: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ATLAS")]
+    """The atlas: a folder; or, with the extra `cluster`, a prefix of an object store, such as s3://bucket/campus."""
+    names: Names = ()
+    """Of `create` and `add`: map files, which are copied. Of `remove`: ids of tiles."""
+    id: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the file's name without .topo)")] = None
+    """Of `create` and `add`, for one map: what the tile is called."""
+    world: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: each its own)")] = None
+    """Of `create` and `add`: maps of one world, so that poses in one are poses in the other, too (maps of one recording split, or of
+    recordings whose poses are in one world)."""
+    replace: Flag = False
+    """Of `add`: a tile of the same id is replaced by the new map."""
+    check: Flag = False
+    """Of `info`: also compare every file with its checksum; exit status 1 where one is missing or another."""
+    json: File = None
+    """Write what the atlas holds afterwards as JSON to this file (- for standard output)."""
+
+    def run(self) -> int:
+        self._check_usage()
+        found = []
+        if self.action == "info":
+            from topoloc.atlas.atlas import Atlas, tile_problem
+
+            atlas = Atlas.open(self.atlas)
+            manifest = atlas.manifest
+            if self.check:
+                found = [f"tile {tile.tile_id}: {problem}" for tile in manifest.tiles if (problem := tile_problem(atlas, tile))]
+        else:
+            manifest = self._written()
+        facts = describe(self.atlas, manifest) | ({"check": found or "ok"} if self.check else {})
+        if self.json != "-":
+            print_atlas(facts)
+        write_json(self.json, facts)
+        for problem in found:
+            print(f"error: {problem}", file=sys.stderr)
+        return 1 if found else 0
+
+    def _written(self) -> Any:
+        from topoloc.atlas.editing import add_tiles, create_atlas, new_tiles, remove_tiles
+
+        if self.action == "remove":
+            return remove_tiles(self.atlas, self.names)
+        new = new_tiles(self.names, self.id, self.world)
+        return create_atlas(self.atlas, new) if self.action == "create" else add_tiles(self.atlas, new, self.replace)
+
+    def _check_usage(self) -> None:
+        if self.action == "info" and self.names:
+            raise UsageError("info takes an atlas alone")
+        if self.action in ("add", "remove") and not self.names:
+            raise UsageError(f"{self.action} takes an atlas and at least one {'map' if self.action == 'add' else 'tile'}")
+        if self.id is not None and (self.action not in ("create", "add") or len(self.names) != 1):
+            raise UsageError("--id is of one map that is added")
+        if self.world is not None and self.action not in ("create", "add"):
+            raise UsageError("--world is of maps that are added")
+        if self.replace and self.action != "add":
+            raise UsageError("--replace belongs to add")
+        if self.check and self.action != "info":
+            raise UsageError("--check belongs to info")
+
+
+def describe(where: str, manifest: Any) -> dict[str, Any]:
+    """The facts of an atlas: those of its tiles, and their sums."""
+    tiles = [tile.to_json() for tile in manifest.tiles]
+    origin = manifest.origin
+    return {
+        "path": where,
+        "serial": manifest.serial,
+        "num_tiles": len(tiles),
+        "num_nodes": sum(tile.num_nodes for tile in manifest.tiles),
+        "bytes": sum(tile.map.num_bytes + tile.places.num_bytes for tile in manifest.tiles),
+        "origin": None if origin is None else {"lat": origin.lat, "lon": origin.lon, "h": origin.h},
+        "tiles": tiles,
+    }
+
+
+def print_atlas(facts: dict[str, Any]) -> None:
+    """For people: a line each tile."""
+    width = max((len(tile["id"]) for tile in facts["tiles"]), default=0)
+    print_facts(
+        [
+            ("atlas", f"{facts['path']}, serial {facts['serial']}"),
+            ("tiles", f"{facts['num_tiles']}, {facts['num_nodes']} nodes, {facts['bytes'] / 1e6:.2f} MB"),
+            *(("", f"{tile['id']:<{width}}  {_tile_line(tile)}") for tile in facts["tiles"]),
+            *([("check", "ok" if facts["check"] == "ok" else f"{len(facts['check'])} tiles are damaged")] if "check" in facts else []),
+        ]
+    )
+
+
+def _tile_line(tile: dict[str, Any]) -> str:
+    least, most = tile["box_world"]
+    extent = " x ".join(f"{high - low:.1f}" for low, high in zip(least, most, strict=True))
+    box = tile["geo_box"]
+    place = "" if box is None else f"  {box[0]:.6f} {box[1]:.6f} to {box[2]:.6f} {box[3]:.6f}"
+    return f"{tile['num_nodes']} nodes  {extent} m  {tile['map']['bytes'] / 1e6:.1f} MB  {', '.join(tile['kinds'])}{place}"

@@ -1,0 +1,195 @@
+"""Tiles added and removed: nobody's are lost, files stay as long as somebody may read them, and no longer."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from uuid import uuid4
+
+import pytest
+
+from topoloc.atlas import editing
+from topoloc.atlas.atlas import Atlas, tile_problem
+from topoloc.atlas.editing import NewTile, add_tiles, create_atlas, new_tiles, remove_tiles
+from topoloc.atlas.manifest import Tile
+from topoloc.atlas.store import Store
+from topoloc.errors import AtlasError
+
+NUM_WRITES = {"folder": 25, "object store": 12}
+
+
+@pytest.fixture(params=["folder", "object store"])
+def somewhere(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
+    """Where an atlas may be made: a folder, and a store of objects."""
+    if request.param == "folder":
+        yield str(tmp_path / "campus")
+    else:
+        pytest.importorskip("fsspec", reason="the extra cluster is not installed")
+        yield f"memory://{uuid4().hex}/campus"
+
+
+def _tiles(where: str) -> list[str]:
+    return [tile.tile_id for tile in Atlas.open(where).manifest.tiles]
+
+
+def test_tiles_come_and_go(somewhere: str, room_map: Path, other_map: Path):
+    assert create_atlas(somewhere, new_tiles([str(room_map)])).serial == 1
+    assert add_tiles(somewhere, new_tiles([str(other_map)], "annex")).serial == 2
+    assert _tiles(somewhere) == ["annex", "room"]
+    read = Atlas.open(somewhere)
+    assert [tile_problem(read, tile) for tile in read.manifest.tiles] == [None, None]
+    assert read.map_path(read.tile("room")).read_bytes() == room_map.read_bytes()
+    assert remove_tiles(somewhere, ["room"]).serial == 3
+    assert _tiles(somewhere) == ["annex"]
+
+
+def test_two_tiles_of_one_id_are_refused(somewhere: str, room_map: Path, other_map: Path):
+    create_atlas(somewhere, new_tiles([str(room_map)]))
+    with pytest.raises(AtlasError, match="has a tile room already"):
+        add_tiles(somewhere, new_tiles([str(other_map)], "room"))
+    with pytest.raises(AtlasError, match="two tiles would be called room"):
+        new_tiles([str(room_map), f"elsewhere/{room_map.name}"])
+    with pytest.raises(AtlasError, match="is an atlas already"):
+        create_atlas(somewhere, [])
+    assert Atlas.open(somewhere).manifest.serial == 1
+
+
+def test_whoever_has_opened_an_atlas_keeps_its_tiles(somewhere: str, room_map: Path, other_map: Path):
+    create_atlas(somewhere, new_tiles([str(room_map)], "hall"))
+    before = Atlas.open(somewhere)
+    add_tiles(somewhere, new_tiles([str(other_map)], "hall"), replaces=True)
+    assert before.map_path(before.tile("hall")).read_bytes() == room_map.read_bytes()
+    after = Atlas.open(somewhere)
+    assert after.map_path(after.tile("hall")).read_bytes() == other_map.read_bytes()
+
+
+def test_files_that_nobody_names_go_after_their_time(room_map: Path, other_map: Path, tmp_path: Path):
+    where = tmp_path / "campus"
+    create_atlas(str(where), new_tiles([str(room_map)], "hall"))
+    files = lambda: {path.suffix for path in (where / "tiles").iterdir() if path.name.startswith("hall")}  # noqa: E731
+    litter = where / "tiles" / "killed-0123.topo"
+    litter.write_bytes(b"of a writer that was killed")
+    remove_tiles(str(where), ["hall"])
+    assert files() == {".topo", ".places"}
+    add_tiles(str(where), new_tiles([str(other_map)]))
+    assert files() == {".topo", ".places"}  # within their time
+    assert litter.exists()
+    long_ago = time.time() - 2 * editing.GRACE_S
+    for path in (where / "tiles").iterdir():
+        os.utime(path, (long_ago, long_ago))
+    add_tiles(str(where), new_tiles([str(other_map)], "more"))
+    assert files() == {".topo", ".places"}  # put long ago, but named until just now
+    assert not litter.exists()
+    add_tiles(str(where), new_tiles([str(other_map)], "even-more"), grace_s=0.0)
+    assert files() == set()
+    assert Atlas.open(str(where)).manifest.retired == {}
+    assert _tiles(str(where)) == ["even-more", "more", "other"]
+
+
+def test_a_tile_that_comes_back_is_not_swept(room_map: Path, tmp_path: Path):
+    where = str(tmp_path / "campus")
+    create_atlas(where, new_tiles([str(room_map)]))
+    remove_tiles(where, ["room"])
+    add_tiles(where, new_tiles([str(room_map)]))
+    remove_tiles_again = add_tiles(where, new_tiles([str(room_map)], "twin"), grace_s=0.0)
+    assert remove_tiles_again.retired == {}
+    read = Atlas.open(where)
+    assert [tile_problem(read, tile) for tile in read.manifest.tiles] == [None, None]
+
+
+def test_two_writers_at_once_lose_nothing(somewhere: str, room_map: Path, monkeypatch: pytest.MonkeyPatch):
+    """Writes of two writers that begin together; what is slow about a tile is left out."""
+    num_writes = NUM_WRITES["object store" if somewhere.startswith("memory:") else "folder"]
+    create_atlas(somewhere, new_tiles([str(room_map)]))
+    ready = Atlas.open(somewhere).tile("room")
+    if somewhere.startswith("memory:"):
+        _one_object_at_a_time(monkeypatch)
+
+    def made(new: NewTile, store: Store) -> Tile:
+        return replace(ready, tile_id=new.tile_id, world=new.world)
+
+    monkeypatch.setattr(editing, "tile_of", made)
+    begin, failures = threading.Barrier(2), list[BaseException]()
+
+    def write(writer: str) -> None:
+        try:
+            begin.wait()
+            for number in range(num_writes):
+                add_tiles(somewhere, new_tiles([str(room_map)], f"{writer}{number}"))
+        except BaseException as error:
+            failures.append(error)
+            raise
+
+    writers = [threading.Thread(target=write, args=(name,)) for name in "ab"]
+    for writer in writers:
+        writer.start()
+    for writer in writers:
+        writer.join()
+    manifest = Atlas.open(somewhere).manifest
+    assert not failures
+    assert {tile.tile_id for tile in manifest.tiles} == {"room"} | {f"{name}{number}" for name in "ab" for number in range(num_writes)}
+    assert manifest.serial == 1 + 2 * num_writes
+
+
+def _one_object_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """fsspec's store in memory looks first and writes then, unlike S3; here both are one step."""
+    from fsspec.implementations.memory import MemoryFileSystem
+
+    lock, write = threading.Lock(), MemoryFileSystem.pipe_file
+
+    def at_once(self: MemoryFileSystem, path: str, value: bytes, mode: str = "overwrite", **kwargs: object) -> None:
+        with lock:
+            if mode == "create" and self.exists(path):
+                raise FileExistsError(path)
+            write(self, path, value, "overwrite")
+
+    monkeypatch.setattr(MemoryFileSystem, "pipe_file", at_once)
+
+
+def test_a_writer_that_comes_too_late_begins_anew(room_map: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Another writer commits between reading and committing: its tile is there afterwards, and a clash of ids with it is told."""
+    where = str(tmp_path / "campus")
+    create_atlas(where, [])
+    made: Callable[[NewTile, Store], Tile] = editing.tile_of
+
+    def meanwhile(new: NewTile, store: Store) -> Tile:
+        monkeypatch.setattr(editing, "tile_of", made)
+        add_tiles(where, new_tiles([str(room_map)], "first"))
+        return made(new, store)
+
+    monkeypatch.setattr(editing, "tile_of", meanwhile)
+    add_tiles(where, new_tiles([str(room_map)], "second"))
+    assert _tiles(where) == ["first", "second"]
+    remove_tiles(where, ["first"])
+    monkeypatch.setattr(editing, "tile_of", meanwhile)
+    with pytest.raises(AtlasError, match="has a tile first already"):
+        add_tiles(where, new_tiles([str(room_map)], "first"))
+
+
+def test_a_file_that_is_not_the_one_that_was_added_is_named(own_atlas: Path):
+    read = Atlas.open(str(own_atlas))
+    tile = read.tile("room")
+    path = own_atlas / tile.map.name
+    path.write_bytes(path.read_bytes()[:-1] + b"?")
+    assert "checksum" in str(tile_problem(read, tile))
+    path.unlink()
+    assert "missing" in str(tile_problem(read, tile))
+    assert tile_problem(read, read.tile("other")) is None
+
+
+def test_what_is_no_atlas_is_said_to_be_none(tmp_path: Path, room_map: Path):
+    with pytest.raises(AtlasError, match="is no atlas"):
+        Atlas.open(str(tmp_path))
+    with pytest.raises(AtlasError, match="is no atlas"):
+        add_tiles(str(tmp_path), new_tiles([str(room_map)]))
+    with pytest.raises(AtlasError, match="no tile can be called"):
+        new_tiles([str(room_map)], "../up")
+    create_atlas(str(tmp_path / "campus"), [])
+    with pytest.raises(AtlasError, match="has no tile 'room'"):
+        remove_tiles(str(tmp_path / "campus"), ["room"])
+    shutil.rmtree(tmp_path / "campus")

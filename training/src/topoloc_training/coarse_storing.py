@@ -1,0 +1,36 @@
+"""Keeping a taught coarse localizer in a map file: apart from the teaching, for no result of it follows from how a map is edited."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from topoloc.map.edit import editing
+from topoloc.map.schema import SCHEMA_VERSION
+from topoloc.map.sessions import Edit, today
+from topoloc.map.topomap import TopoMetricMap
+from topoloc.places.coarse import CoarseModel
+
+
+def store_coarse(path: Path, target: Path, model: CoarseModel, make_default: bool) -> None:
+    """Write to `target`, which may be `path`, the map of `path` with this coarse localizer in it: at once or not at all.
+
+    Args:
+        make_default: it answers from now on where the user names none.
+
+    Raises:
+        MapError: `path` is no map, or `target` cannot be written.
+    """
+    name = f"train {model.name}"
+    if target.exists() and path.samefile(target):
+        with editing(path) as edit:
+            edit.commit(_with_model(edit.topomap, model, make_default), name)
+        return
+    with TopoMetricMap.load(path) as topomap:
+        edits = [*topomap.edits, Edit(topomap.free_ids.edit, name, today(), SCHEMA_VERSION)]
+        replace(_with_model(topomap, model, make_default), edits=edits).save(target)
+
+
+def _with_model(topomap: TopoMetricMap, model: CoarseModel, make_default: bool) -> TopoMetricMap:
+    models = {name: topomap.coarse_models[name] for name in topomap.coarse_models} | {model.name: model}
+    return replace(topomap, coarse_models=models, default_coarse=model.name if make_default else topomap.default_coarse)
