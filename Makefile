@@ -1,6 +1,7 @@
 # make demo      maps a rendered room by day, asks it by day and by night, writes topoloc-demo/report.html; installs what that needs
 # make install   the program with all its extras and the tests' tools, into .venv, at the versions of constraints.txt
 # make test      all checks: ruff, import contract, types, tests; installs into .venv only what these need
+# make test-slow   the few tests that `make test` leaves out for their time: the paper made again, networks trained
 # make lint      the same without the tests
 # make docs      these pages as HTML, in docs/_build/html; a warning is an error
 # make clean     remove what the above made
@@ -14,7 +15,7 @@ CANDIDATES := $(PYTHON) python3.13 python3.12 python3.11 python3
 # Without a look at the network for a newer pyright; its node comes from the package index.
 PYRIGHT := PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright
 
-.PHONY: demo install test lint docs clean
+.PHONY: demo install test test-slow lint docs clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed-core
@@ -24,6 +25,9 @@ install: $(VENV)/installed-all
 
 test: lint
 	@$(BIN)/pytest --numprocesses auto --maxprocesses 4
+
+test-slow: $(VENV)/installed-test
+	@$(BIN)/pytest -m slow
 
 lint: $(VENV)/installed-test
 	@$(BIN)/ruff check --quiet

@@ -16,7 +16,8 @@ from topoloc.evaluation.metrics import summarize
 from topoloc.map.nodes import NodeConfig
 from topoloc.places.network_config import PictureConfig
 from topoloc_training.classifier_config import CnnFcConfig, TrainingConfig
-from topoloc_training.coarse_training import CoarseTrainingConfig, store_coarse, train_coarse
+from topoloc_training.coarse_storing import store_coarse
+from topoloc_training.coarse_training import CoarseTrainingConfig, train_coarse
 
 
 def main(map_file: Path | None, weights: str | None, epochs: int, out: Path) -> None:

@@ -12,6 +12,7 @@ from functools import cache
 import numpy as np
 
 from tiny_world import BASELINE, LEVEL_FROM_CAM, Panel, render, right_pose, smooth_texture
+from topoloc.features.kinds import learned_kind
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3, exp_so3
@@ -91,6 +92,12 @@ class WalkAhead:
 def built_corridor() -> TopoMetricMap:
     """The map of the walk ahead, with side nodes, of SURF alone."""
     return build_map(WalkAhead(0), BuildConfig(other_kinds=()))
+
+
+@cache
+def corridor_of_two_kinds() -> TopoMetricMap:
+    """The same, of SURF and the learned features at hand, which describe the side nodes. Raises MissingExtraError without ONNX Runtime."""
+    return build_map(WalkAhead(0), BuildConfig(other_kinds=(learned_kind(),)))
 
 
 @cache

@@ -18,10 +18,10 @@ import topoloc_worlds
 
 
 def _modules_with_checked_shapes() -> list[str]:
-    """All leaf modules but the Numba kernels, whose compiler cannot take a wrapped function."""
+    """All leaf modules but the Numba kernels, whose compiler cannot take a wrapped function, and messages whose types DDS reads itself."""
     packages = (topoloc, topoloc_worlds, topoloc_training, topoloc_paper)
     modules = [m for package in packages for m in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")]
-    return [m.name for m in modules if not m.ispkg and not m.name.endswith("_kernels")]
+    return [m.name for m in modules if not m.ispkg and not m.name.endswith(("_kernels", ".ros_messages"))]
 
 
 _hook = install_import_hook(_modules_with_checked_shapes(), "beartype.beartype")

@@ -87,6 +87,16 @@ def test_damaged_code_is_made_again(module: Path, kind: str):
     assert _run(module, XDG_CACHE_HOME="/dev/null") == ("7.0 1 0", "")
 
 
+def test_whether_code_is_kept_can_be_asked(module: Path):
+    asks = "from topoloc.compiled import is_kept; import own_kernels; print(is_kept(own_kernels.more))"
+    assert _run(module, asks)[0].splitlines()[-1] == "False"
+    _run(module)
+    assert _run(module, asks)[0].splitlines()[-1] == "True"
+    for file in (module / "__pycache__").glob("*.nbi"):
+        file.write_bytes(b"?")
+    assert _run(module, asks)[0].splitlines()[-1] == "False"
+
+
 def test_a_changed_kernel_beside_it_makes_it_another(module: Path):
     _run(module)
     (module / "own_kernels.py").write_text(_MODULE.replace("2.0 * x", "5.0 * x"))

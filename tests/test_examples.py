@@ -102,6 +102,7 @@ def test_reject_elsewhere(run: Run, lab: Path):
     assert accepted == [("day@0::8", "4", "4"), ("corridor", "0", "8"), ("street@0::2", "0", "4")]
 
 
+@pytest.mark.slow
 def test_follow_stream(run: Run):
     printed = run("follow_stream")
     assert re.findall(r"^images/0000(\d\d)\.jpg: predicted \((\w+)\)", printed, re.MULTILINE) == [
@@ -129,6 +130,7 @@ def test_inspect_map(run: Run, lab: Path, tmp_path: Path):
     assert cv2.imread(str(tmp_path / "map.png")).std() > 5.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coarse", ["cnn-fc", "cnn-nn"])
 def test_train_classifier(run: Run, coarse: str, tmp_path: Path, request: pytest.FixtureRequest):
     pytest.importorskip("torch")

@@ -17,16 +17,18 @@ from topoloc.cli import BROUGHT, COMMANDS, all_commands, main
 
 ROOT = Path(__file__).parents[1]
 HEAVY = ("cv2", "faiss", "matplotlib", "numba", "numpy", "poselib", "torch", "tyro")
+SERVING = ("fastapi", "uvicorn", "pydantic", "prometheus_client", "python_multipart", "starlette")
 # What the core runs without: the extras, and the tests' own tools.
 FOREIGN = (
     "torch",
     "torchvision",
     "mitsuba",
     "matplotlib",
-    "fastapi",
-    "uvicorn",
-    "pydantic",
-    "viser",
+    *SERVING,
+    "httpx",
+    "cyclonedds",
+    "carla",
+    "pyzed",
     "mcap",
     "rosbags",
     "google",
@@ -57,7 +59,7 @@ for name in names:
     try:
         importlib.import_module(name)
     except ModuleNotFoundError as error:
-        assert error.name in ("torch", "matplotlib", "mcap"), (name, error)
+        assert error.name.split(".")[0] in ("torch", "matplotlib", "mcap", "cyclonedds", *SERVING), (name, error)
         learning.append(name)
 print(json.dumps([names, learning, sorted(Barred.asked)]))
 """
@@ -150,15 +152,18 @@ def test_nothing_heavy_is_loaded_before_it_is_needed(statement: str):
 
 
 def test_every_module_loads_without_extras_but_learned_classifiers_and_figures():
-    answer = _run(sys.executable, "-c", f"FOREIGN = {FOREIGN}\n{_IMPORT_ALL}", **os.environ)
+    answer = _run(sys.executable, "-c", f"FOREIGN, SERVING = {FOREIGN}, {SERVING}\n{_IMPORT_ALL}", **os.environ)
     assert answer.returncode == 0, answer.stderr
     modules, learning, asked = json.loads(answer.stdout)
     assert "topoloc.localization.localizer" in modules
     assert "topoloc.places.cnn_fc" in learning
     assert "topoloc.places.network_config" not in learning
     drawing = {f"topoloc.evaluation.{name}" for name in ("figures", "map_figure", "report")}
-    others = [name for name in learning if not name.startswith("topoloc.places.") and name not in drawing]
-    assert others == ["topoloc.sequences.bags.mcap_file"]
+    others = [name for name in learning if not name.startswith(("topoloc.places.", "topoloc.service.")) and name not in drawing]
+    assert others == ["topoloc.export.ros_messages", "topoloc.sequences.bags.mcap_file"]
+    assert not {"topoloc.service.client", "topoloc.service.config", "topoloc.atlas.open_maps"} & set(learning), (
+        "commands and clients need these"
+    )
     assert "torchvision" not in asked
 
 

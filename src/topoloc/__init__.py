@@ -17,23 +17,27 @@ if TYPE_CHECKING:
     from topoloc.geometry.rigid import Rigid3
     from topoloc.localization.localizer import Localizer, LocalizerConfig
     from topoloc.localization.map_facts.building import build_map
-    from topoloc.localization.result import Alternative, Localization, NotLocalized, Provenance
+    from topoloc.localization.provenance import Provenance
+    from topoloc.localization.result import Alternative, Localization, NotLocalized
     from topoloc.localization.search import Trace
-    from topoloc.localization.warm_up import warm_up
     from topoloc.map.build import BuildConfig
     from topoloc.map.topomap import TopoMetricMap
     from topoloc.sequences.frame import DepthImage, StereoFrame
     from topoloc.sequences.memory_sequence import MemorySequence
     from topoloc.sequences.open import open_sequence
+    from topoloc.service.client import AsyncClient, Client
     from topoloc.tracking.stream_result import StreamedPose
     from topoloc.tracking.tracker import Tracker, TrackerConfig
+    from topoloc.tracking.warm_up import warm_up
 
     __version__: str
 
 __all__ = [
     "Alternative",
+    "AsyncClient",
     "BuildConfig",
     "Camera",
+    "Client",
     "DepthImage",
     "GeoPose",
     "Localization",
@@ -60,8 +64,10 @@ __all__ = [
 
 _MODULES = {
     "Alternative": "topoloc.localization.result",
+    "AsyncClient": "topoloc.service.client",
     "BuildConfig": "topoloc.map.build",
     "Camera": "topoloc.geometry.camera",
+    "Client": "topoloc.service.client",
     "DepthImage": "topoloc.sequences.frame",
     "GeoPose": "topoloc.geometry.geodesy",
     "Localization": "topoloc.localization.result",
@@ -69,7 +75,7 @@ _MODULES = {
     "LocalizerConfig": "topoloc.localization.localizer",
     "MemorySequence": "topoloc.sequences.memory_sequence",
     "NotLocalized": "topoloc.localization.result",
-    "Provenance": "topoloc.localization.result",
+    "Provenance": "topoloc.localization.provenance",
     "Rigid3": "topoloc.geometry.rigid",
     "StereoFrame": "topoloc.sequences.frame",
     "StereoRig": "topoloc.geometry.rig",
@@ -82,7 +88,7 @@ _MODULES = {
     "build_map": "topoloc.localization.map_facts.building",
     "open_sequence": "topoloc.sequences.open",
     "set_num_threads": "topoloc.compiled",
-    "warm_up": "topoloc.localization.warm_up",
+    "warm_up": "topoloc.tracking.warm_up",
 }
 
 

@@ -46,6 +46,11 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return compiled
 
 
+def is_kept(compiled: Any) -> bool:
+    """Whether machine code of this kernel lies somewhere, so that its first call takes no time to speak of."""
+    return compiled._cache.is_kept
+
+
 def set_num_threads(number: int) -> None:
     """At most so many threads work on one query, one frame or one mapping image.
 
@@ -84,6 +89,10 @@ class _KeptCode(NullCache):
     def cache_path(self) -> Any:
         return self._caches[0].cache_path
 
+    @property
+    def is_kept(self) -> bool:
+        return any(folder.is_kept for folder in self._caches)
+
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         for folder in self._caches:
             try:
@@ -116,6 +125,14 @@ class _FolderCache(FunctionCache):
     def __init__(self, function: Callable[..., Any], folder: str) -> None:
         self._impl_class = type("_Impl", (CompileResultCacheImpl,), {"_locator_classes": [_Place(function, folder)]})
         super().__init__(function)
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether there is code of the function as it is now."""
+        try:
+            return bool(self._cache_file._load_index())
+        except Exception:  # damaged: what unpickling raises then is anybody's guess
+            return False
 
 
 class _Place:

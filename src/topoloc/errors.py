@@ -8,7 +8,9 @@ TopolocError
 ├── TrajectoryError       a trajectory file with NaN, bad rotations, or times that match no frame
 ├── MapError              a map that cannot be opened, read or written
 │   ├── MapVersionError       written by a later topoloc, schema unknown here
-│   └── EmptyMapError         no node could be built, or the map holds none
+│   ├── EmptyMapError         no node could be built, or the map holds none
+│   ├── UnknownMapError       no map of this name where maps are asked for by name
+│   └── AtlasError            an atlas that cannot be opened, read or written, or two tiles of one id
 ├── WeightsError          weights of a network that are missing, damaged or of another network
 ├── TrainingError         a training that cannot begin or go on: nothing to learn from, a loss that is not finite
 ├── ConfigError           a setting that is unknown, of the wrong type or out of its bounds; names the key
@@ -16,6 +18,7 @@ TopolocError
 ├── ResultError           a result (a JSON line) that is none
 ├── GeoreferenceError     no place on earth, or points that do not say where a map lies on it
 ├── FeatureKindError      features of a kind that there is not, or whose fitted weights are damaged
+├── ServiceError          a service that does not answer, or refuses
 └── MissingExtraError     an optional dependency is not installed; names the extra
 """
 
@@ -56,6 +59,14 @@ class EmptyMapError(MapError):
     """A map without a single usable node."""
 
 
+class UnknownMapError(MapError):
+    """No map of this name."""
+
+
+class AtlasError(MapError):
+    """An atlas that cannot be opened, read or written, or a tile that it cannot take."""
+
+
 class WeightsError(TopolocError):
     """Weights of a network that are missing, damaged, or those of another network."""
 
@@ -82,6 +93,14 @@ class GeoreferenceError(TopolocError):
 
 class FeatureKindError(TopolocError):
     """Features of an unknown kind, or fitted weights that cannot be read; the text names the kinds or the file."""
+
+
+class ServiceError(TopolocError):
+    """A service that does not answer, or refuses; `status` is its HTTP status, None where there was no answer."""
+
+    def __init__(self, text: str, status: int | None = None) -> None:
+        super().__init__(text)
+        self.status = status
 
 
 class MissingExtraError(TopolocError):

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from topoloc.cli import main
+from topoloc.sequences.open import open_sequence
+from topoloc.sequences.trajectory import Trajectory, write_tum
 
 Complaint = Callable[..., str]
 
@@ -59,3 +62,17 @@ def test_the_lab_of_the_zed_minutes_later(shared: Path, tmp_path: Path, capsys: 
     assert fit["median_translation_m"] < 0.02
     for row, other in zip(fit["map_from_truth"][:3], known, strict=False):
         assert row == pytest.approx(other, abs=0.02)
+
+
+def test_truth_of_another_convention_is_read_as_told(room_map: Path, queries: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    inverse, out = tmp_path / "inverse", tmp_path / "a.json"
+    shutil.copytree(queries, inverse)
+    sequence = open_sequence(queries)
+    poses = [pose.inverse() for pose in sequence.poses if pose is not None]
+    write_tum(inverse / "truth.tum", Trajectory(poses, sequence.t_ns))
+    assert main(["evaluate", str(room_map), f"{inverse}@0:3", "--poses", "inverse", "--json", str(out)]) == 0
+    evaluation = json.loads(out.read_text())
+    assert evaluation["num_localized"] == 3
+    assert evaluation["median_translation_m"] < 0.05
+    assert main(["evaluate", str(room_map), str(inverse), "--poses", "upside-down"]) == 1
+    assert "known are" in capsys.readouterr().err

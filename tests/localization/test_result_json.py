@@ -17,10 +17,13 @@ from built_room import built_room, unseen_views
 from schemas import SCHEMA, check_result
 from tiny_world import CAMERA, render, room
 from topoloc.errors import ResultError
+from topoloc.geometry.calibration_check import CalibrationDoubt
 from topoloc.geometry.geodesy import CAM_FROM_BODY, GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.localization.evidence import Evidence
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.result import Alternative, Localization, NotLocalized, Provenance, result_from_json
+from topoloc.localization.provenance import Provenance
+from topoloc.localization.result import Alternative, Localization, NotLocalized, result_from_json
 from topoloc.places.coarse import NodeScore
 from topoloc.tracking.tracker import Tracker
 
@@ -47,6 +50,14 @@ REFUSED = NotLocalized(
 )
 
 
+SUSPECTED = replace(
+    LOCALIZED,
+    evidence=Evidence(60, 55, 140, 160, 3, 0.4, 0.3, 0.8, 12),
+    noise_share=0.25,
+    calibration_doubt=CalibrationDoubt(261.5, 0.5, 300.0, np.array([320.0, 200.5]), np.array([320.0, 190.0]), True, False, np.arange(6.0)),
+)
+
+
 def rounded(value: Any) -> Any:
     """A quaternion becomes a matrix and a quaternion again: the last digits may differ."""
     if isinstance(value, dict):
@@ -60,7 +71,18 @@ def test_the_schema_is_one():
     Draft202012Validator.check_schema(SCHEMA)
 
 
-@pytest.mark.parametrize("result", [LOCALIZED, replace(LOCALIZED, geopose=PLACE.geopose(POSE)), REFUSED, NotLocalized("unreadable")])
+@pytest.mark.parametrize(
+    "result",
+    [
+        LOCALIZED,
+        SUSPECTED,
+        replace(SUSPECTED, evidence=Evidence(60, 55, 140, 160, 3, 0.4, 0.3, 0.8)),
+        replace(LOCALIZED, geopose=PLACE.geopose(POSE)),
+        REFUSED,
+        replace(REFUSED, alternatives=(Alternative(POSE, 0.5, 3, PLACE.geopose(POSE)),)),
+        NotLocalized("unreadable"),
+    ],
+)
 def test_what_was_written_comes_again(result: Localization | NotLocalized):
     text = json.dumps(result.to_json("a.png"), allow_nan=False)
     check_result(json.loads(text))
@@ -68,6 +90,32 @@ def test_what_was_written_comes_again(result: Localization | NotLocalized):
     assert type(again) is type(result)
     assert again.provenance == result.provenance
     assert rounded(again.to_json("a.png")) == rounded(json.loads(text))
+
+
+def test_what_was_suspected_is_known_again():
+    again = Localization.from_json(SUSPECTED.to_json("a.png"))
+    assert again.evidence == SUSPECTED.evidence
+    assert again.noise_share == 0.25
+    assert again.calibration_doubt is not None
+    assert str(again.calibration_doubt) == str(SUSPECTED.calibration_doubt)
+    np.testing.assert_array_equal(again.calibration_doubt.shift, np.arange(6.0))
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        {"evidence": 3},
+        {"evidence": {"num_matches": 1}},
+        {"noise_share": 2.0},
+        {"calibration_doubt": []},
+        {"calibration_doubt": {"focal_length_px": -1}},
+        {"calibration_doubt": SUSPECTED.to_json("a")["calibration_doubt"] | {"shift": [1.0]}},
+        {"calibration_doubt": SUSPECTED.to_json("a")["calibration_doubt"] | {"of": "focal_length"}},
+    ],
+)
+def test_what_is_no_evidence_or_doubt(broken: dict[str, Any]):
+    with pytest.raises(ResultError, match="no result"):
+        Localization.from_json(SUSPECTED.to_json("a") | broken)
 
 
 def test_real_results_fit_the_schema(tiny_recording: Path):

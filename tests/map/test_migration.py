@@ -57,6 +57,7 @@ def test_schema_2_answers_the_same_bytes_and_is_saved_as_schema_3(tmp_path: Path
     assert path.stat().st_size > 1.2 * (tmp_path / "new.topo").stat().st_size
 
 
+@pytest.mark.slow
 def test_schema_1_without_side_tables_is_a_map_without_sides(tmp_path: Path):
     old = TopoMetricMap.load(write_schema_1(replace(built_corridor(), sides=None), tmp_path / "old.topo"))
     assert old.sides is None

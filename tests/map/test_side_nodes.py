@@ -18,7 +18,6 @@ from built_corridor import WalkAhead, built_corridor, corridor
 from tiny_world import render
 from topoloc.errors import MapError
 from topoloc.features.extraction import FeatureConfig
-from topoloc.features.kinds import KINDS, SURF
 from topoloc.features.side_views import SideViewConfig
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
@@ -130,7 +129,7 @@ def test_pictures_that_show_no_walls_have_no_sides():
     blank = np.full_like(view.grey, 90)
     assert described(replace(view, grey=blank, right_grey=blank)) == []
     assert described(view, SideNodesConfig(views=SideViewConfig(nearest=0.5))) == []
-    assert gather_sides([], SideNodesConfig()) is None
+    assert gather_sides([], "surf", SideNodesConfig()) is None
 
 
 def test_without_spacing_a_map_has_none(tiny_recording: Path):
@@ -270,8 +269,3 @@ def test_damage_to_side_tables_is_a_map_error_of_one_line(saved_corridor: Path, 
     with pytest.raises(MapError, match=r"corridor\.topo is damaged") as caught:
         read_sides(saved_corridor)
     assert "\n" not in str(caught.value)
-
-
-def test_a_kind_that_walls_are_never_asked_for_has_no_sides(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(KINDS, "surf", replace(SURF, has_angle=False))
-    assert build_map([WalkAhead(0)], BuildConfig(nodes=SPACED)).sides is None

@@ -42,7 +42,7 @@ def with_ids(topomap: TopoMetricMap, ids: list[int], kept: list[int]) -> TopoMet
         ]
         described = [node for node in described if node.summary.of_node in alive]
         side_models = {name: in_ids(model, side_ids) for name, model in sides.coarse_models.items()}
-        sides = SideNodes([node.summary for node in described], described, side_models)
+        sides = SideNodes([node.summary for node in described], described, side_models, sides.kind)
     return replace(
         topomap,
         nodes=nodes,

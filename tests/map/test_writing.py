@@ -141,7 +141,7 @@ def with_bytes(path: Path, offset: int, data: bytes) -> Path:
 def test_files_that_are_no_map_are_told_apart(tmp_path: Path):
     with pytest.raises(MapError, match=r"cannot open map .*no\.topo: No such file"):
         TopoMetricMap.load(tmp_path / "no.topo")
-    with pytest.raises(MapError, match="cannot open map"):
+    with pytest.raises(MapError, match="is no map but a folder"):
         TopoMetricMap.load(tmp_path)
     (tmp_path / "empty.topo").write_bytes(b"")
     with pytest.raises(MapError, match="the file is empty"):

@@ -10,6 +10,7 @@ import pytest
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.pose_conventions import PoseReading
 from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.sequences.frame import StereoFrame
 from topoloc.sequences.open import open_sequence
 from topoloc.sequences.recording import SequenceView
 from topoloc.slam.measured_steps import MeasuredStep, MeasuredStepsConfig, measure_steps
@@ -72,6 +73,28 @@ def test_a_wrong_convention_is_named(name: str):
     assert verdict.conventions == conventions
 
 
+def without_metres(steps: list[MeasuredStep]) -> list[MeasuredStep]:
+    """The same steps as a single camera gives them."""
+    ways = [step.first_from_last.translation for step in steps]
+    units = [Rigid3(step.first_from_last.rotation, way / np.linalg.norm(way)) for step, way in zip(steps, ways, strict=True)]
+    return [replace(step, first_from_last=unit, median_depth=0.0, has_scale=False) for step, unit in zip(steps, units, strict=True)]
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_single_camera_names_all_but_the_unit(name: str):
+    spoil, conventions = WRONG[name]
+    steps = without_metres(steps_of(POSES, 0))
+    assert judge_poses(steps, POSES, T_NS).is_believed
+    verdict = judge_poses(steps, [spoil(pose) for pose in POSES], T_NS)
+    assert verdict.conventions == (() if name == "mm" else conventions)
+    assert verdict.is_believed == (name == "mm")
+
+
+def test_of_a_single_camera_poses_that_do_not_move_are_not_believed():
+    still = [Rigid3(pose.rotation, np.zeros(3)) for pose in POSES]
+    assert not judge_poses(without_metres(steps_of(POSES, 0)), still, T_NS).is_believed
+
+
 def test_the_mounting_on_a_body_is_found():
     verdict = judge_poses(steps_of(POSES, 0), [pose @ BODY_FROM_CAM.inverse() for pose in POSES], T_NS)
     (convention,) = verdict.conventions
@@ -125,6 +148,20 @@ def test_a_recording_is_refused_in_one_line(tiny_recording: Path):
     inverse = [pose.inverse() for pose in sequence.poses if pose is not None]
     with pytest.raises(TrajectoryError, match="--poses inverse"):
         check_poses(SequenceView(sequence, list(range(len(sequence))), list(inverse)))
+
+
+class LeftPicturesAlone(SequenceView):
+    def __getitem__(self, index: int) -> StereoFrame:
+        return replace(super().__getitem__(index), right=None, rig=None)
+
+
+def test_a_recording_of_single_pictures_is_held_against_them_too(tiny_recording: Path):
+    sequence = open_sequence(tiny_recording)
+    rows = list(range(len(sequence)))
+    check_poses(LeftPicturesAlone(sequence, rows, list(sequence.poses)))
+    inverse = [pose.inverse() for pose in sequence.poses if pose is not None]
+    with pytest.raises(TrajectoryError, match="--poses inverse"):
+        check_poses(LeftPicturesAlone(sequence, rows, list(inverse)))
 
 
 def test_gaps_of_more_than_half(tiny_recording: Path):

@@ -6,7 +6,6 @@ import base64
 import io
 from collections.abc import Mapping, Sequence
 from html import escape
-from importlib import resources
 from typing import Any
 
 import matplotlib
@@ -16,6 +15,7 @@ from topoloc.evaluation.figure_style import STYLE, svg_text
 from topoloc.evaluation.figures import draw_error_curves
 from topoloc.evaluation.map_figure import draw_map
 from topoloc.evaluation.metrics import Answer
+from topoloc.evaluation.page_shell import page_style
 from topoloc.evaluation.query_gallery import gallery, typical_queries, worst_queries
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.atomic import write_bytes, write_text
@@ -94,7 +94,7 @@ class _Files:
 def write_page(bench: Bench, results: Mapping[str, Any]) -> None:
     """Write `report.html` and the folder `figures`. Raises TopolocError where they cannot be written."""
     files = _Files(bench)
-    style = resources.files("topoloc.evaluation").joinpath("report.css").read_text(encoding="utf-8") + _STYLE
+    style = page_style() + _STYLE
     sections = [_section("What this is", "", f"<p>{escape(about(results)).replace('`', '')}</p>")]
     sections += [_table_section(results, "targets"), _table_section(results, "accuracy", _accuracy_figures(files, results))]
     sections += [_dataset_section(bench, files, dataset) for dataset in (*bench.rendered, *bench.real)]

@@ -22,15 +22,26 @@ COMMANDS = {
     "evaluate": ("topoloc.cli.evaluate", "localize a recording with known truth and judge the poses"),
     "explain": ("topoloc.cli.explain", "why a picture got its answer, or none, and what would help"),
     "info": ("topoloc.cli.info", "what a map file holds"),
+    "atlas": ("topoloc.cli.atlas", "many maps asked as one: an atlas made, added to, looked into"),
+    "update": ("topoloc.cli.update", "a new recording joins a map: another light, a changed room, new parts"),
+    "merge": ("topoloc.cli.merge", "one map of two that were made apart and overlap"),
+    "prune": ("topoloc.cli.prune", "drop from a map what is gone, and what adds least, to a size"),
+    "history": ("topoloc.cli.history", "how a map came to be what it is: its edits, and which can be taken back"),
+    "undo": ("topoloc.cli.undo", "take the last edit of a map back, to the byte"),
+    "record": ("topoloc.cli.record", "a recording made: a ZED, CARLA, a webcam or a stream becomes a folder that every command reads"),
     "export": ("topoloc.cli.export", "a map or results for other programs: COLMAP, nerfstudio, PLY, GeoJSON, MCAP, TUM, KITTI"),
+    "view": ("topoloc.cli.view", "a map and what was found in it, in 3-D in the browser"),
     "georeference": ("topoloc.cli.georeference", "where on earth a map lies; its results then carry OGC GeoPoses"),
+    "serve": ("topoloc.cli.serve", "an HTTP service that localizes pictures in maps"),
+    "follow": ("topoloc.cli.follow", "where is this camera now? a line for each picture of a webcam, a stream, a recording"),
     "weights": ("topoloc.cli.weights", "networks of local features: which are known and here, and how to get others"),
     "config": ("topoloc.cli.config", "all other settings as a TOML file, with defaults and meanings"),
 }
 BROUGHT = {"simulate": "topoloc-worlds", "train": "topoloc-training", "benchmark": "topoloc-paper"}
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 _IN_HELP = ("demo", "simulate", "slam", "build", "train", "localize", "evaluate", "explain", "benchmark", "info")
-_IN_HELP += ("export", "georeference", "weights", "config")
+_IN_HELP += ("atlas", "update", "merge", "prune", "history", "undo", "view", "record", "export")
+_IN_HELP += ("georeference", "serve", "follow", "weights", "config")
 LEAST_ADDRESS_SPACE = 1_600_000_000
 
 

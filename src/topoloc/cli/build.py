@@ -10,7 +10,6 @@ from typing import Annotated
 import tyro
 
 from topoloc.cli.features_option import BUILD_FEATURES, kinds_to_build
-from topoloc.cli.info import describe_map
 from topoloc.cli.output import (
     CameraOption,
     File,
@@ -27,11 +26,13 @@ from topoloc.cli.settings_file import read_settings, with_option
 from topoloc.geometry.pose_conventions import PoseReading
 from topoloc.localization.map_facts.building import Trust, build_map
 from topoloc.map.build import BuildConfig
+from topoloc.map.description import describe_map
 from topoloc.sequences.colmap import aligned
 from topoloc.sequences.frame import StereoSequence
+from topoloc.sequences.known_distances import scale_of
 from topoloc.sequences.recording import has_scale, scaled
 from topoloc.sequences.trajectory import as_read, with_trajectory
-from topoloc.slam.slam import SlamConfig, posed_by_slam
+from topoloc.slam.slam import SlamConfig, run_slam, with_slam_poses
 
 
 @dataclass(frozen=True)
@@ -61,8 +62,12 @@ class Command:
     """Calibration of the recordings instead of their own: camera.json, OpenCV's or Kalibr's YAML, SN*.conf, or `fx,fy,cx,cy`."""
     images: Annotated[str | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="(default: images/ beside the model)")] = None
     """Pictures of a COLMAP model, where SEQ is one."""
-    scale: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="")] = None
-    """A unit of the recordings' own poses, in metres: of models made of pictures alone, which know no metre."""
+    scale: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]],
+        tyro.conf.arg(metavar="METRES|IMAGE_A,IMAGE_B=METRES", help_behavior_hint="(distances: may be given several times)"),
+    ] = ()
+    """A unit of the recordings' own poses, in metres, of models made of pictures alone, which know no metre; or a measured distance between
+    the cameras of two pictures."""
     topics: Topics = None
     """Of a bag, which topic is what: left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom."""
     d_thresh: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="(default: by what is seen)")] = None
@@ -83,14 +88,18 @@ class Command:
         recordings, target = self._split_paths()
         read = [path for path in (*self.trajectory, self.config) if path not in ("truth", "slam", None)]
         check_outputs([str(target), self.json], inputs=read)
-        if self.scale is not None and not 0.0 < self.scale < float("inf"):
-            raise UsageError(f"--scale must be a positive number, not {self.scale:g}")
+        if any("=" not in text and not _is_positive(text) for text in self.scale):
+            raise UsageError(f"--scale must be a positive number, or IMAGE_A,IMAGE_B=3.2m, not {self.scale[0][:80]}")
         settings = read_settings(self.config)
         config = kinds_to_build(self._with_options(settings.of(BuildConfig)), self.features)
         sequences, poses_from = self._open(recordings)
         with progress_bar() as progress:
             if poses_from[0] == "slam":
-                sequences = posed_by_slam(sequences, settings.of(SlamConfig), progress)
+                result = run_slam(sequences, settings.of(SlamConfig), progress)
+                sequences = with_slam_poses(sequences, result)
+                apart = result.num_submaps - result.num_joined
+                if apart:
+                    print(f"{apart} of {result.num_submaps} sub-maps see nothing in common with the others", file=sys.stderr)
             _report_gaps(sequences)
             trust = Trust(poses="unchecked" in (self.poses or "").split(","), gaps=self.allow_gaps or poses_from[0] == "slam")
             topomap = build_map(sequences, config, progress, poses_from, trust)
@@ -131,7 +140,7 @@ class Command:
                 raise UsageError("--poses says how given poses are written; those of SLAM are ours")
             if set(trajectories) != {"slam"}:
                 raise UsageError("--trajectory slam goes for all recordings or for none: its world is no other's")
-            if self.scale is not None:
+            if self.scale:
                 raise UsageError("--scale is that of the recordings' own poses, and slam finds others")
             return sequences, list(trajectories)
         pairs = zip(sequences, trajectories, strict=True)
@@ -139,12 +148,12 @@ class Command:
 
     def _with_poses(self, sequence: StereoSequence, trajectory: str) -> StereoSequence:
         reading = PoseReading.of(",".join(name for name in (self.poses or "").split(",") if name != "unchecked"))
-        if trajectory != "truth" and self.scale is not None:
+        if trajectory != "truth" and self.scale:
             raise UsageError("--scale is that of the recordings' own poses, and --trajectory takes others")
         if trajectory != "truth":
             has_metres = has_scale(sequence)
             return with_trajectory(sequence, Path(trajectory), reading) if has_metres else aligned(sequence, Path(trajectory))
-        return as_read(sequence if self.scale is None else scaled(sequence, self.scale), reading)
+        return as_read(scaled(sequence, scale_of(self.scale, sequence)) if self.scale else sequence, reading)
 
 
 def _report_gaps(sequences: list[StereoSequence]) -> None:
@@ -152,6 +161,13 @@ def _report_gaps(sequences: list[StereoSequence]) -> None:
         num_without = sum(pose is None for pose in sequence.poses)
         if num_without:
             print(f"{sequence.name}: {num_without} of {len(sequence)} frames have no pose and are left out", file=sys.stderr)
+
+
+def _is_positive(text: str) -> bool:
+    try:
+        return 0.0 < float(text) < float("inf")
+    except ValueError:
+        return False
 
 
 def _first_bytes(path: Path) -> bytes:

@@ -11,7 +11,6 @@ from typing import Annotated, Any
 
 import tyro
 
-from topoloc.cli.info import describe_map
 from topoloc.cli.output import File, UsageError, check_outputs, print_recordings, progress_bar, report_writer, write_json
 from topoloc.demo.recordings import ROLES, SHIPPED, Role, missing_recordings
 from topoloc.demo.words import PAPER_LAB, night_in_words, words_of
@@ -21,6 +20,7 @@ from topoloc.evaluation.metrics import Answer, by_recording, summarize
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.building import build_map
 from topoloc.localization.result import Localization
+from topoloc.map.description import describe_map
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.atomic import write_text
 from topoloc.sequences.frame import StereoSequence
@@ -58,7 +58,7 @@ class Command:
             report = str(out / "report.html")
         except MissingExtraError as missing:
             report = f"none; {missing}"
-        write_json(self.json, evaluation)
+        write_json(self.json, evaluation | {"answers": [answer.to_json() for answer in answers]})
         if self.json != "-":
             seconds = f"{time.perf_counter() - start:.0f} s in all, {mapped - start:.0f} s of them until the map was there"
             _print(out, evaluation, seconds, report)

@@ -1,4 +1,4 @@
-"""topoloc evaluate MAP SEQ [SEQ ...]."""
+"""topoloc evaluate MAP|ATLAS SEQ [SEQ ...]."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from topoloc.cli.features_option import ASKED_FEATURES, localizer_of
-from topoloc.cli.info import describe_map
+from topoloc.atlas.config import AtlasConfig
+from topoloc.atlas.judged_tile import JudgedTile
+from topoloc.cli.features_option import ASKED_FEATURES
+from topoloc.cli.map_or_atlas import localizer_at
 from topoloc.cli.output import (
     CameraOption,
     File,
@@ -27,26 +29,31 @@ from topoloc.cli.output import (
     report_writer,
     write_json,
 )
-from topoloc.cli.settings_file import read_settings, with_option
+from topoloc.cli.settings_file import Settings, read_settings, with_option
 from topoloc.errors import TrajectoryError
 from topoloc.evaluation.experiments import answer_elsewhere, answer_queries
 from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION, Answer, by_recording, length_text, summarize
 from topoloc.evaluation.world_fit import WorldFit, fit_worlds
+from topoloc.geometry.pose_conventions import PoseReading
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.localizer import LocalizerConfig
-from topoloc.map.topomap import TopoMetricMap
+from topoloc.localization.calibration_doubt import verdicts_of
+from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.map.description import describe_map
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.json_file import read_json
+from topoloc.sequences.trajectory import as_read
 
 
 @dataclass(frozen=True)
 class Command:
     """What `topoloc evaluate` takes."""
 
-    map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP")]
-    """The map file."""
+    map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
+    """The map file, or an atlas."""
     sequences: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="SEQ ...", help_behavior_hint="")] = ()
     """Recordings with known truth. PATH@1::2 takes every second frame of PATH, from the second on."""
+    tile: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(atlases only)")] = None
+    """Of an atlas: the tile in whose world the recordings' truth is given. A pose in a tile of another world is a false accept."""
     elsewhere: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="SEQ", help_behavior_hint="(may be given several times)")
     ] = ()
@@ -63,6 +70,10 @@ class Command:
     """The recordings' format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap, rosbag, mcap, zed, video or folder."""
     camera: CameraOption = None
     """Calibration of the recordings instead of their own: camera.json, OpenCV's or Kalibr's YAML, SN*.conf, or `fx,fy,cx,cy`."""
+    poses: Annotated[
+        str | None, tyro.conf.arg(metavar="CONVENTION[,CONVENTION]", help_behavior_hint="(default: world_from_cam, metres)")
+    ] = None
+    """How the recordings' truth is written, where it is not world_from_cam in metres: inverse, opengl, wxyz, mm, as of `build`."""
     topics: Topics = None
     """Of a bag, which topic is what: left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom."""
     json: File = None
@@ -79,28 +90,32 @@ class Command:
             raise UsageError("--fit-map-from-truth is of one recording, without --map-from-truth")
         inputs = [path for path in (self.map, self.map_from_truth, self.config) if path]
         check_outputs([self.json, self.report, self.fit_map_from_truth], inputs)
-        config = with_option(read_settings(self.config).of(LocalizerConfig), "coarse", self.coarse, "--coarse")
+        settings = read_settings(self.config)
+        config = with_option(settings.of(LocalizerConfig), "coarse", self.coarse, "--coarse")
         write_report = report_writer() if self.report else None
-        topomap = TopoMetricMap.load(self.map)
-        info = describe_map(topomap, Path(self.map))
+        judged = self._judged(settings, config)
+        topomap = judged.topomap
+        info = describe_map(topomap, topomap.file.path if topomap.file else Path(self.map))
         map_from_truth = _read_rigid(Path(self.map_from_truth)) if self.map_from_truth else None
-        sequences = [open_recording(path, self.format, self.camera, self.topics) for path in self.sequences]
+        reading = PoseReading.of(self.poses)
+        sequences = [as_read(open_recording(path, self.format, self.camera, self.topics), reading) for path in self.sequences]
         others = [open_recording(path, self.format, self.camera, self.topics) for path in self.elsewhere]
-        localizer = localizer_of(topomap, config, self.features)
         labels = _labels([*self.sequences, *self.elsewhere], [*sequences, *others])
         answers: list[Answer] = []
         with progress_bar() as progress:
             for sequence, label in zip(sequences, labels, strict=False):
-                answers += answer_queries(localizer, sequence, map_from_truth, progress, label)
+                answers += answer_queries(judged, sequence, map_from_truth, progress, label)
             for sequence, label in zip(others, labels[len(sequences) :], strict=True):
-                answers += answer_elsewhere(localizer, sequence, progress, label)
-        fits = [fit for of_one in by_recording(answers).values() if (fit := fit_worlds(of_one)) is not None]
-        evaluation = summarize(answers) | {"map": info, "world_fits": [fit.to_json() for fit in fits]}
+                answers += answer_elsewhere(judged, sequence, progress, label)
+        of_worlds = [] if isinstance(judged, JudgedTile) else by_recording(answers).values()
+        fits = [fit for of_one in of_worlds if (fit := fit_worlds(of_one)) is not None]
+        calibrations = _calibrations(answers)
+        evaluation = summarize(answers) | {"map": info, "world_fits": [fit.to_json() for fit in fits], "calibrations": calibrations}
         if self.json != "-":
             _print(evaluation)
         for fit in fits:
             print(_offer(fit, self.fit_map_from_truth), file=sys.stderr if self.json == "-" else sys.stdout)
-        write_json(self.json, evaluation)
+        write_json(self.json, evaluation | {"answers": [answer.to_json() for answer in answers]})
         if write_report and self.report:
             write_report(Path(self.report), evaluation, answers, topomap)
             if self.json != "-":
@@ -108,11 +123,35 @@ class Command:
         self._write_fit(fits)
         return 0
 
+    def _judged(self, settings: Settings, config: LocalizerConfig) -> Localizer | JudgedTile:
+        """The map; or the atlas, in the world of the tile that the recordings' truth is given in."""
+        localizer = localizer_at(self.map, config, self.features, settings.of(AtlasConfig))
+        if isinstance(localizer, Localizer):
+            if self.tile is not None:
+                raise UsageError(f"--tile is of an atlas, and {self.map} is none")
+            return localizer
+        tiles = list(localizer.atlas.manifest.by_id)
+        tile_id = self.tile or (tiles[0] if len(tiles) == 1 or not self.sequences else None)
+        if tile_id is None:
+            raise UsageError("--tile: which tile's world is the recordings' truth in?")
+        if self.report or self.fit_map_from_truth:
+            raise UsageError("--report and --fit-map-from-truth are of a map: give the tile's own file")
+        return JudgedTile.of(localizer, tile_id)
+
     def _write_fit(self, fits: Sequence[WorldFit]) -> None:
         if self.fit_map_from_truth and not fits:
             raise TrajectoryError(f"{self.fit_map_from_truth} is not written: no rigid transform between two worlds explains the errors")
         if self.fit_map_from_truth:
             write_json(self.fit_map_from_truth, {"map_from_truth": fits[0].map_from_truth.matrix().tolist()})
+
+
+def _calibrations(answers: Sequence[Answer]) -> list[dict[str, Any]]:
+    """What the pictures of each recording say together of their cameras."""
+    return [
+        {"recording": name} | verdict.to_json()
+        for name, of_one in by_recording(answers).items()
+        for verdict in verdicts_of(answer.result for answer in of_one if answer.world_from_cam is not None)
+    ]
 
 
 def _offer(fit: WorldFit, written: str | None) -> str:
@@ -170,5 +209,6 @@ def _print(evaluation: dict[str, Any]) -> None:
     if e["not_localized"]:
         facts.append(("not localized", ", ".join(f"{reason} {count}" for reason, count in e["not_localized"].items())))
     facts.append(("median ms", ", ".join(f"{stage} {ms:.1f}" for stage, ms in e["median_times_ms"].items())))
+    facts += [("calibration", f"{one['recording']}: {one['detail']}") for one in e["calibrations"]]
     facts.append(("map", f"{e['map']['num_nodes']} nodes, {e['map']['bytes'] / 1e6:.2f} MB, {e['map']['length_m']:.1f} m"))
     print_facts(facts)

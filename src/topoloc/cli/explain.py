@@ -4,18 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
+from topoloc.atlas.atlas_localizer import AtlasLocalizer
+from topoloc.atlas.config import AtlasConfig
 from topoloc.cli.features_option import ASKED_FEATURES, localizer_of
+from topoloc.cli.map_or_atlas import camera_for, is_atlas, open_atlas
 from topoloc.cli.output import File, UsageError, check_outputs, write_json
-from topoloc.cli.query_camera import camera_of_frame, named_camera
 from topoloc.cli.settings_file import read_settings, with_option
-from topoloc.evaluation.explanation import Explanation, explain
+from topoloc.evaluation.explanation import Explanation, explain, facts_of
 from topoloc.evaluation.explanation_page import row_of, verdict, write_explanation
 from topoloc.localization.localizer import LocalizerConfig
+from topoloc.localization.query import Picture
+from topoloc.localization.query_camera import camera_of_frame, named_camera
+from topoloc.localization.result import Localization
 from topoloc.map.topomap import TopoMetricMap
+from topoloc.sequences.frame import StereoFrame
 from topoloc.sequences.open import open_sequence
 from topoloc.sequences.recording import single_pictures
 
@@ -24,8 +30,8 @@ from topoloc.sequences.recording import single_pictures
 class Command:
     """What `topoloc explain` takes."""
 
-    map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP")]
-    """The map file."""
+    map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
+    """The map file; or an atlas, of which the tile is explained that answers."""
     image: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="IMAGE")]
     """The picture; or one of a recording, as in walk@17."""
     camera: Annotated[
@@ -45,21 +51,43 @@ class Command:
 
     def run(self) -> int:
         check_outputs([self.out, self.json], inputs=[path for path in (self.map, self.config) if path])
-        config = with_option(read_settings(self.config).of(LocalizerConfig), "coarse", self.coarse, "--coarse")
-        with TopoMetricMap.load(self.map) as topomap:
+        settings = read_settings(self.config)
+        config = with_option(settings.of(LocalizerConfig), "coarse", self.coarse, "--coarse")
+        path, ranking = Path(self.map), list[str]()
+        if is_atlas(self.map):
+            path, ranking = self._tile_of(open_atlas(self.map, config, self.features, settings.of(AtlasConfig)))
+        with TopoMetricMap.load(path) as topomap:
             of_size = None if self.camera is None else named_camera(self.camera, topomap)
             localizer = localizer_of(topomap, config, self.features)
-            sequence = single_pictures(open_sequence(self.image))
-            if len(sequence) != 1:
-                raise UsageError(f"explain takes one picture, and {self.image} has {len(sequence)}; {self.image}@0 is its first")
-            frame = sequence[0]
+            frame = self._frame()
             explanation = explain(localizer, frame.image, camera_of_frame(frame, of_size))
             if self.out:
                 write_explanation(Path(self.out), frame.name, frame.image, explanation, topomap)
         if self.json != "-":
+            for line in ranking:
+                print(line)
             _print(explanation, self.out)
-        write_json(self.json, _facts(frame.name, explanation))
+        write_json(self.json, facts_of(frame.name, explanation) | ({"tiles": ranking} if ranking else {}))
         return 0
+
+    def _frame(self) -> StereoFrame:
+        sequence = single_pictures(open_sequence(self.image))
+        if len(sequence) != 1:
+            raise UsageError(f"explain takes one picture, and {self.image} has {len(sequence)}; {self.image}@0 is its first")
+        return sequence[0]
+
+    def _tile_of(self, localizer: AtlasLocalizer) -> tuple[Path, list[str]]:
+        """The map of the tile that answers for the picture, and in words what the atlas made of it."""
+        frame, of_size = self._frame(), None if self.camera is None else camera_for(localizer, self.camera)
+        camera = camera_of_frame(frame, of_size)
+        result = localizer.localize(frame.image, camera)
+        tile_id = result.provenance.tile
+        assert tile_id is not None
+        likest = ", ".join(f"{name} {likeness:.2f}" for name, likeness in localizer.rank(Picture(frame.image, camera))[:5])
+        said = f"in tile {tile_id}"
+        if not isinstance(result, Localization):
+            said = f"not localized ({result.reason}{f', {result.detail}' if result.detail else ''}); most of it is known to tile {tile_id}"
+        return localizer.atlas.map_path(localizer.atlas.tile(tile_id)), [f"atlas: {said}", f"looks most like: {likest}"]
 
 
 def _print(explanation: Explanation, page: str | None) -> None:
@@ -72,19 +100,3 @@ def _print(explanation: Explanation, page: str | None) -> None:
         print(f"  {source} ({features}): {facts}: {became}")
     if page:
         print(f"page: {page}")
-
-
-def _facts(name: str, explanation: Explanation) -> dict[str, Any]:
-    poses = [
-        {
-            "source": pose.tried.source,
-            "features": pose.tried.features,
-            "node": pose.fit.node_id if pose.fit.node_id >= 0 else None,
-            "num_first_matches": len(pose.tried.first.matches),
-            "num_first_inliers": pose.tried.first.num_inliers,
-            "probability": pose.probability,
-            "verdict": pose.verdict,
-        }
-        for pose in explanation.poses
-    ]
-    return explanation.result.to_json(name) | {"advice": explanation.advice, "num_features": explanation.num_features, "tried": poses}

@@ -10,13 +10,13 @@ import numpy as np
 import tyro
 
 from topoloc.cli.output import File, UsageError, check_outputs, print_facts, write_json
+from topoloc.cli.waiting import say_waiting
 from topoloc.errors import GeoreferenceError
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3
+from topoloc.map.edit import editing
 from topoloc.map.georeferencing import Up, WorldFit, find_up, fit_georeference, georeference_by_view
 from topoloc.map.known_places import KnownPlaces, read_gnss, read_points
-from topoloc.map.schema import SCHEMA_VERSION
-from topoloc.map.sessions import Edit, today
 from topoloc.map.topomap import TopoMetricMap
 
 
@@ -46,15 +46,14 @@ class Command:
             raise UsageError("georeference takes a map and one of --origin, --gnss and --points")
         check_outputs([self.json], inputs=[path for path in (self.map, self.gnss, self.points) if path])
         origin = None if self.origin is None else _origin_from(self.origin)
-        with TopoMetricMap.load(self.map) as topomap:
+        with editing(self.map, say_waiting) as edit:
+            topomap = edit.topomap
             posed = [image.world_from_cam for image in topomap.place_images] or [s.world_from_cam for s in topomap.summaries]
             if not posed:
                 raise GeoreferenceError(f"map {self.map} has no mapping picture")
             up = find_up(posed, self.up)
             found, fitted = self._found(topomap, posed[0], up, origin)
-            number = max([topomap.next_ids.edit, *(edit.edit_id + 1 for edit in topomap.edits)])
-            edits = [*topomap.edits, Edit(number, f"georeference {found.source}", today(), SCHEMA_VERSION)]
-            replace(topomap, georeference=found, edits=edits).save(self.map)
+            edit.commit(replace(topomap, georeference=found), f"georeference {found.source}")
         facts = found.to_json() | {"heading_deg": found.heading_deg(posed[0].rotation[:, 2]), "up": None if self.points else up.axis}
         if fitted is not None:
             fit = fitted[1]

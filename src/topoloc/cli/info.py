@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from topoloc.cli.output import File, Flag, check_outputs, print_facts, write_json
-from topoloc.errors import EmptyMapError, MapError
+from topoloc.atlas.atlas import is_atlas
+from topoloc.cli import atlas
+from topoloc.cli.output import File, Flag, UsageError, check_outputs, print_facts, write_json
+from topoloc.errors import MapError
+from topoloc.map.description import describe_map
 
 MAX_DAMAGES = 20
 
@@ -18,23 +21,34 @@ MAX_DAMAGES = 20
 class Command:
     """What `topoloc info` takes."""
 
-    map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP")]
-    """The map file."""
+    map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
+    """The map file, or an atlas."""
     json: File = None
     """Write the same as JSON to this file (- for standard output)."""
 
     check: Flag = False
     """Also look at every byte of the map, and whether its nodes agree with their neighbours; exit status 1 where something is wrong."""
 
+    graph: Annotated[str | None, tyro.conf.arg(metavar="FILE.graphml|FILE.geojson", help_behavior_hint="")] = None
+    """Write nodes, junctions and the ways between them to this file; GeoJSON of a map that knows its place on earth."""
+
     def run(self) -> int:
         from topoloc.map.topomap import TopoMetricMap
 
-        check_outputs([self.json], inputs=[self.map])
+        if is_atlas(self.map) and self.graph:
+            raise UsageError("--graph is of one map; name a tile's file")
+        if is_atlas(self.map):
+            return atlas.Command("info", self.map, check=self.check, json=self.json).run()
+        check_outputs([self.json, self.graph], inputs=[self.map])
         with TopoMetricMap.load(self.map) as topomap:
             found = _damages(topomap, Path(self.map)) if self.check else []
             if found:
                 print("\n".join(found[:MAX_DAMAGES]))
                 raise MapError(f"map {self.map} is damaged: {len(found)} things are wrong, the first: {found[0]}")
+            if self.graph:
+                from topoloc.export.map_graph import write_graph
+
+                write_graph(topomap, Path(self.graph))
             info = describe_map(topomap, Path(self.map)) | ({"check": "ok"} if self.check else {})
         if self.json != "-":
             _print(info)
@@ -49,48 +63,6 @@ def _damages(topomap: Any, path: Path) -> list[str]:
 
     found = damages(path)
     return found or [str(contradiction) for contradiction in contradictions(topomap)]
-
-
-def describe_map(topomap: Any, path: Path) -> dict[str, Any]:
-    """The facts of a map that evaluations and `info` print: counts, bytes, extent, configuration.
-
-    Raises:
-        EmptyMapError: the map has no node.
-    """
-    import numpy as np
-
-    from topoloc.map.checking import list_coarse
-    from topoloc.map.contents import map_id_of
-
-    if len(topomap.summaries) == 0:
-        raise EmptyMapError(f"map {path} has no nodes")
-    centres = np.array([s.world_from_cam.translation for s in topomap.summaries])
-    return {
-        "path": str(path),
-        "map": map_id_of(topomap),
-        "version": topomap.version,
-        "georeference": None if topomap.georeference is None else topomap.georeference.to_json(),
-        "bytes": path.stat().st_size,
-        "num_nodes": len(topomap.summaries),
-        "num_points": sum(s.num_points for s in topomap.summaries),
-        "num_side_nodes": len(topomap.sides.summaries) if topomap.sides else 0,
-        "num_place_images": len(topomap.place_images),
-        "length_m": round(topomap.length_m, 3),
-        "extent_m": np.ptp(centres, axis=0).round(3).tolist(),
-        "recordings": sorted({s.recording for s in topomap.summaries}),
-        "sessions": [_session_facts(session) for session in topomap.sessions],
-        "edits": [asdict(edit) for edit in topomap.edits],
-        "coarse": sorted(topomap.coarse_models),
-        "default_coarse": topomap.default_coarse,
-        "kinds": topomap.kinds,
-        "coarse_models": list_coarse(path),
-        "config": topomap.config.to_json(),
-    }
-
-
-def _session_facts(session: Any) -> dict[str, Any]:
-    camera = None if session.camera is None else session.camera.to_json()
-    return asdict(session) | {"camera": camera, "start_date": session.start_date, "end_date": session.end_date}
 
 
 def _print(info: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""topoloc localize MAP INPUT ..."""
+"""topoloc localize MAP|ATLAS INPUT ..."""
 
 from __future__ import annotations
 
@@ -11,7 +11,11 @@ from typing import Annotated
 
 import tyro
 
-from topoloc.cli.features_option import ASKED_FEATURES, localizer_of
+from topoloc.atlas.atlas_localizer import AtlasLocalizer
+from topoloc.atlas.config import AtlasConfig
+from topoloc.cli.features_option import ASKED_FEATURES
+from topoloc.cli.live_answers import NEEDS_CALIBRATION, live_answers, live_input
+from topoloc.cli.map_or_atlas import camera_for, is_atlas, localizer_at
 from topoloc.cli.output import (
     File,
     Flag,
@@ -24,23 +28,20 @@ from topoloc.cli.output import (
     progress_bar,
     write_text,
 )
-from topoloc.cli.query_answers import QueryAnswer, answer_line, exit_status, stream_summary, trajectory_of
-from topoloc.cli.query_camera import CameraOfSize, camera_of_frame, named_camera
+from topoloc.cli.query_answers import QueryAnswer, answer_line, exit_status, say_verdicts, stream_summary, trajectory_of
 from topoloc.cli.settings_file import read_settings, with_option
 from topoloc.errors import CalibrationError, QueryError, TopolocError, UnreadableImageError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.query_camera import CameraOfSize, camera_of_frame
 from topoloc.localization.result import NotLocalized
 from topoloc.map.sessions import path_of
-from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import find_format
 from topoloc.sequences.recording import single_pictures
 from topoloc.sequences.trajectory import frame_poses, read_trajectory, write_tum
 from topoloc.tracking.tracker import Tracker, TrackerConfig
-
-# The camera of a picture of this width and height (pixels).
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,10 +75,11 @@ class StreamOptions:
 class Command:
     """What `topoloc localize` takes."""
 
-    map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP")]
-    """The map file."""
+    map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
+    """The map file; or an atlas, of which each picture is asked alone."""
     inputs: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="INPUT ...", help_behavior_hint="(required)")] = ()
-    """Images, folders of images, videos, recordings. PATH@0:100 takes the first hundred frames of PATH."""
+    """Images, folders of images, videos, recordings; PATH@0:100 takes the first hundred frames of PATH. Or one camera that runs now: a
+    device number, rtsp:// or http:// URL, or GStreamer pipeline."""
     camera: Annotated[
         str | None, tyro.conf.arg(metavar="FILE|fx,fy,cx,cy|map|unknown", help_behavior_hint="(default: that of the recording)")
     ] = None
@@ -110,20 +112,26 @@ class Command:
         config = with_option(settings.of(LocalizerConfig), "coarse", self.coarse, "--coarse")
         config = with_option(config, "max_ms", self.max_ms, "--max-ms")
         tracking = self._tracking(settings.of(TrackerConfig))
-        topomap = TopoMetricMap.load(self.map)
-        camera = None if self.camera is None or self._stereo_calibration else named_camera(self.camera, topomap)
-        queries = [self._open(path) for path in self.inputs]
-        localizer = localizer_of(topomap, config, self.features)
+        localizer = localizer_at(self.map, config, self.features, settings.of(AtlasConfig))
+        camera = None if self.camera is None or self._stereo_calibration else camera_for(localizer, self.camera)
+        live = live_input(self.inputs)
+        queries = [] if live else [self._open(path) for path in self.inputs]
         answers: list[QueryAnswer] = []
         total = sum(len(query.sequence) for query in queries)
+        coming = _answers(localizer, tracking, queries, camera)
+        if live:
+            if camera is None:
+                raise UsageError(f"{live} has no calibration: --camera says it")
+            tracker = Tracker(localizer, tracking) if isinstance(localizer, Localizer) and not self.streams.single else None
+            coming = live_answers(localizer, tracker, live, camera)
         start = time.perf_counter()
         try:
             with interruptible(), progress_bar() as progress:
-                for answer in _answers(localizer, tracking, queries, camera):
+                for answer in coming:
                     answers.append(answer)
                     as_json = self.json == "-"
                     print(json.dumps(answer.to_json()) if as_json else answer_line(answer), flush=True)
-                    progress("queries", len(answers), total)
+                    progress("queries", len(answers), total or len(answers))
         except (KeyboardInterrupt, TopolocError) as stopped:
             files = self._write_files(answers) if answers else []
             if not files:
@@ -131,19 +139,24 @@ class Command:
             what = "interrupted" if isinstance(stopped, KeyboardInterrupt) else str(stopped)
             raise TopolocError(f"{what} (results of the {len(answers)} queries before: {', '.join(files)})") from stopped
         self._write_files(answers)
-        if any(query.is_stream for query in queries) and self.json != "-":
+        if any(answer.streamed for answer in answers) and self.json != "-":
             print(stream_summary(answers, time.perf_counter() - start))
+        say_verdicts(answers)
         return exit_status(answers)
 
     def _check_usage(self) -> None:
         if self.streams.stream and self.streams.single:
             raise UsageError("--stream and --single cannot both be meant")
-        if self.streams.odometry is not None and len(self.inputs) > 1:
-            raise UsageError("--odometry is that of one stream: give one input with it")
+        if self.streams.odometry is not None and (len(self.inputs) > 1 or live_input(self.inputs)):
+            raise UsageError("--odometry is that of one recorded stream: give one input with it")
+        streams = self.streams
+        if is_atlas(self.map) and (streams.stream or streams.smoothed or streams.odometry or streams.max_jump is not None):
+            raise UsageError("an atlas is asked picture by picture: --stream, --smoothed, --odometry and --max-jump are for maps")
 
     def _open(self, path: str) -> _Query:
         """Recordings and videos are streams; pictures, and folders of them, are single unless they are said not to be."""
-        is_stream = self.streams.stream or (not self.streams.single and find_format(path, self.format) != "folder")
+        is_single = self.streams.single or is_atlas(self.map)
+        is_stream = self.streams.stream or (not is_single and find_format(path, self.format) != "folder")
         sequence = single_pictures(open_recording(path, self.format, self._stereo_calibration, self.topics))
         is_stream = is_stream and len(sequence) > 1
         odometry = None
@@ -176,10 +189,10 @@ class Command:
 
 
 def _answers(
-    localizer: Localizer, tracking: TrackerConfig, queries: list[_Query], camera_of_size: CameraOfSize | None
+    localizer: Localizer | AtlasLocalizer, tracking: TrackerConfig, queries: list[_Query], camera_of_size: CameraOfSize | None
 ) -> Iterator[QueryAnswer]:
     for query in queries:
-        tracker = Tracker(localizer, tracking) if query.is_stream else None
+        tracker = Tracker(localizer, tracking) if query.is_stream and isinstance(localizer, Localizer) else None
         for i, frame_name in enumerate(query.sequence.names):
             name = frame_name if len(queries) == 1 else query.path if len(query.sequence) == 1 else f"{query.path}/{frame_name}"
             try:
@@ -199,7 +212,12 @@ def _has_times(photos: StereoSequence) -> bool:
 
 
 def _answer(
-    name: str, query: _Query, index: int, localizer: Localizer, tracker: Tracker | None, camera_of_size: CameraOfSize | None
+    name: str,
+    query: _Query,
+    index: int,
+    localizer: Localizer | AtlasLocalizer,
+    tracker: Tracker | None,
+    camera_of_size: CameraOfSize | None,
 ) -> QueryAnswer:
     """One picture, alone or as the next of a stream."""
     t_ns, odom_from_cam = query.sequence.t_ns[index], query.odom_from_cams[index]
@@ -212,6 +230,6 @@ def _answer(
     if tracker is None:
         return QueryAnswer(name, t_ns, localizer.localize(frame.image, camera, t_ns=t_ns if query.has_times else None))
     if isinstance(camera, RoughCamera):
-        raise CalibrationError("a stream needs a calibration: --camera FILE, --camera fx,fy,cx,cy or --camera map; or --single")
+        raise CalibrationError(NEEDS_CALIBRATION)
     streamed = tracker.process(frame.image, camera, t_ns, odom_from_cam)
     return QueryAnswer(name, t_ns, streamed.result, streamed)

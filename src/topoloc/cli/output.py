@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -85,6 +87,28 @@ def interruptible() -> Iterator[None]:
         if _is_out_of_memory(error):
             raise MemoryError from error
         raise
+
+
+@contextmanager
+def ended_by_signals() -> Iterator[threading.Event]:
+    """Ctrl-C and SIGTERM set the event, at which work that could go on for ever ends in good order; a second one interrupts it."""
+    stop = threading.Event()
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def end(number: int, _: object) -> None:
+        stop.set()
+        signal.signal(number, before[signal.Signals(number)])
+
+    if threading.current_thread() is not threading.main_thread():  # only there can signals be heard
+        yield stop
+        return
+    for number in before:
+        signal.signal(number, end)
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _is_out_of_memory(error: Exception) -> bool:

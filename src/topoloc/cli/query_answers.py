@@ -9,6 +9,7 @@ from itertools import pairwise
 from typing import Any
 
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.calibration_doubt import verdicts_of
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.sequences.trajectory import Trajectory
 from topoloc.tracking.stream_result import StreamedPose
@@ -56,6 +57,13 @@ def exit_status(answers: list[QueryAnswer]) -> int:
     return 0
 
 
+def say_verdicts(answers: list[QueryAnswer]) -> None:
+    """One line on stderr for each camera whose calibration the pictures contradict together."""
+    for verdict in verdicts_of(answer.result for answer in answers):
+        if verdict.contradicts:
+            print(f"warning: {verdict}", file=sys.stderr)
+
+
 def answer_line(answer: QueryAnswer) -> str:
     """One query for people."""
     result, state = answer.result, f"{answer.streamed.state}  " if answer.streamed is not None else ""
@@ -66,11 +74,12 @@ def answer_line(answer: QueryAnswer) -> str:
             evidence = f"  ({len(result.alternatives)} alternatives)" if result.alternatives else ""
         return f"{answer.query}  {state}not localized: {result.reason}{evidence}{ms}"
     focal = "" if result.focal_length_px is None else f"  f {result.focal_length_px:.0f} px (found)"
+    tile = "" if result.provenance.tile is None else f"  tile {result.provenance.tile}"
     x, y, z = result.world_from_cam.translation
     w, i, j, k = result.world_from_cam.quat_wxyz()
     return (
         f"{answer.query}  {state}at {x:.3f} {y:.3f} {z:.3f} m, quat wxyz {w:.4f} {i:.4f} {j:.4f} {k:.4f}  p {result.probability:.2f}"
-        f"  node {result.node_id}  ({result.num_inliers} of {result.num_matches} matches){focal}{ms}"
+        f"{tile}  node {result.node_id}  ({result.num_inliers} of {result.num_matches} matches){focal}{ms}"
     )
 
 

@@ -22,11 +22,16 @@ from topoloc.errors import ConfigError
 T = TypeVar("T")
 
 # table of the file: module and class of its configuration, and the commands that it is for; more come with other distributions
+_ASKING = ("localize", "evaluate", "explain", "serve", "follow")
 TABLES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "build": ("topoloc.map.build", "BuildConfig", ("build",)),
-    "localize": ("topoloc.localization.localizer", "LocalizerConfig", ("localize", "evaluate", "explain")),
-    "track": ("topoloc.tracking.tracker", "TrackerConfig", ("localize",)),
-    "slam": ("topoloc.slam.slam", "SlamConfig", ("slam", "build")),
+    "localize": ("topoloc.localization.localizer", "LocalizerConfig", (*_ASKING, "update", "merge")),
+    "atlas": ("topoloc.atlas.config", "AtlasConfig", ("localize", "evaluate", "explain", "serve")),
+    "track": ("topoloc.tracking.tracker", "TrackerConfig", ("localize", "serve", "follow")),
+    "slam": ("topoloc.slam.slam", "SlamConfig", ("slam", "build", "update")),
+    "update": ("topoloc.lifelong.update", "UpdateConfig", ("update", "merge")),
+    "prune": ("topoloc.lifelong.prune", "PruneConfig", ("prune",)),
+    "serve": ("topoloc.service.config", "ServiceConfig", ("serve",)),
 }
 _WIDTH = 110
 _LARGEST_FILE = 1_000_000

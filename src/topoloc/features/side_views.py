@@ -52,15 +52,19 @@ class SideView:
     points_img: Float32[np.ndarray, "a b 2"]
     inside: Bool[np.ndarray, "a b"]
 
+    def from_world(self, cam_from_world: Rigid3) -> Rigid3:
+        """The pose of the side camera (side_from_world), of that of the picture's camera."""
+        return self.cam_from_side.inverse() @ cam_from_world
+
     def picture(self, grey: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "a b"]:
         """What the side camera sees. Beyond the picture its border goes on, which makes no edges of its own."""
         # None is right here, whatever the stubs say: OpenCV 5 takes an empty second map for a map.
         return cv2.remap(grey, self.points_img, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # pyright: ignore
 
     def within(self, features: Features) -> Features:
-        """The features that lie in what the picture holds."""
+        """The features that lie in what the picture holds, with the dense descriptors of all of it."""
         columns, rows = np.rint(features.points_img).astype(int).T
-        return features.select(self.inside[rows, columns])
+        return replace(features.select(self.inside[rows, columns]), dense=features.dense)
 
     def in_picture(self, features: Features, camera: Camera) -> Features:
         """The same features at the pixels of the picture itself, which `camera` took."""

@@ -14,7 +14,8 @@ from topoloc.localization.belief import MIN_LEAD, Hypothesis, lead
 from topoloc.localization.calibration_doubt import doubt_of_calibration
 from topoloc.localization.evidence import doubt_of, is_only_imprecise, precision_at, precision_of
 from topoloc.localization.pose_fit import SeenPoints
-from topoloc.localization.result import Alternative, Localization, NotLocalized, Provenance, Reason
+from topoloc.localization.provenance import Provenance
+from topoloc.localization.result import Alternative, Localization, NotLocalized, Reason
 from topoloc.localization.search import Search
 
 _ELSEWHERE_DEG = 10.0
@@ -23,10 +24,12 @@ _MIN_ALTERNATIVE = 0.01  # ones that are less probable beside the best one are n
 
 Answered = tuple[Localization, SeenPoints]
 """A pose, and the points that it stands on, in pixels of the image as it came."""
+Verdict = tuple[Localization | NotLocalized, list[Answered]]
+"""A result, and each pose that it names: its own, or its alternatives, in their order."""
 
 
-def answer(search: Search) -> tuple[Localization | NotLocalized, list[Answered]]:
-    """The result, and each pose that it names: its own, or its alternatives, in their order."""
+def answer(search: Search) -> Verdict:
+    """What follows from what is believed."""
     ranked = search.belief.ranked(search.weights.rivals)
     min_probability = search.config.evidence.min_probability
     if not ranked or ranked[0].probability < min_probability:
@@ -36,26 +39,33 @@ def answer(search: Search) -> tuple[Localization | NotLocalized, list[Answered]]
     probability = precision_of(best.evidence) / (1.0 + others)
     is_leading = all(by >= _least_lead(search, best, other) for by, other in zip(leads, ranked[1:], strict=True))
     if is_leading and probability >= min_probability:
-        return _calibration_checked(search, best, probability)
+        named = _answered(search, best, probability)
+        return named[0], [named]
     return _ambiguity(search, ranked, leads, others)
 
 
-def _calibration_checked(search: Search, best: Hypothesis, probability: float) -> tuple[Localization | NotLocalized, list[Answered]]:
-    """The answer; a calibration that the picture contradicts costs it precision, which may be all that it has."""
+def final_answer(search: Search) -> Verdict:
+    """`answer`, where no other features are asked any more: held against its calibration, which the picture may contradict. That costs it
+    precision, which may be all that it has."""
+    result, named = answer(search)
+    if isinstance(result, NotLocalized):
+        return result, named
+    best = search.belief.ranked(search.weights.rivals)[0]
     with search.query.clock.stage("calibration"):
-        doubt = doubt_of_calibration(search, best.fit)
+        seen, doubt = doubt_of_calibration(search, best.fit)
     if doubt is None:
-        named = _answered(search, best, probability)
-        return named[0], [named]
+        result = replace(result, seen_camera=seen, times_ms=search.query.clock.times_ms())
+        return result, [(result, points) for _, points in named]
     covariance = best.covariance + np.outer(doubt.shift, doubt.shift)
     evidence = replace(best.evidence, doubt=max(best.evidence.doubt, _doubt_with(search, best, covariance)))
     paid = replace(best, covariance=covariance, evidence=evidence)
-    probability *= precision_at(evidence.doubt)
+    probability = result.probability * precision_at(evidence.doubt)
     if probability < search.config.evidence.min_probability:
-        return _refused(search, "too_few_inliers", paid, f"the calibration is doubtful: {doubt}"), []
-    localization, seen = _answered(search, paid, probability)
-    localization = replace(localization, calibration_doubt=doubt)
-    return localization, [(localization, seen)]
+        refusal = _refused(search, "too_few_inliers", paid, f"the calibration is doubtful: {doubt}")
+        return replace(refusal, seen_camera=seen), []
+    localization, points = _answered(search, paid, probability)
+    localization = replace(localization, calibration_doubt=doubt, seen_camera=seen)
+    return localization, [(localization, points)]
 
 
 def _doubt_with(search: Search, best: Hypothesis, covariance: Float[np.ndarray, "6 6"]) -> float:
@@ -105,7 +115,7 @@ def _answered(search: Search, best: Hypothesis, probability: float) -> Answered:
     return localization, best.fit.seen_points(search.query.scale)
 
 
-def _ambiguity(search: Search, ranked: list[Hypothesis], leads: list[float], others: float) -> tuple[NotLocalized, list[Answered]]:
+def _ambiguity(search: Search, ranked: list[Hypothesis], leads: list[float], others: float) -> Verdict:
     """It is one of these; how probable each is, beside "nowhere"."""
     best = ranked[0]
     shares = [1.0 / (1.0 + others), *(math.exp(-one) / (1.0 + others) for one in leads)]

@@ -29,6 +29,13 @@ def object_of(line: str | bytes | Mapping[str, Any]) -> Mapping[str, Any]:
     return data
 
 
+def mapping(value: Any, key: str) -> Mapping[str, Any]:
+    """An object under a key."""
+    if not isinstance(value, Mapping):
+        raise ResultError(f"no result: {key!r} is no object")
+    return value
+
+
 def wanted(data: Mapping[str, Any], key: str) -> Any:
     """What stands under a key that must be there."""
     if key not in data:
@@ -74,6 +81,11 @@ def rigid(value: Any, key: str) -> Rigid3:
         return Rigid3.from_quat_wxyz(np.array(quat_wxyz), np.array(translation))
     except TrajectoryError as error:
         raise ResultError(f"no result: {key!r}: {error}") from None
+
+
+def pose_json(world_from_cam: Rigid3) -> dict[str, list[float]]:
+    """A pose as all our JSON has it, metres; what `rigid` reads."""
+    return {"translation": world_from_cam.translation.tolist(), "quat_wxyz": world_from_cam.quat_wxyz().tolist()}
 
 
 def covariance(value: Any, key: str) -> Float[np.ndarray, "6 6"]:

@@ -145,6 +145,7 @@ def wall_score_features(evidence: Evidence) -> tuple[float, ...]:
         math.log((e.num_inliers + 1) / (e.num_matches + 10)),
         math.log(e.spread + 0.02),
         math.log(e.num_distinct + 1),
+        math.log(e.even_share + 0.002),
         math.log(max(e.doubt, 0.01)),
     )
 

@@ -74,6 +74,7 @@ class WallWeights:
     spread: float
     doubt: float
     distinct: float
+    even_share: float
     bias: float
     sigma_px: float
     least_shared_errors: float
@@ -81,7 +82,7 @@ class WallWeights:
     @property
     def in_order(self) -> tuple[float, ...]:
         """In the order of `wall_score_features`; without the bias."""
-        return (self.found, self.chance, self.inliers, self.inlier_share, self.spread, self.distinct, self.doubt)
+        return (self.found, self.chance, self.inliers, self.inlier_share, self.spread, self.distinct, self.even_share, self.doubt)
 
 
 @dataclass(frozen=True)

@@ -11,24 +11,27 @@ behaviour.
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import cached_property
 from typing import TypeVar
 
 from topoloc.bounds import check_bounds
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
-from topoloc.localization.answer import Answered, answer
+from topoloc.localization.answer import Answered, Verdict, answer, final_answer
 from topoloc.localization.asked_kind import AskedKind, kinds_to_ask
-from topoloc.localization.belief import Belief, is_same_pose
+from topoloc.localization.belief import Belief
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.fitted_weights import FittedWeights
 from topoloc.localization.propose import propose, propose_more
-from topoloc.localization.query import Query, check_size, reduced_image, unknown_camera
+from topoloc.localization.provenance import Provenance
+from topoloc.localization.query import Picture, Query, reduced_image, unknown_camera
 from topoloc.localization.refine import hypothesis_of, say_on
-from topoloc.localization.result import Localization, NotLocalized, Provenance, at_time
+from topoloc.localization.result import Localization, NotLocalized, at_time
 from topoloc.localization.search import Proposal, Search, Trace
 from topoloc.map.contents import map_id_of
 from topoloc.map.topomap import TopoMetricMap
@@ -107,11 +110,33 @@ class Localizer:
         prior: Rigid3 | None,
         max_ms: float | None = None,
         trace: Trace | None = None,
-    ) -> tuple[Localization | NotLocalized, list[Answered]]:
+    ) -> Verdict:
         """As `localize`; also each pose that the result names (its own, or its alternatives) with the points that it stands on."""
-        check_size(image, camera)
-        result, named = self._answered(image, camera, prior, max_ms, trace)
+        return self.ask(Picture(image, camera), prior, max_ms, trace)
+
+    def ask(self, picture: Picture, prior: Rigid3 | None = None, max_ms: float | None = None, trace: Trace | None = None) -> Verdict:
+        """As `localize_near`, of a picture whose features other maps may have asked for before."""
+        searches = self._searches(self._query(picture, max_ms), trace)
+        result, named = self._answered(searches, prior)
+        for search in searches:  # they know each other: a ring, which would keep the picture in memory until the collector comes by
+            search.before = search.following = None
+        camera = picture.camera
         return self.completed(result, camera), [(self.completed(one, camera), seen) for one, seen in named]
+
+    @cached_property
+    def at_first_glance(self) -> Localizer:
+        """The same map asked by its first kind of features and by retrieval alone: the cheapest question that a clear picture answers."""
+        other, first = copy.copy(self), self._kinds[0]
+        c = first.config
+        brief = replace(
+            c,
+            look_alikes=replace(c.look_alikes, max_groups=0),
+            viewpoints=replace(c.viewpoints, num_nodes=0),
+            walls=replace(c.walls, num_ranked=0),
+            max_repetitions=0,
+        )
+        other._kinds, other.config = [replace(first, config=brief)], brief
+        return other
 
     def completed(self, result: R, camera: Camera | RoughCamera | None = None, t_ns: int | None = None) -> R:
         """The result with the map that it is of, where on earth that is, the picture's camera, and its time (nanoseconds)."""
@@ -120,22 +145,22 @@ class Localizer:
             camera = None if focal is None else camera.with_focal(focal)
         of_map = Provenance(self.map_id, self.topomap.version, t_ns=t_ns, camera=camera)
         provenance = replace(of_map, features=result.provenance.features)
-        if isinstance(result, NotLocalized):
-            return replace(result, provenance=provenance)
         georeference = self.topomap.georeference
+        if isinstance(result, NotLocalized):
+            alternatives = result.alternatives
+            if georeference:
+                alternatives = tuple(replace(one, geopose=georeference.geopose(one.world_from_cam)) for one in alternatives)
+            return replace(result, provenance=provenance, alternatives=alternatives)
         return replace(result, provenance=provenance, geopose=georeference.geopose(result.world_from_cam) if georeference else None)
 
-    def _answered(
-        self, image: Image, camera: Camera | RoughCamera, prior: Rigid3 | None, max_ms: float | None, trace: Trace | None
-    ) -> tuple[Localization | NotLocalized, list[Answered]]:
-        searches, result, named = self._searches(self._query(image, camera, max_ms), trace), None, list[Answered]()
+    def _answered(self, searches: list[Search], prior: Rigid3 | None) -> Verdict:
+        result, named = None, list[Answered]()
         for search in searches:
             _follow_up(search, propose(search, prior))
-            result, named = answer(search)
-            is_settled = search.is_clear or search.following is None or prior is not None
-            if search.is_stopped or (isinstance(result, Localization) and is_settled):
-                doubted = self._doubted(searches[0], search, result) if prior is None else None
-                return doubted or (result, named)
+            is_last = search.is_stopped or search.is_clear or search.following is None or prior is not None
+            result, named = final_answer(search) if is_last else answer(search)
+            if search.is_stopped or (is_last and isinstance(result, Localization)):
+                return result, named
         if len(searches) > 1 and not named and prior is None:
             of_first = self._second_look(searches[0], searches[-1])
             if of_first[1]:
@@ -143,25 +168,7 @@ class Localizer:
         assert result is not None
         return result, named
 
-    def _doubted(self, first: Search, last: Search, result: Localization | NotLocalized) -> tuple[NotLocalized, list[Answered]] | None:
-        """The first kind's verdict where it leaves open what the last kind answers; None where the answer stands.
-
-        A pose that two kinds find and that is clear by neither, in a light in which both see, may be a twin of a place that the map's nodes
-        do not show. What the first kind has beside its nodes, the walls above all, then has its say.
-        """
-        if first is last or first.is_stopped or last.is_stopped or last.is_clear or not isinstance(result, Localization):
-            return None
-        pose, weights = last.belief.ranked(last.weights.rivals)[0], first.weights.rivals
-        seen = first.belief.best(weights)
-        if seen is None or seen.probability < self.config.evidence.min_probability:
-            return None
-        if not is_same_pose(seen.fit, pose.fit, self.config.evidence):
-            return None
-        _follow_up(first, propose_more(first))
-        of_first, named = answer(first)
-        return (of_first, named) if isinstance(of_first, NotLocalized) else None
-
-    def _second_look(self, first: Search, last: Search) -> tuple[Localization | NotLocalized, list[Answered]]:
+    def _second_look(self, first: Search, last: Search) -> Verdict:
         """What the first kind of features finds by all that it has, where the others found nothing; they are heard on it."""
         _follow_up(first, propose_more(first))
         weights = first.weights.rivals
@@ -171,7 +178,7 @@ class Localizer:
             log_odds = one.log_odds if one.is_from_walls else one.log_odds + say_on(last, one)
             if one.is_from_walls or log_odds >= _LEAST_SECOND:
                 seconded = seconded.given(replace(one, log_odds=log_odds), self.config.evidence, weights)
-        return answer(replace(first, belief=seconded))
+        return final_answer(replace(first, belief=seconded))
 
     def _searches(self, query: Query, trace: Trace | None) -> list[Search]:
         """One by each kind of features, which know each other."""
@@ -189,11 +196,12 @@ class Localizer:
         """rho of the map by its first kind of features: the share of a match's variance that its points have in common."""
         return self._kinds[0].correlated_errors
 
-    def _query(self, image: Image, camera: Camera | RoughCamera, max_ms: float | None) -> Query:
+    def _query(self, picture: Picture, max_ms: float | None) -> Query:
+        image, camera = picture.image, picture.camera
         start, limit = time.perf_counter(), max_ms if max_ms is not None else self.config.max_ms
         reduced, lens = reduced_image(image, camera, self.map.focal, self.config.max_finer, self.config.max_side_px)
         deadline = float("inf") if limit is None else start + limit / 1e3
-        return Query(reduced, lens, image.shape[1] / lens.width, self.map.feature_config, deadline=deadline)
+        return Query(reduced, lens, image.shape[1] / lens.width, self.map.feature_config, deadline=deadline, shared=picture.features)
 
 
 def _follow_up(search: Search, proposals: Iterable[Proposal]) -> None:

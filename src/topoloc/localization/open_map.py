@@ -57,9 +57,9 @@ class OpenMap:
 
     @cached_property
     def walls(self) -> WallIndex | None:
-        """The map's side nodes; None where it has none, or features whose size and orientation say nothing of the wall's slant."""
+        """The map's side nodes; None where it has none, or by features of another kind."""
         sides = self.topomap.sides
-        return WallIndex(self.topomap, sides) if sides is not None and self.kind.has_scale and self.kind.has_angle else None
+        return WallIndex(self.topomap, sides) if sides is not None and sides.kind == self.kind.name else None
 
     def with_ids(self, candidates: list[NodeScore]) -> list[NodeScore]:
         """Candidates as they are reported: until then a candidate's `node_id` is the row of its node."""

@@ -8,9 +8,9 @@ picture is reduced until its pixels see as much as the map's did; a coarser one 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import cv2
@@ -46,6 +46,50 @@ class StageClock:
         return self._times_ms | {"total": (time.perf_counter() - self._start) * 1e3}
 
 
+class SharedFeatures:
+    """The features of one picture by its size and their settings, extracted once, whichever of several maps asks for them first."""
+
+    def __init__(self) -> None:
+        self._kept: dict[tuple[int, int, FeatureConfig], Features] = {}
+
+    def of(self, query: Query) -> Features:
+        """Of the picture as it was reduced for a query."""
+        key = (query.image.shape[1], query.image.shape[0], query.feature_config)
+        if key not in self._kept:
+            self._kept[key] = query.extracted()
+        return self._kept[key]
+
+
+class StoredFeatures(SharedFeatures):
+    """Those of a picture of which nothing else is left, by their kinds, such as a node of another map; pixels of `width` columns."""
+
+    def __init__(self, known: Mapping[str, Features], width: int) -> None:
+        self._known, self._width = known, width
+
+    def of(self, query: Query) -> Features:
+        """As they would be in the picture as it was reduced. Raises KeyError where they are of other kinds."""
+        known, scale = self._known[query.feature_config.kind], np.float32(query.image.shape[1] / self._width)
+        return replace(known, points_img=(known.points_img + np.float32(0.5)) * scale - np.float32(0.5), sizes_px=known.sizes_px * scale)
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A picture with what is known of its camera, to be asked of one map or of several. Raises as `check_size`."""
+
+    image: Image
+    camera: Camera | RoughCamera
+    features: SharedFeatures = field(default_factory=SharedFeatures)
+
+    def __post_init__(self) -> None:
+        check_size(self.image, self.camera)
+
+    @staticmethod
+    def of_features(known: Mapping[str, Features], camera: Camera) -> Picture:
+        """One of which nothing but local features is left, by their kinds. What looks at the picture itself (other scales and turns of it,
+        walls, what a network says beside its key points) finds nothing in it."""
+        return Picture(np.zeros((camera.height, camera.width), np.uint8), camera, StoredFeatures(known, camera.width))
+
+
 @dataclass(frozen=True, eq=False)
 class Query:
     """An image with what is known of its camera (`lens`), reduced; the image as it came is `scale` times as wide.
@@ -59,6 +103,7 @@ class Query:
     feature_config: FeatureConfig
     clock: StageClock = field(default_factory=StageClock)
     deadline: float = float("inf")
+    shared: SharedFeatures = field(default_factory=SharedFeatures)
 
     @property
     def camera(self) -> Camera:
@@ -71,6 +116,10 @@ class Query:
 
     @cached_property
     def features(self) -> Features:
+        """The local features."""
+        return self.shared.of(self)
+
+    def extracted(self) -> Features:
         """Patch normalisation, then the local features."""
         with self.clock.stage("patch_normalization"):
             normalized = normalize_image(self.grey, self.feature_config)

@@ -33,9 +33,8 @@ def hypothesis_of(search: Search, proposal: Proposal) -> Hypothesis | None:
     """The proposal followed up; None where too little was found for any evidence."""
     if isinstance(proposal, WallProposal):
         with search.query.clock.stage("walls"):
-            refined = refine_wall(proposal)
-            final = refined[0] if refined is not None else None
-            hypothesis = weigh_wall(proposal, *refined) if refined is not None else None
+            final = refine_wall(proposal)
+            hypothesis = weigh_wall(proposal, final) if final is not None else None
     else:
         final = refine(search, proposal) if proposal.repeats is None else proposal.fit
         hypothesis = weigh(search, proposal, final)

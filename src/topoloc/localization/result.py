@@ -3,55 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.errors import CalibrationError, GeoreferenceError, ResultError
-from topoloc.geometry.calibration_check import CalibrationDoubt
-from topoloc.geometry.camera import Camera
+from topoloc.errors import GeoreferenceError, ResultError
+from topoloc.geometry.calibration_check import DOUBT_LENGTHS, CalibrationDoubt, SeenCamera
 from topoloc.geometry.geodesy import GeoPose
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization import checked_json as checked
+from topoloc.localization.checked_json import pose_json
 from topoloc.localization.evidence import Evidence
+from topoloc.localization.provenance import NOTHING_KNOWN, Provenance
 from topoloc.places.coarse import NodeScore
 
 Reason = Literal["too_few_matches", "too_few_inliers", "ambiguous", "not_in_map", "jump", "unreadable"]
-
-
-@dataclass(frozen=True)
-class Provenance:
-    """What a result comes from: the map by its id, in which version (the number of its last edit), by which kind of `features`; when the
-    picture was taken (nanoseconds), and with which camera. What is not known is None, or empty."""
-
-    map_id: str = ""
-    map_version: int = 0
-    features: str = ""
-    t_ns: int | None = None
-    camera: Camera | None = None
-
-    def to_json(self) -> dict[str, Any]:
-        camera = None if self.camera is None else self.camera.to_json()
-        return {"map": self.map_id, "version": self.map_version, "t_ns": self.t_ns, "camera": camera, "features": self.features}
-
-    @staticmethod
-    def from_json(data: Mapping[str, Any]) -> Provenance:
-        """Of a result's JSON; results of before there was any have none. Raises ResultError."""
-        t_ns, camera = data.get("t_ns"), data.get("camera")
-        if camera is not None and not isinstance(camera, dict):
-            raise ResultError("no result: 'camera' is no object")
-        try:
-            return Provenance(
-                checked.text(data.get("map", ""), "map"),
-                checked.whole(data.get("version", 0), "version"),
-                checked.text(data.get("features", ""), "features"),
-                None if t_ns is None else checked.whole(t_ns, "t_ns", -(2**63)),
-                None if camera is None else Camera.from_json(camera),
-            )
-        except CalibrationError as error:
-            raise ResultError(f"no result: {error}") from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +36,8 @@ class Localization:
     less than 0.25 m; weighed from `evidence`, with weights that were fitted to this kind of features: `calibrated` is False where none are,
     and those of another kind stand in. `node_id` is the node that most inliers come from; `times_ms` the milliseconds of each
     stage; `focal_length_px` the focal length found with the pose, None where the camera was calibrated. `calibration_doubt` is what the
-    picture says against its calibration; covariance and probability have paid for it. `geopose` is the camera's place on
+    picture says against its calibration; covariance and probability have paid for it. `seen_camera` is what the picture says of its camera
+    in any case, for many of them to be heard together (`calibration_verdict.py`). `geopose` is the camera's place on
     earth, of maps that know theirs (`topoloc georeference`).
     """
 
@@ -84,9 +53,10 @@ class Localization:
     focal_length_px: float | None = None
     noise_share: float = 1.0
     calibrated: bool = True
-    provenance: Provenance = Provenance()
+    provenance: Provenance = NOTHING_KNOWN
     geopose: GeoPose | None = None
     calibration_doubt: CalibrationDoubt | None = None
+    seen_camera: SeenCamera | None = None
 
     @property
     def localized(self) -> Literal[True]:
@@ -113,7 +83,7 @@ class Localization:
         return {
             "query": query,
             "localized": True,
-            "world_from_cam": _pose_json(self.world_from_cam),
+            "world_from_cam": pose_json(self.world_from_cam),
             "covariance": self.covariance.tolist(),
             "position_sigma_m": self.position_sigma_m,
             "rotation_sigma_deg": self.rotation_sigma_deg,
@@ -122,13 +92,15 @@ class Localization:
             "node": self.node_id,
             **_evidence_json(self),
             **({} if self.focal_length_px is None else {"focal_length_px": self.focal_length_px}),
+            **({} if self.noise_share == 1.0 else {"noise_share": self.noise_share}),
+            **({} if self.evidence is None else {"evidence": asdict(self.evidence)}),
             **({} if self.calibration_doubt is None else {"calibration_doubt": self.calibration_doubt.to_json()}),
             **({} if self.geopose is None else {"geopose": self.geopose.to_json()}),
         }
 
     @staticmethod
     def from_json(line: str | bytes | Mapping[str, Any]) -> Localization:
-        """What `to_json` wrote, as text or read already; its query, `evidence`, `noise_share` and `calibration_doubt` are not kept.
+        """What `to_json` wrote, as text or read already; its query and `seen_camera` are not kept.
 
         Raises:
             ResultError: it is no result, or one of an image that was not localized.
@@ -136,33 +108,38 @@ class Localization:
         data = checked.object_of(line)
         if checked.wanted(data, "localized") is not True:
             raise ResultError("the result of an image that was not localized holds no pose (NotLocalized.from_json reads it)")
-        focal, geopose = data.get("focal_length_px"), data.get("geopose")
-        try:
-            return Localization(
-                checked.rigid(checked.wanted(data, "world_from_cam"), "world_from_cam"),
-                checked.covariance(checked.wanted(data, "covariance"), "covariance"),
-                checked.number(checked.wanted(data, "probability"), "probability", 0.0, 1.0),
-                checked.whole(checked.wanted(data, "node"), "node"),
-                **_evidence_from(data),
-                focal_length_px=None if focal is None else checked.number(focal, "focal_length_px", 0.0),
-                calibrated=data.get("calibrated", True) is not False,
-                provenance=Provenance.from_json(data),
-                geopose=None if geopose is None else GeoPose.from_json(geopose),
-            )
-        except GeoreferenceError as error:
-            raise ResultError(f"no result: 'geopose': {error}") from None
+        focal, evidence, doubt = (data.get(key) for key in ("focal_length_px", "evidence", "calibration_doubt"))
+        return Localization(
+            checked.rigid(checked.wanted(data, "world_from_cam"), "world_from_cam"),
+            checked.covariance(checked.wanted(data, "covariance"), "covariance"),
+            checked.number(checked.wanted(data, "probability"), "probability", 0.0, 1.0),
+            checked.whole(checked.wanted(data, "node"), "node"),
+            **_evidence_from(data),
+            evidence=None if evidence is None else _evidence_of(evidence),
+            focal_length_px=None if focal is None else checked.number(focal, "focal_length_px", 0.0),
+            noise_share=checked.number(data.get("noise_share", 1.0), "noise_share", 0.0, 1.0),
+            calibrated=data.get("calibrated", True) is not False,
+            provenance=Provenance.from_json(data),
+            geopose=_geopose_of(data),
+            calibration_doubt=None if doubt is None else _doubt_of(doubt),
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Alternative:
-    """A pose that may be the image's, and how probable that is; the rest of all is the probability of none of them."""
+    """A pose that may be the image's, and how probable that is; the rest of all is the probability of none of them. `geopose` as of a
+    `Localization`; `tile` names the tile of an atlas in whose world the pose is."""
 
     world_from_cam: Rigid3
     probability: float
     node_id: int
+    geopose: GeoPose | None = None
+    tile: str | None = None
 
     def to_json(self) -> dict[str, Any]:
-        return {"world_from_cam": _pose_json(self.world_from_cam), "probability": self.probability, "node": self.node_id}
+        pose = {"world_from_cam": pose_json(self.world_from_cam), "probability": self.probability, "node": self.node_id}
+        pose |= {} if self.tile is None else {"tile": self.tile}
+        return pose if self.geopose is None else pose | {"geopose": self.geopose.to_json()}
 
     @staticmethod
     def from_json(data: Any) -> Alternative:
@@ -173,6 +150,8 @@ class Alternative:
             checked.rigid(checked.wanted(data, "world_from_cam"), "world_from_cam"),
             checked.number(checked.wanted(data, "probability"), "probability", 0.0, 1.0),
             checked.whole(checked.wanted(data, "node"), "node"),
+            _geopose_of(data),
+            None if data.get("tile") is None else checked.text(data["tile"], "tile"),
         )
 
 
@@ -190,7 +169,8 @@ class NotLocalized:
     times_ms: dict[str, float] = field(default_factory=dict)
     detail: str = ""
     alternatives: tuple[Alternative, ...] = ()
-    provenance: Provenance = Provenance()
+    provenance: Provenance = NOTHING_KNOWN
+    seen_camera: SeenCamera | None = None
 
     @property
     def localized(self) -> Literal[False]:
@@ -238,10 +218,6 @@ def at_time(result: R, t_ns: int) -> R:
     return replace(result, provenance=replace(result.provenance, t_ns=t_ns))
 
 
-def _pose_json(world_from_cam: Rigid3) -> dict[str, list[float]]:
-    return {"translation": world_from_cam.translation.tolist(), "quat_wxyz": world_from_cam.quat_wxyz().tolist()}
-
-
 def _evidence_json(result: Localization | NotLocalized) -> dict[str, Any]:
     return {
         "candidates": [[c.node_id, round(c.score, 4)] for c in result.candidates],
@@ -250,6 +226,46 @@ def _evidence_json(result: Localization | NotLocalized) -> dict[str, Any]:
         "times_ms": {stage: round(ms, 3) for stage, ms in result.times_ms.items()},
         **result.provenance.to_json(),
     }
+
+
+def _geopose_of(data: Mapping[str, Any]) -> GeoPose | None:
+    try:
+        return None if data.get("geopose") is None else GeoPose.from_json(data["geopose"])
+    except GeoreferenceError as error:
+        raise ResultError(f"no result: 'geopose': {error}") from None
+
+
+def _evidence_of(value: Any) -> Evidence:
+    data = checked.mapping(value, "evidence")
+    values: dict[str, Any] = {}
+    for one in fields(Evidence):
+        is_missing = one.name == "num_distinct" and data.get(one.name) is None
+        read = checked.whole if one.name.startswith("num_") else checked.number
+        values[one.name] = None if is_missing else read(checked.wanted(data, one.name), f"evidence.{one.name}")
+    return Evidence(**values)
+
+
+def _doubt_of(value: Any) -> CalibrationDoubt:
+    data = checked.mapping(value, "calibration_doubt")
+
+    def vector(key: str, length: int) -> np.ndarray:
+        values = [checked.number(one, key) for one in checked.items(checked.wanted(data, key), key)]
+        if len(values) != length:
+            raise ResultError(f"no result: {key!r} is no {length} numbers")
+        return np.array(values)
+
+    of = checked.items(checked.wanted(data, "of"), "of")
+    focal, sigma, calibrated = (checked.number(checked.wanted(data, key), key, 0.0) for key in DOUBT_LENGTHS)
+    return CalibrationDoubt(
+        focal,
+        sigma,
+        calibrated,
+        vector("principal_point_px", 2),
+        vector("calibrated_principal_point_px", 2),
+        "focal_length" in of,
+        "principal_point" in of,
+        vector("shift", 6),
+    )
 
 
 def _evidence_from(data: Mapping[str, Any]) -> dict[str, Any]:

@@ -7,55 +7,32 @@ with their 3-D positions. All mapping images, labelled with their node, teach th
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float32
 
 from topoloc.bounds import check_bounds
 from topoloc.errors import EmptyMapError
 from topoloc.features.features import Features
 from topoloc.features.kinds import find_kind
 from topoloc.map.config import MapConfig
-from topoloc.map.entries import Edge, NodeSummary, PlaceImage, TopoNode
-from topoloc.map.landmarks import Observations, observe_points, refine_points, session_sums
-from topoloc.map.mapping_frames import MappingFrame, MappingImage, PointLocator, mapping_image, posed_frames, small_jpeg
+from topoloc.map.drafts import NodeDraft, draft_node, finish_node, observe
+from topoloc.map.entries import Edge, PlaceImage
+from topoloc.map.mapping_frames import MappingFrame, MappingImage, PointLocator, mapping_image, posed_frames
 from topoloc.map.nodes import NodeConfig, NodePoses, node_distances, place_nodes
 from topoloc.map.schema import SCHEMA_VERSION
 from topoloc.map.sessions import Edit, Light, Session, mean_light, path_of, poses_source_of, today
-from topoloc.map.side_nodes import describe_sides, gather_sides, nodes_with_sides
+from topoloc.map.side_nodes import gather_sides, nodes_with_sides
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.coarse import CoarseModel
 from topoloc.places.vlad import SurfVlad, VladConfig, learn_words, placed, vlad
 from topoloc.sequences.frame import StereoSequence
-from topoloc.slam.metric_points import keypoint_sigmas
 
 BuildConfig = MapConfig
 Progress = Callable[[str, int, int], None]
 """Called with a stage's name, steps done and steps in all."""
-
-
-@dataclass(frozen=True, eq=False)
-class _DraftPoints:
-    """Points of a node in the making as first measured, and what other images saw of them so far."""
-
-    features: Features
-    points_cam: Float[np.ndarray, "n 3"]
-    covariances: Float[np.ndarray, "n 3 3"]
-    observations: list[Observations]
-
-
-@dataclass(frozen=True, eq=False)
-class _NodeDraft:
-    """A node in the making, its points by their kinds of features; `sources` are the frames that these were first measured in."""
-
-    frame: MappingFrame
-    image: MappingImage
-    template_jpeg: bytes
-    points: dict[str, _DraftPoints]
-    sides: list[TopoNode]
-    sources: list[MappingFrame]
 
 
 def build_map(
@@ -86,7 +63,7 @@ def build_map(
     node_config = _resolve_node_config(frames, locator, config)
     drafts = _draft_nodes(frames, locator, node_config, config, progress)
     place_images, lights, coarse = _visit_all_images(frames, drafts, node_config, config, progress)
-    of_kind = {kind: [_finish_node(node_id, draft, kind, config) for node_id, draft in enumerate(drafts)] for kind in config.kinds}
+    of_kind = {kind: [finish_node(node_id, draft, kind, config) for node_id, draft in enumerate(drafts)] for kind in config.kinds}
     nodes = of_kind.pop(config.features.kind)
     sides = [replace(side, summary=replace(side.summary, of_node=node_id)) for node_id, draft in enumerate(drafts) for side in draft.sides]
     poses_from = poses_from or [poses_source_of(sequence) for sequence in sequences]
@@ -98,7 +75,7 @@ def build_map(
         coarse_models={model.name: model for model in coarse},
         config=replace(config, nodes=node_config),
         length_m=_trajectory_length(frames),
-        sides=gather_sides(sides, config.sides),
+        sides=gather_sides(sides, config.kind_of_sides, config.sides),
         sessions=[_session(k, sequence, frames, lights, poses_from[k], drafts) for k, sequence in enumerate(sequences)],
         edits=[Edit(1, "build", today(), SCHEMA_VERSION)],
         other_kinds=of_kind,
@@ -111,7 +88,7 @@ def _session(
     frames: list[MappingFrame],
     lights: list[Light],
     poses_from: str,
-    drafts: list[_NodeDraft],
+    drafts: list[NodeDraft],
 ) -> Session:
     """What the map remembers of a recording; `lights` are those of the frames."""
     of_session = [k for k, frame in enumerate(frames) if frame.session_id == session_id]
@@ -139,15 +116,14 @@ def _resolve_node_config(frames: list[MappingFrame], locator: PointLocator, conf
 
 def _draft_nodes(
     frames: list[MappingFrame], locator: PointLocator, node_config: NodeConfig, config: BuildConfig, progress: Progress
-) -> list[_NodeDraft]:
+) -> list[NodeDraft]:
     """The trajectory discretised by Eq. 1; a picture with too few points (dark, blurred, blank) becomes no node."""
     frame_idx = place_nodes([frame.world_from_cam for frame in frames], node_config)
     kind = find_kind(config.features.kind)
-    has_sides = kind.has_scale and kind.has_angle  # without them nobody asks for the walls
-    with_sides = nodes_with_sides([frames[i].world_from_cam for i in frame_idx], node_config, config.sides) if has_sides else set()
-    drafts: list[_NodeDraft] = []
+    with_sides = nodes_with_sides([frames[i].world_from_cam for i in frame_idx], node_config, config.sides)
+    drafts: list[NodeDraft] = []
     for done, i in enumerate(frame_idx):
-        draft = _draft_node(frames[i], locator, done in with_sides, config)
+        draft = draft_node(frames[i], locator, done in with_sides, config)
         if len(draft.points[kind.name].features) >= config.min_node_points:
             drafts.append(draft)
         progress("nodes", done + 1, len(frame_idx))
@@ -156,22 +132,8 @@ def _draft_nodes(
     return drafts
 
 
-def _draft_node(frame: MappingFrame, locator: PointLocator, with_sides: bool, config: BuildConfig) -> _NodeDraft:
-    view = frame.view()
-    image = locator.image(frame, view)
-    located, sources = locator.locate(frame, view, image)
-    points = {}
-    for kind, features in image.features.items():
-        rows = np.flatnonzero(located[kind].valid)
-        points[kind] = _DraftPoints(features.select(rows), located[kind].points_cam[rows], located[kind].covariances[rows], [])
-    template_jpeg = small_jpeg(view.picture, config.template_side_px, quality=75)
-    summary = NodeSummary(-1, frame.sequence.name, frame.name, frame.t_ns, image.world_from_cam, 0, frame.session_id)
-    sides = describe_sides(summary, view, config.features, config.points, config.sides) if with_sides and not sources else []
-    return _NodeDraft(frame, image, template_jpeg, points, sides, [frame, *sources])
-
-
 def _visit_all_images(
-    frames: list[MappingFrame], drafts: list[_NodeDraft], node_config: NodeConfig, config: BuildConfig, progress: Progress
+    frames: list[MappingFrame], drafts: list[NodeDraft], node_config: NodeConfig, config: BuildConfig, progress: Progress
 ) -> tuple[list[PlaceImage], list[Light], list[CoarseModel]]:
     """Label every mapping image with its nearest node, let it observe the points of the nodes around, and teach the
     coarse localizer of each kind of features with it; its light is measured on the way."""
@@ -186,7 +148,7 @@ def _visit_all_images(
         nearest = np.argsort(node_distances(image.world_from_cam, node_poses, node_config.lambda_rot), kind="stable")
         for node_id in nearest[: config.landmarks.nodes_per_image]:
             if frame not in drafts[node_id].sources:
-                _observe(drafts[node_id], image, frame.session_id, config)
+                observe(drafts[node_id], image, frame.session_id, config)
         for kind, features in image.features.items():
             vlads[kind].append(vlad(_placed(features, image, config.vlad_of(kind)), words[kind]))
             cells[kind].append(features.cells)
@@ -200,40 +162,13 @@ def _visit_all_images(
     return images, lights, [model if kind == first else replace(model, name=f"{model.name}@{kind}") for kind, model in models.items()]
 
 
-def _words(drafts: list[_NodeDraft], kind: str, config: BuildConfig) -> Float32[np.ndarray, "k d"]:
+def _words(drafts: list[NodeDraft], kind: str, config: BuildConfig) -> Float32[np.ndarray, "k d"]:
     placed_features = [_placed(draft.points[kind].features, draft.image, config.vlad_of(kind)) for draft in drafts]
     return learn_words(np.concatenate(placed_features), config.vlad)
 
 
 def _placed(features: Features, image: MappingImage, config: VladConfig) -> np.ndarray:
     return placed(features, image.camera.width, image.camera.height, config)
-
-
-def _observe(draft: _NodeDraft, image: MappingImage, session_id: int, config: BuildConfig) -> None:
-    cam_from_node = image.world_from_cam.inverse() @ draft.image.world_from_cam
-    for kind, features in image.features.items():
-        points, sigmas_px = draft.points[kind], keypoint_sigmas(features, config.points)
-        known, seen_by = (points.features, points.points_cam, points.covariances), (features, sigmas_px, image.camera, cam_from_node)
-        points.observations.append(observe_points(*known, *seen_by, config.landmarks, session_id))
-
-
-def _finish_node(node_id: int, draft: _NodeDraft, kind: str, config: BuildConfig) -> TopoNode:
-    """Refine the points of a kind by what was observed; keep those seen again first, the strongest among them."""
-    points, frame, image = draft.points[kind], draft.frame, draft.image
-    refined = refine_points(points.points_cam, points.covariances, points.observations, config.landmarks)
-    rows = np.flatnonzero(refined.agrees)
-    rows = np.sort(rows[np.argsort(-np.minimum(refined.num_observations[rows], 2), kind="stable")][: config.max_node_points])
-    sqrt_covs = np.linalg.cholesky(refined.covariances[rows])[:, *np.tril_indices(3)]
-    sums = session_sums(refined.points_cam, points.points_cam, points.covariances, points.observations, rows, frame.session_id)
-    return TopoNode(
-        NodeSummary(node_id, frame.sequence.name, frame.name, frame.t_ns, image.world_from_cam, len(rows), frame.session_id),
-        image.camera,
-        points.features.select(rows),
-        refined.points_cam[rows].astype(np.float32),
-        sqrt_covs.astype(np.float32),
-        draft.template_jpeg,
-        sums,
-    )
 
 
 def _edges_along(frames: list[MappingFrame], node_ids: list[int]) -> list[Edge]:

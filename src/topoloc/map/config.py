@@ -54,6 +54,11 @@ class MapConfig:
         except (MissingExtraError, WeightsError):
             return [self.features.kind]
 
+    @property
+    def kind_of_sides(self) -> str:
+        """The kind of features that side nodes are described with: one that a network gives, where the map has one."""
+        return next((kind for kind in self.kinds if find_kind(kind).network is not None), self.features.kind)
+
     def features_of(self, kind: str) -> FeatureConfig:
         """The settings of the features of this kind: those of `features`, but for the picture's normalization, which suits the kind."""
         return self.features if kind == self.features.kind else replace(self.features, kind=kind, normalization=None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import no_type_check
 
 from topoloc.geometry.geodesy import Georeference
@@ -69,6 +69,20 @@ class MapContents:
     def version(self) -> int:
         """The number of its last edit: 1 as it was built, 0 where it has no history."""
         return max((edit.edit_id for edit in self.edits), default=0)
+
+    @property
+    def free_ids(self) -> NextIds:
+        """Ids that nothing in the map has or had; place images get theirs when they are written."""
+        return replace(
+            self.next_ids,
+            session=max([self.next_ids.session, *(session.session_id + 1 for session in self.sessions)]),
+            node=max([self.next_ids.node, *(summary.node_id + 1 for summary in self.summaries)]),
+            edit=max([self.next_ids.edit, *(edit.edit_id + 1 for edit in self.edits)]),
+        )
+
+    def nodes_of(self, kind: str):  # no return type: at run time an entry would be read to look at it
+        """The nodes with their points of one of the map's kinds of features. Raises KeyError where it holds no such features."""
+        return self.nodes if kind == self.kind else self.other_kinds[kind]
 
     @property
     def kinds(self) -> list[str]:

@@ -77,14 +77,16 @@ class PlaceImage:
 class SideNodes:
     """Nodes seen once more by cameras turned to the left and to the right (`side_nodes.py`).
 
-    `summaries[i]` and `nodes[i]` describe side node i: session, name and time are those of the node `of_node` whose picture it comes
-    from, the pose is that of the side camera, and there is no template. The one model of `coarse_models` ranks side nodes by
-    looks; its array `centres` (n, 3) holds the world points (metres) in the middle of what each of them shows.
+    They are described by features of one `kind`. `summaries[i]` and `nodes[i]` describe side node i: session, name and time are those of
+    the node `of_node` whose picture it comes from, the pose is that of the side camera, and there is no template. The one model of
+    `coarse_models` ranks side nodes by looks; its array `centres` (n, 3) holds the world points (metres) in the middle of what each of
+    them shows.
     """
 
     summaries: Sequence[NodeSummary]
     nodes: Sequence[TopoNode]
     coarse_models: Mapping[str, CoarseModel]
+    kind: str
 
 
 @dataclass(frozen=True)

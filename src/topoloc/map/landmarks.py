@@ -142,6 +142,22 @@ def session_sums(
     return sums
 
 
+def counted_again(num_points: int, observations: list[Observations], session_id: int) -> LandmarkSums | None:
+    """How often a later session's pictures should have shown a node's points, and did; None where they should have shown none.
+
+    The points stay where they are, so of information next to nothing is kept, and the counts alone take room in the file.
+    """
+    expected, num_seen = np.zeros(num_points, np.int64), np.zeros(num_points, np.int64)
+    for seen in observations:
+        expected[np.union1d(seen.in_view, seen.rows)] += 1
+        num_seen[seen.rows] += 1
+    rows = np.flatnonzero(expected > 0)
+    if len(rows) == 0:
+        return None
+    nothing = np.zeros((len(rows), 3, 3)), np.zeros((len(rows), 3))
+    return LandmarkSums.of(session_id, rows, *nothing, expected[rows], num_seen[rows])
+
+
 def _in_view(points_node: Float[np.ndarray, "n 3"], camera: Camera, cam_from_node: Rigid3) -> Int[np.ndarray, " v"]:
     """The points that lie in the camera's picture, whatever may stand before them."""
     with np.errstate(invalid="ignore"):

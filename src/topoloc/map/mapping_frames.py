@@ -26,6 +26,7 @@ from topoloc.sequences.recording import has_scale
 from topoloc.slam.metric_points import MetricPoints, keypoint_sigmas, locate_points
 from topoloc.slam.motion_points import OtherPicture, choose_pictures, locate_by_motion, usual_step
 
+PLACE_QUALITY = 60  # of the place images' JPEG
 _KEPT_IMAGES = 48  # single pictures locate the points of several nodes; their features are found once
 
 
@@ -78,7 +79,7 @@ def posed_frames(sequence: StereoSequence, session_id: int) -> list[MappingFrame
 
 def mapping_image(frame: MappingFrame, view: FrameView, config: MapConfig) -> MappingImage:
     """A frame that has been read, described by all kinds of features."""
-    jpeg = small_jpeg(view.picture, config.place_side_px, quality=60)
+    jpeg = small_jpeg(view.picture, config.place_side_px, PLACE_QUALITY)
     world_from_view = frame.world_from_cam @ view.view_from_cam.inverse()
     features = {kind: extract_features(view.grey, config.features_of(kind)) for kind in config.kinds}
     return MappingImage(view.camera, world_from_view, features, jpeg, light_of(view.picture))

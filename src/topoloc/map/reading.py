@@ -65,9 +65,11 @@ def _contents_of(file: MapFile) -> MapContents:
     kinds = _kinds_of(facts, config)
     sides = None
     if file.count(f"{SIDE}nodes") > 0:
-        sides = SideNodes(
-            _stored_summaries(file, SIDE), _stored_nodes(file, config.features.kind, SIDE), _Keyed(file, f"{SIDE}coarse_models", _model_of)
-        )
+        kind = value_from(str, json_of(facts["kind_of_sides"]), "kind_of_sides") if "kind_of_sides" in facts else config.features.kind
+        if kind not in kinds:
+            raise Damage(f"kind_of_sides: the map has no features {kind!r}")
+        models = _Keyed(file, f"{SIDE}coarse_models", _model_of)
+        sides = SideNodes(_stored_summaries(file, SIDE), _stored_nodes(file, kind, SIDE), models, kind)
     return MapContents(
         summaries=_stored_summaries(file),
         nodes=_stored_nodes(file, config.features.kind),
@@ -82,7 +84,7 @@ def _contents_of(file: MapFile) -> MapContents:
         repetitions=Repetitions(facts["repetitions"], _Keyed(file, "repetitions", _moves_of)) if "repetitions" in facts else None,
         sides=sides,
         sessions=list(_sessions_of(file).values()),
-        edits=[Edit(*row.values()) for row in file.rows("edits")],
+        edits=_edits_of(file),
         next_ids=settings_from(NextIds, json_of(facts.get("next_ids", "{}")), "next_ids"),
         map_id=_map_id_of(facts),
         georeference=Georeference.from_json(json_of(facts["georeference"])) if "georeference" in facts else None,
@@ -116,6 +118,13 @@ def _shared_errors_of(facts: Mapping[str, str], key: str) -> SharedErrors | None
     if not 0.0 <= found.rho < math.inf:
         raise Damage("shared errors that are no share")
     return found
+
+
+def _edits_of(file: MapFile) -> list[Edit]:
+    changes = json_of(file.facts.get("changes", "{}"))
+    if not isinstance(changes, dict) or not all(isinstance(of_edit, dict) for of_edit in changes.values()):
+        raise Damage("changes: what each edit changed is expected")
+    return [Edit(**row, changes=changes.get(str(row["edit_id"]))) for row in file.rows("edits")]
 
 
 def _sessions_of(file: MapFile) -> dict[int, Session]:

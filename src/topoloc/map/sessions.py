@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import Any
 
 import numpy as np
 
@@ -64,12 +65,14 @@ class Session:
 
 @dataclass(frozen=True)
 class Edit:
-    """One change of the map: its name, the day (ISO, UTC), and the schema of the file that it was written in."""
+    """One change of the map: its name, the day (ISO, UTC), the schema of the file that it was written in, and what it changed: numbers
+    and texts by their names."""
 
     edit_id: int
     name: str
     date: str
     schema: int
+    changes: Mapping[str, Any] | None = None
 
 
 def today() -> str:

@@ -68,14 +68,15 @@ def describe_sides(
     return [node for node in sides if node is not None]
 
 
-def gather_sides(described: list[TopoNode], config: SideNodesConfig) -> SideNodes | None:
-    """All side nodes of a map, numbered, with what ranks them by looks; None without any. Each knows the node that it is of."""
+def gather_sides(described: list[TopoNode], kind: str, config: SideNodesConfig) -> SideNodes | None:
+    """All side nodes of a map, by features of one kind, numbered, with what ranks them by looks; None without any. Each knows the node that
+    it is of."""
     if not described:
         return None
     nodes = [replace(node, summary=replace(node.summary, node_id=k)) for k, node in enumerate(described)]
     model = _coarse(nodes, config.vlad).to_model()
     model = replace(model, arrays={**model.arrays, "centres": np.array([_centre(node) for node in nodes])})
-    return SideNodes([node.summary for node in nodes], nodes, {model.name: model})
+    return SideNodes([node.summary for node in nodes], nodes, {model.name: model}, kind)
 
 
 def _side_node(

@@ -60,7 +60,7 @@ class TopoMetricMap(MapContents):
         return {summary.node_id: row for row, summary in enumerate(self.summaries)}
 
     def by_kind(self, kind: str) -> TopoMetricMap:
-        """The map as if it were made of this one of its kinds of features alone, the walls left out; itself by its first kind.
+        """The map as if it were made of this one of its kinds of features alone, its walls too; itself by its first kind.
 
         Raises:
             FeatureKindError: it holds no such features.
@@ -74,7 +74,7 @@ class TopoMetricMap(MapContents):
             nodes=self.other_kinds[kind],
             config=replace(self.config, features=self.config.features_of(kind), other_kinds=()),
             shared_errors=self.other_shared_errors.get(kind),
-            sides=None,
+            sides=self.sides if self.sides is not None and self.sides.kind == kind else None,
             other_kinds={},
             other_shared_errors={},
         )

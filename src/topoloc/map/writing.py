@@ -43,11 +43,22 @@ def save_map(topomap: MapContents, path: Path) -> None:
     if os.path.isdir(path):  # Path.is_dir raises for names that are too long
         raise MapError(f"cannot write map {path}: it is a folder")
     try:
-        with replaced_file(path) as temporary, closing(sqlite3.connect(temporary, isolation_level=None)) as database:
-            _Writer(database).write(topomap)
-    except (sqlite3.OperationalError, OSError, ValueError) as error:
+        with replaced_file(path) as temporary:
+            write_map(topomap, temporary)
+    except (OSError, ValueError) as error:
         if isinstance(error, ValueError) and "null" not in str(error):  # of a file's name; any other is a bug
             raise
+        raise MapError(f"cannot write map {path}: {error}") from error
+
+
+def write_map(topomap: MapContents, path: Path) -> None:
+    """Write the map to the empty file `path`. Raises MapError where the disk is full."""
+    try:
+        # an empty name is a database of nobody else's, gone when it is closed
+        with closing(sqlite3.connect("", isolation_level=None)) as database:
+            _Writer(database).write(topomap)
+            copy_in_order(database, path)
+    except sqlite3.OperationalError as error:
         raise MapError(f"cannot write map {path}: {error}") from error
 
 
@@ -60,10 +71,7 @@ class _Writer:
         self._camera_ids: dict[str, int] = {}
 
     def write(self, topomap: MapContents) -> None:
-        # the file is nobody's until it is renamed: no journal is needed to undo what is half done
-        for pragma in (f"page_size = {_PAGE_BYTES}", "journal_mode = OFF", "synchronous = OFF", f"application_id = {APPLICATION_ID}"):
-            self._database.execute(f"PRAGMA {pragma}")
-        self._database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+        self._database.execute("PRAGMA journal_mode = OFF")
         self._database.execute("BEGIN")
         for table in TABLES:
             self._database.execute(creation_of(table))
@@ -81,7 +89,7 @@ class _Writer:
             self._insert_model(model)
         if topomap.sides is not None:
             for node in topomap.sides.nodes:
-                self._insert_node(node, topomap.kind, {}, SIDE)
+                self._insert_node(node, topomap.sides.kind, {}, SIDE)
             for model in topomap.sides.coarse_models.values():
                 self._insert_model(model, SIDE)
         if topomap.repetitions is not None:
@@ -124,6 +132,10 @@ class _Writer:
             "counts": json.dumps({table: len(rows) for table, rows in self._checksums.items() if table != "map"}),
         }
         facts["map_id"] = map_id_of(topomap)
+        if changes := {str(edit.edit_id): dict(edit.changes) for edit in topomap.edits if edit.changes}:
+            facts["changes"] = json.dumps(changes)
+        if topomap.sides is not None:
+            facts["kind_of_sides"] = json.dumps(topomap.sides.kind)
         if topomap.georeference is not None:
             facts["georeference"] = json.dumps(topomap.georeference.to_json())
         if topomap.shared_errors is not None:
@@ -163,6 +175,24 @@ class _Writer:
         self._database.execute(f"INSERT INTO {table} VALUES ({', '.join('?' * (len(row) + 1))})", (*row, checksum))
         names = list(TABLES[table])
         self._checksums[table].append((tuple(row[names.index(name)] for name in ORDER[table].split(", ")), checksum))
+
+
+def copy_in_order(database: sqlite3.Connection, path: Path) -> None:
+    """Write the tables of a map, table by table, each in its order, to the empty file `path`.
+
+    The same rows make the same bytes then, in whatever order they came together: an edit can be undone to the byte.
+    """
+    database.execute("ATTACH ? AS file", (str(path),))
+    # the file is nobody's until it is renamed: no journal is needed to undo what is half done
+    for pragma in (f"page_size = {_PAGE_BYTES}", "journal_mode = OFF", "synchronous = OFF", f"application_id = {APPLICATION_ID}"):
+        database.execute(f"PRAGMA file.{pragma}")
+    database.execute(f"PRAGMA file.user_version = {SCHEMA_VERSION}")
+    database.execute("BEGIN")
+    for table in TABLES:
+        database.execute(creation_of(table).replace("CREATE TABLE ", "CREATE TABLE file.", 1))
+        database.execute(f"INSERT INTO file.{table} SELECT * FROM main.{table} ORDER BY {ORDER[table]}")
+    database.execute("COMMIT")
+    database.execute("DETACH file")
 
 
 def digest_of(checksums: Mapping[str, Sequence[bytes]]) -> str:

@@ -39,9 +39,9 @@ class GlobalMapConfig:
     """Standard deviation of a feature's place in the picture, in the adjustment of all."""
 
 
-def join_submaps(keyframes: Sequence[KeyFrame], links: Sequence[Link], landmarks: Landmarks) -> list[int]:
-    """Bring every sub-map that a link reaches into the world of the first; the sub-maps that are joined, the first among them."""
-    joined = [keyframes[0].submap]
+def join_submaps(keyframes: Sequence[KeyFrame], links: Sequence[Link], landmarks: Landmarks, first: int) -> list[int]:
+    """Bring every sub-map that a link reaches into the world of sub-map `first`; the sub-maps that are joined, `first` among them."""
+    joined = [first]
     remaining = list(links)
     while True:
         crossing = next((k for k in remaining if (keyframes[k.source].submap in joined) != (keyframes[k.target].submap in joined)), None)

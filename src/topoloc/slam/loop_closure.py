@@ -81,20 +81,24 @@ def find_links(
 
 def _propose(keyframes: Sequence[KeyFrame], places: list[int], config: LoopConfig) -> list[tuple[int, int]]:
     """(target, source) of pairs that look alike, source the earlier one."""
-    features = [place.features for i in places if (place := keyframes[i].place) is not None]
-    descriptors = np.concatenate([f.descriptors for f in features])
-    if len(descriptors) == 0:
-        return []
-    words = learn_words(descriptors, config.vlad)
-    localizer = SurfVlad.fit(words, np.stack([vlad(f.descriptors, words) for f in features]), np.arange(len(places)), config.vlad)
-    blank = np.zeros((1, 1), np.uint8)
     pairs = set()
-    for number, own in enumerate(features):
-        ranked = localizer.rank(blank, own, len(places))
-        others = (score.node_id for score in ranked if _may_be_loop(keyframes, places, score.node_id, number, config))
+    for number, ranked in enumerate(rank_places([keyframes[i] for i in places], config.vlad)):
+        others = (other for other in ranked if _may_be_loop(keyframes, places, other, number, config))
         for _, other in zip(range(config.num_candidates), others, strict=False):
             pairs.add((places[max(number, other)], places[min(number, other)]))
     return sorted(pairs)
+
+
+def rank_places(keyframes: Sequence[KeyFrame], config: VladConfig) -> list[list[int]]:
+    """For each key frame, which must have places, all of them (rows) by how much they look like it; nothing where there are no features."""
+    features = [keyframe.place.features for keyframe in keyframes if keyframe.place is not None]
+    descriptors = np.concatenate([f.descriptors for f in features])
+    if len(descriptors) == 0:
+        return []
+    words = learn_words(descriptors, config)
+    localizer = SurfVlad.fit(words, np.stack([vlad(f.descriptors, words) for f in features]), np.arange(len(features)), config)
+    blank = np.zeros((1, 1), np.uint8)
+    return [[score.node_id for score in localizer.rank(blank, own, len(features))] for own in features]
 
 
 def _may_be_loop(keyframes: Sequence[KeyFrame], places: list[int], a: int, b: int, config: LoopConfig) -> bool:
@@ -105,19 +109,21 @@ def _may_be_loop(keyframes: Sequence[KeyFrame], places: list[int], a: int, b: in
 def _within_drift(link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig) -> bool:
     source, target = keyframes[link.source], keyframes[link.target]
     if source.submap != target.submap:
-        return source.recording != target.recording or _within_reach(link, keyframes, config)
+        return source.recording != target.recording or is_within_reach(link, keyframes, config)
     way = _way(keyframes, link.source, link.target)
     drift = _difference(link.match.target_from_source, target.cam_from_world @ source.cam_from_world.inverse())
     return bool(drift[0] < 0.5 + config.max_drift * way and drift[1] < np.deg2rad(config.max_drift_deg))
 
 
-def _within_reach(link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig) -> bool:
+def is_within_reach(link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig) -> bool:
     """Whether the camera can have come from the end of the earlier sub-map to the beginning of the later one, as the link has it."""
-    source, target = keyframes[link.source], keyframes[link.target]
+    source, target, target_from_source = keyframes[link.source], keyframes[link.target], link.match.target_from_source
+    if source.submap > target.submap:
+        source, target, target_from_source = target, source, target_from_source.inverse()
     before, after = ([k for k in keyframes if k.submap == end.submap] for end in (source, target))
     end_in_source = source.cam_from_world @ before[-1].cam_from_world.inverse()
     start_in_target = target.cam_from_world @ after[0].cam_from_world.inverse()
-    start_in_source = link.match.target_from_source.inverse() @ start_in_target
+    start_in_source = target_from_source.inverse() @ start_in_target
     seconds = 1e-9 * (after[0].t_ns - before[-1].t_ns)
     reach = 0.5 + config.max_speedup * max(_fastest(before), _fastest(after)) * seconds
     return bool(np.linalg.norm(end_in_source.translation - start_in_source.translation) < reach)

@@ -13,6 +13,7 @@ from topoloc.features.features import Features
 from topoloc.features.kinds import FeatureConfig
 from topoloc.features.matching import MatchingConfig, match_features
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
+from topoloc.geometry.relative_pose import estimate_relative_pose
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.frame_view import FrameView, frame_view
@@ -36,16 +37,19 @@ class MeasuredStepsConfig:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredStep:
-    """`first_from_last` is the motion between the cameras of two frames; `median_depth` (metres) that of the points it stands on."""
+    """`first_from_last` is the motion between the cameras of two frames; `median_depth` (metres) that of the points it stands on. Of a
+    single camera (`has_scale` is False) the way has the length 1, and the depth is unknown (0)."""
 
     first: int
     last: int
     first_from_last: Rigid3
     median_depth: float
+    has_scale: bool = True
 
 
 def measure_steps(sequence: StereoSequence, usable: list[int], config: MeasuredStepsConfig) -> list[MeasuredStep]:
-    """Steps spread over the frames `usable` (their rows, increasing), by the left pictures and the depth of each step's first frame.
+    """Steps spread over the frames `usable` (their rows, increasing), by the left pictures and the depth of each step's first frame; of
+    a single camera by its pictures alone.
 
     A step that cannot be measured, as too little is recognised, is left out.
 
@@ -76,14 +80,16 @@ def _measure_from(sequence: StereoSequence, usable: list[int], start: int, confi
         if step is not None:
             motion, depth = step
             first_from_last = first.view.view_from_cam.inverse() @ motion.inverse() @ last.view.view_from_cam
-            return MeasuredStep(usable[start], usable[other], first_from_last, depth)
+            return MeasuredStep(usable[start], usable[other], first_from_last, depth, has_scale=first.points is not None)
     return None
 
 
 def _seen(sequence: StereoSequence, index: int, config: MeasuredStepsConfig, is_first: bool) -> _Seen:
-    view = frame_view(sequence[index], with_depth=is_first)
+    frame = sequence[index]
+    has_depth = is_first and (frame.right is not None or frame.depth is not None)
+    view = frame_view(frame, with_depth=has_depth)
     features = extract_features(view.grey, config.features)
-    if not is_first:
+    if not has_depth:
         return _Seen(view, features, None)
     located = locate_points(features, view, config.points)
     rows = np.flatnonzero(located.valid)
@@ -92,12 +98,16 @@ def _seen(sequence: StereoSequence, index: int, config: MeasuredStepsConfig, is_
 
 
 def _motion(first: _Seen, last: _Seen, config: MeasuredStepsConfig) -> tuple[Rigid3, float] | None:
-    """last_from_first of the views, and the median depth of what it stands on."""
-    assert first.points is not None
+    """last_from_first of the views, and the median depth of what it stands on; of a single camera 0, and the way has the length 1."""
     matches = match_features(last.features.descriptors, first.features.descriptors, MatchingConfig())
     if len(matches) < config.min_inliers:
         return None
     points_img = last.features.points_img[matches.query_idx].astype(np.float64)
+    if first.points is None:
+        first_img = first.features.points_img[matches.train_idx].astype(np.float64)
+        moved = estimate_relative_pose(first_img, first.view.camera, points_img, last.view.camera)
+        is_seen = moved is not None and np.count_nonzero(moved.inliers) >= config.min_inliers
+        return (moved.second_from_first, 0.0) if is_seen and moved is not None else None
     points, covariances = first.points.points_cam[matches.train_idx], first.points.covariances[matches.train_idx]
     pose = estimate_absolute_pose(points_img, points, last.view.camera, config.pose, point_covariances=covariances)
     if pose is None or np.count_nonzero(pose.inliers) < config.min_inliers:

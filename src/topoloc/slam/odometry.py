@@ -3,7 +3,8 @@
 Read from `Odometry.process`. A frame's points are followed from the frame before, their landmarks give its pose (robust PnP), and where
 too few of them are left, or the view has changed, it becomes a key frame: disparities are measured, new corners become
 landmarks, and the last key frames are adjusted together. A camera that is lost is sought in the last places; after a while
-it starts a sub-map of its own. So it does at once where a repeating wall admits several steps and the motion does not tell which.
+it starts a sub-map of its own, with the frames that were sought in vain. So it does at once where a repeating wall admits several
+steps and the motion does not tell which.
 """
 
 from __future__ import annotations
@@ -34,19 +35,33 @@ class Odometry:
         self._tracks = Tracks(np.zeros(0, np.int64), np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32))
         self._chain: list[KeyFrame] = []  # the key frames since tracking began or began again
         self._num_lost = 0
+        self._missed: list[tuple[int, StereoFrame]] = []  # the frames since the camera was lost that may begin a sub-map
         self._history = MotionHistory(config.prediction)
         self._repeats: list[Rigid3] = []  # of the last frame before the camera was lost
         self._bias = DisparityBias()
 
-    def process(self, frame_idx: int, frame: StereoFrame) -> FramePose | None:
-        """Where this frame is, or None where that is not known."""
+    def process(self, frame_idx: int, frame: StereoFrame) -> list[FramePose]:
+        """Where this frame is, and those before it whose place is known only now; nothing where that is not known."""
+        measured = self._measured(frame)
+        pose = self._follow(frame_idx, frame, measured)
+        return [pose] if pose is not None else self._lost(frame_idx, frame, measured)
+
+    def finish(self) -> list[FramePose]:
+        """The recording is at its end: the frames that were sought in vain until then."""
+        return self._begin_again() if len(self._missed) > 1 else []
+
+    def _measured(self, frame: StereoFrame) -> MeasuredView:
         measured = measured_view(frame)
         if measured.right is not None:
             self._bias.information = 1.0 / self._config.sigma_bias_px**2
+        return measured
+
+    def _follow(self, frame_idx: int, frame: StereoFrame, measured: MeasuredView) -> FramePose | None:
+        """Where the frame is, by its step from the last one."""
         step = self._track(frame, measured)
         if step is None:
-            return self._lost(frame_idx, frame, measured)
-        self._num_lost = 0
+            return None
+        self._num_lost, self._missed = 0, []
         self._tracks = step.tracks
         self._remember(frame, measured, step.cam_from_world)
         assert self._reference is not None
@@ -175,27 +190,50 @@ class Odometry:
         candidates = (k for k in reversed(self._keyframes) if k.recording == self._recording and k.submap == self._reference.submap)
         return [keyframe for keyframe in candidates if keyframe.place is not None][:num]
 
-    def _lost(self, frame_idx: int, frame: StereoFrame, measured: MeasuredView) -> FramePose | None:
+    def _lost(self, frame_idx: int, frame: StereoFrame, measured: MeasuredView) -> list[FramePose]:
         """Seek the camera in the last places; after a while begin again."""
         self._num_lost += 1
+        self._missed.append((frame_idx, frame))
         if self._num_lost > self._config.max_lost_tracked:
             self._last = None
-        found = None
         if self._reference is not None and self._num_lost <= self._config.max_lost_frames:
             found = self._relocalize(frame, measured)
-            if found is None and self._reference is not None:
-                return None
-        if found is None:
-            corners = find_corners(measured.view.grey, np.zeros((0, 2)), self._config.tracking)
-            if not self._checks.can_start(frame, measured, corners, self._config.disparity):
-                return None
-        cam_from_world, motion = found or (Rigid3.identity(), None)
+            if found is not None:
+                return [self._start(frame_idx, frame, measured, *found)]
+            if self._reference is not None:
+                return []
+        return self._begin_again()
+
+    def _begin_again(self) -> list[FramePose]:
+        """A sub-map of the frames that were sought in vain, from the first on which all others follow."""
+        missed, self._missed, self._reference = self._missed, [], None
+        num_keyframes, num_landmarks, num_lost = len(self._keyframes), self._landmarks.num, self._num_lost
+        poses: list[FramePose] = []
+        for frame_idx, frame in missed:
+            measured = self._measured(frame)
+            pose = self._follow(frame_idx, frame, measured) if poses else None
+            if pose is None:  # what came before it leads nowhere
+                poses, self._reference = [], None
+                del self._keyframes[num_keyframes:]
+                self._landmarks.num = num_landmarks
+                corners = find_corners(measured.view.grey, np.zeros((0, 2)), self._config.tracking)
+                if self._checks.can_start(frame, measured, corners, self._config.disparity):
+                    pose = self._start(frame_idx, frame, measured, Rigid3.identity(), None)
+            if pose is not None:
+                poses.append(pose)
+        self._num_lost = 0 if poses else num_lost
+        return poses
+
+    def _start(
+        self, frame_idx: int, frame: StereoFrame, measured: MeasuredView, cam_from_world: Rigid3, motion: Motion | None
+    ) -> FramePose:
+        """Tracking begins with this frame, as a key frame."""
         self._last, self._chain = None, []
         self._history.stop()
         self._tracks = self._tracks.select(np.zeros(0, np.int64))
         self._add_keyframe(frame, frame_idx, cam_from_world, measured, motion)
         self._remember(frame, measured, cam_from_world)
-        self._num_lost = 0
+        self._num_lost, self._missed = 0, []
         assert self._reference is not None
         return FramePose(frame_idx, self._reference, Rigid3.identity(), measured.view.view_from_cam)
 

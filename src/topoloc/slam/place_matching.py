@@ -18,6 +18,8 @@ from topoloc.sequences.frame_view import FrameView
 from topoloc.slam.keyframes import PlaceView, StereoCamera
 from topoloc.slam.metric_points import MetricPointsConfig, locate_points
 
+_ELSEWHERE = 0.05  # of the picture's width, so that a feature is not itself at another scale
+
 
 @dataclass(frozen=True)
 class PlaceMatchingConfig:
@@ -76,3 +78,29 @@ def match_places(source: PlaceView, target: PlaceView, stereo: StereoCamera, con
     if np.sqrt(np.trace(pose.covariance[:3, :3])) > config.max_sigma:
         return None
     return PlaceMatch(pose.cam_from_world, pose.covariance, source_rows[pose.inliers], target_rows[pose.inliers])
+
+
+def num_repeated(view: PlaceView, stereo: StereoCamera, config: PlaceMatchingConfig) -> int:
+    """How many of a view's features look like others of the same picture, all as from one other place: a wall of equal panels.
+
+    Each is matched with the one most like it elsewhere in the picture, and the other way round; so many agree on a pose.
+    """
+    points_img, descriptors = view.features.points_img.astype(np.float64), view.features.descriptors
+    apart = np.linalg.norm(points_img[:, None] - points_img, axis=2)
+    likeness = np.where(apart < _ELSEWHERE * stereo.camera.width, -np.inf, descriptors @ descriptors.T)
+    if len(descriptors) < config.min_inliers:
+        return 0
+    rows, nearest = np.arange(len(descriptors)), np.argmax(likeness, axis=1)
+    mutual = (np.argmax(likeness, axis=0)[nearest] == rows) & view.points.valid[nearest] & np.isfinite(likeness[rows, nearest])
+    if np.count_nonzero(mutual) < config.min_inliers:
+        return 0
+    sources = nearest[mutual]
+    pose = estimate_absolute_pose(
+        points_img[mutual],
+        view.points.points_cam[sources],
+        stereo.camera,
+        config.pose,
+        point_covariances=view.points.covariances[sources],
+        priorities=likeness[rows, nearest][mutual].astype(np.float64),
+    )
+    return 0 if pose is None else int(np.count_nonzero(pose.inliers))

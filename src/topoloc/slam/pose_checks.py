@@ -1,9 +1,9 @@
 """Do the poses of a trajectory fit the pictures? If not, which known convention makes them fit?
 
-Steps between pictures are measured from these alone (`measured_steps.py`); a trajectory of the right convention has nearly the same ones.
-Where it has not, the conventions of `geometry/pose_conventions.py` are tried, then a clock that is shifted, then a camera that is mounted
-on the body whose poses these are: hand-eye calibration, body_step @ body_from_cam = body_from_cam @ camera_step (Park and Martin, *Robot
-sensor calibration: solving AX = XB on the Euclidean group*, 1994).
+Steps between pictures are measured from these alone (`measured_steps.py`), of a single camera but for their length; a trajectory of the
+right convention has nearly the same ones. Where it has not, the conventions of `geometry/pose_conventions.py` are tried, then a clock that
+is shifted, then a camera that is mounted on the body whose poses these are: hand-eye calibration, body_step @ body_from_cam =
+body_from_cam @ camera_step (Park and Martin, *Robot sensor calibration: solving AX = XB on the Euclidean group*, 1994).
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ _MIN_TURN, _TURN, _WAY, _SHARE = math.radians(5.0), math.radians(1.5), 0.02, 0.1
 _DEPTH_SHARE = 0.01  # of the depth of what is seen, by which a measured way may be wrong
 _MIN_WAY = 3.0  # times the tolerance
 _UNIT_TOLERANCE = 0.15
+_DIRECTION = math.radians(12.0)  # of a way whose length is unknown
 _FARTHEST = 1e12  # no place in any unit; squares of much more are no numbers
 _MIN_SHIFT_S, _MAX_SHIFT_S, _NUM_SHIFTS, _MAX_GAP_S = 0.02, 3.0, 60, 1.0  # shifts tried to each side
 _NOTED_MISS, _FAR_BETTER = 0.3, 0.4
@@ -81,7 +82,7 @@ def check_gaps(sequence: StereoSequence) -> None:
 
 
 def check_poses(sequence: StereoSequence, config: MeasuredStepsConfig | None = None) -> None:
-    """Hold that the poses of a stereo or RGB-D recording fit its pictures; of single pictures nothing can be said.
+    """Hold that the poses of a recording fit its pictures; those of a single camera but for their unit.
 
     Raises:
         TrajectoryError: they do not; names the convention that makes them fit, as `--poses` takes it, where one does.
@@ -90,8 +91,7 @@ def check_poses(sequence: StereoSequence, config: MeasuredStepsConfig | None = N
     posed = [k for k, pose in enumerate(sequence.poses) if pose is not None]
     if len(posed) < _MIN_TELLING:
         return
-    start = sequence[posed[0]]
-    if start.camera is None or (start.right is None and start.depth is None):
+    if sequence[posed[0]].camera is None:
         return
     verdict = judge_poses(measure_steps(sequence, posed, config or MeasuredStepsConfig()), sequence.poses, sequence.t_ns)
     if verdict.is_believed:
@@ -127,7 +127,7 @@ def judge_poses(steps: Sequence[MeasuredStep], poses: _Poses, t_ns: Sequence[int
 
 def _is_telling(step: MeasuredStep) -> bool:
     way = float(np.linalg.norm(step.first_from_last.translation))
-    return way > _MIN_WAY * (_WAY + _DEPTH_SHARE * step.median_depth) or step.first_from_last.angle() > _MIN_TURN
+    return not step.has_scale or way > _MIN_WAY * (_WAY + _DEPTH_SHARE * step.median_depth) or step.first_from_last.angle() > _MIN_TURN
 
 
 def _steps_of(telling: Sequence[MeasuredStep], poses: _Poses) -> list[Rigid3]:
@@ -140,11 +140,20 @@ def _misses(telling: Sequence[MeasuredStep], steps: Sequence[Rigid3]) -> Float[n
     """By how much each step is not the measured one: 1 is what is tolerated."""
     misses = []
     for measured, step in zip(telling, steps, strict=True):
-        apart, way = step.inverse() @ measured.first_from_last, float(np.linalg.norm(measured.first_from_last.translation))
-        tolerated_way = _WAY + _DEPTH_SHARE * measured.median_depth + _SHARE * way
-        tolerated_turn = _TURN + _SHARE * measured.first_from_last.angle()
-        misses.append(max(float(np.linalg.norm(apart.translation)) / tolerated_way, apart.angle() / tolerated_turn))
+        apart, tolerated_turn = step.inverse() @ measured.first_from_last, _TURN + _SHARE * measured.first_from_last.angle()
+        misses.append(max(_miss_of_way(measured, step), apart.angle() / tolerated_turn))
     return np.array(misses)
+
+
+def _miss_of_way(measured: MeasuredStep, step: Rigid3) -> float:
+    """By how much the way is another one, in units of what is tolerated; of a single camera by its direction alone."""
+    ours, theirs = measured.first_from_last.translation, step.translation
+    if not measured.has_scale:
+        length = float(np.linalg.norm(theirs))
+        return 2.0 if length == 0.0 else float(np.arccos(np.clip(ours @ theirs / length, -1.0, 1.0))) / _DIRECTION
+    tolerated = _WAY + _DEPTH_SHARE * measured.median_depth + _SHARE * float(np.linalg.norm(ours))
+    # seen in the first camera; in the last one the difference is as long
+    return float(np.linalg.norm(ours - theirs)) / tolerated
 
 
 def _by_convention(telling: Sequence[MeasuredStep], poses: _Poses) -> Iterator[_Reading]:
@@ -169,6 +178,8 @@ def _read(telling: Sequence[MeasuredStep], poses: _Poses, conventions: tuple[str
 
 def _unit_of(telling: Sequence[MeasuredStep], steps: Sequence[Rigid3]) -> tuple[tuple[str, ...], float]:
     """The unit that gives the steps their measured lengths, as a convention, and its metres."""
+    if not all(step.has_scale for step in telling):
+        return (), 1.0
     measured = np.array([np.linalg.norm(step.first_from_last.translation) for step in telling])
     lengths = np.array([np.linalg.norm(step.translation) for step in steps])
     long = lengths > 1e-9
@@ -212,7 +223,9 @@ def _is_far_better(other: _Reading, as_is: _Reading) -> bool:
 
 
 def _as_body(telling: Sequence[MeasuredStep], poses: _Poses) -> Iterator[_Reading]:
-    """The poses as those of a body, by the mounting of the camera that fits best."""
+    """The poses as those of a body, by the mounting of the camera that fits best; none by steps that know no metre."""
+    if not all(step.has_scale for step in telling):
+        return
     for conventions in _combined(ROTATIONS, DIRECTIONS):
         steps = _steps_of(telling, _read(telling, poses, conventions))
         pairs = kept = list(zip(telling, steps, strict=True))

@@ -1,12 +1,13 @@
 """Stereo visual SLAM, read from the top: recordings in, the pose of each of their frames out, in one world.
 
 Odometry turns each recording into chains of key frames (sub-maps); loops join them where the same place is seen again, within a
-recording or between two; a pose graph and a bundle adjustment of the whole make them agree. The world is the camera of the
-first frame that was tracked.
+recording or between two, and what many weaker pairs say together where no loop does; a pose graph and a bundle adjustment of the whole
+make them agree. Of sub-maps that stay apart, those that hold most frames are kept. The world is the camera of their first frame.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -18,13 +19,16 @@ from topoloc.bounds import check_bounds
 from topoloc.errors import RecordingError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.frame import StereoFrame, StereoSequence
+from topoloc.sequences.frame_view import frame_view
 from topoloc.sequences.recording import SequenceView
 from topoloc.slam.global_map import GlobalMapConfig, adjust_all, close_loops, join_submaps
 from topoloc.slam.input_checks import InputCheckConfig, InputChecks
-from topoloc.slam.keyframes import FramePose, KeyFrame, Landmarks
-from topoloc.slam.loop_closure import LoopConfig, find_links
+from topoloc.slam.keyframes import FramePose, KeyFrame, Landmarks, PlaceView
+from topoloc.slam.loop_closure import Link, LoopConfig, find_links
 from topoloc.slam.odometry import Odometry
+from topoloc.slam.place_matching import place_view
 from topoloc.slam.steps import OdometryConfig
+from topoloc.slam.submap_joins import JoinConfig, find_joins, group_submaps
 
 Progress = Callable[[str, int, int], None]
 """Called with a stage's name, steps done and steps in all."""
@@ -37,6 +41,7 @@ class SlamConfig:
     checks: InputCheckConfig = field(default_factory=InputCheckConfig)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
     loops: LoopConfig = field(default_factory=LoopConfig)
+    joins: JoinConfig = field(default_factory=JoinConfig)
     globally: GlobalMapConfig = field(default_factory=GlobalMapConfig)
 
 
@@ -44,9 +49,9 @@ class SlamConfig:
 class SlamResult:
     """`poses[r][i]` is world_from_cam of frame i of recording r, None where it is not known.
 
-    `num_submaps` counts the stretches in which tracking was never lost for good; of these `num_joined` share the world of the
-    first, and the frames of the others have no pose. `right_residuals_px` are distances between where landmarks are found in the
-    right pictures and where they should be.
+    `num_submaps` counts the stretches in which tracking was never lost for good; of these `num_joined` share one world, the largest
+    by frames of the first recording, and the frames of the others have no pose. `right_residuals_px` are distances between where
+    landmarks are found in the right pictures and where they should be.
     """
 
     poses: list[list[Rigid3 | None]]
@@ -86,7 +91,8 @@ def run_slam(
         tracked.append(_track(sequence, odometry, checks, progress))
         residuals += checks.right_residuals_px
     links = find_links(keyframes, config.loops, progress)
-    joined = join_submaps(keyframes, links, landmarks)
+    links += find_joins(keyframes, links, lambda keyframe: _looked_at(keyframe, sequences, config), config.joins, config.loops)
+    joined = join_submaps(keyframes, links, landmarks, _largest(keyframes, links, tracked[0]))
     links = _optimise(keyframes, links, joined, landmarks, config, progress)
     return SlamResult(
         poses=_world_poses(tracked, joined),
@@ -108,7 +114,15 @@ def posed_by_slam(
     Raises:
         RecordingError: one of them shares no place with the others; and as `run_slam`.
     """
-    result = run_slam(sequences, config, progress)
+    return with_slam_poses(sequences, run_slam(sequences, config, progress))
+
+
+def with_slam_poses(sequences: Sequence[StereoSequence], result: SlamResult) -> list[StereoSequence]:
+    """The recordings with the poses that `run_slam` has found in them.
+
+    Raises:
+        RecordingError: one of them shares no place with the others.
+    """
     for sequence, poses in zip(sequences, result.poses, strict=True):
         if not any(poses):
             raise RecordingError(f"{sequence.name}: no place of it was recognised in {sequences[0].name}; map it alone")
@@ -116,11 +130,14 @@ def posed_by_slam(
 
 
 def _track(sequence: StereoSequence, odometry: Odometry, checks: InputChecks, progress: Progress) -> list[FramePose | None]:
-    poses = []
+    poses: list[FramePose | None] = [None] * len(sequence)
     for i, frame in enumerate(_read_ahead(sequence)):
         checks.check_rig(frame)
-        poses.append(odometry.process(i, frame))
+        for pose in odometry.process(i, frame):
+            poses[pose.frame_idx] = pose
         progress(f"tracking {sequence.name}", i + 1, len(sequence))
+    for pose in odometry.finish():
+        poses[pose.frame_idx] = pose
     checks.verdict()
     if all(pose is None for pose in poses):
         raise RecordingError(f"{sequence.name}: none of the {len(poses)} frames could be tracked: too dark, without texture, or no stereo")
@@ -136,6 +153,17 @@ def _read_ahead(sequence: StereoSequence) -> Iterator[StereoFrame]:
             if i + 1 < len(sequence):
                 coming = reader.submit(sequence.__getitem__, i + 1)
             yield frame
+
+
+def _largest(keyframes: list[KeyFrame], links: list[Link], tracked: list[FramePose | None]) -> int:
+    """The first of the sub-maps that, joined, hold most frames of the first recording."""
+    groups = group_submaps(keyframes, links)
+    return Counter(groups[pose.keyframe.submap] for pose in tracked if pose is not None).most_common(1)[0][0]
+
+
+def _looked_at(keyframe: KeyFrame, sequences: Sequence[StereoSequence], config: SlamConfig) -> PlaceView:
+    """What a key frame looks like that was no place of its own: its picture is read once more."""
+    return place_view(frame_view(sequences[keyframe.recording][keyframe.frame_idx]), config.odometry.places)
 
 
 def _optimise(

@@ -73,7 +73,7 @@ class OdometryConfig:
     max_lost_tracked: Annotated[int, AtLeast(0)] = 3
     """The points of the last frame that was tracked are sought in so many more."""
     max_lost_frames: Annotated[int, AtLeast(0)] = 10
-    """A camera that is lost for longer starts a new sub-map."""
+    """A camera that is lost for longer starts a new sub-map, from the first of these frames on that the others follow."""
     places_asked: Annotated[int, Between(0, 1000)] = 6
     """The last places in which a camera that is lost is sought."""
     place_distance: Annotated[float, AtLeast(0)] = 0.1

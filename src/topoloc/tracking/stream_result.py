@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.result import Localization, NotLocalized, pose_json
 
 State = Literal["localized", "tracked", "predicted", "ambiguous", "lost"]
 
@@ -36,9 +36,7 @@ class StreamedPose:
 
     def to_json(self, query: str) -> dict[str, Any]:
         """One line of the result file, see docs/cli.md."""
-        smoothed = None
-        if self.smoothed is not None:
-            smoothed = {"translation": self.smoothed.translation.tolist(), "quat_wxyz": self.smoothed.quat_wxyz().tolist()}
+        smoothed = None if self.smoothed is None else pose_json(self.smoothed)
         covariance = None if self.smoothed_covariance is None else self.smoothed_covariance.tolist()
         streamed = {"t_ns": self.t_ns, "state": self.state, "smoothed": smoothed, "smoothed_covariance": covariance}
         return self.result.to_json(query) | streamed | ({"repeated": True} if self.is_repeated else {})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+from contextlib import closing
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from built_corridor import WIDE, back, built_corridor, corridor, seen_ahead, seen_on_the_way_back
+from built_corridor import WIDE, back, built_corridor, corridor, corridor_of_two_kinds, seen_ahead, seen_on_the_way_back
 from tiny_world import path_pose, render, room
 from topoloc.errors import MapError
 from topoloc.features.kinds import SURF
@@ -159,7 +160,8 @@ def _twice(topomap: TopoMetricMap, apart: float) -> TopoMetricMap:
         "node_ids": np.concatenate([ids, ids + count]).astype(ids.dtype),
         "centres": np.concatenate([model.arrays["centres"], model.arrays["centres"] + moved.translation]),
     }
-    return replace(topomap, sides=SideNodes([node.summary for node in nodes], nodes, {model.name: replace(model, arrays=arrays)}))
+    models = {model.name: replace(model, arrays=arrays)}
+    return replace(topomap, sides=SideNodes([node.summary for node in nodes], nodes, models, sides.kind))
 
 
 def test_walls_that_stand_in_two_places_are_no_answer():
@@ -199,6 +201,30 @@ def test_walls_that_look_alike_elsewhere_have_less_for_them():
     assert twice[0].log_odds >= twice[1].log_odds
     ways = [hypothesis.world_from_cam.translation[1] for hypothesis in twice]
     assert sorted(round((way - truth.translation[1]) / 60.0) for way in ways[:2]) == [0, 1]
+
+
+def test_learned_features_know_the_walls_where_the_map_has_them(tmp_path: Path):
+    pytest.importorskip("onnxruntime")
+    path = tmp_path / "corridor.topo"
+    corridor_of_two_kinds().save(path)
+    loaded = TopoMetricMap.load(path)
+    assert loaded.sides is not None
+    assert loaded.sides.kind == loaded.kinds[1]
+    assert loaded.by_kind(loaded.kinds[1]).sides is loaded.sides
+    localizer, learned = Localizer(loaded), Localizer(loaded, LocalizerConfig(kinds=(loaded.kinds[1],)))
+    for picture, truth in seen_on_the_way_back()[::2]:
+        assert _is_right(localizer.localize(picture, WIDE), truth)
+        result = learned.localize(picture, WIDE)
+        assert _is_by_walls(result)
+        assert _is_right(result, truth)
+        mirrored = np.ascontiguousarray(picture[:, ::-1])
+        assert isinstance(localizer.localize(mirrored, WIDE), NotLocalized)
+    assert Localizer(loaded, LocalizerConfig(kinds=("surf",))).map.walls is None
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("UPDATE map SET value = '\"sift\"' WHERE key = 'kind_of_sides'")
+        database.commit()
+    with pytest.raises(MapError, match="kind_of_sides"):
+        TopoMetricMap.load(path)
 
 
 def test_from_a_file_the_same_is_answered(tmp_path: Path):

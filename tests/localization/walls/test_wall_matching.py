@@ -17,7 +17,7 @@ from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.local_map import LocalMap
-from topoloc.localization.walls.wall_matching import SeenSide, estimate_pose, match_sides, nearest_sides, of_picture
+from topoloc.localization.walls.wall_matching import SeenSide, count_sides, estimate_pose, match_sides, nearest_sides, of_picture
 from topoloc.map.topomap import SideNodes
 
 PICTURE, TRUTH = seen_on_the_way_back()[2]
@@ -101,15 +101,22 @@ def test_at_a_wrong_pose_little_more_is_found_than_by_chance():
     assert at_truth is not None
     assert elsewhere is not None
     assert len(elsewhere.matches) < 0.5 * len(at_truth.matches)
-    assert at_truth.num_by_chance < 0.4 * len(at_truth.matches)
+    assert count_sides(_around(), TRUTH.inverse(), GUIDED).num_by_chance < 0.4 * len(at_truth.matches)
 
 
 def test_visible_points_are_counted_by_what_they_cover_not_by_how_many_nodes_hold_them():
-    once = match_sides(_around(), TRUTH.inverse(), GUIDED)
-    twice = match_sides([(side, LocalMap.pooled([points, points])) for side, points in _around()], TRUTH.inverse(), GUIDED)
-    assert once is not None
-    assert twice is not None
+    once = count_sides(_around(), TRUTH.inverse(), GUIDED)
+    twice = count_sides([(side, LocalMap.pooled([points, points])) for side, points in _around()], TRUTH.inverse(), GUIDED)
     assert 100 < once.num_visible == twice.num_visible
+
+
+def test_what_must_be_seen_lies_in_the_picture_where_the_points_are():
+    counts = count_sides(_around(), TRUTH.inverse(), GUIDED)
+    assert counts.agreeing_img is None  # SURF says nothing of what is not found
+    assert 100 < len(counts.visible_img) <= 2 * 512
+    points_img = np.concatenate([WIDE.img_from_cam(TRUTH.inverse().apply(points.points_world)) for _, points in _around()])
+    offsets = np.nanmin(np.linalg.norm(counts.visible_img[:, None] - points_img[None], axis=2), axis=1)
+    assert offsets.max() < 2.0  # pixels of the side view are rounded
 
 
 def test_the_pose_of_both_sides_is_refined_round_by_round_from_one_that_is_near():

@@ -1,12 +1,13 @@
 """Fit the weights of a kind of features, and try them on places that they were not fitted to.
 
-    python -m topoloc_paper.fit --kind KIND [--shared ../shared] [--rendered FOLDER] [--step N] [--families NAME ...]
+    python -m topoloc_paper.fit --kind KIND [--shared ../shared] [--rendered FOLDER] [--step N] [--families NAME ...] [--walls]
                                 [--save POSES | --load POSES ...] [--out FILE]
 
 Each place of `corpus.py` is mapped with features of this kind, and asked about its own pictures (in good light and bad), about those of
 other places and about drawn pictures; every pose that was tried is kept, not only the one answered. A pose is right within 0.25 m (5 % of
 the distance, where that is less) and 2 degrees, wrong beyond 0.5 m or 10 degrees; what lies between is left out. The walls to both sides
-are asked where a place is walked back that was mapped in one direction. --step N asks every N-th of the pictures, --families only of the
+are asked where a place is walked back that was mapped in one direction; --walls asks these places alone and fits the weights of the walls,
+the others are taken over. --step N asks every N-th of the pictures, --families only of the
 maps of these places; --by-recording tries each recording's poses on what was fitted to all others, not each family's; --save keeps the
 poses, after each place, and --load fits to poses that were kept. FILE is what ships as `localization/weights/KIND.json`.
 """
@@ -17,14 +18,17 @@ import argparse
 import datetime
 import json
 import os
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from topoloc.errors import TopolocError
 from topoloc.features.kinds import find_kind
+from topoloc.localization.evidence import log_odds_of
 from topoloc.localization.fitted_weights import STAND_IN, FittedWeights, weights_of
-from topoloc_paper.fit.corpus import FAMILIES, PLACES, family_of, open_recordings
+from topoloc_paper.fit.corpus import FAMILIES, PLACES, AskedPlace, family_of, open_recordings
 from topoloc_paper.fit.evidence import (
     Judged,
     best_strength,
@@ -49,6 +53,7 @@ def main() -> None:
     parser.add_argument("--rendered", type=Path)
     parser.add_argument("--step", type=int, default=1)
     parser.add_argument("--families", nargs="+", choices=sorted(set(FAMILIES.values()) - {"drawn"}))
+    parser.add_argument("--walls", action="store_true")
     parser.add_argument("--by-recording", action="store_true")
     parser.add_argument("--save", type=Path)
     parser.add_argument("--load", type=Path, nargs="+")
@@ -61,22 +66,32 @@ def main() -> None:
     if asked.load:
         poses = [pose for path in asked.load for pose in load_poses(path)]
     else:
-        poses = ask_places(asked.kind, asked.shared.resolve() / "data", asked.rendered, asked.step, asked.save, asked.families)
+        places = [place for place in PLACES if asked.families is None or family_of(place.mapping) in asked.families]
+        places = [place for place in places if place.asks_walls] if asked.walls else places
+        poses = ask_places(asked.kind, asked.shared.resolve() / "data", asked.rendered, asked.step, asked.save, places)
+    if asked.walls:
+        _write(fit_walls_alone(asked.kind, poses), asked.out)
+        return
     wrong_of = {pose.queries if asked.by_recording else family_of(pose.mapping) for pose in decided(poses) if pose.is_wrong}
     right_of = {pose.queries if asked.by_recording else family_of(pose.mapping) for pose in decided(poses) if pose.is_right}
     if len(wrong_of) < 2 or len(right_of) < 2:
         parts = "recordings" if asked.by_recording else "families of places"
         raise SystemExit(f"error: right and wrong poses of two {parts} are needed")
-    weights = fit(asked.kind, poses, asked.step, asked.by_recording)
-    if asked.out:
-        asked.out.write_text(json.dumps(weights.to_json(), indent=2) + "\n")
+    _write(fit(asked.kind, poses, asked.step, asked.by_recording), asked.out)
 
 
-def ask_places(kind: str, data: Path, rendered: Path | None, step: int, kept: Path | None, families: list[str] | None) -> list[TriedPose]:
-    """Every pose that the places of the corpus (of these families) lead to; written to `kept` after each place."""
+def _write(weights: FittedWeights, path: Path | None) -> None:
+    if path:
+        path.write_text(json.dumps(weights.to_json(), indent=2) + "\n")
+
+
+def ask_places(
+    kind: str, data: Path, rendered: Path | None, step: int, kept: Path | None, places: Sequence[AskedPlace] = PLACES
+) -> list[TriedPose]:
+    """Every pose that these places lead to; written to `kept` after each place."""
     recordings = open_recordings(data, rendered)
     poses: list[TriedPose] = []
-    for place in (place for place in PLACES if families is None or family_of(place.mapping) in families):
+    for place in places:
         here = ask_place(place, recordings, data, kind, step)
         poses += here
         print(f"{place.mapping}: {len(here)} poses of {len({pose.picture for pose in here})} pictures", flush=True)
@@ -108,6 +123,21 @@ def fit(kind: str, poses: list[TriedPose], step: int, by_recording: bool) -> Fit
     report(poses, before, fitted, held_out)
     print(f"{walls}, fitted to {num_walls} poses ({before.walls})")
     return fitted
+
+
+def fit_walls_alone(kind: str, poses: list[TriedPose]) -> FittedWeights:
+    """The weights in use with those of the walls fitted anew."""
+    before = weights_of(kind)
+    walls, num = fit_walls(poses, before.walls)
+    told = [pose for pose in decided(poses) if pose.evidence.num_distinct is not None]
+    for name, weights in (("in use", before.walls), ("fitted", walls)):
+        log_odds = np.array([log_odds_of(pose.evidence, replace(before, walls=weights)) for pose in told])
+        part = Judged("walls", log_odds, np.array([pose.is_right for pose in told], dtype=bool))
+        clearest = max(log_odds[~part.is_right], default=-99.0)
+        print(f"{name}: {weights}\n  {verdict(part)}; log odds of the clearest wrong pose {clearest:.1f}")
+    places = ", ".join(dict.fromkeys(pose.queries for pose in told))
+    corpus = before.corpus.replace("walls taken over", f"walls fitted to {num} poses of {places} (--walls)") if num else before.corpus
+    return replace(before, walls=walls, corpus=corpus, date=datetime.date.today().isoformat())
 
 
 def corpus_of(poses: list[TriedPose], strength: float, num_hard: int, num_walls: int, by_recording: bool) -> str:

@@ -78,7 +78,7 @@ def ask_place(place: AskedPlace, recordings: dict[str, StereoSequence], data: Pa
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "place.topo"
         sides = SideNodesConfig() if place.asks_walls else SideNodesConfig(spacing=0.0)
-        config = BuildConfig(features=FeatureConfig(kind=kind), sides=sides)
+        config = BuildConfig(features=FeatureConfig(kind=kind), other_kinds=(), sides=sides)
         build_map(recordings[place.mapping], config).save(path)
         localizer = Localizer(TopoMetricMap.load(path))
         world_from_truth = read_rigid(data / place.map_from_truth) if place.map_from_truth else Rigid3.identity()

@@ -63,7 +63,12 @@ def build_map(
             check_gaps(sequence)
         if not (trust.poses or is_slams):
             check_poses(sequence)
-    topomap = build.build_map(sequences, config, progress, poses_from)
+    return with_map_facts(build.build_map(sequences, config, progress, poses_from), progress)
+
+
+def with_map_facts(topomap: TopoMetricMap, progress: build.Progress | None = None) -> TopoMetricMap:
+    """The map with what localizing needs to know of it as a whole, so that who opens its file need not measure it."""
+    topomap = replace(topomap, shared_errors=None, other_shared_errors={}, repetitions=None)
     errors = {kind: _correlated_errors(topomap.by_kind(kind)) for kind in topomap.kinds}
     topomap = replace(topomap, shared_errors=errors.pop(topomap.kind), other_shared_errors=errors)
     return with_repetitions(topomap, progress)

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from topoloc.features.extraction import extract_features
+from topoloc.features.extraction import extract_normalized, normalize_image
 from topoloc.features.matching import match_pooled
 from topoloc.features.side_views import side_views
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig
@@ -24,13 +24,13 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.belief import Hypothesis
 from topoloc.localization.evidence import Evidence, doubt_of, even_share_of, log_odds_of, spread_of
-from topoloc.localization.guided import visible_points
+from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.map_facts.correlated_errors import inflation
 from topoloc.localization.pose_fit import PoseFit
 from topoloc.localization.search import Proposal, Search
 from topoloc.localization.walls.wall_index import WallIndex
-from topoloc.localization.walls.wall_matching import SeenSide, SideMatches, estimate_pose, match_sides, nearest_sides
+from topoloc.localization.walls.wall_matching import SeenSide, SideMatches, count_sides, estimate_pose, match_sides, nearest_sides
 from topoloc.localization.walls.wall_poses import agreeing_pose
 
 
@@ -59,7 +59,7 @@ class SeenWalls:
         assert isinstance(query.lens, Camera)
         for view in side_views(query.lens, index.view_config):
             picture = view.picture(query.grey)
-            features = view.within(extract_features(picture, query.feature_config))
+            features = view.within(extract_normalized(normalize_image(picture, query.feature_config), query.feature_config))
             seen.append(SeenSide(view, features, view.in_picture(features, query.lens)))
             ranked.append([node.node_id for node in index.coarse.rank(picture, features, search.config.walls.num_ranked)])
         return SeenWalls(search, index, seen, ranked)
@@ -121,54 +121,62 @@ def _compared(walls: SeenWalls, view: int, row: int) -> WallProposal | None:
     return WallProposal("walls", fit, is_guided=True, view=view, num_agreeing=num_agreeing, cam_from_world=cam_from_world, walls=walls)
 
 
-def refine_wall(proposal: WallProposal) -> tuple[PoseFit, SideMatches] | None:
+def refine_wall(proposal: WallProposal) -> PoseFit | None:
     """What both sides show around the first pose, and the pose that follows; None where too little does, or the map's nodes see it."""
     walls, config = proposal.walls, proposal.walls.search.config
     cam_from_world, found, pose = proposal.cam_from_world, None, None
-    for k, (radius_px, max_error_px) in enumerate(config.walls.rounds, start=1):
+    for radius_px, max_error_px in config.walls.rounds:
         if _is_mapped(walls.search, cam_from_world):
             return None
-        found = _matched(proposal, cam_from_world, radius_px, with_counts=k == len(config.walls.rounds))
+        found = _matched(proposal, cam_from_world, radius_px)
         pose = _estimate(walls, found, cam_from_world, max_error_px) if found is not None else None
         if pose is None or np.count_nonzero(pose.inliers) < config.evidence.min_inliers:
             return None
         cam_from_world = pose.cam_from_world
     if found is None or pose is None or _is_mapped(walls.search, cam_from_world):
         return None
-    return PoseFit(found.features, walls.camera, walls.camera, found.local_map, found.matches, pose), found
+    return PoseFit(found.features, walls.camera, walls.camera, found.local_map, found.matches, pose)
 
 
-def weigh_wall(proposal: WallProposal, final: PoseFit, found: SideMatches) -> Hypothesis | None:
+def weigh_wall(proposal: WallProposal, final: PoseFit) -> Hypothesis | None:
     """The hypothesis with its evidence; None where too little was found for any."""
-    search, pose, camera = proposal.walls.search, final.pose, final.camera
+    walls, search, pose, camera = proposal.walls, proposal.walls.search, final.pose, final.camera
     if pose is None or final.num_inliers < search.config.walls.min_found:
         return None
+    counts = count_sides(_sides_around(walls, pose.cam_from_world), pose.cam_from_world, _guided(walls, search.config.walls.rounds[-1][0]))
     inflated = inflation(final.num_inliers, max(search.rho, search.weights.walls.least_shared_errors))
     covariance = inflated * pose.covariance
-    depths = pose.cam_from_world.apply(found.local_map.points_world[found.matches.train_idx[pose.inliers]])[:, 2]
-    points_img = found.features.points_img[found.matches.query_idx[pose.inliers]].astype(np.float64)
-    visible_img = visible_points(found.local_map, pose.cam_from_world, camera)[1]
+    depths = pose.cam_from_world.apply(final.local_map.points_world[final.matches.train_idx[pose.inliers]])[:, 2]
+    points_img = final.features.points_img[final.matches.query_idx[pose.inliers]].astype(np.float64)
+    agreeing_img = points_img if counts.agreeing_img is None else counts.agreeing_img
     evidence = Evidence(
         num_matches=len(proposal.fit.matches),
         num_inliers=proposal.num_agreeing,
         num_found=final.num_inliers,
-        num_visible=found.num_visible,
-        num_by_chance=found.num_by_chance,
+        num_visible=counts.num_visible,
+        num_by_chance=counts.num_by_chance,
         spread=spread_of(points_img, camera.width, camera.height),
         doubt=doubt_of(covariance, float(np.median(depths)), search.config.evidence),
-        even_share=even_share_of(points_img, visible_img, camera.width, camera.height),
-        num_distinct=_num_distinct(proposal.walls, final),
+        even_share=even_share_of(agreeing_img, counts.visible_img, camera.width, camera.height),
+        num_distinct=_num_distinct(walls, final),
     )
     return Hypothesis("walls", final, evidence, covariance, 1.0 / inflated, log_odds_of(evidence, search.weights))
 
 
-def _matched(proposal: WallProposal, cam_from_world: Rigid3, radius_px: float, with_counts: bool) -> SideMatches | None:
+def _matched(proposal: WallProposal, cam_from_world: Rigid3, radius_px: float) -> SideMatches | None:
     """The matches of the proposal itself, or, with a radius, those of both sides around the pose."""
-    walls = proposal.walls
     if radius_px == 0.0:
-        return SideMatches(proposal.fit.features, proposal.fit.local_map, proposal.fit.matches, 0, 0)
-    sides = [(side, local_map) for side in walls.seen if (local_map := _around(walls, side, cam_from_world)) is not None]
-    return match_sides(sides, cam_from_world, replace(walls.search.config.walls.guided, radius_px=radius_px), with_counts)
+        return SideMatches(proposal.fit.features, proposal.fit.local_map, proposal.fit.matches)
+    return match_sides(_sides_around(proposal.walls, cam_from_world), cam_from_world, _guided(proposal.walls, radius_px))
+
+
+def _guided(walls: SeenWalls, radius_px: float) -> GuidedConfig:
+    return replace(walls.search.config.walls.guided, radius_px=radius_px)
+
+
+def _sides_around(walls: SeenWalls, cam_from_world: Rigid3) -> list[tuple[SeenSide, LocalMap]]:
+    """Each side with the points of the side nodes that show what it must show."""
+    return [(side, local_map) for side in walls.seen if (local_map := _around(walls, side, cam_from_world)) is not None]
 
 
 def _around(walls: SeenWalls, side: SeenSide, cam_from_world: Rigid3) -> LocalMap | None:

@@ -16,6 +16,7 @@ from topoloc.localization.guided import GuidedConfig, count_by_chance, match_gui
 from topoloc.localization.local_map import LocalMap
 
 _CELL_PX = 8
+_NUM_COMPARED = 512  # of the points in view of a side that are compared with dense descriptors
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,41 +30,38 @@ class SeenSide:
 
 @dataclass(frozen=True, eq=False)
 class SideMatches:
-    """Features of both sides, at pixels of the picture, matched with points of side nodes around a pose.
-
-    `num_visible` counts cells of 8 pixels in which a point must be seen, since neighbouring side nodes hold the same wall; `num_by_chance`
-    the matches that would be found were the pose wrong.
-    """
+    """Features of both sides, at pixels of the picture, matched with points of side nodes around a pose."""
 
     features: Features
     local_map: LocalMap
     matches: Matches
+
+
+@dataclass(frozen=True, eq=False)
+class SideCounts:
+    """What must be seen of the walls from a pose, and what would be found were it wrong.
+
+    `num_visible` counts cells of 8 pixels in which a point must be seen, since neighbouring side nodes hold the same wall; `num_by_chance`
+    the matches that would be found were the pose wrong. `visible_img` are the pixels of the picture where points must be seen, at most 512
+    of each side; `agreeing_img` those of them where a network's dense descriptors agree, None of features without such.
+    """
+
     num_visible: int
     num_by_chance: int
+    visible_img: Float[np.ndarray, "v 2"]
+    agreeing_img: Float[np.ndarray, "a 2"] | None
 
 
-def match_sides(
-    sides: list[tuple[SeenSide, LocalMap]], cam_from_world: Rigid3, config: GuidedConfig, with_counts: bool = True
-) -> SideMatches | None:
-    """Both sides' guided matches, each with the points that it is given. None without any.
-
-    `with_counts` also counts what must be seen and what chance finds, which takes as long again.
-    """
-    features, maps, query_idx, train_idx, distances = [], [], [], [], []
-    num_features = num_points = num_visible = num_by_chance = 0
+def match_sides(sides: list[tuple[SeenSide, LocalMap]], cam_from_world: Rigid3, config: GuidedConfig) -> SideMatches | None:
+    """Both sides' guided matches, each with the points that it is given. None without any."""
+    query_idx, train_idx, distances, num_features, num_points = [], [], [], 0, 0
     for side, local_map in sides:
-        side_from_world = side.view.cam_from_side.inverse() @ cam_from_world
-        matches = match_guided(side.features, local_map, side_from_world, side.view.camera, config)
-        features.append(side.in_picture)
-        maps.append(local_map)
+        matches = match_guided(side.features, local_map, side.view.from_world(cam_from_world), side.view.camera, config)
         query_idx.append(matches.query_idx + num_features)
         train_idx.append(matches.train_idx + num_points)
         distances.append(matches.distances)
         num_features, num_points = num_features + len(side.features), num_points + len(local_map.radii)
-        if with_counts:
-            num_visible += _num_visible_cells(side.view, local_map, side_from_world)
-            num_by_chance += count_by_chance(side.features, local_map, side_from_world, side.view.camera, config)
-    if not sides or sum(map(len, query_idx)) == 0:
+    if sum(map(len, query_idx)) == 0:
         return None
     matches = Matches(
         *(
@@ -71,7 +69,27 @@ def match_sides(
             for part, dtype in zip((query_idx, train_idx, distances), (np.int32, np.int32, np.float32), strict=True)
         )
     )
-    return SideMatches(Features.concatenate(features), LocalMap.pooled(maps), matches, num_visible, num_by_chance)
+    features = Features.concatenate([side.in_picture for side, _ in sides])
+    return SideMatches(features, LocalMap.pooled([local_map for _, local_map in sides]), matches)
+
+
+def count_sides(sides: list[tuple[SeenSide, LocalMap]], cam_from_world: Rigid3, config: GuidedConfig) -> SideCounts:
+    """What both sides must show, and what of it agrees."""
+    num_visible, num_by_chance, visible_img, agreeing_img = 0, 0, [np.zeros((0, 2))], [np.zeros((0, 2))]
+    for side, local_map in sides:
+        view, side_from_world = side.view, side.view.from_world(cam_from_world)
+        rows, visible = visible_points(local_map, side_from_world, view.camera)
+        columns, lines = np.clip(np.rint(visible).astype(int), 0, [view.camera.width - 1, view.camera.height - 1]).T
+        seen = np.flatnonzero(view.inside[lines, columns])
+        cells = (lines[seen] // _CELL_PX) * view.camera.width + columns[seen] // _CELL_PX
+        num_visible += len(np.unique(cells))
+        num_by_chance += count_by_chance(side.features, local_map, side_from_world, view.camera, config)
+        seen = seen[np.unique(np.linspace(0, len(seen) - 1, _NUM_COMPARED).astype(int))] if len(seen) else seen
+        visible_img.append(view.points_img[lines[seen], columns[seen]].astype(np.float64))
+        if (dense := side.features.dense) is not None and len(seen):
+            agreeing_img.append(visible_img[-1][dense.agrees(visible[seen], local_map.descriptors[rows[seen]])])
+    has_dense = any(side.features.dense is not None for side, _ in sides)
+    return SideCounts(num_visible, num_by_chance, np.concatenate(visible_img), np.concatenate(agreeing_img) if has_dense else None)
 
 
 def estimate_pose(found: SideMatches, camera: Camera, config: AbsolutePoseConfig, start: Rigid3 | None) -> AbsolutePose | None:
@@ -101,20 +119,12 @@ def nearest_sides(
     Args:
         centres: the world points (metres) in the middle of what the side nodes show; axes: the directions in which they look.
     """
-    side_from_world = view.cam_from_side.inverse() @ cam_from_world
+    side_from_world = view.from_world(cam_from_world)
     looks_alike = side_from_world.rotation[2] @ axes.T > 0.7
     size = np.array([view.camera.width, view.camera.height])
     off_middle = np.linalg.norm((view.camera.img_from_cam(side_from_world.apply(centres)) - size / 2.0) / size[0], axis=1)
     off_middle = np.where(looks_alike & np.isfinite(off_middle), off_middle, np.inf)
     return [int(k) for k in np.argsort(off_middle, kind="stable")[:num_nodes] if off_middle[k] < 1.0]
-
-
-def _num_visible_cells(view: SideView, local_map: LocalMap, side_from_world: Rigid3) -> int:
-    columns, rows = np.rint(visible_points(local_map, side_from_world, view.camera)[1]).astype(int).T
-    columns, rows = np.clip(columns, 0, view.camera.width - 1), np.clip(rows, 0, view.camera.height - 1)
-    inside = view.inside[rows, columns]
-    cells = (rows[inside] // _CELL_PX) * view.camera.width + columns[inside] // _CELL_PX
-    return len(np.unique(cells))
 
 
 def of_picture(local_map: LocalMap, node_id: int) -> LocalMap:

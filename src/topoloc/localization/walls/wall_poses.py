@@ -1,11 +1,14 @@
 """First poses from walls seen from the other side: where might a side view have been taken?
 
-A side view and a side node show the same wall without slant, so that one is the other, moved and scaled. Every single match of key points,
-with their sizes and orientations, says how (as in Lowe, 2004, section 7.4); the one that most of the matches agree with gives the pose.
-PnP on these matches does not: the points lie in one plane, and a plane has a second pose that looks nearly the same from the other slant.
+A side view and a side node show the same wall. PnP on their matches does not say from where: the points lie in one plane, and a plane has
+a second pose that looks nearly the same from the other slant. But people and robots carry cameras upright: two cameras that saw the same
+wall differ by a turn about the vertical and a shift, which two matches give (Kukelova, Bujnak and Pajdla, 2010: pose of a camera
+with known vertical direction). The pose that most of the matches agree with is the first one; how level the cameras were follows later.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from jaxtyping import Float
@@ -13,61 +16,69 @@ from jaxtyping import Float
 from topoloc.features.features import Features, Matches
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.walls.wall_kernels import largest_agreement
 from topoloc.map.topomap import TopoNode
 
-_LARGEST_TURN, _LARGEST_SCALE = 0.5, 4.0
-_TOLERANCE, _TOLERANCE_SHARE, _TOLERANCE_LOG_SCALE = 0.05, 0.15, 0.5
+_NUM_PAIRS = 1500
+_LARGEST_TURN = math.radians(35.0)
+_LEAST_APART = 0.1  # tangents of angles between the two key points of a pair: nearer ones say little of the distance
+_NEAREST, _FARTHEST = 0.2, 100.0  # metres of depth that the points of a pair may have
+_TOLERANCE, _TOLERANCE_SHARE = 0.02, 0.015  # in tangents: for a camera that is not quite level, more off the axis
 
 
 def agreeing_pose(features: Features, camera: Camera, node: TopoNode, matches: Matches) -> tuple[int, Rigid3] | None:
-    """How many matches of a side view's features with a side node's agree on one similarity, and the side_from_world that follows.
+    """How many matches of a side view's features with a side node's agree on one upright pose, and that side_from_world.
 
-    Similarities that turn by more than 0.5 rad or scale by more than 4 are not considered. None with fewer than three matches that agree.
+    Poses turned by more than 35 degrees from the side node's are not considered. None with fewer than three matches that agree.
     """
-    seen, kept = features.select(matches.query_idx), node.features.select(matches.train_idx)
-    to, since = camera.normalized_from_img(seen.points_img), node.camera.normalized_from_img(kept.points_img)
-    turns = np.angle(np.exp(1j * (seen.angles.astype(np.float64) - kept.angles)))
-    scales = seen.sizes_px.astype(np.float64) / camera.fx / (kept.sizes_px / node.camera.fx)
-    plausible = (np.abs(turns) < _LARGEST_TURN) & (np.abs(np.log(scales)) < np.log(_LARGEST_SCALE))
-    agreeing = _largest_consensus(to, since, turns, scales, plausible)
-    if np.count_nonzero(agreeing) < 3:
+    if len(matches) < 3:
         return None
-    points_node = node.points_cam[matches.train_idx[agreeing]].astype(np.float64)
-    side_from_node = _pose_of_similarity(to[agreeing], since[agreeing], float(np.median(turns[agreeing])), points_node)
-    if side_from_node is None:
+    seen = camera.normalized_from_img(features.points_img[matches.query_idx].astype(np.float64))
+    points_node = node.points_cam[matches.train_idx].astype(np.float64)
+    turns, shifts = _poses_of_pairs(seen, points_node)
+    if len(turns) == 0:
         return None
-    return int(np.count_nonzero(agreeing)), side_from_node @ node.summary.world_from_cam.inverse()
-
-
-def _largest_consensus(
-    to: Float[np.ndarray, "n 2"],
-    since: Float[np.ndarray, "n 2"],
-    turns: Float[np.ndarray, " n"],
-    scales: Float[np.ndarray, " n"],
-    plausible: np.ndarray,
-) -> np.ndarray:
-    """The plausible matches that agree with the one that most agree with; row k of the tables below is what match k says of all."""
-    cosines, sines = scales * np.cos(turns), scales * np.sin(turns)
-    dx, dy = (since[None, :, axis] - since[:, None, axis] for axis in (0, 1))
-    moved_x = cosines[:, None] * dx - sines[:, None] * dy
-    moved_y = sines[:, None] * dx + cosines[:, None] * dy
-    seen_x, seen_y = (to[None, :, axis] - to[:, None, axis] for axis in (0, 1))
-    misses = np.hypot(seen_x - moved_x, seen_y - moved_y)
-    agree = misses < _TOLERANCE + _TOLERANCE_SHARE * np.hypot(seen_x, seen_y)
-    agree &= np.abs(np.log(scales)[None, :] - np.log(scales)[:, None]) < _TOLERANCE_LOG_SCALE
-    agree &= plausible[None, :] & plausible[:, None]
-    return agree[np.argmax(agree.sum(axis=1))] if len(agree) else plausible
-
-
-def _pose_of_similarity(
-    to: Float[np.ndarray, "n 2"], since: Float[np.ndarray, "n 2"], turn: float, points_node: Float[np.ndarray, "n 3"]
-) -> Rigid3 | None:
-    """side_from_node, both cameras before the same wall: the scale says how much farther it is, the shift how far along."""
-    spread = np.sum((since - np.median(since, axis=0)) ** 2)
-    if spread < 1e-8:
+    tolerances = _TOLERANCE + _TOLERANCE_SHARE * np.sum(seen**2, axis=1)
+    best, num_agreeing = largest_agreement(seen, points_node, turns, shifts, tolerances, _NEAREST)
+    if num_agreeing < 3:
         return None
-    scale = float(np.sqrt(np.sum((to - np.median(to, axis=0)) ** 2) / spread))
-    depth = float(np.median(points_node[:, 2])) / max(scale, 1e-3)
-    rotation = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
-    points_side = depth * np.column_stack([to, np.ones(len(to))])
-    return Rigid3(rotation, np.median(points_side - points_node @ rotation.T, axis=0))
+    return num_agreeing, _upright(float(turns[best]), shifts[best]) @ node.summary.world_from_cam.inverse()
+
+
+def _upright(turn: float, shift: Float[np.ndarray, " 3"]) -> Rigid3:
+    c, s = math.cos(turn), math.sin(turn)
+    return Rigid3(np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]), shift)
+
+
+def _poses_of_pairs(
+    seen: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k 3"]]:
+    """Turns about the vertical and shifts (side_from_node) that explain pairs of matches; the pairs are the same at every call.
+
+    With depths d of the two points, (u, v) where they are seen and e = d1 - d2 = z' cos - x' sin for the turn, where ' is a difference:
+    v1 d1 - v2 d2 = y' and u1 d1 - u2 d2 = x' cos + z' sin. Without d2 that is a cos + b sin + c = 0.
+    """
+    first, second = np.random.default_rng(0).integers(0, len(seen), (2, _NUM_PAIRS))
+    apart = seen[first] - seen[second]
+    kept = np.abs(apart).max(axis=1) > _LEAST_APART
+    first, second, apart = first[kept], second[kept], apart[kept]
+    (u, v), (du, dv), (dx, dy, dz) = seen[first].T, apart.T, (points[first] - points[second]).T
+    a, b, c = u * dz * dv - v * dz * du - dx * dv, v * dx * du - u * dx * dv - dz * dv, dy * du
+    size = np.hypot(a, b)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        middle, half = np.arctan2(b, a), np.arccos(-c / size)
+    turns, rows = np.concatenate([middle + half, middle - half]), np.tile(np.arange(len(u)), 2)
+    turns = np.angle(np.exp(1j * turns))
+    allowed = np.abs(turns) < _LARGEST_TURN  # NaN is not
+    turns, rows = turns[allowed], rows[allowed]
+    cos, sin = np.cos(turns), np.sin(turns)
+    e = cos * dz[rows] - sin * dx[rows]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        by_rows = (dy[rows] - v[rows] * e) / dv[rows]
+        by_columns = (cos * dx[rows] + sin * dz[rows] - u[rows] * e) / du[rows]
+    depths = np.where(np.abs(dv[rows]) > np.abs(du[rows]), by_rows, by_columns) + e
+    near = (depths > _NEAREST) & (depths < _FARTHEST)
+    turns, rows, cos, sin, depths = turns[near], rows[near], cos[near], sin[near], depths[near]
+    x, y, z = points[first[rows]].T
+    turned = np.column_stack([cos * x + sin * z, y, cos * z - sin * x])
+    return turns, depths[:, None] * np.column_stack([u[rows], v[rows], np.ones(len(rows))]) - turned

@@ -37,7 +37,7 @@ warm_up(lambda *step: steps.append(step))
 Localizer.localize = localize
 assert [isinstance(answer, Localization) for answer in answers] == [True, True, False], answers
 assert np.allclose(answers[0].world_from_cam.translation, [0.1, 0.0, 0.0], atol=2e-3)
-assert steps == [("compiling", number, 5) for number in range(6)]
+assert steps == [("compiling", number, 7) for number in range(8)]
 compiled = {kernel: len(kernel.signatures) for kernel in KERNELS}
 for picture, camera in queries:
     localizer = Localizer(TopoMetricMap.load(map_file))

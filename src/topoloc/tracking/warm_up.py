@@ -1,4 +1,4 @@
-"""Everything that a query needs, compiled before the first one comes: a made-up place is mapped and asked about.
+"""Everything that a query needs, compiled before the first one comes: a made-up place is mapped, asked about and walked through.
 
 The machine code is kept (see `compiled.py`): with it this takes a second or two, without it half a minute.
 """
@@ -13,14 +13,21 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from topoloc.compiled import is_kept
 from topoloc.features.extraction import FeatureConfig, extract_features
+from topoloc.features.features import Matches
 from topoloc.features.matching import MatchingConfig, match_features
+from topoloc.features.surf_detector_kernels import integral_image
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.guided_kernels import match_projections
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.walls.wall_poses import agreeing_pose
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.frame import DepthImage, StereoFrame
+from topoloc.slam.pose_graph_kernels import solve_graph
+from topoloc.tracking.tracker import Tracker
 
 Progress = Callable[[str, int, int], None]
 STAGE = "compiling"
@@ -30,8 +37,13 @@ _TEXELS_PER_METRE = 130.0
 _WALL_Z, _WALL_SLOPE = 2.0, 0.4  # the wall: z = 2 m + 0.4 x
 
 
+def is_warm() -> bool:
+    """Whether the machine code of what answers is kept: of kernels with which a search begins and ends, and of the last in streams."""
+    return all(map(is_kept, (integral_image, match_projections, solve_graph)))
+
+
 def warm_up(progress: Progress | None = None) -> None:
-    """Compile, or load, all that localizing an image calls, so that the first query takes no longer than the later ones.
+    """Compile, or load, all that localizing an image or a stream calls, so that the first query takes no longer than the later ones.
 
     Also fills the cache of machine code where there is none: in a container's image, while it is built.
 
@@ -51,12 +63,24 @@ def warm_up(progress: Progress | None = None) -> None:
         def ask(image: UInt8[np.ndarray, "h w"], camera: Camera | None) -> None:
             Localizer(TopoMetricMap.load(map_file)).localize(image, camera)
 
+        def look_to_the_sides() -> None:
+            node = TopoMetricMap.load(map_file).nodes[0]
+            rows = np.arange(len(node.features), dtype=np.int32)
+            agreeing_pose(node.features, node.camera, node, Matches(rows, rows, np.zeros(len(rows), np.float32)))
+
+        def follow() -> None:
+            tracker = Tracker(Localizer(TopoMetricMap.load(map_file)))
+            for number in range(4):
+                tracker.process(_seen(wall, 0.02 * number)[0], _CAMERA, 100_000_000 * number)
+
         steps: tuple[Callable[[], object], ...] = (
             features,
             lambda: build_map(_Walk(wall)).save(map_file),
             lambda: ask(pictures[1], _CAMERA),
             lambda: ask(pictures[1], None),
             lambda: ask(lost, _CAMERA),
+            look_to_the_sides,
+            follow,
         )
         for number, step in enumerate(steps):
             if progress:

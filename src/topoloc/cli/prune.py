@@ -1,0 +1,47 @@
+"""topoloc prune MAP [--max-mb N]."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from topoloc.cli.output import File, UsageError, check_outputs, write_json
+from topoloc.cli.settings_file import read_settings
+from topoloc.cli.waiting import say_waiting
+from topoloc.lifelong.prune import PruneConfig, prune_map
+from topoloc.map.edit import editing
+
+
+@dataclass(frozen=True)
+class Command:
+    """What `topoloc prune` takes."""
+
+    map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP")]
+    """The map file, which is replaced."""
+    max_mb: Annotated[float | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: only what is gone is dropped)")] = None
+    """Megabytes that the file may have: every node keeps the landmarks that add most."""
+    json: File = None
+    """Write what was dropped to this file (- for standard output)."""
+    config: File = None
+    """All other settings: a TOML file, as `topoloc config prune` prints it."""
+
+    def run(self) -> int:
+        if self.max_mb is not None and not 0.0 < self.max_mb < 1e6:
+            raise UsageError(f"--max-mb must be megabytes, not {self.max_mb:g}")
+        check_outputs([self.json], inputs=[path for path in (self.map, self.config) if path])
+        config = read_settings(self.config).of(PruneConfig)
+        with editing(self.map, say_waiting) as edit:
+            before = edit.path.stat().st_size
+            pruned = prune_map(edit.topomap, edit.path, None if self.max_mb is None else round(self.max_mb * 1e6), config)
+            changes = pruned.changes | {"bytes_before": before}
+            if pruned.topomap is not edit.topomap:
+                edit.commit(pruned.topomap, "prune" if self.max_mb is None else f"prune to {self.max_mb:g} MB", changes)
+        changes["bytes"] = Path(self.map).stat().st_size
+        if self.json != "-":
+            dropped = f"{changes['landmarks_gone']} landmarks are gone, {changes['landmarks_dropped']} more dropped"
+            print(f"{self.map}: {dropped}, {before / 1e6:.2f} to {changes['bytes'] / 1e6:.2f} MB")
+        write_json(self.json, {"map": self.map} | changes)
+        return 0

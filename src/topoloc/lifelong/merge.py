@@ -1,0 +1,179 @@
+"""Two maps of overlapping places become one: read from `merge_maps`.
+
+Nothing but the maps is needed: what is stored of a node is asked of the other map as a picture would be. The second map's nodes, which keep
+their order and distances, are held in place by these answers like the frames of a session (`session_poses.py`). Nodes that the
+first map holds well are left out, the others join it, with their sessions, what these know of their points, and their walls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from topoloc.bounds import check_bounds
+from topoloc.errors import MapError, TrajectoryError
+from topoloc.geometry.rigid import Rigid3
+from topoloc.lifelong.coarse_models import PlaceView, with_place_views
+from topoloc.lifelong.overlay import Overlay
+from topoloc.lifelong.session_poses import Progress, SessionPoses, held_by
+from topoloc.lifelong.update import UpdateConfig, is_well_held
+from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.map_facts.building import with_map_facts
+from topoloc.localization.query import Picture
+from topoloc.localization.result import Localization
+from topoloc.map.nodes import NodePoses, node_distances
+from topoloc.map.side_nodes import gather_sides
+from topoloc.map.sums import LandmarkSums
+from topoloc.map.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
+
+
+@dataclass(frozen=True, eq=False)
+class MergedMap:
+    """The first map with the second one in it, and what that changed: numbers by their names."""
+
+    topomap: TopoMetricMap
+    changes: dict[str, Any]
+
+
+def merge_maps(
+    first: TopoMetricMap,
+    second: TopoMetricMap,
+    config: UpdateConfig | None = None,
+    localizer_config: LocalizerConfig | None = None,
+    progress: Progress | None = None,
+) -> MergedMap:
+    """One map of two, in the world of the first.
+
+    Raises:
+        ConfigError: a setting is out of its bounds.
+        MapError: they are one map, or the second lacks a kind of features of the first.
+        TrajectoryError: they see too little in common, or not at the distances that both say.
+        FeatureKindError, MissingExtraError, WeightsError: the maps' features cannot be compared here.
+    """
+    config, progress = config or UpdateConfig(), progress or (lambda stage, done, total: None)
+    check_bounds(config)
+    if missing := set(first.kinds) - set(second.kinds):
+        raise MapError(f"the second map holds no features {', '.join(sorted(missing))}, which the first has; build it with them")
+    if first.map_id is not None and first.map_id == second.map_id:
+        raise MapError("they are one map in two versions; nothing is merged")
+    held = _held(first, second, config, localizer_config, progress)
+    d_thresh = first.config.nodes.d_thresh
+    assert d_thresh is not None, "a map's own configuration is resolved"
+    added = [row for row, answer in held.answers.items() if not is_well_held(answer, d_thresh, config)]
+    poses = {row: pose for row, pose in enumerate(held.world_from_cams) if pose is not None}
+    merged = _with_nodes(first, second, added, poses)
+    changes = {
+        "nodes_of_second": len(second.summaries),
+        "localized": sum(answer is not None for answer in held.answers.values()),
+        "agreeing": len(held.agreeing),
+        "nodes_added": len(added),
+    }
+    return MergedMap(with_map_facts(merged, progress), changes)
+
+
+def _held(
+    first: TopoMetricMap, second: TopoMetricMap, config: UpdateConfig, localizer_config: LocalizerConfig | None, progress: Progress
+) -> SessionPoses:
+    """The second map's nodes, by their rows, in the world of the first."""
+    localizer = Localizer(first, localizer_config)
+    answers: dict[int, Localization | None] = {}
+    for row in range(len(second.summaries)):
+        features = {kind: second.nodes_of(kind)[row].features for kind in first.kinds}
+        result = localizer.ask(Picture.of_features(features, second.nodes[row].camera))[0]
+        answers[row] = result if isinstance(result, Localization) else None
+        progress("comparing the maps", row + 1, len(second.summaries))
+    own = {row: summary.world_from_cam for row, summary in enumerate(second.summaries)}
+    d_thresh = first.config.nodes.d_thresh
+    assert d_thresh is not None, "a map's own configuration is resolved"
+    try:
+        return held_by("the second map", own, answers, d_thresh, config.poses)
+    except TrajectoryError as error:
+        raise TrajectoryError(str(error).replace("the map stays as it is", "nothing is merged")) from None
+
+
+def _with_nodes(first: TopoMetricMap, second: TopoMetricMap, added: Sequence[int], poses: Mapping[int, Rigid3]) -> TopoMetricMap:
+    base = first.free_ids.session
+    sessions = {session.session_id: replace(session, session_id=base + k) for k, session in enumerate(second.sessions)}
+    session_ids = {old: session.session_id for old, session in sessions.items()}
+    first_id = first.free_ids.node
+    new_id = {row: first_id + k for k, row in enumerate(added)}
+    nodes = {kind: [_moved(second.nodes_of(kind)[row], new_id[row], poses[row], session_ids) for row in added] for kind in first.kinds}
+    views = {
+        kind: [PlaceView(n.features, n.camera.width, n.camera.height, n.summary.node_id) for n in of_kind]
+        for kind, of_kind in nodes.items()
+    }
+    summaries = [*first.summaries, *(node.summary for node in nodes[first.kind])]
+    grown = {kind: Overlay(first.nodes_of(kind), {}, nodes[kind]) for kind in first.kinds}
+    return replace(
+        first,
+        summaries=summaries,
+        nodes=grown.pop(first.kind),
+        other_kinds=grown,
+        edges=sorted({*first.edges, *_edges(first, second, new_id, poses)}, key=lambda edge: (edge.source_id, edge.target_id)),
+        place_images=Overlay(first.place_images, {}, _images(second, new_id, poses, session_ids)),
+        coarse_models=with_place_views(first, views),
+        length_m=first.length_m + second.length_m * len(added) / max(len(second.summaries), 1),
+        sessions=[*first.sessions, *sessions.values()],
+        sides=_sides(first, second, new_id, poses, summaries),
+    )
+
+
+def _view(node: TopoNode) -> PlaceView:
+    return PlaceView(node.features, node.camera.width, node.camera.height, node.summary.node_id)
+
+
+def _moved(node: TopoNode, node_id: int, world_from_cam: Rigid3, session_ids: Mapping[int, int]) -> TopoNode:
+    """A node of the second map as one of the first."""
+    of = node.summary
+    summary = replace(of, node_id=node_id, world_from_cam=world_from_cam, session_id=session_ids.get(of.session_id, of.session_id))
+    sums = [_of_session(sums, session_ids) for sums in node.sums]
+    return replace(node, summary=summary, sums=sums)
+
+
+def _of_session(sums: LandmarkSums, session_ids: Mapping[int, int]) -> LandmarkSums:
+    return replace(sums, session_id=session_ids.get(sums.session_id, sums.session_id))
+
+
+def _images(
+    second: TopoMetricMap, new_id: Mapping[int, int], poses: Mapping[int, Rigid3], session_ids: Mapping[int, int]
+) -> list[PlaceImage]:
+    """The mapping pictures that became the added nodes: others cannot be looked at again."""
+    wanted = {(second.summaries[row].session_id, second.summaries[row].name): row for row in new_id}
+    found = []
+    for image in second.place_images:
+        row = wanted.get((image.session_id, image.name))
+        if row is not None:
+            session_id = session_ids.get(image.session_id, image.session_id)
+            changes = {"node_id": new_id[row], "world_from_cam": poses[row], "session_id": session_id, "image_id": None}
+            found.append(replace(image, **changes))
+    return found
+
+
+def _edges(first: TopoMetricMap, second: TopoMetricMap, new_id: Mapping[int, int], poses: Mapping[int, Rigid3]) -> set[Edge]:
+    """The second map's edges; a node that was left out is the one of the first map that stands nearest."""
+    lambda_rot = first.config.nodes.lambda_rot
+    assert lambda_rot is not None, "a map's own configuration is resolved"
+    old = NodePoses.of([summary.world_from_cam for summary in first.summaries])
+    ids = {}
+    for row, summary in enumerate(second.summaries):
+        nearest = int(node_distances(poses[row], old, lambda_rot).argmin())
+        ids[summary.node_id] = new_id.get(row, first.summaries[nearest].node_id)
+    return {Edge(ids[e.source_id], ids[e.target_id]) for e in second.edges if ids[e.source_id] != ids[e.target_id]}
+
+
+def _sides(first: TopoMetricMap, second: TopoMetricMap, new_id: Mapping[int, int], poses: Mapping[int, Rigid3], summaries: Sequence[Any]):
+    """The walls along the way of both, where they are described alike."""
+    if first.sides is None or second.sides is None or first.sides.kind != second.sides.kind:
+        return first.sides
+    row_of = {summary.node_id: row for row, summary in enumerate(second.summaries)}
+    nodes = list(first.sides.nodes)
+    known = {summary.node_id: summary for summary in summaries}
+    for side in second.sides.nodes:
+        row = None if side.summary.of_node is None else row_of[side.summary.of_node]
+        if row is not None and row in new_id:
+            of_node = known[new_id[row]]
+            moved = poses[row] @ second.summaries[row].world_from_cam.inverse() @ side.summary.world_from_cam
+            summary = replace(side.summary, of_node=of_node.node_id, session_id=of_node.session_id, world_from_cam=moved)
+            nodes.append(replace(side, summary=summary))
+    return gather_sides(nodes, first.sides.kind, first.config.sides)

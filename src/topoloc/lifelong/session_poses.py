@@ -1,0 +1,222 @@
+"""Where a new session was taken, in the world of a map: the pictures that the map localizes hold the session's own motion in place.
+
+The session's motion is that of its poses (given, or SLAM's) in any world of their own; of a single camera without poses, the map itself is
+asked for every picture, as a stream. One rigid transform must explain most of what the map answers, but for a drift; the motion and
+the answers are then brought to agree as a pose graph, in which the map stands still.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from topoloc.bounds import Above, AtLeast, Between
+from topoloc.errors import CalibrationError, TrajectoryError
+from topoloc.geometry.rigid import Rigid3, covariance_of_inverse
+from topoloc.localization.localizer import Localizer
+from topoloc.localization.result import Localization
+from topoloc.map.config import MapConfig
+from topoloc.map.nodes import place_nodes
+from topoloc.sequences.frame import StereoSequence
+from topoloc.slam.pose_graph import Edge, PoseGraphConfig, optimise_graph
+from topoloc.tracking.tracker import Tracker
+
+Progress = Callable[[str, int, int], None]
+"""Called with a stage's name, steps done and steps in all."""
+_MIN_SPREAD_M = 0.5  # the scale of what hardly moves says nothing
+
+
+@dataclass(frozen=True)
+class SessionPosesConfig:
+    """How a session is held in place, and when it is refused."""
+
+    max_scale: Annotated[float, Above(0)] = 0.03
+    """A metre of the motion may be off by this share of a metre of the map, beside three sigmas of what the answers say of it."""
+    max_drift: Annotated[float, Between(0, 1)] = 0.03
+    """Of two answers of the map that agree, the motion between them may be off by this share of the way ..."""
+    max_turn_drift_deg: Annotated[float, AtLeast(0)] = 0.3
+    """... and by so many degrees a metre of the way, ..."""
+    slack: Annotated[float, Above(0)] = 0.3
+    """... and by so many D_thresh in any case, ..."""
+    slack_deg: Annotated[float, Above(0)] = 2.0
+    """... and by so many degrees."""
+    min_agreeing: Annotated[int, Between(2, 1000)] = 5
+    """Pictures that the map must localize in agreement with the motion; with fewer the session is refused."""
+    min_share: Annotated[float, Between(0, 1)] = 0.5
+    """Share of the localized pictures that must agree; with fewer the session is refused."""
+    drift: Annotated[float, Above(0)] = 0.01
+    """Sigma of the motion from picture to picture, as a share of its way, beside a millimetre."""
+    turn_drift: Annotated[float, Above(0)] = 0.002
+    """Sigma of its rotation, radians a metre of the way and a radian of the turn, beside half a milliradian."""
+    widened: Annotated[float, Above(0)] = 3.0
+    """The map's answers are trusted as if their sigmas were so many times as large: neighbours share errors of the map."""
+    graph: PoseGraphConfig = field(default_factory=PoseGraphConfig)
+
+
+@dataclass(frozen=True, eq=False)
+class SessionPoses:
+    """world_from_cam of each frame, up to the last with a pose, in the map's world, None where it is not known; what the map answered to
+    the frames that it was asked of, and which of these answers hold the session in place."""
+
+    world_from_cams: list[Rigid3 | None]
+    answers: Mapping[int, Localization | None]
+    agreeing: list[int]
+
+
+def poses_by_motion(
+    sequence: StereoSequence, localizer: Localizer, of_map: MapConfig, config: SessionPosesConfig, progress: Progress
+) -> SessionPoses:
+    """Of a session that has poses of its own, in any world. Frames so far apart as nodes of the map are asked.
+
+    Raises:
+        TrajectoryError: the map recognises too little of it, or not as its poses say.
+        UnreadableImageError, QueryError: from its pictures.
+    """
+    d_thresh = of_map.nodes.d_thresh
+    assert d_thresh is not None, "a map's own configuration is resolved"
+    own = {index: pose for index, pose in enumerate(sequence.poses) if pose is not None}
+    indices = list(own)
+    asked = [indices[k] for k in place_nodes(list(own.values()), of_map.nodes)]
+    answers: dict[int, Localization | None] = {}
+    for done, index in enumerate(asked):
+        frame = sequence[index]
+        result = localizer.localize(frame.image, frame.camera)
+        answers[index] = result if isinstance(result, Localization) else None
+        progress(f"localizing {sequence.name}", done + 1, len(asked))
+    return held_by(sequence.name, own, answers, d_thresh, config)
+
+
+def held_by(
+    name: str, own: Mapping[int, Rigid3], answers: Mapping[int, Localization | None], d_thresh: float, config: SessionPosesConfig
+) -> SessionPoses:
+    """A motion of its own world held in place by what a map answers to some of its pictures, all by their numbers.
+
+    Raises:
+        TrajectoryError: the map recognises too little of it, or not as the motion says.
+    """
+    localized = {index: result for index, result in answers.items() if result is not None}
+    agreeing = _agreeing(name, own, localized, len(answers), d_thresh, config)
+    return SessionPoses(_held(max(own) + 1, own, {k: localized[k] for k in agreeing}, config), answers, agreeing)
+
+
+def poses_by_map(
+    sequence: StereoSequence, tracker: Tracker, of_map: MapConfig, config: SessionPosesConfig, progress: Progress
+) -> SessionPoses:
+    """Of a session without poses: where the map localizes its pictures, as a stream. Frames so far apart as nodes are the answers.
+
+    Raises:
+        TrajectoryError: the map recognises too little of it.
+        UnreadableImageError, QueryError: from its pictures.
+    """
+    poses = list[Rigid3 | None]()
+    seen: dict[int, Localization] = {}
+    for index, t_ns in enumerate(sequence.t_ns):
+        frame = sequence[index]
+        if frame.camera is None:
+            raise CalibrationError(f"{sequence.name}: a session that the map is asked for needs a calibration (--camera)")
+        found = tracker.process(frame.image, frame.camera, t_ns)
+        is_known = found.state in ("localized", "tracked")
+        poses.append(found.smoothed if is_known else None)
+        if is_known and isinstance(found.result, Localization):
+            seen[index] = found.result
+        progress(f"localizing {sequence.name}", index + 1, len(sequence))
+    known = [index for index, pose in enumerate(poses) if pose is not None]
+    if len(known) < config.min_agreeing:
+        raise TrajectoryError(f"{sequence.name}: the map recognises {len(known)} of its {len(sequence)} pictures: too few to join")
+    asked = [known[k] for k in place_nodes([pose for pose in poses if pose is not None], of_map.nodes)]
+    return SessionPoses(poses, {index: seen.get(index) for index in asked}, [index for index in asked if index in seen])
+
+
+def _agreeing(
+    name: str, own: Mapping[int, Rigid3], localized: Mapping[int, Localization], num_asked: int, d_thresh: float, config: SessionPosesConfig
+) -> list[int]:
+    """The largest set of answers that one transform of the motion explains."""
+    indices = list(localized)
+    if len(indices) < config.min_agreeing:
+        raise TrajectoryError(
+            f"{name}: the map recognises {len(indices)} of {num_asked} pictures asked: another place, or changed; the map stays as it is"
+        )
+    _check_scale(name, own, localized, config.max_scale)
+    ways, slack_m = _ways(own), config.slack * d_thresh
+    agrees = np.array([_agree_with(k, own, localized, ways, slack_m, config) for k in indices])
+    best = agrees[int(np.argmax(agrees.sum(axis=1)))]
+    if best.sum() < max(config.min_agreeing, config.min_share * len(indices)):
+        raise TrajectoryError(
+            f"{name}: of {len(indices)} pictures that the map localizes {int(best.sum())} agree with its poses; the map stays as it is"
+        )
+    return [index for index, is_in in zip(indices, best, strict=True) if is_in]
+
+
+def _agree_with(
+    k: int,
+    own: Mapping[int, Rigid3],
+    localized: Mapping[int, Localization],
+    ways: Mapping[int, float],
+    slack_m: float,
+    config: SessionPosesConfig,
+) -> Bool[np.ndarray, " n"]:
+    """Which answers agree with the transform of the motion that answer `k` says."""
+    world_from_own = localized[k].world_from_cam @ own[k].inverse()
+    agrees = []
+    for index, answer in localized.items():
+        off = answer.world_from_cam.inverse() @ world_from_own @ own[index]
+        way = abs(ways[index] - ways[k])
+        near = float(np.linalg.norm(off.translation)) <= slack_m + config.max_drift * way
+        agrees.append(near and np.degrees(off.angle()) <= config.slack_deg + config.max_turn_drift_deg * way)
+    return np.array(agrees)
+
+
+def _check_scale(name: str, own: Mapping[int, Rigid3], localized: Mapping[int, Localization], max_scale: float) -> None:
+    """Hold that a metre of the motion is one of the map, by the distances between what was localized."""
+    a = np.array([own[k].translation for k in localized])
+    b = np.array([answer.world_from_cam.translation for answer in localized.values()])
+    rows, columns = np.triu_indices(len(a), 1)
+    own_lengths, lengths = np.linalg.norm(a[rows] - a[columns], axis=1), np.linalg.norm(b[rows] - b[columns], axis=1)
+    far = lengths > 0.5 * lengths.max()  # the scale of what hardly moves says nothing
+    if lengths.max() < _MIN_SPREAD_M or (own_lengths[far] == 0.0).any():
+        return
+    ratios = lengths[far] / own_lengths[far]
+    scale = float(np.median(ratios))
+    spread = 1.4826 * float(np.median(np.abs(ratios - scale)))
+    if abs(scale - 1.0) > max_scale + 3.0 * spread / np.sqrt(len(a)):
+        raise TrajectoryError(f"{name}: a metre of its poses is {scale:.3g} m of the map; the map stays as it is")
+
+
+def _ways(own: Mapping[int, Rigid3]) -> dict[int, float]:
+    """Metres gone up to each frame."""
+    positions = np.array([pose.translation for pose in own.values()])
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    return dict(zip(own, np.concatenate([[0.0], np.cumsum(steps)]).tolist(), strict=True))
+
+
+def _held(
+    num_frames: int, own: Mapping[int, Rigid3], anchors: Mapping[int, Localization], config: SessionPosesConfig
+) -> list[Rigid3 | None]:
+    """The motion held in place by the anchors: a pose graph whose first node is the map's world, which does not move."""
+    indices = list(own)
+    first = min(anchors)
+    world_from_own = anchors[first].world_from_cam @ own[first].inverse()
+    cam_from_worlds = [Rigid3.identity(), *((world_from_own @ own[k]).inverse() for k in indices)]
+    edges = [_motion(row, own[a], own[b], config) for row, (a, b) in enumerate(pairwise(indices), 1)]
+    row_of = {index: row for row, index in enumerate(indices, 1)}
+    for index, answer in anchors.items():
+        covariance = config.widened**2 * covariance_of_inverse(answer.world_from_cam, answer.covariance)
+        edges.append(Edge(0, row_of[index], answer.world_from_cam.inverse(), covariance, is_loop=True))
+    optimised = optimise_graph(cam_from_worlds, edges, config.graph)[1:]
+    poses: list[Rigid3 | None] = [None] * num_frames
+    for index, cam_from_world in zip(indices, optimised, strict=True):
+        poses[index] = cam_from_world.inverse()
+    return poses
+
+
+def _motion(row: int, own_from_a: Rigid3, own_from_b: Rigid3, config: SessionPosesConfig) -> Edge:
+    b_from_a = own_from_b.inverse() @ own_from_a
+    way = float(np.linalg.norm(b_from_a.translation))
+    sigma_m, sigma_rad = 0.001 + config.drift * way, 0.0005 + config.turn_drift * (way + b_from_a.angle())
+    covariance: Float[np.ndarray, "6 6"] = np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3)
+    return Edge(row, row + 1, b_from_a, covariance, is_loop=False)

@@ -1,0 +1,270 @@
+"""A new session joins a map: read from `update_map`.
+
+The session is first put where it was taken (`session_poses.py`). Where the map localizes its pictures well, nothing is added but what they
+saw of the landmarks that are there already: these counts tell later what is gone. Where it does not (new places, another light, a changed
+room), the session's own pictures become nodes, as if a map were built of them, and the pictures around teach the coarse localizers
+the way to these nodes. Nothing of what the map had is changed or dropped.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Annotated, Any
+
+import numpy as np
+from jaxtyping import Int
+
+from topoloc.bounds import Above, Between, check_bounds
+from topoloc.errors import TrajectoryError
+from topoloc.geometry.rigid import covariance_of_inverse, position_covariance
+from topoloc.lifelong.coarse_models import PlaceView, with_place_views
+from topoloc.lifelong.overlay import Overlay
+from topoloc.lifelong.session_poses import Progress, SessionPoses, SessionPosesConfig, poses_by_map, poses_by_motion
+from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.map_facts.building import with_map_facts
+from topoloc.localization.result import Localization
+from topoloc.map.drafts import NodeDraft, draft_node, finish_node, observe
+from topoloc.map.landmarks import Observations, counted_again, observe_points
+from topoloc.map.mapping_frames import PLACE_QUALITY, MappingFrame, MappingImage, PointLocator, mapping_image, posed_frames, small_jpeg
+from topoloc.map.nodes import NodePoses, node_distances
+from topoloc.map.sessions import Light, Session, mean_light, path_of
+from topoloc.map.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
+from topoloc.sequences.frame import StereoSequence
+from topoloc.sequences.frame_view import frame_view
+from topoloc.sequences.recording import SequenceView
+from topoloc.slam.metric_points import keypoint_sigmas
+from topoloc.tracking.tracker import Tracker
+
+_PICTURES_COMPARED = 3
+
+
+@dataclass(frozen=True)
+class UpdateConfig:
+    """When a session's pictures need nodes of their own."""
+
+    poses: SessionPosesConfig = field(default_factory=SessionPosesConfig)
+    min_inliers: Annotated[int, Between(1, 10_000)] = 60
+    """A picture that the map localizes with at least so many inliers ..."""
+    max_sigma: Annotated[float, Above(0)] = 0.1
+    """... and to within so many D_thresh (a sigma of its position) needs no node."""
+
+
+@dataclass(frozen=True, eq=False)
+class MapUpdate:
+    """The map with the session in it, the session with its poses in the map's world, and what changed: numbers and texts by their names."""
+
+    topomap: TopoMetricMap
+    sequence: StereoSequence
+    changes: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class _Joined:
+    """What the session brings: its nodes by kind of features, its pictures with the nodes that they belong to, what it saw of nodes that
+    were there, and its light."""
+
+    nodes: dict[str, list[TopoNode]]
+    images: list[PlaceImage]
+    views: dict[str, list[PlaceView]]
+    seen: dict[tuple[str, int], list[Observations]]
+    lights: list[Light]
+
+
+def update_map(
+    topomap: TopoMetricMap,
+    sequence: StereoSequence,
+    poses_from: str,
+    config: UpdateConfig | None = None,
+    localizer_config: LocalizerConfig | None = None,
+    progress: Progress | None = None,
+) -> MapUpdate:
+    """The map with one more session in it.
+
+    Args:
+        sequence: with poses in any metric world, or, where `poses_from` is `map`, pictures of a stream.
+        poses_from: where its poses come from, for the map to remember; `map`: the map is asked for every picture.
+
+    Raises:
+        ConfigError: a setting is out of its bounds.
+        TrajectoryError: it is in the map already; the map recognises too little of it, or not as its poses say.
+        FeatureKindError, MissingExtraError, WeightsError: the map's features cannot be found here.
+        RecordingError, CalibrationError, UnreadableImageError: from reading the recording.
+    """
+    config, progress = config or UpdateConfig(), progress or (lambda stage, done, total: None)
+    check_bounds(config)
+    _refuse_known(topomap, sequence)
+    localizer = Localizer(topomap, localizer_config)
+    if poses_from == "map":
+        held = poses_by_map(sequence, Tracker(localizer), topomap.config, config.poses, progress)
+    else:
+        held = poses_by_motion(sequence, localizer, topomap.config, config.poses, progress)
+    session_id = topomap.free_ids.session
+    without = [None] * (len(sequence) - len(held.world_from_cams))
+    posed = SequenceView(sequence, list(range(len(sequence))), [*held.world_from_cams, *without])
+    frames = posed_frames(posed, session_id)
+    joined = _joined(topomap, frames, held, config, progress)
+    session = _session(session_id, sequence, frames, joined, poses_from)
+    changed = _with_session(topomap, session, frames, joined)
+    first = joined.nodes[topomap.kind]
+    changes = {
+        "session": session_id,
+        "recording": sequence.name,
+        "frames": len(sequence),
+        "frames_with_pose": len(frames),
+        "asked": len(held.answers),
+        "localized": sum(answer is not None for answer in held.answers.values()),
+        "agreeing": len(held.agreeing),
+        "nodes_added": len(first),
+        "points_added": sum(len(node.features) for node in first),
+        "place_images_added": len(joined.images),
+        "not_taught": sorted({name.partition("@")[0] for name in topomap.coarse_models if not name.startswith("surf-vlad")}),
+    }
+    return MapUpdate(with_map_facts(changed, progress), posed, changes)
+
+
+def _refuse_known(topomap: TopoMetricMap, sequence: StereoSequence) -> None:
+    """A session that is in the map already is not doubled. Names and clocks may be those of another day: pictures, or paths, decide."""
+    if len(sequence) == 0:
+        return
+    times, path = (min(sequence.t_ns), max(sequence.t_ns)), path_of(sequence)
+    for session in topomap.sessions:
+        if session.name != sequence.name or session.start_ns is None or session.end_ns is None:
+            continue
+        if min(times[1], session.end_ns) < max(times[0], session.start_ns):
+            continue
+        is_same_file = path is not None and path == session.recording and (session.start_ns, session.end_ns) == times
+        if is_same_file or _shows_the_same(topomap, session.session_id, sequence):
+            raise TrajectoryError(f"{sequence.name}: it is in the map already, as session {session.session_id}; the map stays as it is")
+
+
+def _shows_the_same(topomap: TopoMetricMap, session_id: int, sequence: StereoSequence) -> bool:
+    """Whether pictures of one name are one picture, by what the map keeps of them."""
+    rows = {name: index for index, name in enumerate(sequence.names)}
+    common = [image for image in topomap.place_images if image.session_id == session_id and image.name in rows]
+    tried = [common[k] for k in np.unique(np.linspace(0, len(common) - 1, _PICTURES_COMPARED).astype(int))] if common else []
+    side = topomap.config.place_side_px
+    same = [small_jpeg(frame_view(sequence[rows[image.name]], False).picture, side, PLACE_QUALITY) == image.jpeg for image in tried]
+    return any(same)
+
+
+def _joined(
+    topomap: TopoMetricMap, frames: Sequence[MappingFrame], held: SessionPoses, config: UpdateConfig, progress: Progress
+) -> _Joined:
+    of_map = topomap.config
+    d_thresh, lambda_rot = of_map.nodes.d_thresh, of_map.nodes.lambda_rot
+    assert d_thresh is not None
+    assert lambda_rot is not None
+    locator = PointLocator(frames, of_map)
+    by_index = {frame.index: frame for frame in frames}
+    wanted = [by_index[k] for k, answer in held.answers.items() if k in by_index and not is_well_held(answer, d_thresh, config)]
+    drafts = list[NodeDraft]()
+    for done, frame in enumerate(wanted):
+        draft = draft_node(frame, locator, False, of_map)
+        if len(draft.points[topomap.kind].features) >= of_map.min_node_points:
+            drafts.append(draft)
+        progress("new nodes", done + 1, len(wanted))
+    covered = {by_index[k] for k in held.answers if k in by_index} - {draft.frame for draft in drafts}
+    joined = _Joined({kind: [] for kind in topomap.kinds}, [], {kind: [] for kind in topomap.kinds}, defaultdict(list), [])
+    old = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
+    new = NodePoses.of([draft.image.world_from_cam for draft in drafts]) if drafts else None
+    drafted = {draft.frame: draft.image for draft in drafts}
+    first_id = topomap.free_ids.node
+    for done, frame in enumerate(frames):
+        to_old = node_distances(frame.world_from_cam, old, lambda_rot)
+        to_new = np.zeros(0) if new is None else node_distances(frame.world_from_cam, new, lambda_rot)
+        is_of_new = len(to_new) > 0 and (to_new.min() <= max(d_thresh, to_old.min()))
+        if is_of_new or frame in covered:
+            image = drafted.get(frame) or mapping_image(frame, frame.view(with_depth=False), of_map)
+            joined.lights.append(image.light)
+            if frame in covered:
+                _see_again(topomap, image, frame.session_id, np.argsort(to_old, kind="stable"), joined)
+            if is_of_new:
+                _observe_new(drafts, frame, image, np.argsort(to_new, kind="stable"), topomap)
+                _teach(joined, frame, image, first_id + int(to_new.argmin()))
+        progress(f"pictures of {frame.sequence.name}", done + 1, len(frames))
+    for kind in topomap.kinds:
+        joined.nodes[kind] = [finish_node(first_id + k, draft, kind, of_map) for k, draft in enumerate(drafts)]
+    return joined
+
+
+def is_well_held(answer: Localization | None, d_thresh: float, config: UpdateConfig) -> bool:
+    """Whether the map needs no node where this answer was given."""
+    if answer is None or answer.num_inliers < config.min_inliers:
+        return False
+    of_inverse = covariance_of_inverse(answer.world_from_cam, answer.covariance)
+    at_camera = position_covariance(answer.world_from_cam.inverse(), of_inverse)
+    return float(np.sqrt(np.linalg.eigvalsh(at_camera)[-1])) <= config.max_sigma * d_thresh
+
+
+def _observe_new(
+    drafts: Sequence[NodeDraft], frame: MappingFrame, image: MappingImage, nearest: Int[np.ndarray, " n"], topomap: TopoMetricMap
+) -> None:
+    for k in nearest[: topomap.config.landmarks.nodes_per_image]:
+        if frame not in drafts[k].sources:
+            observe(drafts[k], image, frame.session_id, topomap.config)
+
+
+def _see_again(topomap: TopoMetricMap, image: MappingImage, session_id: int, nearest: Int[np.ndarray, " n"], joined: _Joined) -> None:
+    """What a picture shows of the nodes that are there."""
+    config = topomap.config
+    for row in nearest[: config.landmarks.nodes_per_image].tolist():
+        cam_from_node = image.world_from_cam.inverse() @ topomap.summaries[row].world_from_cam
+        for kind, features in image.features.items():
+            node = topomap.nodes_of(kind)[row]
+            roots = np.zeros((len(node.features), 3, 3))
+            roots[:, *np.tril_indices(3)] = node.point_sqrt_covs
+            known = (node.features, node.points_cam.astype(np.float64), roots @ roots.transpose(0, 2, 1))
+            seen_by = (features, keypoint_sigmas(features, config.points), image.camera, cam_from_node)
+            joined.seen[kind, row].append(observe_points(*known, *seen_by, config.landmarks, session_id))
+
+
+def _teach(joined: _Joined, frame: MappingFrame, image: MappingImage, node_id: int) -> None:
+    joined.images.append(PlaceImage(frame.sequence.name, frame.name, node_id, image.world_from_cam, image.place_jpeg, frame.session_id))
+    for kind, features in image.features.items():
+        joined.views[kind].append(PlaceView(features, image.camera.width, image.camera.height, node_id))
+
+
+def _session(session_id: int, sequence: StereoSequence, frames: Sequence[MappingFrame], joined: _Joined, poses_from: str) -> Session:
+    t_ns = [frame.t_ns for frame in frames]
+    camera = sequence[frames[0].index].camera
+    return Session(session_id, sequence.name, path_of(sequence), poses_from, min(t_ns), max(t_ns), camera, mean_light(joined.lights))
+
+
+def _with_session(topomap: TopoMetricMap, session: Session, frames: Sequence[MappingFrame], joined: _Joined) -> TopoMetricMap:
+    nodes = {kind: _with_nodes(topomap, kind, joined) for kind in topomap.kinds}
+    summaries = [*topomap.summaries, *(node.summary for node in joined.nodes[topomap.kind])]
+    steps = [b.world_from_cam.translation - a.world_from_cam.translation for a, b in pairwise(frames)]
+    return replace(
+        topomap,
+        summaries=summaries,
+        nodes=nodes.pop(topomap.kind),
+        other_kinds=nodes,
+        edges=sorted({*topomap.edges, *_edges(topomap, summaries, frames)}, key=lambda edge: (edge.source_id, edge.target_id)),
+        place_images=Overlay(topomap.place_images, {}, joined.images),
+        coarse_models=with_place_views(topomap, joined.views),
+        length_m=topomap.length_m + float(sum(np.linalg.norm(step) for step in steps)),
+        sessions=[*topomap.sessions, session],
+    )
+
+
+def _with_nodes(topomap: TopoMetricMap, kind: str, joined: _Joined) -> Overlay[TopoNode]:
+    """The nodes of a kind: those that were there, with what the session saw of their points, and the new ones."""
+    before, changed = topomap.nodes_of(kind), {}
+    for (of_kind, row), seen in joined.seen.items():
+        if of_kind == kind:
+            node = before[row]
+            sums = counted_again(len(node.features), seen, seen[0].session_id)
+            changed[row] = replace(node, sums=[*node.sums, sums]) if sums is not None else node
+    return Overlay(before, changed, joined.nodes[kind])
+
+
+def _edges(topomap: TopoMetricMap, summaries: Sequence[Any], frames: Sequence[MappingFrame]) -> set[Edge]:
+    """An edge wherever the session went from one node to another."""
+    lambda_rot = topomap.config.nodes.lambda_rot
+    assert lambda_rot is not None
+    poses = NodePoses.of([summary.world_from_cam for summary in summaries])
+    nearest = [summaries[int(node_distances(frame.world_from_cam, poses, lambda_rot).argmin())].node_id for frame in frames]
+    return {Edge(source, target) for source, target in pairwise(nearest) if source != target}

@@ -1,0 +1,56 @@
+"""What a result comes from: map, features, time and camera."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from topoloc.errors import CalibrationError, ResultError
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization import checked_json as checked
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What a result comes from: the map by its id, in which version (the number of its last edit), by which kind of `features`; when the
+    picture was taken (nanoseconds), and with which camera. What is not known is None, or empty. `tile` is what the map is called in the
+    atlas that was asked, `atlas_from_cam` the camera's pose in the atlas's world; None where no atlas was asked, or that is not known."""
+
+    map_id: str = ""
+    map_version: int = 0
+    features: str = ""
+    t_ns: int | None = None
+    camera: Camera | None = None
+    tile: str | None = None
+    atlas_from_cam: Rigid3 | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        camera = None if self.camera is None else self.camera.to_json()
+        of_atlas: dict[str, Any] = {} if self.tile is None else {"tile": self.tile}
+        if self.atlas_from_cam is not None:
+            of_atlas["atlas_from_cam"] = checked.pose_json(self.atlas_from_cam)
+        return of_atlas | {"map": self.map_id, "version": self.map_version, "t_ns": self.t_ns, "camera": camera, "features": self.features}
+
+    @staticmethod
+    def from_json(data: Mapping[str, Any]) -> Provenance:
+        """Of a result's JSON; results of before there was any have none. Raises ResultError."""
+        t_ns, camera, tile, pose = (data.get(key) for key in ("t_ns", "camera", "tile", "atlas_from_cam"))
+        if camera is not None and not isinstance(camera, dict):
+            raise ResultError("no result: 'camera' is no object")
+        try:
+            return Provenance(
+                checked.text(data.get("map", ""), "map"),
+                checked.whole(data.get("version", 0), "version"),
+                checked.text(data.get("features", ""), "features"),
+                None if t_ns is None else checked.whole(t_ns, "t_ns", -(2**63)),
+                None if camera is None else Camera.from_json(camera),
+                None if tile is None else checked.text(tile, "tile"),
+                None if pose is None else checked.rigid(pose, "atlas_from_cam"),
+            )
+        except CalibrationError as error:
+            raise ResultError(f"no result: {error}") from None
+
+
+NOTHING_KNOWN = Provenance()

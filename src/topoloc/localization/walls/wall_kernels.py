@@ -1,0 +1,35 @@
+"""Numba kernel of `wall_poses`: which of many upright poses do most matches agree with?"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from topoloc.compiled import kernel
+
+
+@kernel()
+def largest_agreement(seen, points, turns, shifts, tolerances, nearest):
+    """Row of the pose that most matches agree with, and how many these are.
+
+    Match k sees the point `points[k]` at the tangents `seen[k]`; pose j turns it by `turns[j]` about the vertical (y) and shifts it. The
+    two agree within `tolerances[k]`, where the point is at least `nearest` metres before the camera.
+    """
+    best, most = 0, 0
+    for j in range(len(turns)):
+        cosine, sine = np.cos(turns[j]), np.sin(turns[j])
+        count = 0
+        for k in range(len(seen)):
+            if count + len(seen) - k <= most:
+                break
+            x, y, z = points[k, 0], points[k, 1], points[k, 2]
+            depth = cosine * z - sine * x + shifts[j, 2]
+            if depth < nearest:
+                continue
+            miss_u = cosine * x + sine * z + shifts[j, 0] - seen[k, 0] * depth
+            miss_v = y + shifts[j, 1] - seen[k, 1] * depth
+            limit = tolerances[k] * depth
+            if miss_u * miss_u + miss_v * miss_v < limit * limit:
+                count += 1
+        if count > most:
+            best, most = j, count
+    return best, most

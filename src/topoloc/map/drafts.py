@@ -1,0 +1,83 @@
+"""Nodes in the making: points as first measured, what other mapping images saw of them since, and the node that comes of both."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from topoloc.features.features import Features
+from topoloc.map.config import MapConfig
+from topoloc.map.entries import NodeSummary, TopoNode
+from topoloc.map.landmarks import Observations, observe_points, refine_points, session_sums
+from topoloc.map.mapping_frames import MappingFrame, MappingImage, PointLocator, small_jpeg
+from topoloc.map.side_nodes import describe_sides
+from topoloc.slam.metric_points import keypoint_sigmas
+
+
+@dataclass(frozen=True, eq=False)
+class DraftPoints:
+    """Points of a node in the making as first measured, and what other images saw of them so far."""
+
+    features: Features
+    points_cam: Float[np.ndarray, "n 3"]
+    covariances: Float[np.ndarray, "n 3 3"]
+    observations: list[Observations]
+
+
+@dataclass(frozen=True, eq=False)
+class NodeDraft:
+    """A node in the making, its points by their kinds of features; `sources` are the frames that these were first measured in."""
+
+    frame: MappingFrame
+    image: MappingImage
+    template_jpeg: bytes
+    points: dict[str, DraftPoints]
+    sides: list[TopoNode]
+    sources: list[MappingFrame]
+
+
+def draft_node(frame: MappingFrame, locator: PointLocator, with_sides: bool, config: MapConfig) -> NodeDraft:
+    view = frame.view()
+    image = locator.image(frame, view)
+    located, sources = locator.locate(frame, view, image)
+    points = {}
+    for kind, features in image.features.items():
+        rows = np.flatnonzero(located[kind].valid)
+        points[kind] = DraftPoints(features.select(rows), located[kind].points_cam[rows], located[kind].covariances[rows], [])
+    template_jpeg = small_jpeg(view.picture, config.template_side_px, quality=75)
+    summary = NodeSummary(-1, frame.sequence.name, frame.name, frame.t_ns, image.world_from_cam, 0, frame.session_id)
+    sides = (
+        describe_sides(summary, view, config.features_of(config.kind_of_sides), config.points, config.sides)
+        if with_sides and not sources
+        else []
+    )
+    return NodeDraft(frame, image, template_jpeg, points, sides, [frame, *sources])
+
+
+def observe(draft: NodeDraft, image: MappingImage, session_id: int, config: MapConfig) -> None:
+    cam_from_node = image.world_from_cam.inverse() @ draft.image.world_from_cam
+    for kind, features in image.features.items():
+        points, sigmas_px = draft.points[kind], keypoint_sigmas(features, config.points)
+        known, seen_by = (points.features, points.points_cam, points.covariances), (features, sigmas_px, image.camera, cam_from_node)
+        points.observations.append(observe_points(*known, *seen_by, config.landmarks, session_id))
+
+
+def finish_node(node_id: int, draft: NodeDraft, kind: str, config: MapConfig) -> TopoNode:
+    """Refine the points of a kind by what was observed; keep those seen again first, the strongest among them."""
+    points, frame, image = draft.points[kind], draft.frame, draft.image
+    refined = refine_points(points.points_cam, points.covariances, points.observations, config.landmarks)
+    rows = np.flatnonzero(refined.agrees)
+    rows = np.sort(rows[np.argsort(-np.minimum(refined.num_observations[rows], 2), kind="stable")][: config.max_node_points])
+    sqrt_covs = np.linalg.cholesky(refined.covariances[rows])[:, *np.tril_indices(3)]
+    sums = session_sums(refined.points_cam, points.points_cam, points.covariances, points.observations, rows, frame.session_id)
+    return TopoNode(
+        NodeSummary(node_id, frame.sequence.name, frame.name, frame.t_ns, image.world_from_cam, len(rows), frame.session_id),
+        image.camera,
+        points.features.select(rows),
+        refined.points_cam[rows].astype(np.float32),
+        sqrt_covs.astype(np.float32),
+        draft.template_jpeg,
+        sums,
+    )

@@ -1,0 +1,107 @@
+"""Sub-maps joined across a gap by what many weak pairs of pictures say together; and not joined by one thing that hangs in two rooms."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from aliased_wall import walk_along
+from room_frames import RIG, FrameList, walk
+
+import tiny_world
+from topoloc.geometry.alignment import absolute_trajectory_errors
+from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.sequences.frame import StereoFrame, StereoSequence
+from topoloc.sequences.frame_view import frame_view
+from topoloc.slam.input_checks import InputCheckConfig, InputChecks
+from topoloc.slam.keyframes import FramePose, KeyFrame, Landmarks, PlaceView
+from topoloc.slam.loop_closure import LoopConfig, find_links
+from topoloc.slam.odometry import Odometry
+from topoloc.slam.place_matching import PlaceMatchingConfig, place_view
+from topoloc.slam.slam import SlamConfig, run_slam
+from topoloc.slam.steps import OdometryConfig
+from topoloc.slam.submap_joins import JoinConfig, find_joins, group_submaps
+
+HERE, BEYOND = np.arange(0.0, 4.8, 0.4), np.arange(6.0, 10.8, 0.4)
+GAP_S = 2.0
+AROUND = 0.8  # radians by which the camera has turned in the gap: a strip at the edge is in both parts
+STRICT = PlaceMatchingConfig(min_inliers=120)  # no single pair of pictures is believed
+
+
+def frames(places: np.ndarray, panels: list[tiny_world.Panel], turn: float = 0.0, start_s: float = 0.0) -> list[StereoFrame]:
+    """A tenth of a second after each other, the camera turned to the left by `turn` radians."""
+    made = []
+    for i, place in enumerate(places):
+        path = tiny_world.path_pose(float(place))
+        pose = Rigid3(exp_so3(np.array([0.0, 0.0, turn])) @ path.rotation, path.translation)
+        noise = 10 * round(1000 * start_s) + 2 * i
+        left, right = (tiny_world.render(panels, p, noise_seed=noise + k)[0] for k, p in enumerate((pose, tiny_world.right_pose(pose))))
+        t_ns = round(1e9 * start_s) + i * 100_000_000
+        made.append(StereoFrame(f"{t_ns}.png", t_ns, left, tiny_world.CAMERA, right, RIG, world_from_cam=pose))
+    return made
+
+
+def tracked(*recordings: FrameList) -> tuple[list[KeyFrame], list[FramePose]]:
+    """Key frames and known frames of odometry alone."""
+    keyframes: list[KeyFrame] = []
+    landmarks, poses = Landmarks(), []
+    for number, recording in enumerate(recordings):
+        odometry = Odometry(number, keyframes, landmarks, InputChecks(recording.name, InputCheckConfig()), OdometryConfig())
+        for i, frame in enumerate(recording.frames):
+            poses += odometry.process(i, frame)
+        poses += odometry.finish()
+    return keyframes, poses
+
+
+def looking_at(*recordings: StereoSequence):
+    def look(keyframe: KeyFrame) -> PlaceView:
+        return place_view(frame_view(recordings[keyframe.recording][keyframe.frame_idx]), PlaceMatchingConfig())
+
+    return look
+
+
+def test_what_both_sides_of_a_gap_see_at_their_edges_joins_them_and_no_frame_is_lost():
+    room = tiny_world.room()
+    walked = FrameList([*frames(HERE, room), *frames(BEYOND, room, AROUND, GAP_S)])
+    result = run_slam(walked, SlamConfig(odometry=OdometryConfig(places=STRICT), loops=LoopConfig(matching=STRICT)))
+    assert (result.num_submaps, result.num_joined, result.num_lost) == (2, 2, 0)
+    found = [pose for pose in result.poses[0] if pose is not None]
+    assert len(found) == len(walked)
+    assert absolute_trajectory_errors([pose for pose in walked.poses if pose is not None], found).max() < 0.02
+
+
+@pytest.fixture(scope="module")
+def two_rooms() -> tuple[FrameList, FrameList]:
+    """All is another in the second room but one board, which hangs where it hangs in the first."""
+    here, there = tiny_world.room(), tiny_world.room(3)
+    return FrameList(frames(HERE, here)), FrameList(frames(HERE + 0.1, [*there[:3], here[3], there[4]], start_s=10.0))
+
+
+def test_a_board_that_hangs_in_two_rooms_joins_them_not(two_rooms: tuple[FrameList, FrameList]):
+    keyframes, _ = tracked(*two_rooms)
+    assert find_links(keyframes, LoopConfig()) == []
+    config = JoinConfig()
+    assert find_joins(keyframes, [], looking_at(*two_rooms), config, LoopConfig()) == []
+    blind = replace(config, min_seen_again=0.0, min_covered=0.0)
+    deceived = find_joins(keyframes, [], looking_at(*two_rooms), blind, LoopConfig())
+    assert len(deceived) > 0
+    assert set(group_submaps(keyframes, deceived).values()) == {0}
+
+
+def test_equal_panels_join_nothing():
+    """Each recording is shorter than a panel, so that no other place of it says otherwise."""
+    places, times = np.arange(0.0, 1.0, 0.12), list(0.1 * np.arange(9))
+    here, there = (walk_along(list(places + start), times) for start in (0.0, 10.06))
+    keyframes, _ = tracked(here, there)
+    assert find_joins(keyframes, [], looking_at(here, there), JoinConfig(), LoopConfig()) == []
+
+
+def test_frames_sought_in_vain_at_the_end_are_a_submap():
+    """Six frames elsewhere are fewer than those for which the camera is sought."""
+    here, there = walk(list(HERE[:6])), walk(list(HERE[:6]), seed=3)
+    later = [replace(frame, t_ns=frame.t_ns + 2_000_000_000) for frame in there.frames]
+    keyframes, poses = tracked(FrameList([*here.frames, *later]))
+    assert [pose.frame_idx for pose in poses] == list(range(12))
+    assert {keyframe.submap for keyframe in keyframes} == {0, 1}
+    assert [pose.keyframe.submap for pose in poses] == [0] * 6 + [1] * 6
