@@ -94,6 +94,8 @@ class AtlasLocalizer:
         if not atlas.manifest.tiles:
             raise AtlasError(f"the atlas {atlas.store.where} has no tiles; `topoloc atlas add` adds them")
         self.problems: dict[str, str] = {}
+        for note in atlas.notes:
+            self._warn(note)
         for tile_id, problem in atlas.problems.items():
             self._warn(f"tile {tile_id} is asked after all others: {problem}")
         self._focal = max(tile.focal_px for tile in atlas.manifest.tiles)
