@@ -34,7 +34,7 @@ class AtlasIndex:
     def __init__(
         self, tile_ids: Sequence[str], vectors: Sequence[PlaceVectors], shards: Sequence[tuple[PlaceShard, Sequence[int]]] = ()
     ) -> None:
-        self._tile_ids = list(tile_ids)
+        self._tile_ids, self._all = list(tile_ids), np.ones(len(tile_ids), bool)
         self._by_kind: dict[str, list[_Places]] = {}
         for kind in {kind for one in vectors for kind in one}:
             rows = [number for number, one in enumerate(vectors) if kind in one and len(one[kind]) > 0]
@@ -61,7 +61,7 @@ class AtlasIndex:
             by_kind: the picture's place vector by each kind that it was described with, the one that tells most the last.
             among: only these tiles are named; None: all.
         """
-        is_asked = np.array([among is None or tile_id in among for tile_id in self._tile_ids], bool)
+        is_asked = self._all if among is None else np.array([tile_id in among for tile_id in self._tile_ids], bool)
         likeness: dict[int, float] = {}
         for kind, vector in by_kind.items():
             found = self._found(kind, np.ascontiguousarray(vector, np.float32), num_tiles, is_asked)

@@ -28,7 +28,7 @@ from topoloc.errors import AtlasError
 from topoloc.features.network_files import cache_folder
 from topoloc.places.shared_vocabulary import shared_vocabulary
 
-MAX_EXACT_PLACES, SHARD_PLACES = 10_000, 1 << 20
+MAX_EXACT_PLACES, SHARD_PLACES = 20_000, 1 << 20
 """So many places that lie in no shard are compared one by one; so many places a shard holds, but for those of one tile."""
 _MAX_UNSEEN, _UNUSED_S = 0.25, 86_400.0
 ReadPlaces = Callable[[Tile], PlaceVectors]

@@ -1,7 +1,7 @@
 """A shard of an atlas's places: those of many tiles by one kind of features, found by codes of 32 bytes, compared by themselves.
 
 FAISS keeps of each place a product-quantised code (half a byte for two of its numbers) in the cell of its nearest centre. A query looks into
-the nearest eighth of the cells, and the places that look nearest by their codes are compared by their vectors, half floats that stay on the
+the nearest eighth of the cells (64 at least), and the places that look nearest by their codes are compared by their vectors, half floats that stay on the
 disk: only pages that are asked come into memory, and processes share them. One file holds it all, with a checksum; it can be made anew at
 any time.
 """
@@ -11,7 +11,8 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ NUM_COMPARED, MAX_COMPARED = 1024, 16_384
 """Places that are compared by their vectors; where they are of too few tiles, eight times as many, up to the second number."""
 MAX_ROWS_COMPARED = 8_192
 """Of tiles that have no more places together than this, all are compared."""
-_CELLS_PER_PROBE, _MAX_CELLS = 8, 4096
+_MIN_PROBES, _CELLS_PER_PROBE, _MAX_CELLS = 64, 8, 4096
 _NUM_LEARNT_FROM, _CHUNK = 65_536, 65_536
 _MAGIC, _ALIGNMENT = b"topoloc-places-1\n", 4096
 
@@ -56,7 +57,7 @@ class PlaceShard:
         self.kind, self.vocabulary, self.tiles, self.vectors = kind, vocabulary, list(tiles), vectors
         self.bounds: Int[np.ndarray, " _"] = np.cumsum([0, *(tile.num_rows for tile in tiles)])
         self._codes = _coded(vectors) if codes is None else codes
-        self._num_probes = max(1, round(self._codes.nlist / _CELLS_PER_PROBE))
+        self._num_probes = min(self._codes.nlist, max(_MIN_PROBES, round(self._codes.nlist / _CELLS_PER_PROBE)))
         self._chosen: tuple[bytes, Any] | None = None
 
     @property
@@ -73,30 +74,34 @@ class PlaceShard:
         Args:
             is_asked: of each tile whether it may be named.
         """
+        num_asked, count = int(is_asked.sum()), max(NUM_COMPARED, 16 * num_tiles)
+        while True:
+            rows, similarities = self.nearest(vector, count, is_asked)
+            tiles, first = np.unique(np.searchsorted(self.bounds, rows, "right") - 1, return_index=True)
+            if len(tiles) >= min(num_tiles, num_asked) or count >= MAX_COMPARED:
+                best = np.argsort(first)[:num_tiles]
+                return tiles[best], similarities[first[best]]
+            count *= 8
+
+    def nearest(
+        self, vector: Float32[np.ndarray, " d"], count: int, is_asked: Bool[np.ndarray, " t"]
+    ) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
+        """The rows of about so many of the most similar places of these tiles, the nearest first, and their similarities; of more tiles
+        than few, those that look so by their codes."""
         asked = np.flatnonzero(is_asked)
         num_rows = int((self.bounds[asked + 1] - self.bounds[asked]).sum())
         if num_rows <= MAX_ROWS_COMPARED:
-            rows = [np.arange(self.bounds[tile], self.bounds[tile + 1]) for tile in asked]
-            return self._best_of_tiles(vector, np.concatenate(rows) if rows else np.zeros(0, np.int64), num_tiles)
-        chosen = None if len(asked) == len(is_asked) else self._chosen_rows(is_asked)
-        parameters = faiss.SearchParametersIVF(nprobe=self._num_probes, sel=chosen)
-        count = max(NUM_COMPARED, 16 * num_tiles)
-        while True:
-            _, rows = self._codes.search(vector[None], min(count, num_rows), params=parameters)
-            tiles, similarities = self._best_of_tiles(vector, rows[0][rows[0] >= 0], num_tiles)
-            if len(tiles) >= min(num_tiles, len(asked)) or count >= min(MAX_COMPARED, num_rows):
-                return tiles, similarities
-            count *= 8
-
-    def _best_of_tiles(
-        self, vector: Float32[np.ndarray, " d"], rows: Int[np.ndarray, " n"], num_tiles: int
-    ) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
+            spans = [np.arange(self.bounds[tile], self.bounds[tile + 1]) for tile in asked]
+            rows = np.concatenate(spans) if spans else np.zeros(0, np.int64)
+        else:
+            chosen = None if len(asked) == len(is_asked) else self._chosen_rows(is_asked)
+            parameters = faiss.SearchParametersIVF(nprobe=self._num_probes, sel=chosen)
+            with _one_thread():
+                found = self._codes.search(vector[None], min(count, num_rows), params=parameters)[1][0]
+            rows = found[found >= 0]
         similarities = self.vectors[rows].astype(np.float32) @ vector
         order = np.argsort(-similarities, kind="stable")
-        of_tile = np.searchsorted(self.bounds, rows[order], "right") - 1
-        tiles, first = np.unique(of_tile, return_index=True)
-        best = np.argsort(first)[:num_tiles]
-        return tiles[best], similarities[order][first[best]]
+        return rows[order], similarities[order]
 
     def _chosen_rows(self, is_asked: Bool[np.ndarray, " t"]) -> Any:
         """FAISS's filter for the places of these tiles; the last one is kept, for the next query mostly has the same."""
@@ -165,13 +170,23 @@ def _coded(vectors: Float16[np.ndarray, "n d"]) -> Any:
     num_rows, dimension = vectors.shape
     num_cells = max(1, min(round(math.sqrt(num_rows)), _MAX_CELLS))
     num_parts = dimension // 2 if dimension % 2 == 0 else dimension
-    index = faiss.IndexIVFPQFastScan(
-        faiss.IndexFlatIP(dimension), dimension, num_cells, num_parts, 4, faiss.METRIC_INNER_PRODUCT, 32, True
-    )
+    index = faiss.IndexIVFPQFastScan(faiss.IndexFlatIP(dimension), dimension, num_cells, num_parts, 4, faiss.METRIC_INNER_PRODUCT, 32, True)
     index.cp.niter, index.cp.seed, index.cp.min_points_per_centroid = 8, 1, 1
     index.pq.cp.min_points_per_centroid = 1
     sample = np.sort(np.random.default_rng(1).permutation(num_rows)[:_NUM_LEARNT_FROM])
-    index.train(vectors[sample].astype(np.float32))  # pyright: ignore[reportCallIssue]
-    for start in range(0, num_rows, _CHUNK):
-        index.add(vectors[start : start + _CHUNK].astype(np.float32))  # pyright: ignore[reportCallIssue]
+    with _one_thread():
+        index.train(vectors[sample].astype(np.float32))  # pyright: ignore[reportCallIssue]
+        for start in range(0, num_rows, _CHUNK):
+            index.add(vectors[start : start + _CHUNK].astype(np.float32))  # pyright: ignore[reportCallIssue]
     return index
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """FAISS by this thread alone: its threads wait for each other at full speed, ten times as long where others need the processors."""
+    before = faiss.omp_get_max_threads()
+    faiss.omp_set_num_threads(1)
+    try:
+        yield
+    finally:
+        faiss.omp_set_num_threads(before)
