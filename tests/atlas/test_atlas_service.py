@@ -73,9 +73,7 @@ def _geopose(client: TestClient, queries: Path, *readings: dict[str, float]) -> 
     return client.post("/localize/geopose", json={"id": "1", "sensorReadings": said})
 
 
-def test_the_geopose_protocol_asks_the_atlas_and_only_tiles_near_the_device(
-    client: TestClient, own_atlas: Path, room_map: Path, queries: Path
-):
+def test_geopose_asks_the_atlas_and_only_tiles_near_the_device(client: TestClient, own_atlas: Path, room_map: Path, queries: Path):
     assert _geopose(client, queries).status_code == 409
     with TopoMetricMap.load(room_map) as topomap:
         turned = Rigid3(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.zeros(3))

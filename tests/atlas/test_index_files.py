@@ -112,7 +112,7 @@ def test_a_small_shard_is_made_one_with_what_comes(campus: Campus, monkeypatch: 
     assert sorted(len(PlaceShard.open(path).vectors) for path in campus.files) == [
         720,
         1320,
-    ]  # others may still have opened the smaller one
+    ]  # the smaller may be open elsewhere
     long_ago = time.time() - 2 * 86_400
     for path in campus.files:
         os.utime(path, (long_ago, long_ago))

@@ -1,9 +1,9 @@
 """A shard of an atlas's places: those of many tiles by one kind of features, found by codes of 32 bytes, compared by themselves.
 
-FAISS keeps of each place a product-quantised code (half a byte for two of its numbers) in the cell of its nearest centre. A query looks into
-the nearest eighth of the cells (64 at least), and the places that look nearest by their codes are compared by their vectors, half floats that stay on the
-disk: only pages that are asked come into memory, and processes share them. One file holds it all, with a checksum; it can be made anew at
-any time.
+FAISS keeps of each place a product-quantised code (half a byte for two of its numbers) in the cell of its nearest centre. A query looks
+into the nearest eighth of the cells (64 at least), and the places that look nearest by their codes are compared by their vectors, half
+floats that stay on the disk: only pages that are asked come into memory, and processes share them. One file holds it all, with a checksum;
+it can be made anew at any time.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class PlaceShard:
             rows = np.concatenate(spans) if spans else np.zeros(0, np.int64)
         else:
             chosen = None if len(asked) == len(is_asked) else self._chosen_rows(is_asked)
-            parameters = faiss.SearchParametersIVF(nprobe=self._num_probes, sel=chosen)
+            parameters = faiss.SearchParametersIVF(nprobe=self._num_probes, sel=chosen)  # pyright: ignore[reportCallIssue]
             with _one_thread():
                 found = self._codes.search(vector[None], min(count, num_rows), params=parameters)[1][0]
             rows = found[found >= 0]
@@ -108,7 +108,7 @@ class PlaceShard:
         key, known = is_asked.tobytes(), self._chosen
         if known is None or known[0] != key:
             bits = np.packbits(np.repeat(is_asked, np.diff(self.bounds)), bitorder="little")
-            self._chosen = known = key, faiss.IDSelectorBitmap(bits)
+            self._chosen = known = key, faiss.IDSelectorBitmap(bits)  # pyright: ignore[reportCallIssue]
         return known[1]
 
     def save(self, folder: Path) -> Path:
@@ -127,7 +127,7 @@ class PlaceShard:
 
             file.write(_MAGIC + bytes(32))
             write(len(header).to_bytes(8, "little") + header)
-            write(memoryview(codes))
+            write(codes.tobytes())
             write(bytes(-file.tell() % _ALIGNMENT))
             for start in range(0, len(self.vectors), _CHUNK):
                 write(np.ascontiguousarray(self.vectors[start : start + _CHUNK]).data)
@@ -137,7 +137,7 @@ class PlaceShard:
 
     @staticmethod
     def open(path: Path) -> PlaceShard:
-        """A shard as it was saved; its vectors stay on the disk. Raises AtlasError where the file is missing, damaged or of another kind."""
+        """A shard as it was saved; its vectors stay on the disk. Raises AtlasError: the file is missing, damaged or another."""
         try:
             return _opened(path)
         except (OSError, ValueError, TypeError, KeyError, RuntimeError, RecursionError, OverflowError) as error:

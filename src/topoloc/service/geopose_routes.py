@@ -80,7 +80,7 @@ async def localize_geopose(request: Request, only: MapOnly = None) -> Response:
 
 
 def _replied(service: Service, body: bytes, only: str | None) -> tuple[GeoPoseReply | None, dict[str, Localization | NotLocalized]]:
-    """The work of a request: the answer of each map, and of each atlas by the tile that knows most; and the reply where they agree on one."""
+    """The work of a request: the answer of each map, and of each atlas; and the reply where they agree on one place."""
     asked = read_request(body)
     reading = asked.camera_reading()
     picture = picture_of(reading)
@@ -107,10 +107,11 @@ def _replied(service: Service, body: bytes, only: str | None) -> tuple[GeoPoseRe
             georeferences |= known
     if not results:
         raise Refusal(409, "no map here knows where on earth it lies; `topoloc georeference` tells it")
-    best = _agreed({name: result for name, result in results.items() if isinstance(result, Localization)})
+    found = {name: result for name, result in results.items() if isinstance(result, Localization)}
+    best = _agreed(found)
     if best is None:
         return None, results
-    return reply_to(asked, results[best], georeferences[best], 1e3 * time.time()), results
+    return reply_to(asked, found[best], georeferences[best], 1e3 * time.time()), results
 
 
 def _camera_of(reading: CameraReading, picture: PictureBytes | Image, image: Image, topomap: TopoMetricMap | None) -> Camera | RoughCamera:
