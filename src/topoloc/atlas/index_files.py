@@ -83,7 +83,6 @@ def open_index(tiles: Sequence[Tile], read: ReadPlaces, folder: Path) -> OpenedI
     for kind, vectors in few.items():
         if sum(len(rows) for _, rows in vectors) > MAX_EXACT_PLACES:
             kept[kind] = work.with_new_shards(kind, kept[kind], vectors)
-            vectors.clear()
     work.remove_unused(kept)
     ids = [tile.tile_id for tile in tiles]
     exact = dict[str, dict[str, np.ndarray]]()
@@ -158,16 +157,17 @@ class _Opening:
                     rest[kind].append((ShardTile(tile.tile_id, tile.places.sha256, len(rows)), rows.astype(np.float16)))
         return rest
 
-    def with_new_shards(self, kind: str, kept: Sequence[_Kept], rest: Sequence[_Rows]) -> list[_Kept]:
-        """All of them in shards; those that are less than half full are made one with the rest."""
+    def with_new_shards(self, kind: str, kept: Sequence[_Kept], rest: list[_Rows]) -> list[_Kept]:
+        """All of them in shards; those that are less than half full are made one with the rest, which is emptied."""
         full = [one for one in kept if one.num_live >= SHARD_PLACES // 2]
-        pending = [row for one in kept if one not in full for row in one.rows()] + list(rest)
+        pending = [row for one in kept if one not in full for row in one.rows()] + rest
+        rest.clear()
         while pending:
             sizes = np.cumsum([tile.num_rows for tile, _ in pending])
             count = max(1, int(np.searchsorted(sizes, SHARD_PLACES, "right")))
-            part, pending = pending[:count], pending[count:]
-            shard = PlaceShard(kind, self.versions[kind], [tile for tile, _ in part], np.concatenate([rows for _, rows in part]))
-            full.append(_Kept(self._saved(shard), [True] * len(part)))
+            tiles = [tile for tile, _ in pending[:count]]
+            shard = PlaceShard(kind, self.versions[kind], tiles, _taken(pending, count))
+            full.append(_Kept(self._saved(shard), [True] * count))
         return full
 
     def _saved(self, shard: PlaceShard) -> PlaceShard:
@@ -188,3 +188,16 @@ class _Opening:
                     os.utime(path)
                 elif time.time() - path.stat().st_mtime > _UNUSED_S:
                     path.unlink()
+
+
+def _taken(pending: list[_Rows], count: int) -> Float16[np.ndarray, "n d"]:
+    """The vectors of the first tiles, which are let go of one by one: they are half of a gigabyte."""
+    num_rows = sum(tile.num_rows for tile, _ in pending[:count])
+    stacked, first = np.empty((num_rows, pending[0][1].shape[1]), np.float16), 0
+    for number in range(count):
+        tile, rows = pending[number]
+        stacked[first : first + tile.num_rows] = rows
+        first += tile.num_rows
+        pending[number] = tile, rows[:0].copy()
+    del pending[:count]
+    return stacked

@@ -1,7 +1,7 @@
 """A shard of an atlas's places: those of many tiles by one kind of features, found by codes of 32 bytes, compared by themselves.
 
 FAISS keeps of each place a product-quantised code (half a byte for two of its numbers) in the cell of its nearest centre. A query looks
-into the nearest eighth of the cells (64 at least), and the places that look nearest by their codes are compared by their vectors, half
+into the nearest eighth of the cells (96 at least), and the places that look nearest by their codes are compared by their vectors, half
 floats that stay on the disk: only pages that are asked come into memory, and processes share them. One file holds it all, with a checksum;
 it can be made anew at any time.
 """
@@ -28,7 +28,7 @@ NUM_COMPARED, MAX_COMPARED = 1024, 16_384
 """Places that are compared by their vectors; where they are of too few tiles, eight times as many, up to the second number."""
 MAX_ROWS_COMPARED = 8_192
 """Of tiles that have no more places together than this, all are compared."""
-_MIN_PROBES, _CELLS_PER_PROBE, _MAX_CELLS = 64, 8, 4096
+_MIN_PROBES, _CELLS_PER_PROBE, _MAX_CELLS = 96, 8, 4096
 _NUM_LEARNT_FROM, _CHUNK = 65_536, 65_536
 _MAGIC, _ALIGNMENT = b"topoloc-places-1\n", 4096
 
