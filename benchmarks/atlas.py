@@ -3,8 +3,8 @@
     python benchmarks/atlas.py ATLAS TILE=RECORDING ... [--elsewhere RECORDING ...] [--alike c1,c2] [--memory-mb 256] [--json FILE]
 
 Each picture is asked of its own tile's map alone and of the atlas, in turns, in one process. `--alike` names tiles of places that share
-things (two fittings of one building): an answer in another of them is counted apart, and held against the recording's truth. A picture of `--elsewhere` is asked of each tile's
-map alone, and of the atlas: its time is compared with the mean of theirs.
+things (two fittings of one building): an answer in another of them is counted apart, and held against the recording's truth. A picture of
+`--elsewhere` is asked of each tile's map alone, and of the atlas: its time is compared with the mean of theirs.
 """
 
 from __future__ import annotations
@@ -75,9 +75,10 @@ def asked_elsewhere(localizer: AtlasLocalizer, alone: dict[str, Localizer], fram
 def elsewhere_line(name: str, rows: list[dict[str, Any]]) -> str:
     """The figures of a recording of elsewhere, or of all."""
     ratios = [row["ms_atlas"] / row["ms_alone"] for row in rows]
+    by_atlas, by_maps = sum(row["answer"] is not None for row in rows), sum(row["poses_alone"] for row in rows)
     return (
-        f"{name:24} {len(rows):4} pictures of elsewhere: poses by the atlas {sum(row['answer'] is not None for row in rows)}, by single maps "
-        f"{sum(row['poses_alone'] for row in rows)}; time {np.median(ratios):.2f} of a single map's in the median, {np.min(ratios):.2f} to "
+        f"{name:24} {len(rows):4} pictures of elsewhere: poses by the atlas {by_atlas}, by single maps {by_maps}; "
+        f"time {np.median(ratios):.2f} of a single map's in the median, {np.min(ratios):.2f} to "
         f"{np.max(ratios):.2f}"
     )
 

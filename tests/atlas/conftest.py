@@ -57,7 +57,7 @@ def s3_server() -> Iterator[str]:
 @pytest.fixture
 def s3_bucket(s3_server: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> str:
     """A new bucket, `s3://...`; files that are read of it are kept in a folder of the test."""
-    import s3fs
+    import s3fs  # pyright: ignore[reportMissingImports]
 
     said = {"AWS_ENDPOINT_URL": s3_server, "AWS_DEFAULT_REGION": "us-east-1"}
     said |= {"AWS_ACCESS_KEY_ID": "tests", "AWS_SECRET_ACCESS_KEY": "tests", "TOPOLOC_CACHE": str(tmp_path / "cache")}

@@ -87,7 +87,7 @@ def test_of_manifests_of_one_number_the_first_counts(s3_bucket: str):
 
 
 def test_what_another_machine_wrote_since_the_last_listing_is_there(s3_bucket: str):
-    import s3fs
+    import s3fs  # pyright: ignore[reportMissingImports]
 
     first = ObjectStore(f"{s3_bucket}/campus")
     s3fs.S3FileSystem.clear_instance_cache()

@@ -139,9 +139,9 @@ class _Opening:
         return kept
 
     def read_rest(self, kept: dict[str, list[_Kept]], read: ReadPlaces) -> dict[str, list[_Rows]]:
-        """The place vectors, by kind, of tiles that lie in no shard of it."""
+        """The place vectors, by kind, of tiles that lie in no shard of it; as soon as they fill one they are made one of those `kept`."""
         known = {kind: {tile.tile_id for one in of_kind for tile in one.live} for kind, of_kind in kept.items()}
-        rest: dict[str, list[_Rows]] = {kind: [] for kind in kept}
+        rest, num_rows = {kind: list[_Rows]() for kind in kept}, dict.fromkeys(kept, 0)
         for tile in self.tiles:
             ours = [kind for kind, version in tile.vocabularies.items() if self.versions.get(kind) == version]
             lacking = [kind for kind in ours if tile.tile_id not in known[kind]]
@@ -155,6 +155,10 @@ class _Opening:
             for kind in lacking:
                 if len(rows := vectors.get(kind, np.zeros((0, 1)))) > 0:
                     rest[kind].append((ShardTile(tile.tile_id, tile.places.sha256, len(rows)), rows.astype(np.float16)))
+                    num_rows[kind] += len(rows)
+                if num_rows[kind] >= SHARD_PLACES:
+                    kept[kind].append(self._new_shard(kind, rest[kind]))
+                    num_rows[kind] = sum(one.num_rows for one, _ in rest[kind])
         return rest
 
     def with_new_shards(self, kind: str, kept: Sequence[_Kept], rest: list[_Rows]) -> list[_Kept]:
@@ -163,12 +167,16 @@ class _Opening:
         pending = [row for one in kept if one not in full for row in one.rows()] + rest
         rest.clear()
         while pending:
-            sizes = np.cumsum([tile.num_rows for tile, _ in pending])
-            count = max(1, int(np.searchsorted(sizes, SHARD_PLACES, "right")))
-            tiles = [tile for tile, _ in pending[:count]]
-            shard = PlaceShard(kind, self.versions[kind], tiles, _taken(pending, count))
-            full.append(_Kept(self._saved(shard), [True] * count))
+            full.append(self._new_shard(kind, pending))
         return full
+
+    def _new_shard(self, kind: str, pending: list[_Rows]) -> _Kept:
+        """A shard of the first of these tiles, as many as it holds, which are taken out of the list."""
+        sizes = np.cumsum([tile.num_rows for tile, _ in pending])
+        count = max(1, int(np.searchsorted(sizes, SHARD_PLACES, "right")))
+        tiles = [tile for tile, _ in pending[:count]]
+        shard = PlaceShard(kind, self.versions[kind], tiles, _taken(pending, count))
+        return _Kept(self._saved(shard), [True] * count)
 
     def _saved(self, shard: PlaceShard) -> PlaceShard:
         """As it lies in its file, of which only pages that are asked come into memory; where that cannot be written, as it is."""
