@@ -1,4 +1,4 @@
-"""The coarse search of an atlas over more and more places: time, recall of exact search, memory, bytes; drawn over the number of places.
+"""The coarse search of an atlas over more and more places: time, recall of exact search, memory, bytes, look-alikes; drawn.
 
     python benchmarks/atlas_index.py ATLAS [--sizes 1000 10000 100000 1000000] [--likeness 0.6 0.7 0.8] [--figure FILE.png] [--json FILE]
 
@@ -52,14 +52,19 @@ def prepared(folder: Path, true: Float32[np.ndarray, "n d"], size: int, num_quer
     rng = np.random.default_rng(0)
     places = made_up(true, size, rng).astype(np.float16)
     places.tofile(folder / "places")
-    queries = {}
+    queries, exact = {}, {}
     for likeness in likenesses:
-        asked = places[rng.integers(size, size=num_queries)].astype(np.float32)
+        own = rng.integers(size, size=num_queries)
+        asked = places[own].astype(np.float32)
         away = made_up(true, num_queries, rng)
         away -= np.sum(away * asked, axis=1, keepdims=True) * asked
         away /= np.linalg.norm(away, axis=1, keepdims=True)
-        queries[str(likeness)] = np.ascontiguousarray(likeness * asked + np.sqrt(1 - likeness**2) * away, np.float32)
-    exact = {f"nearest {name}": nearest(places, asked) for name, asked in queries.items()}
+        queries[str(likeness)] = asked = np.ascontiguousarray(likeness * asked + np.sqrt(1 - likeness**2) * away, np.float32)
+        rows = nearest(places, asked)
+        similar = np.einsum("qkd,qd->qk", places[rows].astype(np.float32), asked)
+        exact[f"nearest {likeness}"] = rows
+        exact[f"rival {likeness}"] = np.where(rows == own[:, None], -1.0, similar).max(axis=1)
+        exact[f"rank {likeness}"] = np.where((rows == own[:, None]).any(axis=1), np.argmax(rows == own[:, None], axis=1), NUM_NEIGHBOURS)
     np.savez(folder / "queries.npz", **queries, **exact)  # pyright: ignore[reportArgumentType]
     compared, times, similarities = places.astype(np.float32), [], np.empty(size, np.float32)
     for query in queries[str(likenesses[0])][:20]:
@@ -131,7 +136,7 @@ def asked(folder: Path, kind: str, dimension: int) -> dict[str, Any]:
         queries = {name: stored[name] for name in stored.files}
     bounds = np.cumsum([0, *np.diff(np.linspace(0, (folder / "places").stat().st_size // (2 * dimension), len(tiles) + 1).astype(int))])
     rows = {}
-    for likeness in (name for name in queries if not name.startswith("nearest")):
+    for likeness in (name for name in queries if " " not in name):
         times, hits, firsts = [], 0.0, 0
         for query, right in zip(queries[likeness], queries[f"nearest {likeness}"], strict=True):
             start = time.perf_counter()
@@ -142,7 +147,13 @@ def asked(folder: Path, kind: str, dimension: int) -> dict[str, Any]:
             firsts += ranked[0][0] == of_right[0]
         count = len(queries[likeness])
         rows[likeness] = {"ms": float(np.median(times)), "p90_ms": float(np.percentile(times, 90))}
-        rows[likeness] |= {"recall_of_tiles": hits / count, "first": firsts / count}
+        rows[likeness] |= {
+            "recall_of_tiles": hits / count,
+            "first": firsts / count,
+            "rival": float(np.median(queries[f"rival {likeness}"])),
+        }
+        rows[likeness]["own_first"] = float(np.mean(queries[f"rank {likeness}"] == 0))
+        rows[likeness]["own_among_nearest"] = float(np.mean(queries[f"rank {likeness}"] < NUM_NEIGHBOURS))
     after = memory_mb()
     for likeness, row in rows.items():
         row["recall"] = recall_of_places(folder, queries, likeness)
@@ -166,14 +177,14 @@ def recall_of_places(folder: Path, queries: dict[str, np.ndarray], likeness: str
 
 
 def drawn(rows: dict[int, dict[str, Any]], path: Path) -> None:
-    """Time, memory and the time of making over the number of places, all on logarithmic axes."""
+    """Time, memory, the time of making, and look-alikes over the number of places, which is on a logarithmic axis."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
     sizes = sorted(rows)
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    figure, (left, right, alike) = plt.subplots(1, 3, figsize=(14, 4), layout="constrained")
     for likeness in rows[sizes[0]]["by_likeness"]:
         left.loglog(sizes, [rows[size]["by_likeness"][likeness]["ms"] for size in sizes], "o-", label=f"index, likeness {likeness}")
     left.loglog(sizes, [rows[size]["exact_ms"] for size in sizes], "s--", color="grey", label="comparing all")
@@ -184,7 +195,13 @@ def drawn(rows: dict[int, dict[str, Any]], path: Path) -> None:
     right.loglog(sizes, [rows[size]["made"]["s"] for size in sizes], "s-", label="made once (s)")
     right.loglog(sizes, [rows[size]["opened_s"] for size in sizes], "d-", label="opened (s)")
     right.set(xlabel="places", ylabel="megabytes, seconds")
-    for axes in (left, right):
+    for likeness in rows[sizes[0]]["by_likeness"]:
+        shares = [rows[size]["by_likeness"][likeness]["own_among_nearest"] for size in sizes]
+        alike.semilogx(sizes, shares, "o-", label=f"own place among {NUM_NEIGHBOURS}, likeness {likeness}")
+    rivals = [np.mean([row["rival"] for row in rows[size]["by_likeness"].values()]) for size in sizes]
+    alike.semilogx(sizes, rivals, "s--", color="grey", label="likeness of the best look-alike")
+    alike.set(xlabel="places", ylabel="share; likeness", ylim=(0, 1.05))
+    for axes in (left, right, alike):
         axes.grid(True, which="major", alpha=0.3)
         axes.legend(fontsize=8)
     figure.savefig(path, dpi=110)
@@ -196,7 +213,8 @@ def printed(size: int, row: dict[str, Any]) -> None:
         print(
             f"{size:>9} places, likeness {likeness}: {of_one['ms']:.2f} ms (p90 {of_one['p90_ms']:.2f}; all {row['exact_ms']:.2f}); "
             f"recall@{NUM_NEIGHBOURS} of places {100 * of_one['recall']:.1f} %, tiles {100 * of_one['recall_of_tiles']:.1f} %, nearest one "
-            f"first {100 * of_one['first']:.1f} %",
+            f"first {100 * of_one['first']:.1f} %; best look-alike {of_one['rival']:.3f}, own place first "
+            f"{100 * of_one['own_first']:.0f} %, among {NUM_NEIGHBOURS} {100 * of_one['own_among_nearest']:.0f} %",
             flush=True,
         )
     print(
