@@ -45,7 +45,7 @@ def s3_server() -> Iterator[str]:
     """The address of moto's server, which speaks the API of Amazon S3, on this machine."""
     for needed in ("s3fs", "moto", "flask", "flask_cors"):
         pytest.importorskip(needed, reason="an S3 server to test on needs: pip install s3fs 'moto[s3]' flask flask-cors")
-    from moto.server import ThreadedMotoServer
+    from moto.server import ThreadedMotoServer  # pyright: ignore[reportMissingImports]
 
     server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     server.start()

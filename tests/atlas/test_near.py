@@ -13,7 +13,7 @@ from tiny_world import CAMERA
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.atlas_localizer import AtlasLocalizer
 from topoloc.atlas.manifest import Manifest, StoredFile, Tile
-from topoloc.atlas.near import NearPlace, NearPose, metres_to_box, tiles_in_reach
+from topoloc.atlas.near import NearPlace, NearPose, metres_to_boxes, tiles_in_reach
 from topoloc.atlas.open_maps import Maps
 from topoloc.errors import AtlasError
 from topoloc.geometry.geodesy import GeoPoint, Georeference
@@ -36,17 +36,17 @@ def _manifest(*tiles: Tile) -> Manifest:
 
 
 def test_distance_is_along_the_ground_to_the_box():
-    tile = _tile("a", GeoPoint(50.0, 4.0, 0.0))
+    boxes = _manifest(_tile("a", GeoPoint(50.0, 4.0, 0.0)), _tile("unknown")).geo_boxes
     west = GeoPoint.from_ecef(GeoPoint(50.0, 4.0, 0.0).ecef_from_enu().apply(np.array([-300.0, 5.0, 0.0])))
-    assert metres_to_box(NearPlace(west.lat, west.lon, 1.0), tile) == pytest.approx(300.0, rel=0.005)
+    assert metres_to_boxes(NearPlace(west.lat, west.lon, 1.0), boxes) == pytest.approx([300.0, 0.0], rel=0.005)
     inside = GeoPoint.from_ecef(GeoPoint(50.0, 4.0, 0.0).ecef_from_enu().apply(np.array([3.0, 5.0, 0.0])))
-    assert metres_to_box(NearPlace(inside.lat, inside.lon, 1.0), tile) == 0.0
+    assert metres_to_boxes(NearPlace(inside.lat, inside.lon, 1.0), boxes) == pytest.approx([0.0, 0.0])
 
 
 def test_the_date_line_is_no_border():
-    tile = _tile("fiji", GeoPoint(-17.0, 179.9999, 0.0))
-    assert metres_to_box(NearPlace(-17.0, -179.9999, 1.0), tile) < 30.0
-    assert metres_to_box(NearPlace(-17.0, 0.0, 1.0), tile) > 1e7
+    boxes = _manifest(_tile("fiji", GeoPoint(-17.0, 179.9999, 0.0))).geo_boxes
+    assert metres_to_boxes(NearPlace(-17.0, -179.9999, 1.0), boxes)[0] < 30.0
+    assert metres_to_boxes(NearPlace(-17.0, 0.0, 1.0), boxes)[0] > 1e7
 
 
 def test_only_tiles_that_are_known_to_lie_elsewhere_are_out_of_reach():

@@ -6,6 +6,7 @@ import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from uuid import uuid4
 
 import pytest
 
@@ -111,6 +112,20 @@ def test_a_manifest_that_is_removed_while_it_is_read_is_sought_again(s3_bucket: 
 
     monkeypatch.setattr(store, "_manifests", late)
     assert store.manifest() == b"2"
+
+
+def test_a_conflict_with_another_writer_is_tried_anew_and_other_failures_are_told(monkeypatch: pytest.MonkeyPatch):
+    pytest.importorskip("fsspec", reason="the extra cluster is not installed")
+    store = ObjectStore(f"memory://{uuid4().hex}/campus")
+    said = ["An error occurred (ConditionalRequestConflict) when calling the PutObject operation", "no space"]
+
+    def refused(*args: object, **kwargs: object) -> None:
+        raise OSError(said.pop(0))
+
+    monkeypatch.setattr(store._files, "pipe_file", refused)
+    assert not store.commit(None, b"1")
+    with pytest.raises(AtlasError, match="no space"):
+        store.commit(None, b"1")
 
 
 def test_an_answer_that_was_lost_is_no_other_writer(s3_bucket: str, monkeypatch: pytest.MonkeyPatch):

@@ -183,8 +183,9 @@ class _Opening:
         try:
             return PlaceShard.open(shard.save(self.folder))
         except (OSError, AtlasError) as error:
-            text = f"the index of {len(shard.vectors)} places stays in memory, and is made at each opening: cannot write {self.folder}"
-            self.notes.append(f"{text}: {getattr(error, 'strerror', None) or error}")
+            text = "the index stays in memory, and is made at each opening: cannot write"
+            if not any(note.startswith(text) for note in self.notes):
+                self.notes.append(f"{text} {self.folder}: {getattr(error, 'strerror', None) or error}")
             return shard
 
     def remove_unused(self, kept: dict[str, list[_Kept]]) -> None:

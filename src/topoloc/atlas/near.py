@@ -6,8 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float
 
-from topoloc.atlas.manifest import Manifest, Tile
+from topoloc.atlas.manifest import Manifest
 from topoloc.errors import AtlasError, GeoreferenceError
 from topoloc.geometry.geodesy import GeoPoint
 from topoloc.geometry.rigid import Rigid3
@@ -79,48 +80,47 @@ def tiles_in_reach(manifest: Manifest, near: Near | None, placed_only: bool = Fa
     Raises:
         AtlasError: no tile is of the world that is named.
     """
-    tiles = [tile for tile in manifest.tiles if tile.geo_box is not None or not placed_only]
-    if near is None:
-        return dict.fromkeys((tile.tile_id for tile in tiles), None)
-    if isinstance(near, NearPlace):
-        return dict.fromkeys((tile.tile_id for tile in tiles if metres_to_box(near, tile) <= near.radius_m), None)
-    return _near_pose(manifest, near, tiles)
+    is_placed = ~np.isnan(manifest.geo_boxes[:, 0])
+    may_be = is_placed if placed_only else np.ones_like(is_placed)
+    if isinstance(near, NearPose):
+        return _near_pose(manifest, near, may_be)
+    if near is not None:
+        may_be = may_be & (metres_to_boxes(near, manifest.geo_boxes) <= near.radius_m)
+    return dict.fromkeys(manifest.tiles[number].tile_id for number in np.flatnonzero(may_be))
 
 
-def metres_to_box(near: NearPlace, tile: Tile) -> float:
-    """From a place to the tile's box of latitudes and longitudes, along the ground; 0 of a tile that has none."""
-    if tile.geo_box is None:
-        return 0.0
-    least_lat, least_lon, most_lat, most_lon = tile.geo_box
-    lat = min(max(near.lat, least_lat), most_lat)
-    beside = [near.lon + turn for turn in (-360.0, 0.0, 360.0)]  # the same meridian, on either side of 180 degrees
-    lon = min((min(max(one, least_lon), most_lon) - one for one in beside), key=abs)
-    up = math.sin(math.radians(lat - near.lat) / 2.0)
-    across = math.sin(math.radians(lon) / 2.0)
-    along = up * up + math.cos(math.radians(lat)) * math.cos(math.radians(near.lat)) * across * across
-    return 2.0 * _EARTH_RADIUS_M * math.asin(min(1.0, math.sqrt(along)))
+def metres_to_boxes(near: NearPlace, boxes: Float[np.ndarray, "t 4"]) -> Float[np.ndarray, " t"]:
+    """From a place to boxes of latitudes and longitudes (least latitude, longitude, then the largest; degrees), along the ground; 0 to what
+    is NaN."""
+    lat = np.clip(near.lat, boxes[:, 0], boxes[:, 2])
+    turned = near.lon + np.array([[-360.0], [0.0], [360.0]])  # the same meridian, on either side of 180 degrees
+    lon = np.abs(np.clip(turned, boxes[:, 1], boxes[:, 3]) - turned).min(axis=0)
+    up, across = np.sin(np.radians(lat - near.lat) / 2.0), np.sin(np.radians(lon) / 2.0)
+    along = up**2 + np.cos(np.radians(lat)) * math.cos(math.radians(near.lat)) * across**2
+    return np.nan_to_num(2.0 * _EARTH_RADIUS_M * np.arcsin(np.minimum(1.0, np.sqrt(along))))
 
 
 _EARTH_RADIUS_M = 6_371_000.0
 
 
-def _near_pose(manifest: Manifest, near: NearPose, tiles: list[Tile]) -> dict[str, Rigid3 | None]:
-    of_world = [tile for tile in manifest.tiles if tile.world == near.world]
-    if not of_world:
+def _near_pose(manifest: Manifest, near: NearPose, may_be: Bool[np.ndarray, " t"]) -> dict[str, Rigid3 | None]:
+    of_world = np.array([tile.world == near.world for tile in manifest.tiles], bool)
+    if not of_world.any():
         worlds = ", ".join(sorted({tile.world for tile in manifest.tiles})[:8])
         raise AtlasError(f"the atlas has no world {near.world[:80]!r} (it has: {worlds})")
-    atlas_from_world = next((tile.atlas_from_world for tile in of_world if tile.atlas_from_world is not None), None)
-    reached = dict[str, Rigid3 | None]()
-    for tile in tiles:
-        if tile.world == near.world:
-            pose = near.world_from_cam
-        elif atlas_from_world is not None and tile.atlas_from_world is not None:
+    centre, boxes = near.world_from_cam.translation, manifest.world_boxes
+    apart = np.linalg.norm(np.clip(centre, boxes[:, 0], boxes[:, 1]) - centre, axis=1)
+    in_reach = np.flatnonzero(may_be & of_world & (apart <= near.radius_m))
+    reached: dict[str, Rigid3 | None] = {manifest.tiles[number].tile_id: near.world_from_cam for number in in_reach}
+    known = [manifest.tiles[number].atlas_from_world for number in np.flatnonzero(of_world)]
+    atlas_from_world = next((pose for pose in known if pose is not None), None)
+    for number in np.flatnonzero(may_be & ~of_world) if atlas_from_world is not None else ():
+        tile = manifest.tiles[number]
+        if tile.atlas_from_world is not None:
             pose = tile.atlas_from_world.inverse() @ atlas_from_world @ near.world_from_cam
-        else:
-            continue
-        nearest = np.clip(pose.translation, tile.box_world[0], tile.box_world[1])
-        if np.linalg.norm(nearest - pose.translation) <= near.radius_m:
-            reached[tile.tile_id] = pose
+            nearest = np.clip(pose.translation, tile.box_world[0], tile.box_world[1])
+            if np.linalg.norm(nearest - pose.translation) <= near.radius_m:
+                reached[tile.tile_id] = pose
     return reached
 
 
