@@ -114,7 +114,9 @@ def _near_pose(manifest: Manifest, near: NearPose, may_be: Bool[np.ndarray, " t"
     reached: dict[str, Rigid3 | None] = {manifest.tiles[number].tile_id: near.world_from_cam for number in in_reach}
     known = [manifest.tiles[number].atlas_from_world for number in np.flatnonzero(of_world)]
     atlas_from_world = next((pose for pose in known if pose is not None), None)
-    for number in np.flatnonzero(may_be & ~of_world) if atlas_from_world is not None else ():
+    if atlas_from_world is None:
+        return reached
+    for number in np.flatnonzero(may_be & ~of_world):
         tile = manifest.tiles[number]
         if tile.atlas_from_world is not None:
             pose = tile.atlas_from_world.inverse() @ atlas_from_world @ near.world_from_cam
