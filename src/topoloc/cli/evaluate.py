@@ -19,6 +19,7 @@ from topoloc.cli.map_or_atlas import localizer_at
 from topoloc.cli.output import (
     CameraOption,
     File,
+    Flag,
     Format,
     Topics,
     UsageError,
@@ -59,7 +60,7 @@ class Command:
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="SEQ", help_behavior_hint="(may be given several times)")
     ] = ()
     """A recording of another place: every pose given for one of its images counts as a false accept."""
-    against_itself: bool = False
+    against_itself: Flag = False
     """No recording is needed: which parts of the map are weakly held, and where to walk next. Each node is asked of the rest of the map."""
     map_from_truth: File = None
     """A JSON file with the 4x4 matrix (metres) that takes the world of the recordings' truth into the map's, where they differ."""
