@@ -65,7 +65,7 @@ class Command:
     map_from_truth: File = None
     """A JSON file with the 4x4 matrix (metres) that takes the world of the recordings' truth into the map's, where they differ."""
     fit_map_from_truth: File = None
-    """Where errors are explained by one rigid transform between the two worlds, write that to this file, for --map-from-truth."""
+    """Where one rigid transform between the two worlds explains the errors, write it to this file; --map-from-truth reads it."""
     coarse: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")] = None
     """Coarse localizer that is asked; `topoloc info` names those of the map."""
     features: ASKED_FEATURES = None

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Int
 
 from topoloc.bounds import AtLeast, Between, check_bounds
 from topoloc.errors import MapError
+from topoloc.lifelong.earlier_recall import earlier_recall
 from topoloc.lifelong.overlay import Overlay
 from topoloc.localization.map_facts.building import with_map_facts
 from topoloc.map.sums import LandmarkSums
@@ -44,6 +45,8 @@ class PruneConfig:
     """Landmarks that a node keeps at least; a budget that asks for fewer is refused."""
     max_gone_share: Annotated[float, AtLeast(0)] = 0.7
     """Of a node's landmarks at most this share is taken for gone."""
+    earlier_asked: Annotated[int, Between(0, 10_000)] = 24
+    """Nodes, at most, that the map is asked before and after, for its history to tell what the edit cost; 0: none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +80,7 @@ def prune_map(topomap: TopoMetricMap, path: Path, max_bytes: int | None = None, 
             return PrunedMap(topomap, {"landmarks_gone": 0, "landmarks_dropped": 0})
         pruned = _with_fewer(topomap, gone, most, config)
         if max_bytes is None or budget is None or (size := _bytes_of(pruned.topomap)) <= max_bytes:
-            return pruned
+            return replace(pruned, changes=pruned.changes | earlier_recall(topomap, pruned.topomap, config.earlier_asked))
         budget -= round(1.1 * (size - max_bytes)) + _PAGES  # how well bytes pack is known only now
 
 

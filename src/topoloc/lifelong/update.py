@@ -21,6 +21,7 @@ from topoloc.bounds import Above, Between, check_bounds
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.rigid import covariance_of_inverse, position_covariance
 from topoloc.lifelong.coarse_models import PlaceView, with_place_views
+from topoloc.lifelong.earlier_recall import earlier_recall
 from topoloc.lifelong.overlay import Overlay
 from topoloc.lifelong.session_poses import Progress, SessionPoses, SessionPosesConfig, poses_by_map, poses_by_motion
 from topoloc.localization.localizer import Localizer, LocalizerConfig
@@ -50,6 +51,8 @@ class UpdateConfig:
     """A picture that the map localizes with at least so many inliers ..."""
     max_sigma: Annotated[float, Above(0)] = 0.1
     """... and to within so many D_thresh (a sigma of its position) needs no node."""
+    earlier_asked: Annotated[int, Between(0, 10_000)] = 24
+    """Nodes of earlier sessions, at most, that the map is asked before and after, for its history to tell what the edit cost; 0: none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +125,8 @@ def update_map(
         "place_images_added": len(joined.images),
         "not_taught": sorted({name.partition("@")[0] for name in topomap.coarse_models if not name.startswith("surf-vlad")}),
     }
-    return MapUpdate(with_map_facts(changed, progress), posed, changes)
+    changed = with_map_facts(changed, progress)
+    return MapUpdate(changed, posed, changes | earlier_recall(topomap, changed, config.earlier_asked, localizer_config))
 
 
 def _refuse_known(topomap: TopoMetricMap, sequence: StereoSequence) -> None:
