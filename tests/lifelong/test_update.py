@@ -168,7 +168,9 @@ def test_another_day_of_the_same_name_and_clock_is_another_session(map_file: Pat
 
 
 def test_the_history_tells_what_was_done(map_file: Path, second_half: Path, capsys: pytest.CaptureFixture[str]):
-    assert main(["update", str(map_file), str(second_half)]) == 0
+    assert main(["update", str(map_file), str(second_half), "--light", "evening"]) == 0
+    with TopoMetricMap.load(map_file) as topomap:
+        assert [session.light_name for session in topomap.sessions] == [None, "evening"]
     capsys.readouterr()
     assert main(["history", str(map_file)]) == 0
     lines = capsys.readouterr().out.splitlines()
