@@ -137,7 +137,8 @@ class WeakParts:
         of_reason = {reason: [part for part in self.parts if part.reason == reason] for reason in REASONS}
         poor = sorted(of_reason["not_held"] + of_reason["few_landmarks"], key=lambda part: -len(part.nodes))
         if poor:
-            why = "the rest of the map does not hold them" if poor[0].reason == "not_held" else "they have few landmarks"
+            is_one, is_not_held = len(poor[0].nodes) == 1, poor[0].reason == "not_held"
+            why = f"the rest of the map does not hold {'it' if is_one else 'them'}" if is_not_held else "few landmarks are known there"
             said.append(f"Walk again past {self._described(poor[0])}: {why}.")
         if one_way := of_reason["one_direction"]:
             num, of = self.count("one_direction"), len(self.nodes)
@@ -146,7 +147,7 @@ class WeakParts:
         if len(said) < 2 and len(self.session_names) < 2:
             said.append("All of it is of one session: a walk on another day, or in another light, tells what lasts.")
         elif len(said) < 2 and of_reason["single_session"]:
-            said.append(f"Walk again past {self._described(of_reason['single_session'][0])}: only one session saw them.")
+            said.append(f"Walk again past {self._described(of_reason['single_session'][0])}: seen by one session alone.")
         return " ".join(said[:2]) or "No part is weak."
 
     def _described(self, part: WeakPart) -> str:
