@@ -58,6 +58,22 @@ def replaced_file(path: Path) -> Iterator[Path]:
         os.close(lock)
 
 
+@contextmanager
+def scratch_file(path: Path) -> Iterator[Path]:
+    """An empty file beside `path` to try something out in, removed at the end; what a killed process leaves, the next writer removes.
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
+    scratch, lock = _own_file(_target(path))
+    try:
+        yield scratch
+    finally:
+        with suppress(OSError):
+            scratch.unlink()
+        os.close(lock)
+
+
 def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
     """Write a folder with these files (names may have folders), all of it or nothing.
 
