@@ -32,6 +32,7 @@ TABLES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "update": ("topoloc.lifelong.update", "UpdateConfig", ("update", "merge")),
     "prune": ("topoloc.lifelong.prune", "PruneConfig", ("prune",)),
     "serve": ("topoloc.service.config", "ServiceConfig", ("serve",)),
+    "cluster": ("topoloc.cluster.config", "ClusterConfig", ("build",)),
 }
 _WIDTH = 110
 _LARGEST_FILE = 1_000_000

@@ -58,6 +58,25 @@ def replaced_file(path: Path) -> Iterator[Path]:
         os.close(lock)
 
 
+@contextmanager
+def scratch_file(path: Path) -> Iterator[Path]:
+    """An empty file beside `path` that is removed afterwards; those of writers that were killed are removed by the next one.
+
+    It must be written to as it is: what is renamed over it is nobody's.
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
+    remove_leftovers(path)
+    temporary, lock = _own_file(path)
+    try:
+        yield temporary
+    finally:
+        with suppress(OSError):
+            temporary.unlink()
+        os.close(lock)
+
+
 def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
     """Write a folder with these files (names may have folders), all of it or nothing.
 
@@ -120,6 +139,16 @@ def remove_leftovers(path: Path) -> None:
         if owner != name and owner.endswith(".part") and not (path.parent / owner).exists():
             with suppress(OSError):
                 (path.parent / name).unlink()
+
+
+def remove_all_leftovers(folder: Path) -> None:
+    """Remove what killed writers of whatever file left in a folder; what a living process writes stays."""
+    try:
+        names = [entry.name for entry in os.scandir(folder) if entry.name.startswith(".") and entry.name.endswith(".part")]
+    except OSError:
+        return
+    for name in names:
+        _remove_unowned(folder / name)
 
 
 def _prefix(path: Path) -> str:
