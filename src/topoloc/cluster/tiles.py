@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from topoloc.atlas.atlas import store_at
 from topoloc.atlas.editing import NewTile, add_tiles
@@ -32,6 +32,7 @@ from topoloc.sequences.atomic import scratch_file
 State = Literal["built", "there", "failed"]
 
 
+@runtime_checkable
 class Maker(Protocol):
     """Makes the map of a recording; it may be pickled."""
 
@@ -155,6 +156,6 @@ def _words(recording: str) -> list[str]:
     chosen = bool(at) and re.fullmatch(r"[-0-9:,/]+", selection) is not None
     parts = list(Path(folder if chosen else recording).parts) or [""]
     if chosen:
-        parts[-1] += f"_{selection}"
-    words = [re.sub(r"[^A-Za-z0-9_.-]+", "-", part).strip("-") for part in parts]
+        parts[-1] += "_" + re.sub("[:,/]", "-", selection)
+    words = [re.sub(r"[^A-Za-z0-9_.-]+", "-", part) for part in parts]
     return [word for word in words if word.strip("._-")] or ["recording"]

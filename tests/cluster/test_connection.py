@@ -1,0 +1,80 @@
+"""Which clusters can be reached, and how it is said of those that cannot. None is started here."""
+
+from __future__ import annotations
+
+import socket
+import sys
+import tempfile
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from topoloc.cluster.connection import _own_folder, connected
+from topoloc.errors import ClusterError, MissingExtraError
+
+Complaint = Callable[..., str]
+needs_ray = pytest.mark.usefixtures("ray")
+
+
+@pytest.fixture(scope="module")
+def ray():
+    return pytest.importorskip("ray", reason="Ray is not installed (the extra cluster)")
+
+
+@needs_ray
+@pytest.mark.parametrize(
+    ("address", "says"),
+    [
+        ("somewhere", "HOST:PORT, auto or local"),
+        ("127.0.0.1:", "HOST:PORT, auto or local"),
+        ("127.0.0.1:99999", "HOST:PORT, auto or local"),
+        ("ray://127.0.0.1:10001", "clients are not served"),
+    ],
+)
+def test_addresses_that_are_none(address: str, says: str, tiny_recording: Path, tmp_path: Path, complaint: Complaint):
+    assert says in complaint("build", tiny_recording, tmp_path / "campus", "--ray", address)
+
+
+@needs_ray
+def test_nobody_answers(tiny_recording: Path, tmp_path: Path, complaint: Complaint, monkeypatch: pytest.MonkeyPatch):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    assert f"no Ray cluster answers at 127.0.0.1:{port}" in complaint(
+        "build", tiny_recording, tmp_path / "campus", "--ray", f"127.0.0.1:{port}"
+    )
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setattr("ray._private.services.find_gcs_addresses", cache(set))
+    monkeypatch.setattr("ray._private.utils.read_ray_address", lambda *_: None)
+    with pytest.raises(ClusterError, match="no Ray cluster runs on this machine"), connected("auto"):
+        pass
+
+
+def test_without_ray_the_extra_is_named(tiny_recording: Path, tmp_path: Path, complaint: Complaint, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    assert "pip install 'topoloc[cluster]'" in complaint("build", tiny_recording, tmp_path / "campus", "--ray", "auto")
+    with pytest.raises(MissingExtraError, match="cluster"), connected("local"):
+        pass
+
+
+def test_folders_of_killed_clusters_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    (tmp_path / "topoloc-ray-left" / "session").mkdir(parents=True)
+    with _own_folder() as one:
+        assert list(tmp_path.iterdir()) == [one]
+        with _own_folder() as two:
+            assert sorted(tmp_path.iterdir()) == sorted([one, two])
+        assert list(tmp_path.iterdir()) == [one]
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("option", [["--world", "campus"], ["--replace"]])
+def test_options_of_a_cluster_alone(option: list[str], tiny_recording: Path, tmp_path: Path, complaint: Complaint):
+    assert "belong to --ray" in complaint("build", tiny_recording, tmp_path / "room.topo", *option, status=2)
+
+
+def test_a_forgotten_atlas(tiny_recording: Path, room_map: Path, tmp_path: Path, complaint: Complaint):
+    for last in (tiny_recording, f"{tiny_recording}@0:5", room_map):
+        assert "was ATLAS forgotten?" in complaint("build", tiny_recording, last, "--ray", "auto", status=2)
+    assert "last, the atlas" in complaint("build", tiny_recording, "--ray", "auto", status=2)
