@@ -18,3 +18,21 @@ class ClusterConfig:
     """Megabytes that Ray sets aside for each recording that is mapped; 0: nothing is reckoned."""
     max_retries: Annotated[int, Between(0, 100)] = 3
     """How often a recording is begun again whose worker, or machine, went away."""
+
+
+@dataclass(frozen=True)
+class ReplicasConfig:
+    """How many processes of a service answer on a cluster."""
+
+    least: Annotated[int, Between(1, 10_000)] = 1
+    """Replicas that are always there."""
+    most: Annotated[int, Between(1, 10_000)] = 1
+    """Replicas at most; more than `least` come and go as they are needed."""
+    cpus_per_replica: Annotated[int, Between(1, 1024)] = 1
+    """Processors of a replica, and pictures that it localizes at a time, where `serve.workers` does not say so."""
+    busy: Annotated[float, Between(0.05, 20)] = 1.0
+    """Another replica comes where each has more than so many requests a picture that it localizes at a time."""
+    upscale_delay_s: Annotated[float, AtLeast(0)] = 10.0
+    """Seconds that it must have been so before another one comes."""
+    downscale_delay_s: Annotated[float, AtLeast(0)] = 300.0
+    """Seconds that there must have been too many before one goes."""
