@@ -30,7 +30,7 @@ def ray():
         ("somewhere", "HOST:PORT, auto or local"),
         ("127.0.0.1:", "HOST:PORT, auto or local"),
         ("127.0.0.1:99999", "HOST:PORT, auto or local"),
-        ("ray://127.0.0.1:10001", "clients are not served"),
+        ("ray://127.0.0.1:10001", "no client of Ray"),
     ],
 )
 def test_addresses_that_are_none(address: str, says: str, tiny_recording: Path, tmp_path: Path, complaint: Complaint):
