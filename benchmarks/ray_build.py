@@ -2,9 +2,9 @@
 
     python benchmarks/ray_build.py SEQ [SEQ ...] [--nodes 2]
 
-Both nodes are this machine, with one processor each. One by one is `topoloc build SEQ MAP`, a process each, with one thread. What is lost is
-the time on the clock over the processor time of the work divided by the processors, once of the commands one by one and once of the tasks;
-beside it the share of it that processors idled, and what Ray's own processes took, for on a busy machine the clock counts others' work, too.
+Both nodes are this machine, with one processor each. One by one is `topoloc build SEQ MAP`, a process each, with one thread. What is lost
+is the time on the clock over the processor time of the work divided by the processors, once of the commands one by one and once of the
+tasks. On a busy machine the clock counts others' work, too; so what processors idled and what Ray itself took stand beside it.
 """
 
 from __future__ import annotations
@@ -119,20 +119,16 @@ def main() -> None:
         atlas = Atlas.open(where)
         same = [atlas.map_path(atlas.tile(name)).read_bytes() == (Path(folder) / f"{name}.topo").read_bytes() for name in names]
     tasks_s = sum(outcome.cpu_seconds for outcome in outcomes)
-    for outcome in outcomes:
-        print(
-            f"  {outcome.recording}: {outcome.state} {outcome.reason or ''} {outcome.seconds:.1f} s, {outcome.cpu_seconds:.1f} s of processor"
-        )
-    print(f"one by one: {alone_s:.1f} s on the clock, {work_s:.1f} s of processor")
+    for one in outcomes:
+        print(f"  {one.recording}: {one.state} {one.reason or ''} {one.seconds:.1f} s, of a processor {one.cpu_seconds:.1f} s")
+    print(f"one by one: {alone_s:.1f} s on the clock, {work_s:.1f} s of a processor")
     print(
-        f"{args.nodes} nodes: {wall_s:.1f} s on the clock; tasks {tasks_s:.1f} s of processor, Ray and the workers' starts {cpu_s - tasks_s:.1f} s"
+        f"{args.nodes} nodes: {wall_s:.1f} s on the clock; of a processor {tasks_s:.1f} s the tasks, {cpu_s - tasks_s:.1f} s Ray and starts"
     )
     for name, seconds in (("one by one", work_s), ("the tasks", tasks_s)):
         print(f"clock over work of {name} / {args.nodes}: {wall_s / (seconds / args.nodes):.3f}")
-    busy = 1 - (cpu_s + idle) / (wall_s * (os.cpu_count() or 1))
-    print(
-        f"of all processors' time others took {100 * busy:.0f} %; our own and idle time over work one by one: {(cpu_s + idle) / work_s:.3f}"
-    )
+    others = 1 - (cpu_s + idle) / (wall_s * (os.cpu_count() or 1))
+    print(f"others took {100 * others:.0f} % of the processors; our time and idle time over work one by one: {(cpu_s + idle) / work_s:.3f}")
     print(f"same bytes: {sum(same)} of {len(same)}")
 
 
