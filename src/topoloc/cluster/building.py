@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -57,6 +58,7 @@ def build_on_ray(build: AtlasBuild, address: str, show: Show | None = None, is_l
     manifest_of(build.atlas)  # known before a cluster is asked
     show = show or (lambda number, state: None)
     with connected(address) as ray:
+        _warn_of_few_processors(ray, build.config.cpus_per_recording)
         board = progress_board(ray) if is_live else None
         numbers = {_submitted(ray, build, number, board): number for number in range(len(build.jobs))}
         outcomes: dict[int, Outcome] = {}
@@ -71,9 +73,17 @@ def build_on_ray(build: AtlasBuild, address: str, show: Show | None = None, is_l
         return [outcomes[number] for number in range(len(build.jobs))]
 
 
+def _warn_of_few_processors(ray: Any, wanted: int) -> None:
+    """A cluster may grow as it is asked; one that does not would let the recordings wait for ever."""
+    most = max((node["Resources"].get("CPU", 0.0) for node in ray.nodes() if node["Alive"]), default=0.0)
+    if most < wanted:
+        print(f"warning: no machine of the cluster has {wanted} processors for a recording now, {most:g} at most", file=sys.stderr)
+
+
 def _submitted(ray: Any, build: AtlasBuild, number: int, board: Any) -> Any:
     job, config = build.jobs[number], build.config
-    work = Work(job, build.atlas, build.replaces, os.getcwd(), os.environ.get("SOURCE_DATE_EPOCH"))
+    atlas = build.atlas if "://" in build.atlas else os.path.abspath(build.atlas)
+    work = Work(job, atlas, build.replaces, os.getcwd(), os.environ.get("SOURCE_DATE_EPOCH"))
     task = ray.remote(run_task).options(
         num_cpus=config.cpus_per_recording,
         memory=config.memory_mb_per_recording * 1_000_000 or None,

@@ -10,7 +10,6 @@ import pickle
 import platform
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
@@ -53,8 +52,10 @@ def run_task(packed: bytes, terms: Terms, board: Any, number: int) -> bytes:
         raise ClusterError(f"{platform.node()} has topoloc {version('topoloc')}, and {terms.version} asks it")
     os.environ |= dict.fromkeys(_THREADS, str(terms.num_threads))
     work: Work = pickle.loads(packed)
-    with suppress(OSError):  # a machine without that folder finds recordings that are named by whole paths
+    try:
         os.chdir(work.folder)
+    except OSError:  # then whole paths are found all the same, and others are not looked for elsewhere
+        os.chdir("/")
     os.environ.pop("SOURCE_DATE_EPOCH", None)
     if work.epoch is not None:
         os.environ["SOURCE_DATE_EPOCH"] = work.epoch
