@@ -74,6 +74,11 @@ def test_options_of_a_cluster_alone(option: list[str], tiny_recording: Path, tmp
     assert "belong to --ray" in complaint("build", tiny_recording, tmp_path / "room.topo", *option, status=2)
 
 
+def test_names_that_no_world_and_no_two_tiles_have(tiny_recording: Path, tmp_path: Path, complaint: Complaint):
+    assert "can be called 'the campus'" in complaint("build", tiny_recording, tmp_path / "campus", "--ray", "auto", "--world", "the campus")
+    assert "named twice" in complaint("build", tiny_recording, tiny_recording, tmp_path / "campus", "--ray", "auto")
+
+
 def test_a_forgotten_atlas(tiny_recording: Path, room_map: Path, tmp_path: Path, complaint: Complaint):
     for last in (tiny_recording, f"{tiny_recording}@0:5", room_map):
         assert "was ATLAS forgotten?" in complaint("build", tiny_recording, last, "--ray", "auto", status=2)

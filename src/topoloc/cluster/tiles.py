@@ -47,12 +47,20 @@ class Maker(Protocol):
 
 @dataclass(frozen=True)
 class TileJob:
-    """A recording, the id of the tile that becomes of it, the world that it is in, and what makes its map."""
+    """A recording, the id of the tile that becomes of it, the world that it is in, and what makes its map.
+
+    Raises:
+        AtlasError: no tile, or no world, can be called so.
+    """
 
     recording: str
     tile_id: str
     world: str
     maker: Maker
+
+    def __post_init__(self) -> None:
+        check_tile_id(self.tile_id)
+        check_tile_id(self.world)
 
     def digest(self) -> str:
         """Of all that decides what the tile looks like, 64 hexadecimal digits. Raises TopolocError."""
