@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable
@@ -195,3 +197,23 @@ def test_an_atlas_in_an_object_store(
     assert _maps(where) == one_by_one
     assert {number for number, state in seen if isinstance(state, Outcome)} == {0, 1, 2}
     assert any(isinstance(state, Running) and 0 < state.done <= state.total for _, state in seen)
+
+
+@pytest.mark.slow
+def test_a_cluster_of_this_machine_ends_with_the_command(walks: list[Path], tmp_path: Path):
+    pytest.importorskip("ray", reason="Ray is not installed (the extra cluster)")
+    scratch = Path(tempfile.mkdtemp(prefix="rt-"))  # short: sockets lie in it
+    command = [sys.executable, "-m", "topoloc", "build", *map(str, walks), str(tmp_path / "campus"), "--ray", "local"]
+    environment = {**os.environ, "TMPDIR": str(scratch)}
+    try:
+        driver = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+        _wait_for((tmp_path / "campus" / "atlas.json").exists)
+        driver.send_signal(signal.SIGTERM)
+        said = driver.communicate(timeout=60)[1]
+        assert (driver.returncode, said.splitlines()[-1]) == (1, "error: interrupted; every file is as it was or whole")
+        assert list(scratch.glob("topoloc*")) == []
+        assert subprocess.run(command, env=environment, capture_output=True).returncode == 0
+        assert [tile.tile_id for tile in Atlas.open(str(tmp_path / "campus")).manifest.tiles] == [walk.name for walk in walks]
+        assert [path for path in scratch.iterdir() if "topoloc" in path.name] == []
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)

@@ -8,8 +8,10 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
+import signal
 import socket
 import tempfile
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -52,13 +54,22 @@ def connected(address: str) -> Iterator[Any]:
         if address == LOCAL:
             os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
             options |= {"include_dashboard": False, "_temp_dir": str(at_end.enter_context(_own_folder()))}
+        before = signal.getsignal(signal.SIGTERM)
         try:
             ray.init(**options, log_to_driver=False, logging_level="error")
         except Exception as error:  # of many classes, which are no API; the text says what it was
             ray.shutdown()
             raise ClusterError(_why(address, error)) from error
         at_end.callback(ray.shutdown)
+        if threading.current_thread() is threading.main_thread():  # Ray's own handler prints where it was
+            signal.signal(signal.SIGTERM, _interrupt)
+            at_end.callback(signal.signal, signal.SIGTERM, before or signal.SIG_DFL)
         yield ray
+
+
+def _interrupt(number: int, _: object) -> None:
+    """SIGTERM ends the work as Ctrl-C does: in good order."""
+    raise KeyboardInterrupt
 
 
 def _check_address(address: str) -> None:
