@@ -86,6 +86,14 @@ def test_a_missing_recording(room_map: Path, tmp_path: Path, complaint: Complain
     assert "nowhere: no such file or folder" in complaint("build", tmp_path / "nowhere", tmp_path / "room.topo")
     assert "nowhere: no such file or folder" in complaint("localize", room_map, tmp_path / "nowhere")
     assert "nowhere: no such file or folder" in complaint("evaluate", room_map, tmp_path / "nowhere")
+    too_long = "9" * 3000
+    for command in (
+        ["build", too_long, "room.topo"],
+        ["localize", room_map, too_long],
+        ["localize", too_long, "a.png"],
+        ["info", too_long],
+    ):
+        assert too_long in complaint(*command)
 
 
 def test_a_folder_that_is_no_recording(tmp_path: Path, complaint: Complaint):

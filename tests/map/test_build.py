@@ -46,6 +46,15 @@ def test_nodes_follow_eq_1_and_every_image_belongs_to_the_nearest(tiny_map: Topo
     assert [node.summary.node_id for node in tiny_map.nodes] == list(range(len(tiny_map.nodes)))
 
 
+def test_a_map_whose_parts_lie_on_disk_while_it_is_made_is_the_same(
+    tiny_recording: Path, tiny_map: TopoMetricMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    replace(tiny_map, shared_errors=None, repetitions=None).save(tmp_path / "memory.topo")
+    monkeypatch.setattr("topoloc.map.shelf.DEFAULT_BYTES", 0)
+    build_map(topoloc.open_sequence(f"{tiny_recording}@0::2"), tiny_map.config).save(tmp_path / "disk.topo")
+    assert (tmp_path / "disk.topo").read_bytes() == (tmp_path / "memory.topo").read_bytes()
+
+
 def test_points_are_right_and_refined_better_than_measured(tiny_recording: Path, tiny_map: TopoMetricMap):
     unrefined = build_map(topoloc.open_sequence(f"{tiny_recording}@0::2"), BuildConfig(landmarks=LandmarkConfig(nodes_per_image=0)))
     errors, errors_before = (np.concatenate([depth_errors(node) for node in m.nodes]) for m in (tiny_map, unrefined))

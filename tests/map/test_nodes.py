@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.map.nodes import DEPTH_SHARE, RADIANS_PER_NODE, NodeConfig, NodePoses, node_distances, place_nodes
+from topoloc.map.nodes import DEPTH_SHARE, RADIANS_PER_NODE, NearestNodes, NodeConfig, NodePoses, node_distances, place_nodes
 
 
 def moved(x: float, yaw: float = 0.0) -> Rigid3:
@@ -59,6 +59,18 @@ def test_every_frame_is_near_a_node_and_no_two_nodes_are_near(steps: list[tuple[
     assert all(node_distances(pose, nodes, lambda_rot).min() <= d_thresh for pose in poses)
     between = np.array([node_distances(poses[i], nodes, lambda_rot) for i in frame_idx])
     assert (between[~np.eye(len(frame_idx), dtype=bool)] > d_thresh).all()
+
+
+@given(
+    st.lists(st.tuples(st.floats(-20, 20), st.floats(-3, 3)), min_size=1, max_size=120),
+    st.tuples(st.floats(-30, 30), st.floats(-3, 3)),
+    st.integers(1, 4),
+    st.floats(0, 30),
+)
+def test_the_nearest_nodes_are_those_of_all(nodes: list[tuple[float, float]], camera: tuple[float, float], count: int, lambda_rot: float):
+    poses = NodePoses.of([moved(round(x, 1), round(yaw, 1)) for x, yaw in nodes])  # equal ones among them
+    right = np.argsort(node_distances(moved(*camera), poses, lambda_rot), kind="stable")[:count]
+    assert NearestNodes(poses, lambda_rot).rows(moved(*camera), count).tolist() == right.tolist()
 
 
 def test_unset_parameters_follow_from_the_scene():

@@ -15,7 +15,7 @@ from topoloc.features.features import Features
 from topoloc.map.build import BuildConfig, build_map
 from topoloc.map.nodes import NodeConfig, NodePoses, node_distances
 from topoloc.places.coarse import CoarseLocalizer, open_coarse
-from topoloc.places.vlad import SurfVlad, VladConfig, learn_words, placed, vlad
+from topoloc.places.vlad import SurfVlad, VladConfig, learn_words, learn_words_of, placed, vlad
 from topoloc.sequences.pictures import grey_image
 
 NO_IMAGE = np.zeros((2, 2), np.uint8)
@@ -86,6 +86,14 @@ def test_words_are_the_same_each_time():
     config = VladConfig(num_words=16, max_training_descriptors=2000)
     rows = descriptors(3000, 6)
     np.testing.assert_array_equal(learn_words(rows, config), learn_words(rows, config))
+
+
+@pytest.mark.parametrize("limit", [40, 10_000])
+def test_words_of_parts_are_those_of_all(limit: int):
+    parts = [descriptors(count, seed=count) for count in (50, 1, 200)]
+    config = VladConfig(num_words=2, max_training_descriptors=limit)
+    words = learn_words_of([len(part) for part in parts], lambda k: parts[k], config)
+    np.testing.assert_array_equal(words, learn_words(np.concatenate(parts), config))
 
 
 @pytest.mark.parametrize("dimension", [128, 4])

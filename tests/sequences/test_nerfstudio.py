@@ -156,6 +156,13 @@ def test_files_that_are_no_json(tmp_path: Path, text: str):
         open_sequence(tmp_path)
 
 
+def test_a_picture_with_a_name_that_no_disk_holds_is_missing(capture: Make):
+    folder = capture(lambda data: data["frames"][1].update(file_path="images/" + "9" * 5000), depth_scale=None)
+    sequence = open_sequence(folder)
+    with pytest.raises(TopolocError, match="999"):
+        sequence[next(k for k, name in enumerate(sequence.names) if "999" in name)]
+
+
 def test_missing_pictures_and_depth_of_another_shape(capture: Make):
     folder = capture()
     (folder / "images" / "frame_1.png").unlink()

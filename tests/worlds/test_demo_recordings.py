@@ -19,6 +19,7 @@ from topoloc_worlds.routes import frame_poses, plan_route
 from topoloc_worlds.worlds import find_world
 
 
+@pytest.mark.slow  # the light of two conditions is traced
 def test_rendering_begins_where_it_was_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     pytest.importorskip("mitsuba")
     small = Camera.pinhole(32, 20, 19.0, 19.0, 15.5, 9.5)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -24,7 +25,7 @@ def store_at(where: str) -> Store:
 
 def is_atlas(where: str) -> bool:
     """Is this an atlas, and no map?"""
-    return "://" in where or (Path(where) / MANIFEST).is_file()
+    return "://" in where or os.path.isfile(Path(where) / MANIFEST)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ own (`map/memory.py`); here a map counts by the bytes of its file, which no open
 
 from __future__ import annotations
 
+import os
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
@@ -64,7 +65,7 @@ class Maps:
         self._places: OrderedDict[str, _Place] = OrderedDict()  # the one used last is the last
         self._atlas_paths = dict[Path, tuple[tuple[int, ...], dict[str, Path]]]()
         for source in self._sources:
-            if not source.exists():
+            if not os.path.exists(source):
                 raise MapError(f"{source}: no such map")
         self.paths()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -157,8 +158,8 @@ def _check_atlas(last: str) -> None:
     """Hold that an atlas lies there, or may. Raises UsageError."""
     from topoloc.atlas.atlas import is_atlas
 
-    path = Path(last)
-    if not is_atlas(last) and (path.is_file() or (path.is_dir() and any(path.iterdir())) or ("@" in last and not path.exists())):
+    is_other = os.path.isfile(last) or (os.path.isdir(last) and any(os.scandir(last))) or ("@" in last and not os.path.exists(last))
+    if is_other and not is_atlas(last):
         raise UsageError(f"the last argument is the atlas to write, but {last} is none; was ATLAS forgotten?")
 
 

@@ -93,7 +93,7 @@ class MapMaking:
 
         files = [path for text in self.recordings for path in _files_of(split_selection(text)[0])]
         named = (*self.asked.trajectory, self.camera or "", self.images or "")
-        files += [path for text in named if text and Path(text).exists() for path in _files_of(Path(text))]
+        files += [path for text in named if text and os.path.exists(text) for path in _files_of(Path(text))]
         facts = {
             "settings": asdict(self),
             "versions": [__version__, SCHEMA_VERSION],
@@ -140,7 +140,7 @@ def _report_gaps(sequences: list[StereoSequence]) -> None:
 
 def _files_of(path: Path) -> Iterator[Path]:
     """The file, or all files below the folder. Raises RecordingError."""
-    if not path.exists():
+    if not os.path.exists(path):  # no error of a name that is too long
         raise RecordingError(f"{path}: no such file or folder")
     if path.is_file():
         yield path

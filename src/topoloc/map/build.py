@@ -15,19 +15,20 @@ from jaxtyping import Float32
 
 from topoloc.bounds import check_bounds
 from topoloc.errors import EmptyMapError
-from topoloc.features.features import Features
 from topoloc.features.kinds import find_kind
+from topoloc.geometry.camera import Camera
 from topoloc.map.config import MapConfig
-from topoloc.map.drafts import NodeDraft, draft_node, finish_node, observe
-from topoloc.map.entries import Edge, PlaceImage
-from topoloc.map.mapping_frames import MappingFrame, MappingImage, PointLocator, mapping_image, posed_frames
-from topoloc.map.nodes import NodeConfig, NodePoses, node_distances, place_nodes
+from topoloc.map.drafts import Drafts, draft_node, finish_node, observe
+from topoloc.map.entries import Edge, PlaceImage, TopoNode
+from topoloc.map.mapping_frames import MappingFrame, PointLocator, mapping_image, posed_frames
+from topoloc.map.nodes import NearestNodes, NodeConfig, NodePoses, place_nodes
 from topoloc.map.schema import SCHEMA_VERSION
 from topoloc.map.sessions import Edit, Light, Session, mean_light, path_of, poses_source_of, today
+from topoloc.map.shelf import Shelf
 from topoloc.map.side_nodes import gather_sides, nodes_with_sides
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.coarse import CoarseModel
-from topoloc.places.vlad import SurfVlad, VladConfig, learn_words, placed, vlad
+from topoloc.places.vlad import SurfVlad, learn_words_of, placed, vlad
 from topoloc.sequences.frame import StereoSequence
 
 BuildConfig = MapConfig
@@ -63,9 +64,8 @@ def build_map(
     node_config = _resolve_node_config(frames, locator, config)
     drafts = _draft_nodes(frames, locator, node_config, config, progress)
     place_images, lights, coarse = _visit_all_images(frames, drafts, node_config, config, progress)
-    of_kind = {kind: [finish_node(node_id, draft, kind, config) for node_id, draft in enumerate(drafts)] for kind in config.kinds}
+    of_kind, sides = _finished(drafts, config)
     nodes = of_kind.pop(config.features.kind)
-    sides = [replace(side, summary=replace(side.summary, of_node=node_id)) for node_id, draft in enumerate(drafts) for side in draft.sides]
     poses_from = poses_from or [poses_source_of(sequence) for sequence in sequences]
     return TopoMetricMap(
         summaries=[node.summary for node in nodes],
@@ -76,7 +76,7 @@ def build_map(
         config=replace(config, nodes=node_config),
         length_m=_trajectory_length(frames),
         sides=gather_sides(sides, config.kind_of_sides, config.sides),
-        sessions=[_session(k, sequence, frames, lights, poses_from[k], drafts) for k, sequence in enumerate(sequences)],
+        sessions=[_session(k, sequence, frames, lights, poses_from[k], drafts.cameras) for k, sequence in enumerate(sequences)],
         edits=[Edit(1, "build", today(), SCHEMA_VERSION)],
         other_kinds=of_kind,
     )
@@ -88,13 +88,13 @@ def _session(
     frames: list[MappingFrame],
     lights: list[Light],
     poses_from: str,
-    drafts: list[NodeDraft],
+    cameras: dict[int, Camera],
 ) -> Session:
-    """What the map remembers of a recording; `lights` are those of the frames."""
+    """What the map remembers of a recording; `lights` are those of the frames, `cameras` those of the sessions."""
     of_session = [k for k, frame in enumerate(frames) if frame.session_id == session_id]
     t_ns = [frames[k].t_ns for k in of_session]
-    camera = next((draft.image.camera for draft in drafts if draft.frame.session_id == session_id), None)
     light = mean_light([lights[k] for k in of_session])
+    camera = cameras.get(session_id)
     return Session(session_id, sequence.name, path_of(sequence), poses_from, min(t_ns), max(t_ns), camera, light)
 
 
@@ -116,59 +116,67 @@ def _resolve_node_config(frames: list[MappingFrame], locator: PointLocator, conf
 
 def _draft_nodes(
     frames: list[MappingFrame], locator: PointLocator, node_config: NodeConfig, config: BuildConfig, progress: Progress
-) -> list[NodeDraft]:
+) -> Drafts:
     """The trajectory discretised by Eq. 1; a picture with too few points (dark, blurred, blank) becomes no node."""
     frame_idx = place_nodes([frame.world_from_cam for frame in frames], node_config)
     kind = find_kind(config.features.kind)
     with_sides = nodes_with_sides([frames[i].world_from_cam for i in frame_idx], node_config, config.sides)
-    drafts: list[NodeDraft] = []
+    drafts = Drafts(Shelf(by_reference=frames))
     for done, i in enumerate(frame_idx):
         draft = draft_node(frames[i], locator, done in with_sides, config)
         if len(draft.points[kind.name].features) >= config.min_node_points:
             drafts.append(draft)
         progress("nodes", done + 1, len(frame_idx))
-    if not drafts:
+    if not drafts.rows:
         raise EmptyMapError(f"{frames[0].sequence.name}: no picture has {config.min_node_points} features with a 3-D position")
     return drafts
 
 
 def _visit_all_images(
-    frames: list[MappingFrame], drafts: list[NodeDraft], node_config: NodeConfig, config: BuildConfig, progress: Progress
+    frames: list[MappingFrame], drafts: Drafts, node_config: NodeConfig, config: BuildConfig, progress: Progress
 ) -> tuple[list[PlaceImage], list[Light], list[CoarseModel]]:
     """Label every mapping image with its nearest node, let it observe the points of the nodes around, and teach the
     coarse localizer of each kind of features with it; its light is measured on the way."""
     assert node_config.lambda_rot is not None
     words = {kind: _words(drafts, kind, config) for kind in config.kinds}
-    node_poses = NodePoses.of([draft.image.world_from_cam for draft in drafts])
-    drafted = {draft.frame: draft.image for draft in drafts}  # read already
+    nodes = NearestNodes(NodePoses.of(drafts.world_from_nodes), node_config.lambda_rot)
     images: list[PlaceImage] = []
-    lights, vlads, cells = [], {kind: [] for kind in config.kinds}, {kind: [] for kind in config.kinds}
+    lights, vlads, cells = [], {kind: Shelf[np.ndarray]() for kind in config.kinds}, {kind: [] for kind in config.kinds}
     for done, frame in enumerate(frames):
-        image = drafted.get(frame) or mapping_image(frame, frame.view(with_depth=False), config)
-        nearest = np.argsort(node_distances(image.world_from_cam, node_poses, node_config.lambda_rot), kind="stable")
-        for node_id in nearest[: config.landmarks.nodes_per_image]:
-            if frame not in drafts[node_id].sources:
-                observe(drafts[node_id], image, frame.session_id, config)
+        image = drafts.image(frame) or mapping_image(frame, frame.view(with_depth=False), config)
+        nearest = nodes.rows(image.world_from_cam, max(1, config.landmarks.nodes_per_image)).tolist()
+        for row in nearest[: config.landmarks.nodes_per_image]:
+            draft = drafts.shelf[row]
+            if frame not in draft.sources:
+                observe(draft, image, frame.session_id, config)
+                drafts.shelf[row] = draft
         for kind, features in image.features.items():
-            vlads[kind].append(vlad(_placed(features, image, config.vlad_of(kind)), words[kind]))
+            described = placed(features, image.camera.width, image.camera.height, config.vlad_of(kind))
+            vlads[kind].append(vlad(described, words[kind]))
             cells[kind].append(features.cells)
-        of_image = (int(nearest[0]), image.world_from_cam, image.place_jpeg, frame.session_id, done + 1)
+        of_image = (nearest[0], image.world_from_cam, image.place_jpeg, frame.session_id, done + 1)
         images.append(PlaceImage(frame.sequence.name, frame.name, *of_image))
         lights.append(image.light)
         progress("images", done + 1, len(frames))
     node_ids = np.array([image.node_id for image in images])
-    learnt = {kind: (words[kind], np.stack(vlads[kind]), node_ids, config.vlad_of(kind), cells[kind]) for kind in config.kinds}
+    learnt = {kind: (words[kind], vlads[kind], node_ids, config.vlad_of(kind), cells[kind]) for kind in config.kinds}
     first, models = config.features.kind, {kind: SurfVlad.fit(*of_kind).to_model() for kind, of_kind in learnt.items()}
     return images, lights, [model if kind == first else replace(model, name=f"{model.name}@{kind}") for kind, model in models.items()]
 
 
-def _words(drafts: list[NodeDraft], kind: str, config: BuildConfig) -> Float32[np.ndarray, "k d"]:
-    placed_features = [_placed(draft.points[kind].features, draft.image, config.vlad_of(kind)) for draft in drafts]
-    return learn_words(np.concatenate(placed_features), config.vlad)
+def _words(drafts: Drafts, kind: str, config: BuildConfig) -> Float32[np.ndarray, "k d"]:
+    return learn_words_of(drafts.num_points[kind], lambda row: drafts.shelf[row].described(kind, config), config.vlad)
 
 
-def _placed(features: Features, image: MappingImage, config: VladConfig) -> np.ndarray:
-    return placed(features, image.camera.width, image.camera.height, config)
+def _finished(drafts: Drafts, config: BuildConfig) -> tuple[dict[str, Sequence[TopoNode]], Sequence[TopoNode]]:
+    """The nodes by their kinds of features, and all side nodes; each draft is looked at once."""
+    of_kind, sides = {kind: Shelf[TopoNode]() for kind in config.kinds}, Shelf[TopoNode]()
+    for node_id, draft in enumerate(drafts.shelf):
+        for kind, nodes in of_kind.items():
+            nodes.append(finish_node(node_id, draft, kind, config))
+        for side in draft.sides:
+            sides.append(replace(side, summary=replace(side.summary, of_node=node_id)))
+    return dict(of_kind), sides
 
 
 def _edges_along(frames: list[MappingFrame], node_ids: list[int]) -> list[Edge]:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from topoloc.features.features import Features
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
 from topoloc.map.config import MapConfig
 from topoloc.map.entries import NodeSummary, TopoNode
 from topoloc.map.landmarks import Observations, observe_points, refine_points, session_sums
 from topoloc.map.mapping_frames import MappingFrame, MappingImage, PointLocator, small_jpeg
+from topoloc.map.shelf import Shelf
 from topoloc.map.side_nodes import describe_sides
+from topoloc.places.vlad import placed
 from topoloc.slam.metric_points import keypoint_sigmas
 
 
@@ -36,6 +40,34 @@ class NodeDraft:
     points: dict[str, DraftPoints]
     sides: list[TopoNode]
     sources: list[MappingFrame]
+
+    def described(self, kind: str, config: MapConfig) -> Float32[np.ndarray, "n d"]:
+        """The descriptors of its points of a kind, as the coarse localizer takes them (`placed`)."""
+        return placed(self.points[kind].features, self.image.camera.width, self.image.camera.height, config.vlad_of(kind))
+
+
+@dataclass(frozen=True, eq=False)
+class Drafts:
+    """The nodes of a map in the making, by their rows; most of them lie on disk (`shelf`). `rows` are those of the frames that they come
+    from, `cameras` the first one of each session, and `num_points` how many points each has, by kind."""
+
+    shelf: Shelf[NodeDraft]
+    world_from_nodes: list[Rigid3] = field(default_factory=list)
+    rows: dict[MappingFrame, int] = field(default_factory=dict)
+    cameras: dict[int, Camera] = field(default_factory=dict)
+    num_points: dict[str, list[int]] = field(default_factory=dict)
+
+    def append(self, draft: NodeDraft) -> None:
+        self.rows[draft.frame] = len(self.shelf)
+        self.world_from_nodes.append(draft.image.world_from_cam)
+        self.cameras.setdefault(draft.frame.session_id, draft.image.camera)
+        for kind, points in draft.points.items():
+            self.num_points.setdefault(kind, []).append(len(points.features))
+        self.shelf.append(draft)
+
+    def image(self, frame: MappingFrame) -> MappingImage | None:
+        """What was found in a frame that became a node."""
+        return self.shelf[self.rows[frame]].image if frame in self.rows else None
 
 
 def draft_node(frame: MappingFrame, locator: PointLocator, with_sides: bool, config: MapConfig) -> NodeDraft:

@@ -102,13 +102,15 @@ class RememberedNodes(Generic[T]):
 
 
 def bytes_of(value: Any) -> int:
-    """Bytes of the arrays and byte strings in a value, its fields and items."""
+    """Bytes of the arrays and byte strings in a value, its fields and items, those of mappings too."""
     if isinstance(value, np.ndarray):
         return value.nbytes
     if isinstance(value, bytes):
         return len(value)
     if isinstance(value, list | tuple):
         return sum(bytes_of(item) for item in value)
+    if isinstance(value, dict):
+        return sum(bytes_of(item) for item in value.values())
     if is_dataclass(value) and not isinstance(value, type):
         return sum(bytes_of(getattr(value, item.name)) for item in fields(value))
     return 0

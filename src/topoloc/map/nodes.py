@@ -9,10 +9,12 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial import KDTree
 
 from topoloc.bounds import Above, AtLeast
 from topoloc.geometry.rigid import Rigid3
@@ -24,6 +26,7 @@ DEPTH_SHARE = 0.15
 # Where the user names no lambda, a turn by this angle alone makes a node. Nodes are cheap (100 KB) and a query asks only
 # the few around it; the closer they are in view, the more of the map's own error they share with it (docs/journal.md).
 RADIANS_PER_NODE = np.deg2rad(2.0)
+_STEPS = list(product((-1, 0, 1), repeat=3))  # to a cube and those around it
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,10 @@ class NodePoses:
     def of(world_from_nodes: list[Rigid3]) -> NodePoses:
         return NodePoses(np.array([p.translation for p in world_from_nodes]), np.array([p.rotation for p in world_from_nodes]))
 
+    def rows(self, rows: Sequence[int] | Int[np.ndarray, " some"]) -> NodePoses:
+        """Those of some nodes."""
+        return NodePoses(self.centres[rows], self.rotations[rows])
+
 
 def node_distances(world_from_cam: Rigid3, nodes: NodePoses, lambda_rot: float) -> Float[np.ndarray, " nodes"]:
     """D_total of Eq. 1 (metres) between a camera and each node."""
@@ -69,13 +76,34 @@ def place_nodes(world_from_cams: list[Rigid3], config: NodeConfig) -> Int[np.nda
     """
     assert config.d_thresh is not None, "resolve the configuration first"
     assert config.lambda_rot is not None, "resolve the configuration first"
-    poses = NodePoses.of(world_from_cams)
-    frame_idx = [0]
-    for k, world_from_cam in enumerate(world_from_cams):
-        nodes = NodePoses(poses.centres[frame_idx], poses.rotations[frame_idx])
-        if node_distances(world_from_cam, nodes, config.lambda_rot).min() > config.d_thresh:
+    poses, frame_idx = NodePoses.of(world_from_cams), list[int]()
+    cells: dict[tuple[int, ...], list[int]] = {}  # frames that became nodes, by the cube of D_thresh that they stand in
+    for k, (world_from_cam, cell) in enumerate(zip(world_from_cams, np.floor(poses.centres / config.d_thresh).tolist(), strict=True)):
+        near = [frame for step in _STEPS for frame in cells.get((cell[0] + step[0], cell[1] + step[1], cell[2] + step[2]), ())]
+        if not near or node_distances(world_from_cam, poses.rows(near), config.lambda_rot).min() > config.d_thresh:
             frame_idx.append(k)
+            cells.setdefault(tuple(cell), []).append(k)
     return np.array(frame_idx)
+
+
+class NearestNodes:
+    """The nodes nearest to a camera by Eq. 1, found without looking at all: none is nearer than the metres to it."""
+
+    def __init__(self, poses: NodePoses, lambda_rot: float) -> None:
+        self._poses, self._lambda_rot, self._tree = poses, lambda_rot, KDTree(poses.centres)
+
+    def rows(self, world_from_cam: Rigid3, count: int) -> Int[np.ndarray, " nodes"]:
+        """Up to `count` nodes, the nearest first; of equal ones the first."""
+        num_nodes, num_looked_at = len(self._poses.centres), 8 * count
+        while True:
+            wanted = np.arange(1, min(num_looked_at, num_nodes) + 1)
+            metres, rows = self._tree.query(world_from_cam.translation, wanted)  # pyright: ignore[reportArgumentType]
+            rows = np.sort(rows)
+            distances = node_distances(world_from_cam, self._poses.rows(rows), self._lambda_rot)
+            order = np.argsort(distances, kind="stable")[:count]
+            if len(rows) == num_nodes or distances[order[-1]] < metres[-1]:
+                return rows[order]
+            num_looked_at *= 4
 
 
 def digest_of_nodes(summaries: Sequence[NodeSummary], method: bytes) -> str:

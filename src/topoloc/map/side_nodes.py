@@ -8,11 +8,12 @@ localizer asks them only where nothing else gave a pose (`localization/walls/`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from topoloc.bounds import AtLeast, Between
 from topoloc.features.extraction import FeatureConfig, extract_features
@@ -20,7 +21,8 @@ from topoloc.features.side_views import SideView, SideViewConfig, side_views
 from topoloc.geometry.rigid import Rigid3
 from topoloc.map.entries import NodeSummary, SideNodes, TopoNode
 from topoloc.map.nodes import NodeConfig, place_nodes
-from topoloc.places.vlad import SurfVlad, VladConfig, learn_words, placed, vlad
+from topoloc.map.shelf import Shelf
+from topoloc.places.vlad import SurfVlad, VladConfig, learn_words_of, placed, vlad
 from topoloc.sequences.frame_view import FrameView
 from topoloc.slam.metric_points import MetricPointsConfig, locate_points
 
@@ -68,12 +70,12 @@ def describe_sides(
     return [node for node in sides if node is not None]
 
 
-def gather_sides(described: list[TopoNode], kind: str, config: SideNodesConfig) -> SideNodes | None:
+def gather_sides(described: Sequence[TopoNode], kind: str, config: SideNodesConfig) -> SideNodes | None:
     """All side nodes of a map, by features of one kind, numbered, with what ranks them by looks; None without any. Each knows the node that
     it is of."""
-    if not described:
+    if len(described) == 0:
         return None
-    nodes = [replace(node, summary=replace(node.summary, node_id=k)) for k, node in enumerate(described)]
+    nodes = Shelf(replace(node, summary=replace(node.summary, node_id=k)) for k, node in enumerate(described))
     model = _coarse(nodes, config.vlad).to_model()
     model = replace(model, arrays={**model.arrays, "centres": np.array([_centre(node) for node in nodes])})
     return SideNodes([node.summary for node in nodes], nodes, {model.name: model}, kind)
@@ -113,7 +115,9 @@ def _centre(node: TopoNode) -> Float[np.ndarray, " 3"]:
     return node.summary.world_from_cam.apply(np.median(node.points_cam.astype(np.float64), axis=0)[None])[0]
 
 
-def _coarse(nodes: list[TopoNode], config: VladConfig) -> SurfVlad:
-    described = [placed(node.features, node.camera.width, node.camera.height, config) for node in nodes]
-    words = learn_words(np.concatenate(described), config)
-    return SurfVlad.fit(words, np.stack([vlad(descriptors, words) for descriptors in described]), np.arange(len(nodes)), config)
+def _coarse(nodes: Sequence[TopoNode], config: VladConfig) -> SurfVlad:
+    def described(row: int) -> Float32[np.ndarray, "n d"]:
+        return placed(nodes[row].features, nodes[row].camera.width, nodes[row].camera.height, config)
+
+    words = learn_words_of([len(node.features) for node in nodes], described, config)
+    return SurfVlad.fit(words, Shelf(vlad(described(row), words) for row in range(len(nodes))), np.arange(len(nodes)), config)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -103,13 +104,13 @@ class Whitening:
         return np.ascontiguousarray(projected / np.maximum(np.linalg.norm(projected, axis=1, keepdims=True), 1e-6), np.float32)
 
 
-def learn_whitening(raw: Float32[np.ndarray, "n d"], dimension: int) -> Whitening:
+def learn_whitening(raw: Float32[np.ndarray, "n d"] | Sequence[Float32[np.ndarray, " d"]], dimension: int) -> Whitening:
     """Mean and projection to at most `dimension` whitened components, from unit vectors of images.
 
     The variances are softened by the mean one, since the trailing components of few images are noise, which plain
     whitening would blow up.
     """
-    raw = raw[np.unique(np.linspace(0, len(raw) - 1, MAX_LEARNING_IMAGES).astype(int))]
+    raw = np.stack([raw[k] for k in np.unique(np.linspace(0, len(raw) - 1, MAX_LEARNING_IMAGES).astype(int)).tolist()])
     mean = raw.mean(axis=0)
     centred = raw - mean
     by_image = len(raw) < raw.shape[1]  # whichever is smaller: the products of images, or those of dimensions

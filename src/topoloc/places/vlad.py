@@ -10,7 +10,7 @@ the picture, that has half of the say (`cell_grid.py`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Annotated
 
@@ -24,6 +24,8 @@ from topoloc.places.cell_grid import CellGrid
 from topoloc.places.coarse import CoarseModel, Image, NodeScore, model_array
 from topoloc.places.neighbours import PlaceIndex, learn_whitening, visual_words
 from topoloc.places.place_kernels import add_residuals, multiply_rows
+
+_BLOCK = 1024  # vectors whitened at a time
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,7 @@ class SurfVlad:
     @staticmethod
     def fit(
         words: Float32[np.ndarray, "k d"],
-        vlads: Float32[np.ndarray, "n kd"],
+        vlads: Float32[np.ndarray, "n kd"] | Sequence[Float32[np.ndarray, " kd"]],
         node_ids: Int[np.ndarray, " n"],
         config: VladConfig,
         cells: Sequence[Float32[np.ndarray, "rows columns c"] | None] = (),
@@ -75,7 +77,9 @@ class SurfVlad:
         where the kind of features has them."""
         whitening, known = learn_whitening(vlads, config.dimension), [one for one in cells if one is not None]
         grid = CellGrid.fit(np.stack(known)) if len(known) == len(vlads) else None
-        return SurfVlad(words, whitening.mean, whitening.projection, whitening.apply(vlads), node_ids, config, grid)
+        starts = range(0, len(vlads), _BLOCK)
+        vectors = np.concatenate([whitening.apply(np.stack([*vlads[start : start + _BLOCK]])) for start in starts])
+        return SurfVlad(words, whitening.mean, whitening.projection, vectors, node_ids, config, grid)
 
     def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
         """See `CoarseLocalizer.rank`; of the picture itself only the size is looked at. Features without cells are ranked by VLAD alone."""
@@ -149,7 +153,22 @@ def vlad(descriptors: Float32[np.ndarray, "n d"], words: Float32[np.ndarray, "k 
 
 def learn_words(descriptors: Float32[np.ndarray, "n d"], config: VladConfig) -> Float32[np.ndarray, "k d"]:
     """The visual words: k-means centres of the map's descriptors, fewer where there are few of them."""
-    rng = np.random.default_rng(config.seed)
-    if len(descriptors) > config.max_training_descriptors:
-        descriptors = descriptors[np.sort(rng.choice(len(descriptors), config.max_training_descriptors, replace=False))]
-    return visual_words(descriptors, config.num_words, config.seed)
+    return learn_words_of([len(descriptors)], lambda _: descriptors, config)
+
+
+def learn_words_of(
+    num_rows: Sequence[int], part: Callable[[int], Float32[np.ndarray, "_ d"]], config: VladConfig
+) -> Float32[np.ndarray, "k d"]:
+    """As `learn_words` of many parts one after the other, of which one at a time is in memory.
+
+    Args:
+        num_rows: how many descriptors each part has.
+        part: a part by its number.
+    """
+    ends = np.cumsum(num_rows)
+    chosen, total = np.arange(ends[-1]), int(ends[-1])
+    if total > config.max_training_descriptors:
+        chosen = np.sort(np.random.default_rng(config.seed).choice(total, config.max_training_descriptors, replace=False))
+    of_parts = np.split(chosen, np.searchsorted(chosen, ends[:-1]))
+    rows = [part(k)[rows - (ends[k] - num_rows[k])] for k, rows in enumerate(of_parts) if len(rows) or k == 0]
+    return visual_words(np.concatenate(rows), config.num_words, config.seed)

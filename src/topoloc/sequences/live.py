@@ -6,12 +6,12 @@ late by one picture at most, and misses others. Who wants them all (a recording)
 
 from __future__ import annotations
 
+import os
 import re
 import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -30,7 +30,7 @@ def is_live(source: str) -> bool:
     """Whether this names a live source and no file: a device number or ``/dev/video0``, a URL, a pipeline with `` ! ``."""
     if _URL.fullmatch(source) or " ! " in source or source.startswith("/dev/video"):
         return True
-    return bool(_DEVICE.fullmatch(source)) and not Path(source).exists()
+    return bool(_DEVICE.fullmatch(source)) and not os.path.exists(source)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +127,7 @@ def _open(source: str, size: tuple[int, int] | None, stall_s: float) -> Any:
             limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, limit_ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC, 2 * limit_ms]
             capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, limits)
         else:
-            capture = cv2.VideoCapture(int(source) if source.isdigit() and not Path(source).exists() else source)
+            capture = cv2.VideoCapture(int(source) if source.isdigit() and not os.path.exists(source) else source)
         if capture.isOpened() and size is not None:
             capture.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])

@@ -8,6 +8,7 @@ the centre of the top-left pixel is (0.5, 0.5). Depth is along z, of the picture
 
 from __future__ import annotations
 
+import os
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -124,4 +125,4 @@ def _positive(data: dict[str, Any], key: str, default: float, where: str) -> flo
 
 def _with_suffix(folder: Path, name: str) -> str:
     """Blender's scenes name their pictures without the suffix, which is .png."""
-    return name if PurePath(name).suffix or (folder / name).exists() else f"{name}.png"
+    return name if PurePath(name).suffix or os.path.exists(folder / name) else f"{name}.png"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -103,7 +104,7 @@ def find_format(path: str | Path, format: str | None = None) -> str:
     if format is not None and format not in FORMATS:
         raise UnknownFormatError(f"format {format!r} is not known; there are {', '.join(FORMATS)}")
     folder, _ = split_selection(str(path))
-    if not folder.exists():
+    if not os.path.exists(folder):  # no error of a name that is too long
         raise RecordingError(f"{folder}: no such file or folder")
     return format or _recognise(folder)
 
@@ -111,7 +112,7 @@ def find_format(path: str | Path, format: str | None = None) -> str:
 def split_selection(path: str) -> tuple[Path, str | None]:
     """The recording's folder or file, and the part of it that is chosen behind an @; None: all of it."""
     folder, at, selection = path.rpartition("@")
-    if not at or Path(path).exists():
+    if not at or os.path.exists(path):
         return Path(path), None
     return Path(folder), selection
 
