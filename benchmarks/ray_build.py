@@ -95,7 +95,8 @@ def on_cluster(recordings: list[str], names: list[str], atlas: str, num_nodes: i
         for recording, name in zip(recordings, names, strict=True)
     ]
     node = {"num_cpus": 1, "include_dashboard": False, "object_store_memory": 100_000_000}
-    cluster = Cluster(initialize_head=True, head_node_args=node)
+    files = tempfile.TemporaryDirectory(prefix="ray-", ignore_cleanup_errors=True)
+    cluster = Cluster(initialize_head=True, head_node_args={**node, "temp_dir": files.name})
     try:
         for _ in range(num_nodes - 1):
             cluster.add_node(**node)
@@ -104,6 +105,7 @@ def on_cluster(recordings: list[str], names: list[str], atlas: str, num_nodes: i
         return outcomes, watch.ended()
     finally:
         cluster.shutdown()
+        files.cleanup()
 
 
 def main() -> None:
