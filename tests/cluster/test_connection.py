@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import sys
 import tempfile
@@ -11,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from topoloc.cluster.connection import _own_folder, connected
+from topoloc.cluster.connection import _own_folder, _own_token, _quiet, connected
 from topoloc.errors import ClusterError, MissingExtraError
 
 Complaint = Callable[..., str]
@@ -67,6 +68,30 @@ def test_folders_of_killed_clusters_are_removed(tmp_path: Path, monkeypatch: pyt
             assert sorted(tmp_path.iterdir()) == sorted([one, two])
         assert list(tmp_path.iterdir()) == [one]
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_cluster_of_our_own_has_a_token_of_its_own(monkeypatch: pytest.MonkeyPatch):
+    names = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
+    for name in names:
+        monkeypatch.delenv(name, raising=False)
+    tokens = set()
+    for _ in range(2):
+        with _own_token():
+            tokens.add(os.environ["RAY_AUTH_TOKEN"])
+            os.environ["RAY_AUTH_MODE"] = "token"  # as Ray does
+        assert not set(names) & set(os.environ)
+    assert len(tokens) == 2
+    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
+    with _own_token():
+        assert "RAY_AUTH_TOKEN" not in os.environ
+    assert os.environ["RAY_AUTH_MODE"] == "disabled"
+
+
+def test_what_is_written_past_python_is_not_seen(capfd: pytest.CaptureFixture[str]):
+    with _quiet():
+        os.write(2, b"a warning of C++")
+    os.write(2, b"ours")
+    assert capfd.readouterr().err == "ours"
 
 
 @pytest.mark.parametrize("option", [["--world", "campus"], ["--replace"]])

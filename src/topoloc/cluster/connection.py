@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import contextlib
 import os
+import secrets
 import shutil
 import signal
 import socket
+import sys
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -27,6 +29,7 @@ except ImportError:  # Windows
 LOCAL, AUTO = "local", "auto"
 _PATIENCE_S = 5.0
 _FOLDER = "topoloc-ray-"
+_TOKEN_SETTINGS = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 
 
 def ray_module() -> Any:
@@ -53,10 +56,12 @@ def connected(address: str) -> Iterator[Any]:
         options: dict[str, Any] = {"address": address}
         if address == LOCAL:
             os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+            at_end.enter_context(_own_token())
             options |= {"include_dashboard": False, "_temp_dir": str(at_end.enter_context(_own_folder()))}
         before = signal.getsignal(signal.SIGTERM)
         try:
-            ray.init(**options, log_to_driver=False, logging_level="error")
+            with _quiet():
+                ray.init(**options, log_to_driver=False, logging_level="error")
         except Exception as error:  # of many classes, which are no API; the text says what it was
             ray.shutdown()
             raise ClusterError(_why(address, error)) from error
@@ -95,7 +100,41 @@ def _why(address: str, error: Exception) -> str:
         return f"the Ray cluster at {address} is of another version: {text.partition('mismatch')[2].strip(' :!.')[:300]}"
     if "Could not find any running Ray instance" in text:
         return "no Ray cluster runs on this machine; `ray start --head` starts one, and --ray local takes this machine's processors"
-    return f"no Ray cluster answers at {address}: {text[:300] or type(error).__name__}"
+    told = f"no Ray cluster answers at {address}: {text[:300] or type(error).__name__}"
+    return told if "RAY_AUTH_MODE" in os.environ else f"{told}; one with a token needs RAY_AUTH_MODE=token and it, as on its machines"
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """The C++ part of Ray writes to standard error past all of Python; what matters of it is in the error that follows."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # closed by the caller
+        yield
+        return
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        sys.stderr.flush()
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+
+
+@contextmanager
+def _own_token() -> Iterator[None]:
+    """A cluster of our own answers to us alone. Without this Ray would leave a token in the user's home, which later ones ask for."""
+    if any(name in os.environ for name in _TOKEN_SETTINGS):
+        yield
+        return
+    os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
+    try:
+        yield
+    finally:  # the mode was set by Ray meanwhile
+        for name in _TOKEN_SETTINGS:
+            os.environ.pop(name, None)
 
 
 @contextmanager
