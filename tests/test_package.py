@@ -29,6 +29,7 @@ FOREIGN = (
     "cyclonedds",
     "carla",
     "pyzed",
+    "ray",
     "mcap",
     "rosbags",
     "google",

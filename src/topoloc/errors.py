@@ -18,6 +18,7 @@ TopolocError
 ├── ResultError           a result (a JSON line) that is none
 ├── GeoreferenceError     no place on earth, or points that do not say where a map lies on it
 ├── FeatureKindError      features of a kind that there is not, or whose fitted weights are damaged
+├── ClusterError          a cluster that does not answer, or is of another version
 ├── ServiceError          a service that does not answer, or refuses
 └── MissingExtraError     an optional dependency is not installed; names the extra
 """
@@ -101,6 +102,10 @@ class ServiceError(TopolocError):
     def __init__(self, text: str, status: int | None = None) -> None:
         super().__init__(text)
         self.status = status
+
+
+class ClusterError(TopolocError):
+    """A cluster that does not answer, is none, or is of another version."""
 
 
 class MissingExtraError(TopolocError):

@@ -60,6 +60,33 @@ def test_two_tiles_of_one_id_are_refused(somewhere: str, room_map: Path, other_m
     assert Atlas.open(somewhere).manifest.serial == 1
 
 
+def test_an_atlas_that_is_made_where_there_is_none(somewhere: str, room_map: Path, other_map: Path):
+    with pytest.raises(AtlasError, match="is no atlas"):
+        add_tiles(somewhere, new_tiles([str(room_map)]))
+    assert add_tiles(somewhere, new_tiles([str(room_map)]), creates=True).serial == 1
+    assert add_tiles(somewhere, new_tiles([str(other_map)]), creates=True).serial == 2
+    assert _tiles(somewhere) == ["other", "room"]
+
+
+def test_what_was_made_of_the_same_is_no_other_tile(somewhere: str, room_map: Path, other_map: Path):
+    made = NewTile("room", room_map, "room", recipe="ab" * 32)
+    add_tiles(somewhere, [made], creates=True)
+    assert add_tiles(somewhere, [made]).by_id["room"].recipe == made.recipe
+    for other in (replace(made, recipe="cd" * 32), replace(made, recipe=None)):
+        with pytest.raises(AtlasError, match="has a tile room already"):
+            add_tiles(somewhere, [replace(other, path=other_map)])
+    assert add_tiles(somewhere, new_tiles([str(other_map)], "room"), replaces=True).by_id["room"].recipe is None
+
+
+def test_what_a_killed_writer_left_half_goes(room_map: Path, other_map: Path, tmp_path: Path):
+    where = tmp_path / "campus"
+    create_atlas(str(where), new_tiles([str(room_map)]))
+    left = where / "tiles" / ".hall-0123456789ab.topo.0123456789abcdef.part"
+    left.write_bytes(b"half")
+    add_tiles(str(where), new_tiles([str(other_map)]))
+    assert not left.exists()
+
+
 def test_whoever_has_opened_an_atlas_keeps_its_tiles(somewhere: str, room_map: Path, other_map: Path):
     create_atlas(somewhere, new_tiles([str(room_map)], "hall"))
     before = Atlas.open(somewhere)

@@ -27,13 +27,14 @@ def _tile(name: str, georeference: Georeference | None = None) -> Tile:
 def test_what_is_written_is_read():
     turn = Rigid3(exp_so3(np.array([0.0, 0.0, 0.3])), np.array([5.0, 6.0, 7.0]))
     placed = _tile("b", Georeference(GeoPoint(50.0, 4.0, 30.0), turn, "origin"))
-    written = Manifest().with_tiles({"a": _tile("a"), "b": placed}, now=5.0)
+    written = Manifest().with_tiles({"a": replace(_tile("a"), recipe="cd" * 32), "b": placed}, now=5.0)
     read = Manifest.from_bytes(written.to_bytes(), "here")
     rows, read_rows = ([tile.to_json() for tile in one.tiles] for one in (written, read))
     poses, read_poses = ([row.pop("atlas_from_world") for row in each] for each in (rows, read_rows))
     assert read_rows == rows
     assert np.allclose(read_poses[1], poses[1], atol=1e-12)
     assert [tile.tile_id for tile in read.tiles] == ["a", "b"]
+    assert [tile.recipe for tile in read.tiles] == ["cd" * 32, None]
     assert (read.serial, read.origin) == (1, GeoPoint(50.0, 4.0, 30.0))
     assert read.by_id["a"].atlas_from_world is None
 

@@ -168,7 +168,7 @@ def test_ctrl_c_in_a_compiled_function_is_no_bug(recording: Path, tmp_path: Path
     def interrupted(*_: object, **__: object) -> None:
         raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
 
-    monkeypatch.setattr("topoloc.cli.build.build_map", interrupted)
+    monkeypatch.setattr("topoloc.cli.recording_maps.build_map", interrupted)
     assert "interrupted" in complaint("build", recording, tmp_path / "room.topo")
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from topoloc.errors import TopolocError
-from topoloc.sequences.atomic import remove_leftovers, replaced_file, scratch_file, write_bytes, write_folder
+from topoloc.sequences.atomic import remove_all_leftovers, remove_leftovers, replaced_file, scratch_file, write_bytes, write_folder
 
 WRITER = """
 import sys
@@ -81,6 +81,30 @@ def test_what_a_killed_writer_left_is_removed_and_what_a_living_one_writes_is_no
     living.communicate("\n")
     assert path.read_bytes() == b"half"
     assert sorted(tmp_path.iterdir()) == sorted([path, other])
+
+
+def test_a_scratch_file_is_its_own_while_it_is_used(tmp_path: Path):
+    left = tmp_path / ".scratch.0123456789abcdef.part"
+    left.write_bytes(b"of somebody who was killed")
+    with scratch_file(tmp_path / "scratch") as one:
+        one.write_bytes(b"one")
+        with scratch_file(tmp_path / "scratch") as two:
+            assert sorted(tmp_path.iterdir()) == sorted([one, two])
+        assert one.read_bytes() == b"one"
+    with pytest.raises(KeyError), scratch_file(tmp_path / "scratch"):
+        raise KeyError
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_all_that_nobody_writes_any_more_is_removed_from_a_folder(tmp_path: Path):
+    (tmp_path / ".a.topo.0123456789abcdef.part").write_bytes(b"")
+    kept = [tmp_path / ".hidden", tmp_path / "b.part"]
+    for path in kept:
+        path.write_bytes(b"")
+    with replaced_file(tmp_path / "c.topo") as held:
+        remove_all_leftovers(tmp_path)
+        assert sorted(tmp_path.iterdir()) == sorted([*kept, held])
+    remove_all_leftovers(tmp_path / "nowhere")
 
 
 def test_leftovers_of_older_versions_go_too(tmp_path: Path):

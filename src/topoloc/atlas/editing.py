@@ -23,6 +23,7 @@ from topoloc.geometry.geodesy import Georeference
 from topoloc.map.contents import map_id_of
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.shared_vocabulary import shared_vocabulary
+from topoloc.sequences.atomic import scratch_file
 
 GRACE_S = 3600.0
 """So long files stay that no manifest names any more: readers may have just read the manifest before."""
@@ -33,11 +34,12 @@ Change = Callable[[Manifest], Mapping[str, Tile]]
 
 @dataclass(frozen=True)
 class NewTile:
-    """A map that becomes a tile of this id, in this world."""
+    """A map that becomes a tile of this id, in this world; `recipe` is the digest of what it was made of, where that is known."""
 
     tile_id: str
     path: Path
     world: str
+    recipe: str | None = None
 
 
 def new_tiles(paths: Sequence[str], tile_id: str | None = None, world: str | None = None) -> list[NewTile]:
@@ -72,25 +74,26 @@ def create_atlas(where: str, new: Sequence[NewTile]) -> Manifest:
     return after
 
 
-def add_tiles(where: str, new: Sequence[NewTile], replaces: bool = False, grace_s: float = GRACE_S) -> Manifest:
+def add_tiles(where: str, new: Sequence[NewTile], replaces: bool = False, grace_s: float = GRACE_S, creates: bool = False) -> Manifest:
     """The manifest with these tiles, too.
 
     Args:
-        replaces: tiles of the same ids are replaced, else they are an error.
+        replaces: tiles of the same ids are replaced, else they are an error, unless they were made of the same.
+        creates: where no atlas is there, it is made.
 
     Raises:
         AtlasError: no atlas is there, it has a tile of one of these ids, or it cannot be written.
         MapError: a map is missing, damaged or empty.
     """
     store = store_at(where)
-    _check_free(_read(store), new, replaces)  # before the work begins, and again with each try
+    _check_free(_read(store, creates)[1], new, replaces)  # before the work begins, and again with each try
     added = {tile.tile_id: tile for tile in _put(store, new)}
 
     def with_added(manifest: Manifest) -> Mapping[str, Tile]:
         _check_free(manifest, new, replaces)
         return manifest.by_id | added
 
-    after, names = _changed(store, with_added, grace_s), store.ages()
+    after, names = _changed(store, with_added, grace_s, creates), store.ages()
     for one, tile in zip(new, added.values(), strict=True):
         if not {tile.map.name, tile.places.name} <= set(names):  # an old file of the same contents, swept just before it was named again
             tile_of(one, store)
@@ -113,12 +116,12 @@ def remove_tiles(where: str, tile_ids: Sequence[str], grace_s: float = GRACE_S) 
 def tile_of(new: NewTile, store: Store) -> Tile:
     """What the manifest says of a map; its files are put into the store. Raises MapError, AtlasError."""
     sha256 = sha256_of(new.path)
-    with TopoMetricMap.load(new.path) as topomap, tempfile.TemporaryDirectory() as folder:
+    scratch = scratch_file(Path(tempfile.gettempdir()) / "topoloc-tile.places")
+    with TopoMetricMap.load(new.path) as topomap, scratch as places:
         if len(topomap.summaries) == 0:
             raise EmptyMapError(f"map {new.path} has no nodes")
         vectors = place_vectors(topomap)
         versions = {kind: vocabulary.version for kind in vectors if (vocabulary := shared_vocabulary(kind)) is not None}
-        places = Path(folder) / "places.npz"
         write_vectors(places, vectors)
         of_places = sha256_of(places)
         tile = _described(new, topomap, versions)
@@ -126,7 +129,7 @@ def tile_of(new: NewTile, store: Store) -> Tile:
         vectors_stored = StoredFile(f"{TILES}/{new.tile_id}-{of_places[:12]}.places", of_places, places.stat().st_size)
         store.put(vectors_stored.name, places)
         store.put(stored.name, new.path)
-    return replace(tile, map=stored, places=vectors_stored)
+    return replace(tile, map=stored, places=vectors_stored, recipe=new.recipe)
 
 
 def _put(store: Store, new: Sequence[NewTile]) -> list[Tile]:
@@ -165,26 +168,27 @@ def _geo_box(known: Georeference, centres: np.ndarray) -> tuple[float, float, fl
     return min(lats), min(lons), max(lats), max(lons)
 
 
-def _read(store: Store) -> Manifest:
+def _read(store: Store, creates: bool = False) -> tuple[bytes | None, Manifest]:
+    """The manifest, as bytes and as what they say; an empty one where there is none yet and it is to be made."""
     data = store.manifest()
+    if data is None and creates:
+        return None, Manifest()
     if data is None:
         raise AtlasError(f"{store.where} is no atlas: it has no {MANIFEST}; `topoloc atlas create` makes one")
-    return Manifest.from_bytes(data, f"{store.where}/{MANIFEST}")
+    return data, Manifest.from_bytes(data, f"{store.where}/{MANIFEST}")
 
 
 def _check_free(manifest: Manifest, new: Sequence[NewTile], replaces: bool) -> None:
-    taken = [tile.tile_id for tile in new if tile.tile_id in manifest.by_id]
+    there = manifest.by_id
+    taken = [tile.tile_id for tile in new if tile.tile_id in there and (tile.recipe is None or there[tile.tile_id].recipe != tile.recipe)]
     if taken and not replaces:
         raise AtlasError(f"the atlas has a tile {taken[0]} already; --replace replaces it, --id gives the new one another id")
 
 
-def _changed(store: Store, change: Change, grace_s: float) -> Manifest:
+def _changed(store: Store, change: Change, grace_s: float, creates: bool = False) -> Manifest:
     """Read, change and commit until nobody came in between; then remove what nobody names."""
     for _ in range(_MAX_TRIES):
-        before = store.manifest()
-        if before is None:
-            raise AtlasError(f"{store.where} is no atlas: it has no {MANIFEST}; `topoloc atlas create` makes one")
-        manifest = Manifest.from_bytes(before, f"{store.where}/{MANIFEST}")
+        before, manifest = _read(store, creates)
         now, ages = time.time(), store.ages()
         after = manifest.with_tiles(change(manifest), now)
         gone = [name for name, when in after.retired.items() if name not in ages or min(now - when, ages[name]) > grace_s]

@@ -50,7 +50,8 @@ class Tile:
     `box_world` holds the least and the largest coordinates of its nodes' cameras in the map's own world, metres; `focal_px` the focal
     length of its finest camera. `georeference` is the map's, `geo_box` the least latitude, longitude and the largest ones, degrees;
     both None of a map that knows no place on earth. Tiles of one `world` share their coordinates; it is the tile's own id where nobody said
-    so. `atlas_from_world` brings the map's world into the atlas's, where that is known.
+    so. `atlas_from_world` brings the map's world into the atlas's, where that is known. `recipe` is a digest of the recording and settings
+    that the map was made of, where it was made for this atlas.
     """
 
     tile_id: str
@@ -68,10 +69,12 @@ class Tile:
     georeference: Georeference | None = None
     geo_box: tuple[float, float, float, float] | None = None
     atlas_from_world: Rigid3 | None = None
+    recipe: str | None = None
 
     def to_json(self) -> dict[str, Any]:
         known = self.georeference
-        return {
+        made_of = {} if self.recipe is None else {"recipe": self.recipe}
+        return made_of | {
             "id": self.tile_id,
             "map": self.map.to_json(),
             "places": self.places.to_json() | {"vocabularies": dict(self.vocabularies)},
@@ -188,7 +191,7 @@ def _tile_of(row: dict[str, Any]) -> Tile:
     box = np.array(row["box_world"], np.float64)
     if box.shape != (2, 3) or not np.isfinite(box).all():
         raise ValueError("box_world is no two points")
-    geo_box, georeference, pose = row["geo_box"], row["georeference"], row["atlas_from_world"]
+    geo_box, georeference, pose, recipe = row["geo_box"], row["georeference"], row["atlas_from_world"], row.get("recipe")
     focal = _number(row["focal_px"], "focal_px")
     if focal <= 0.0:
         raise ValueError("focal_px is not above 0")
@@ -212,6 +215,7 @@ def _tile_of(row: dict[str, Any]) -> Tile:
         georeference=None if georeference is None else Georeference.from_json(georeference),
         geo_box=None if corners is None else (corners[0], corners[1], corners[2], corners[3]),
         atlas_from_world=None if pose is None else Rigid3.from_matrix(np.array(pose, np.float64)),
+        recipe=None if recipe is None else _matching(_SHA256, recipe, "recipe"),
     )
 
 

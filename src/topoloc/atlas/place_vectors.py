@@ -13,7 +13,6 @@ from jaxtyping import Float32
 from topoloc.errors import AtlasError
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.shared_vocabulary import shared_vocabulary
-from topoloc.sequences.atomic import replaced_file
 
 PlaceVectors = Mapping[str, Float32[np.ndarray, "_ _"]]
 """Unit vectors of a tile's nodes by the kind of features."""
@@ -42,7 +41,7 @@ def place_vectors(topomap: TopoMetricMap) -> dict[str, Float32[np.ndarray, "_ _"
 def write_vectors(path: Path, vectors: PlaceVectors) -> None:
     """As half floats, each kind an array. Raises OSError."""
     arrays: dict[str, Any] = {kind: rows.astype(np.float16) for kind, rows in vectors.items()}
-    with replaced_file(path) as temporary, temporary.open("wb") as file:
+    with path.open("wb") as file:
         np.savez(file, **arrays)
 
 

@@ -17,7 +17,7 @@ from typing import Protocol, runtime_checkable
 
 from topoloc.atlas.manifest import TILES
 from topoloc.errors import AtlasError, TopolocError
-from topoloc.sequences.atomic import replaced_file, write_bytes
+from topoloc.sequences.atomic import remove_all_leftovers, replaced_file, write_bytes
 
 try:
     import fcntl
@@ -82,6 +82,7 @@ class FolderStore:
                 write_bytes(self.folder / MANIFEST, after)
             except TopolocError as error:
                 raise AtlasError(str(error)) from None
+            remove_all_leftovers(self.folder / TILES)
         return True
 
     def put(self, name: str, path: Path) -> None:

@@ -1,7 +1,8 @@
-"""topoloc build SEQ [SEQ ...] MAP."""
+"""topoloc build SEQ [SEQ ...] MAP; with --ray, SEQ [SEQ ...] ATLAS."""
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,29 +11,12 @@ from typing import Annotated
 import tyro
 
 from topoloc.cli.features_option import BUILD_FEATURES, kinds_to_build
-from topoloc.cli.output import (
-    CameraOption,
-    File,
-    Flag,
-    Format,
-    Topics,
-    UsageError,
-    check_outputs,
-    open_recording,
-    progress_bar,
-    write_json,
-)
-from topoloc.cli.settings_file import read_settings, with_option
-from topoloc.geometry.pose_conventions import PoseReading
-from topoloc.localization.map_facts.building import Trust, build_map
+from topoloc.cli.output import CameraOption, File, Flag, Format, Topics, UsageError, check_outputs, progress_bar, write_json
+from topoloc.cli.recording_maps import MapMaking, PosesAsked
+from topoloc.cli.settings_file import Settings, read_settings, with_option
 from topoloc.map.build import BuildConfig
 from topoloc.map.description import describe_map
-from topoloc.sequences.colmap import aligned
-from topoloc.sequences.frame import StereoSequence
-from topoloc.sequences.known_distances import scale_of
-from topoloc.sequences.recording import has_scale, scaled
-from topoloc.sequences.trajectory import as_read, with_trajectory
-from topoloc.slam.slam import SlamConfig, run_slam, with_slam_poses
+from topoloc.slam.slam import SlamConfig
 
 
 @dataclass(frozen=True)
@@ -40,9 +24,10 @@ class Command:
     """What `topoloc build` takes."""
 
     paths: Annotated[
-        tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="SEQ [SEQ ...] MAP", help_behavior_hint="(required)")
+        tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="SEQ [SEQ ...] MAP|ATLAS", help_behavior_hint="(required)")
     ] = ()
-    """One or several recordings of one place, then the map file to write. PATH@0::2 takes every second frame of PATH."""
+    """One or several recordings of one place, then the map file to write. PATH@0::2 takes every second frame of PATH.
+    With --ray each recording becomes a map of its own, a tile of the atlas that is named last."""
     trajectory: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
         tyro.conf.arg(metavar="truth|slam|FILE", help_behavior_hint="(default: truth where there is one, else slam)"),
@@ -79,30 +64,47 @@ class Command:
     features: BUILD_FEATURES = None
     """Local features of the map, and of every query to it. `learned`: of the first network that `topoloc weights list` finds;
     `both`: of SURF, too."""
+    ray: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT|auto|local", help_behavior_hint="(default: none)")] = None
+    """A Ray cluster on which each recording is mapped, each by itself: `auto` is the one that runs on this machine, `local` one of this
+    machine's processors alone. Called again after it was interrupted, it goes on where it was."""
+    world: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: each its own)")] = None
+    """With --ray, the world that the poses of all recordings are in."""
+    replace: Flag = False
+    """With --ray, a tile of the same id that was made of something else, or otherwise, is replaced."""
     json: File = None
-    """Write what `topoloc info` says of the new map to this file (- for standard output)."""
+    """Write what `topoloc info` says of the new map, or what became of each recording, to this file (- for standard output)."""
     config: File = None
     """All other settings: a TOML file, as `topoloc config build` prints it."""
 
     def run(self) -> int:
+        if self.ray is None and (self.world is not None or self.replace):
+            raise UsageError("--world and --replace belong to --ray")
         recordings, target = self._split_paths()
         read = [path for path in (*self.trajectory, self.config) if path not in ("truth", "slam", None)]
-        check_outputs([str(target), self.json], inputs=read)
+        check_outputs([str(target) if self.ray is None else None, self.json], inputs=read)
         if any("=" not in text and not _is_positive(text) for text in self.scale):
             raise UsageError(f"--scale must be a positive number, or IMAGE_A,IMAGE_B=3.2m, not {self.scale[0][:80]}")
         settings = read_settings(self.config)
-        config = kinds_to_build(self._with_options(settings.of(BuildConfig)), self.features)
-        sequences, poses_from = self._open(recordings)
+        making = self._making(recordings, settings)
+        return self._make_map(making, Path(target)) if self.ray is None else self._make_tiles(making, target, settings)
+
+    def _making(self, recordings: list[str], settings: Settings) -> MapMaking:
+        config = with_option(settings.of(BuildConfig), "nodes.d_thresh", self.d_thresh, "--d-thresh")
+        config = with_option(config, "nodes.lambda_rot", self.lambda_rot, "--lambda")
+        return MapMaking(
+            tuple(recordings),
+            PosesAsked(self.trajectory, self.poses, self.scale, self.allow_gaps),
+            kinds_to_build(config, self.features),
+            settings.of(SlamConfig),
+            self.format,
+            self.camera,
+            self.images,
+            self.topics,
+        )
+
+    def _make_map(self, making: MapMaking, target: Path) -> int:
         with progress_bar() as progress:
-            if poses_from[0] == "slam":
-                result = run_slam(sequences, settings.of(SlamConfig), progress)
-                sequences = with_slam_poses(sequences, result)
-                apart = result.num_submaps - result.num_joined
-                if apart:
-                    print(f"{apart} of {result.num_submaps} sub-maps see nothing in common with the others", file=sys.stderr)
-            _report_gaps(sequences)
-            trust = Trust(poses="unchecked" in (self.poses or "").split(","), gaps=self.allow_gaps or poses_from[0] == "slam")
-            topomap = build_map(sequences, config, progress, poses_from, trust)
+            topomap, poses_from = making.make(progress)
         topomap.save(target)
         info = describe_map(topomap, target)
         if self.json != "-":
@@ -111,56 +113,54 @@ class Command:
         write_json(self.json, info)
         return 0
 
-    def _split_paths(self) -> tuple[list[str], Path]:
-        """The recordings, and the map file to write: never a recording or a file that is no map, as where MAP was forgotten."""
+    def _make_tiles(self, making: MapMaking, atlas: str, settings: Settings) -> int:
+        """Each recording a tile, on the cluster; status 1 where one could not be mapped."""
+        from topoloc.cli.recordings_table import finished_line, recordings_table
+        from topoloc.cluster.building import AtlasBuild, build_on_ray
+        from topoloc.cluster.config import ClusterConfig
+        from topoloc.cluster.tiles import TileJob, tile_ids
+
+        assert self.ray is not None
+        ids = tile_ids(making.recordings)
+        jobs = [TileJob(one.recordings[0], name, self.world or name, one) for name, one in zip(ids, making.one_each(), strict=True)]
+        with recordings_table(making.recordings) as (show, is_live):
+            build = AtlasBuild(jobs, atlas, self.replace, settings.of(ClusterConfig))
+            outcomes = build_on_ray(build, self.ray, show, is_live)
+        for outcome in outcomes:
+            for note in outcome.notes:
+                print(f"{outcome.recording}: {note}", file=sys.stderr)
+            if is_live and outcome.reason is not None:  # below the table once more, where it can be copied
+                print(finished_line(outcome), file=sys.stderr)
+        counts = {state: sum(outcome.state == state for outcome in outcomes) for state in ("built", "there", "failed")}
+        if self.json != "-":
+            print(f"{atlas}: {counts['built']} recordings mapped, {counts['there']} there already, {counts['failed']} failed")
+        write_json(self.json, {"atlas": atlas, **counts, "recordings": [outcome.to_json() for outcome in outcomes]})
+        return 1 if counts["failed"] else 0
+
+    def _split_paths(self) -> tuple[list[str], str]:
+        """The recordings, and the map file or atlas to write: never a recording or a file that is none, as where it was forgotten."""
         if len(self.paths) < 2:
-            raise UsageError("build takes at least one recording and, last, the map file to write")
+            what = "the map file" if self.ray is None else "the atlas"
+            raise UsageError(f"build takes at least one recording and, last, {what} to write")
         *recordings, last = self.paths
+        if self.ray is not None:
+            _check_atlas(last)
+            return recordings, last
         target = Path(last)
         if target.is_dir() or (not target.exists() and Path(last.rpartition("@")[0] or last).exists()):
             raise UsageError(f"the last argument is the map file to write, but {last} is a recording or folder; was MAP forgotten?")
         if target.is_file() and _first_bytes(target) not in (b"", b"SQLite"):
             raise UsageError(f"the last argument is the map file to write, but {last} is a file of another kind; was MAP forgotten?")
-        return recordings, target
-
-    def _with_options(self, config: BuildConfig) -> BuildConfig:
-        config = with_option(config, "nodes.d_thresh", self.d_thresh, "--d-thresh")
-        return with_option(config, "nodes.lambda_rot", self.lambda_rot, "--lambda")
-
-    def _open(self, recordings: list[str]) -> tuple[list[StereoSequence], list[str]]:
-        """The recordings with their poses, and where those of each come from; with `slam` they are still to be found."""
-        sequences = [open_recording(path, self.format, self.camera, self.topics, self.images) for path in recordings]
-        trajectories = self.trajectory or ("truth" if all(any(sequence.poses) for sequence in sequences) else "slam",)
-        if len(trajectories) == 1:
-            trajectories *= len(recordings)
-        if len(trajectories) != len(recordings):
-            raise UsageError(f"{len(recordings)} recordings but {len(trajectories)} trajectories")
-        if "slam" in trajectories:
-            if self.poses is not None:
-                raise UsageError("--poses says how given poses are written; those of SLAM are ours")
-            if set(trajectories) != {"slam"}:
-                raise UsageError("--trajectory slam goes for all recordings or for none: its world is no other's")
-            if self.scale:
-                raise UsageError("--scale is that of the recordings' own poses, and slam finds others")
-            return sequences, list(trajectories)
-        pairs = zip(sequences, trajectories, strict=True)
-        return [self._with_poses(sequence, trajectory) for sequence, trajectory in pairs], list(trajectories)
-
-    def _with_poses(self, sequence: StereoSequence, trajectory: str) -> StereoSequence:
-        reading = PoseReading.of(",".join(name for name in (self.poses or "").split(",") if name != "unchecked"))
-        if trajectory != "truth" and self.scale:
-            raise UsageError("--scale is that of the recordings' own poses, and --trajectory takes others")
-        if trajectory != "truth":
-            has_metres = has_scale(sequence)
-            return with_trajectory(sequence, Path(trajectory), reading) if has_metres else aligned(sequence, Path(trajectory))
-        return as_read(scaled(sequence, scale_of(self.scale, sequence)) if self.scale else sequence, reading)
+        return recordings, last
 
 
-def _report_gaps(sequences: list[StereoSequence]) -> None:
-    for sequence in sequences:
-        num_without = sum(pose is None for pose in sequence.poses)
-        if num_without:
-            print(f"{sequence.name}: {num_without} of {len(sequence)} frames have no pose and are left out", file=sys.stderr)
+def _check_atlas(last: str) -> None:
+    """Hold that an atlas lies there, or may. Raises UsageError."""
+    from topoloc.atlas.atlas import is_atlas
+
+    is_other = os.path.isfile(last) or (os.path.isdir(last) and any(os.scandir(last))) or ("@" in last and not os.path.exists(last))
+    if is_other and not is_atlas(last):
+        raise UsageError(f"the last argument is the atlas to write, but {last} is none; was ATLAS forgotten?")
 
 
 def _is_positive(text: str) -> bool:

@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from topoloc.atlas.config import AtlasConfig
-from topoloc.atlas.open_maps import Maps
-from topoloc.cli.features_option import ASKED_FEATURES, localizer_of
-from topoloc.cli.output import File, Flag, UsageError
+from topoloc.cli.features_option import ASKED_FEATURES
+from topoloc.cli.output import File, Flag, UsageError, ended_by_signals
+from topoloc.cli.served_maps import ServedMaps, read_token
 from topoloc.cli.settings_file import Settings, read_settings, with_option
-from topoloc.compiled import set_num_threads
-from topoloc.errors import MissingExtraError, TopolocError
+from topoloc.cluster.config import ReplicasConfig
+from topoloc.errors import MissingExtraError
 from topoloc.localization.localizer import LocalizerConfig
-from topoloc.map.memory import set_node_memory
 from topoloc.service.config import ServiceConfig
 from topoloc.tracking.tracker import TrackerConfig
-from topoloc.tracking.warm_up import is_warm, warm_up
 
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
-_LEAST_TOKEN = 16
 
 
 @dataclass(frozen=True)
@@ -54,41 +50,74 @@ class Command:
     """Pictures that are localized at a time."""
     max_queue: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: 32)")] = None
     """Requests that may wait for a worker; one more is told to come again later."""
+    ray: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT|auto|local", help_behavior_hint="(default: none)")] = None
+    """A Ray cluster whose machines answer, by Ray Serve: `auto` is the one that runs on this machine, `local` one of this machine alone."""
+    replicas: Annotated[str | None, tyro.conf.arg(metavar="N|LEAST-MOST", help_behavior_hint="(default: 1)")] = None
+    """With --ray, processes that answer; of LEAST-MOST as many as are needed."""
     config: File = None
     """All other settings: a TOML file, as `topoloc config serve` prints it."""
 
     def run(self) -> int:
         if not self.maps:
             raise UsageError("serve takes at least one map, folder of maps or atlas")
-        token = self._checked_token()
+        self._check_access()
+        if self.ray is None and self.replicas is not None:
+            raise UsageError("--replicas belongs to --ray")
         settings = read_settings(self.config)
         config = settings.of(ServiceConfig)
         for name in ("memory_mb", "workers", "max_queue"):
             config = with_option(config, name, getattr(self, name), f"--{name.replace('_', '-')}")
+        read_token(self.token_file)
         try:
-            from topoloc.service.application import Access, make_application
             from topoloc.service.server import Address, serve
         except ModuleNotFoundError as error:
             raise MissingExtraError(f"a service needs {error.name}: pip install 'topoloc[serve]'") from error
-        access = Access(token, loopback_only=self.host in _LOOPBACK and not self.behind_proxy)
-        app = make_application(self._opened_maps(settings, config), config, access, settings.of(TrackerConfig), settings.of(AtlasConfig))
+        if self.ray is not None:
+            return self._run_on_ray(settings, config)
         cert, key = (None if path is None else Path(path) for path in (self.tls_cert, self.tls_key))
+        app = self._served(settings, config).application()
         serve(app, Address(self.host, self.port, cert, key, self.behind_proxy), config)
         return 0
 
-    def _opened_maps(self, settings: Settings, config: ServiceConfig) -> Maps:
-        """The maps, with half of the memory for nodes, and half for the rest of those that are open."""
-        if not is_warm():
-            print("compiling, once, a minute ...", file=sys.stderr, flush=True)
-            warm_up()
-        if config.num_workers > 1:
-            set_num_threads(1)
-        budget, localizer_config = config.memory_mb * 500_000, settings.of(LocalizerConfig)
-        set_node_memory(budget)
-        return Maps([Path(path) for path in self.maps], lambda topomap: localizer_of(topomap, localizer_config, self.features), budget)
+    def _run_on_ray(self, settings: Settings, config: ServiceConfig) -> int:
+        from topoloc.service.on_ray import Front, serve_on_ray
 
-    def _checked_token(self) -> str | None:
-        """The token. Nobody else's machine is answered without one, and never in the clear."""
+        assert self.ray is not None
+        if self.port == 0:
+            raise UsageError("--ray listens on the same port of all machines: --port 0 names none")
+        replicas = self._replicas(settings.of(ReplicasConfig))
+        config = replace(config, workers=config.workers or replicas.cpus_per_replica)
+        served = self._served(settings, config)
+        front = Front(self.host, self.port, config.num_workers, config.max_queue, _whole(self.tls_cert), _whole(self.tls_key))
+        serve_on_ray(served, self.ray, front, replicas, _wait_for_signal)
+        return 0
+
+    def _served(self, settings: Settings, config: ServiceConfig) -> ServedMaps:
+        return ServedMaps(
+            tuple(path if self.ray is None else str(_whole(path)) for path in self.maps),
+            self.features,
+            _whole(self.token_file),
+            self.host in _LOOPBACK and not self.behind_proxy,
+            config,
+            settings.of(LocalizerConfig),
+            settings.of(TrackerConfig),
+            settings.of(AtlasConfig),
+        )
+
+    def _replicas(self, config: ReplicasConfig) -> ReplicasConfig:
+        if self.replicas is None:
+            return config
+        least, dash, most = self.replicas.partition("-")
+        if not least.isdecimal() or (dash and not most.isdecimal()):
+            raise UsageError(f"--replicas is a number, or LEAST-MOST, not {self.replicas[:40]}")
+        config = with_option(config, "least", int(least), "--replicas")
+        config = with_option(config, "most", int(most or least), "--replicas")
+        if config.most < config.least:
+            raise UsageError(f"--replicas {self.replicas[:40]}: more at least than at most")
+        return config
+
+    def _check_access(self) -> None:
+        """Nobody else's machine is answered without a token, and never in the clear."""
         if (self.tls_cert is None) != (self.tls_key is None):
             raise UsageError("--tls-cert and --tls-key go together")
         is_private = self.host in _LOOPBACK and not self.behind_proxy
@@ -96,12 +125,13 @@ class Command:
             raise UsageError(f"--host {self.host} is reached from elsewhere: --token-file FILE is needed")
         if self.host not in _LOOPBACK and self.tls_cert is None and not self.behind_proxy:
             raise UsageError(f"--host {self.host} is reached from elsewhere: --tls-cert and --tls-key, or --behind-proxy, are needed")
-        if self.token_file is None:
-            return None
-        try:
-            token = Path(self.token_file).read_text(encoding="utf-8").strip()
-        except (OSError, ValueError) as error:
-            raise TopolocError(f"cannot read the token in {self.token_file}: {getattr(error, 'strerror', None) or 'no text'}") from None
-        if len(token) < _LEAST_TOKEN or not token.isascii() or not token.isprintable() or " " in token:
-            raise TopolocError(f"{self.token_file}: a token has at least {_LEAST_TOKEN} letters, digits or signs, and no spaces")
-        return token
+
+
+def _wait_for_signal() -> None:
+    with ended_by_signals() as stop:
+        stop.wait()
+
+
+def _whole(path: str | None) -> str | None:
+    """The path as other processes find it, too."""
+    return path if path is None or "://" in path else str(Path(path).absolute())

@@ -33,6 +33,8 @@ TABLES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "against_itself": ("topoloc.lifelong.weak_parts", "WeakPartsConfig", ("evaluate",)),
     "prune": ("topoloc.lifelong.prune", "PruneConfig", ("prune",)),
     "serve": ("topoloc.service.config", "ServiceConfig", ("serve",)),
+    "cluster": ("topoloc.cluster.config", "ClusterConfig", ("build",)),
+    "replicas": ("topoloc.cluster.config", "ReplicasConfig", ("serve",)),
 }
 _WIDTH = 110
 _LARGEST_FILE = 1_000_000

@@ -60,17 +60,21 @@ def replaced_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def scratch_file(path: Path) -> Iterator[Path]:
-    """An empty file beside `path` to try something out in, removed at the end; what a killed process leaves, the next writer removes.
+    """An empty file beside `path` that is removed afterwards; those of writers that were killed are removed by the next one.
+
+    It must be written to as it is: what is renamed over it is nobody's.
 
     Raises:
         OSError: the folder cannot be written.
     """
-    scratch, lock = _own_file(_target(path))
+    target = _target(path)
+    remove_leftovers(target)
+    temporary, lock = _own_file(target)
     try:
-        yield scratch
+        yield temporary
     finally:
         with suppress(OSError):
-            scratch.unlink()
+            temporary.unlink()
         os.close(lock)
 
 
@@ -136,6 +140,16 @@ def remove_leftovers(path: Path) -> None:
         if owner != name and owner.endswith(".part") and not (path.parent / owner).exists():
             with suppress(OSError):
                 (path.parent / name).unlink()
+
+
+def remove_all_leftovers(folder: Path) -> None:
+    """Remove what killed writers of whatever file left in a folder; what a living process writes stays."""
+    try:
+        names = [entry.name for entry in os.scandir(folder) if entry.name.startswith(".") and entry.name.endswith(".part")]
+    except OSError:
+        return
+    for name in names:
+        _remove_unowned(folder / name)
 
 
 def _prefix(path: Path) -> str:

@@ -69,7 +69,7 @@ def open_sequence(
             broken; CalibrationError is one of these.
         TrajectoryError: the recording's truth is malformed or fits no frame.
     """
-    folder, selection = _split_selection(str(path))
+    folder, selection = split_selection(str(path))
     is_side_by_side = format is None and str(camera).endswith(".conf") and video.recognises(folder)
     name = "zed" if is_side_by_side else find_format(path, format)
     sequence = _open_whole(folder, name, camera, {"images": images and Path(images), "topics": topics})
@@ -103,13 +103,14 @@ def find_format(path: str | Path, format: str | None = None) -> str:
     """
     if format is not None and format not in FORMATS:
         raise UnknownFormatError(f"format {format!r} is not known; there are {', '.join(FORMATS)}")
-    folder, _ = _split_selection(str(path))
+    folder, _ = split_selection(str(path))
     if not os.path.exists(folder):  # no error of a name that is too long
         raise RecordingError(f"{folder}: no such file or folder")
     return format or _recognise(folder)
 
 
-def _split_selection(path: str) -> tuple[Path, str | None]:
+def split_selection(path: str) -> tuple[Path, str | None]:
+    """The recording's folder or file, and the part of it that is chosen behind an @; None: all of it."""
     folder, at, selection = path.rpartition("@")
     if not at or os.path.exists(path):
         return Path(path), None

@@ -70,7 +70,7 @@ class Streams:
         """Raises Refusal."""
         stream = self._streams.get(stream_id)
         if stream is None or stream.map_name != map_name:
-            raise Refusal(404, "there is no such stream; one without a picture for a while is forgotten")
+            raise Refusal(404, "there is no such stream here; one without a picture for a while is forgotten")
         return stream
 
     def next(self, stream: Stream, asked: Asked, t_ns: int) -> dict[str, Any]:

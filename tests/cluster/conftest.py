@@ -1,0 +1,54 @@
+"""A cluster of two machines, each with one processor, both of them this one; and small recordings."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+_NODE = {"num_cpus": 1, "object_store_memory": 80_000_000, "include_dashboard": False}
+
+
+@pytest.fixture(scope="module")
+def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder for temporary files of the cluster's workers."""
+    folder = tmp_path_factory.mktemp("scratch")
+    (folder / "ray").mkdir()  # where Ray notes the address of the last cluster
+    return folder
+
+
+@pytest.fixture(scope="module")
+def cluster(scratch: Path) -> Iterator[Any]:
+    """Two nodes; topoloc lies where this process finds it."""
+    pytest.importorskip("ray", reason="Ray is not installed (the extra cluster)")
+    from ray.cluster_utils import Cluster
+
+    folder = tempfile.mkdtemp(prefix="rt-")  # short: sockets lie in it
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        patch.setenv("TMPDIR", str(scratch))
+        patch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), *sys.path]))
+        patch.setenv("RAY_health_check_failure_threshold", "2")
+        patch.setenv("FSSPEC_FILE_AUTO_MKDIR", "true")
+        cluster = Cluster(initialize_head=True, head_node_args={**_NODE, "temp_dir": folder})
+        try:
+            cluster.add_node(**_NODE)
+            yield cluster
+        finally:
+            cluster.shutdown()
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture(scope="session")
+def walks(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Recordings of three rooms, a few pairs each."""
+    from tiny_world import write_stereo_recording
+
+    folder = tmp_path_factory.mktemp("walks")
+    return [write_stereo_recording(folder / f"room{seed}", seed, [0.0, 2.0, 4.0, 6.0, 8.0]) for seed in (1, 2, 3)]
