@@ -14,7 +14,6 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import KDTree
 
 from topoloc.bounds import Above, AtLeast
 from topoloc.geometry.rigid import Rigid3
@@ -87,21 +86,21 @@ def place_nodes(world_from_cams: list[Rigid3], config: NodeConfig) -> Int[np.nda
 
 
 class NearestNodes:
-    """The nodes nearest to a camera by Eq. 1, found without looking at all: none is nearer than the metres to it."""
+    """The nodes nearest to a camera by Eq. 1, of which few are turned towards it: no node is nearer than the metres to it."""
 
     def __init__(self, poses: NodePoses, lambda_rot: float) -> None:
-        self._poses, self._lambda_rot, self._tree = poses, lambda_rot, KDTree(poses.centres)
+        self._poses, self._lambda_rot = poses, lambda_rot
 
     def rows(self, world_from_cam: Rigid3, count: int) -> Int[np.ndarray, " nodes"]:
         """Up to `count` nodes, the nearest first; of equal ones the first."""
-        num_nodes, num_looked_at = len(self._poses.centres), 8 * count
+        metres = np.linalg.norm(self._poses.centres - world_from_cam.translation, axis=1)
+        num_looked_at = 8 * count
         while True:
-            wanted = np.arange(1, min(num_looked_at, num_nodes) + 1)
-            metres, rows = self._tree.query(world_from_cam.translation, wanted)  # pyright: ignore[reportArgumentType]
-            rows = np.sort(rows)
+            is_all = num_looked_at >= len(metres)
+            rows = np.arange(len(metres)) if is_all else np.sort(np.argpartition(metres, num_looked_at)[:num_looked_at])
             distances = node_distances(world_from_cam, self._poses.rows(rows), self._lambda_rot)
             order = np.argsort(distances, kind="stable")[:count]
-            if len(rows) == num_nodes or distances[order[-1]] < metres[-1]:
+            if is_all or distances[order[-1]] < metres[rows].max():
                 return rows[order]
             num_looked_at *= 4
 
