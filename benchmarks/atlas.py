@@ -1,9 +1,10 @@
 """An atlas beside the maps that it is made of: what each tile alone localizes, and what the atlas makes of the same pictures.
 
-    python benchmarks/atlas.py ATLAS TILE=RECORDING ... [--alike c1,c2] [--memory-mb 256] [--json FILE]
+    python benchmarks/atlas.py ATLAS TILE=RECORDING ... [--elsewhere RECORDING ...] [--alike c1,c2] [--memory-mb 256] [--json FILE]
 
 Each picture is asked of its own tile's map alone and of the atlas, in turns, in one process. `--alike` names tiles of places that share
-things (two fittings of one building): an answer in another of them is counted apart, and held against the recording's truth.
+things (two fittings of one building): an answer in another of them is counted apart, and held against the recording's truth. A picture of
+`--elsewhere` is asked of each tile's map alone, and of the atlas: its time is compared with the mean of theirs.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import json
 import resource
 import time
 from collections import Counter
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +57,32 @@ def asked(localizer: AtlasLocalizer, alone: Localizer, tile_id: str, frame: Ster
     return row | {"name": frame.name, "ms_alone": 1e3 * (middle - start), "ms_atlas": 1e3 * (end - middle)}
 
 
+def asked_elsewhere(localizer: AtlasLocalizer, alone: dict[str, Localizer], frame: StereoFrame) -> dict[str, Any]:
+    """One picture of no tile asked of each map alone and of the atlas."""
+    assert frame.camera is not None
+    ms_alone, poses = [], 0
+    for one in alone.values():
+        start = time.process_time()
+        poses += isinstance(one.localize(frame.image, frame.camera), Localization)
+        ms_alone.append(1e3 * (time.process_time() - start))
+    start = time.process_time()
+    result = localizer.localize(frame.image, frame.camera)
+    ms_atlas = 1e3 * (time.process_time() - start)
+    answer = result.provenance.tile if isinstance(result, Localization) else None
+    return {"name": frame.name, "answer": answer, "poses_alone": poses, "ms_alone": float(np.mean(ms_alone)), "ms_atlas": ms_atlas}
+
+
+def elsewhere_line(name: str, rows: list[dict[str, Any]]) -> str:
+    """The figures of a recording of elsewhere, or of all."""
+    ratios = [row["ms_atlas"] / row["ms_alone"] for row in rows]
+    by_atlas, by_maps = sum(row["answer"] is not None for row in rows), sum(row["poses_alone"] for row in rows)
+    return (
+        f"{name:24} {len(rows):4} pictures of elsewhere: poses by the atlas {by_atlas}, by single maps {by_maps}; "
+        f"time {np.median(ratios):.2f} of a single map's in the median, {np.min(ratios):.2f} to "
+        f"{np.max(ratios):.2f}"
+    )
+
+
 def line(name: str, rows: list[dict[str, Any]]) -> str:
     """The figures of a recording, or of all."""
     outcomes, of_alone = Counter(row["outcome"] for row in rows), [row for row in rows if row["alone"]]
@@ -72,10 +100,25 @@ def line(name: str, rows: list[dict[str, Any]]) -> str:
     )
 
 
+def ask_elsewhere(localizer: AtlasLocalizer, paths: list[str]) -> dict[str, list[dict[str, Any]]]:
+    """The rows of each recording, which are printed."""
+    atlas, rows = localizer.atlas, dict[str, list[dict[str, Any]]]()
+    with ExitStack() as opened:
+        maps = {tile.tile_id: opened.enter_context(TopoMetricMap.load(atlas.map_path(tile))) for tile in atlas.manifest.tiles}
+        alone = {tile_id: Localizer(topomap) for tile_id, topomap in maps.items()}
+        for path in paths:
+            sequence = single_pictures(open_sequence(path))
+            rows[path] = [asked_elsewhere(localizer, alone, sequence[k]) for k in range(len(sequence))]
+            print(elsewhere_line(Path(path).name, rows[path]), flush=True)
+    print(elsewhere_line("all", [row for of_one in rows.values() for row in of_one]))
+    return rows
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("atlas")
     parser.add_argument("recordings", nargs="+", metavar="TILE=RECORDING")
+    parser.add_argument("--elsewhere", nargs="+", default=[], metavar="RECORDING")
     parser.add_argument("--alike", default="")
     parser.add_argument("--memory-mb", type=int, default=256)
     parser.add_argument("--json")
@@ -92,8 +135,9 @@ def main() -> None:
             of_one = [asked(localizer, alone, tile_id, sequence[k], set(args.alike.split(","))) for k in range(len(sequence))]
         rows[pair] = of_one
         print(line(f"{tile_id} {Path(path).name}", of_one), flush=True)
-    everything = [row for of_one in rows.values() for row in of_one]
-    print(line("all", everything))
+    print(line("all", [row for of_one in rows.values() for row in of_one]))
+    if args.elsewhere:
+        rows |= ask_elsewhere(localizer, args.elsewhere)
     print(f"most memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
     if args.json:
         Path(args.json).write_text(json.dumps(rows, indent=1))

@@ -1,16 +1,20 @@
 """Writers of one atlas at once, each a process of its own: is every tile there afterwards, and the manifest whole?
 
-    python benchmarks/atlas_writers.py MAP [--writers 2] [--times 50]
+    python benchmarks/atlas_writers.py MAP [--writers 2] [--times 50] [--s3]
 
-Each writer adds so many tiles, one at a time, with the command's own code; the map is the same for all, under ids of their own.
+Each writer adds so many tiles, one at a time, with the command's own code; the map is the same for all, under ids of their own. The atlas
+is a folder; with `--s3` a prefix of moto's server, which speaks the API of Amazon S3 on this machine (s3fs, 'moto[s3]', flask, flask-cors).
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import tempfile
 import time
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -23,14 +27,33 @@ def write(where: str, path: str, writer: int, times: int) -> None:
         add_tiles(where, new_tiles([path], f"w{writer}-{number}"))
 
 
+@contextmanager
+def place(folder: str, is_s3: bool) -> Iterator[str]:
+    """Where the atlas is to be."""
+    if not is_s3:
+        yield str(Path(folder) / "atlas")
+        return
+    import s3fs  # pyright: ignore[reportMissingImports]
+    from moto.server import ThreadedMotoServer  # pyright: ignore[reportMissingImports]
+
+    server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    address = "http://{}:{}".format(*server.get_host_and_port())
+    os.environ.update(AWS_ENDPOINT_URL=address, AWS_DEFAULT_REGION="us-east-1", AWS_ACCESS_KEY_ID="x", AWS_SECRET_ACCESS_KEY="x")
+    os.environ["TOPOLOC_CACHE"] = folder
+    s3fs.S3FileSystem().mkdir("bucket")
+    yield "s3://bucket/atlas"
+    server.stop()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("map")
     parser.add_argument("--writers", type=int, default=2)
     parser.add_argument("--times", type=int, default=50)
+    parser.add_argument("--s3", action="store_true")
     args = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        where = str(Path(folder) / "atlas")
+    with tempfile.TemporaryDirectory() as folder, place(folder, args.s3) as where:
         create_atlas(where, [])
         start = time.perf_counter()
         with ProcessPoolExecutor(args.writers, get_context("spawn")) as pool:

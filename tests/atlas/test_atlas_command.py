@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -60,6 +61,23 @@ def test_pictures_are_localized_in_their_tiles(atlas: Path, of_both: Path, capsy
     assert "tile other" in capsys.readouterr().out
 
 
+def test_near_leaves_tiles_out_that_are_known_to_lie_elsewhere(
+    own_atlas: Path, room_map: Path, of_both: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    shutil.copy(room_map, tmp_path / "room.topo")
+    assert main(["georeference", str(tmp_path / "room.topo"), "--origin", "50.87,4.7,30,0"]) == 0
+    assert main(["atlas", "add", str(own_atlas), str(tmp_path / "room.topo"), "--replace"]) == 0
+    answers = dict[str, list[tuple[bool, str]]]()
+    for place in ("50.87,4.7,50", "-33.9,151.2,50"):
+        capsys.readouterr()
+        main(["localize", str(own_atlas), str(of_both), f"--near={place}", "--json", "-"])
+        lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+        answers[place] = [(line["localized"], line["tile"]) for line in lines]
+    near, far = answers.values()
+    assert near == [(True, "room"), (True, "room"), (True, "other")]
+    assert far == [(False, "other"), (False, "other"), (True, "other")]
+
+
 def test_truth_is_that_of_one_tile(atlas: Path, of_both: Path, capsys: pytest.CaptureFixture[str]):
     """Of the third picture the truth is said to lie in the room, and the answer is in the other one: a false accept."""
     evaluation = json.loads(_json(capsys, "evaluate", atlas, of_both, "--tile", "room"))
@@ -107,6 +125,8 @@ def test_known_failures_are_one_line(args: list[str], said: str, own_atlas: Path
         (["atlas", "create", "ATLAS", "--check"], "--check"),
         (["localize", "ATLAS", "PICTURES", "--stream"], "picture by picture"),
         (["localize", "ATLAS", "PICTURES", "--camera", "map"], "cameras of their own"),
+        (["localize", "ATLAS", "PICTURES", "--near", "here"], "--near"),
+        (["localize", "MAP", "PICTURES", "--near", "50,4,100"], "--near is of an atlas"),
         (["evaluate", "ATLAS", "PICTURES"], "--tile"),
         (["evaluate", "ATLAS", "PICTURES", "--tile", "room", "--report", "x.html"], "--report"),
         (["evaluate", "MAP", "PICTURES", "--tile", "room"], "--tile is of an atlas"),

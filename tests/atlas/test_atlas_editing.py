@@ -6,7 +6,7 @@ import os
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from uuid import uuid4
@@ -20,17 +20,18 @@ from topoloc.atlas.manifest import Tile
 from topoloc.atlas.store import Store
 from topoloc.errors import AtlasError
 
-NUM_WRITES = {"folder": 25, "object store": 12}
+NUM_WRITES = {"folder": 25, "memory": 12, "s3": 12}
 
 
-@pytest.fixture(params=["folder", "object store"])
-def somewhere(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
-    """Where an atlas may be made: a folder, and a store of objects."""
+@pytest.fixture(params=list(NUM_WRITES))
+def somewhere(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """Where an atlas may be made: a folder, fsspec's store in memory, and S3."""
     if request.param == "folder":
-        yield str(tmp_path / "campus")
-    else:
-        pytest.importorskip("fsspec", reason="the extra cluster is not installed")
-        yield f"memory://{uuid4().hex}/campus"
+        return str(tmp_path / "campus")
+    if request.param == "s3":
+        return f"{request.getfixturevalue('s3_bucket')}/campus"
+    pytest.importorskip("fsspec", reason="the extra cluster is not installed")
+    return f"memory://{uuid4().hex}/campus"
 
 
 def _tiles(where: str) -> list[str]:
@@ -131,7 +132,7 @@ def test_a_tile_that_comes_back_is_not_swept(room_map: Path, tmp_path: Path):
 
 def test_two_writers_at_once_lose_nothing(somewhere: str, room_map: Path, monkeypatch: pytest.MonkeyPatch):
     """Writes of two writers that begin together; what is slow about a tile is left out."""
-    num_writes = NUM_WRITES["object store" if somewhere.startswith("memory:") else "folder"]
+    num_writes = NUM_WRITES[somewhere.partition("://")[0] if "://" in somewhere else "folder"]
     create_atlas(somewhere, new_tiles([str(room_map)]))
     ready = Atlas.open(somewhere).tile("room")
     if somewhere.startswith("memory:"):

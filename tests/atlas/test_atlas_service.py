@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import base64
+import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
 from topoloc.atlas.editing import add_tiles, new_tiles, remove_tiles
 from topoloc.atlas.open_maps import Maps
+from topoloc.geometry.geodesy import GeoPoint, Georeference
+from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
+from topoloc.map.topomap import TopoMetricMap
 from topoloc.service.application import Access, make_application
 from topoloc.service.config import ServiceConfig
 
@@ -55,3 +63,40 @@ def test_a_prior_is_of_one_map(client: TestClient, queries: Path):
     answer = client.post("/v1/localize", files={"image": (queries / "view02.png").open("rb")}, data={"prior": prior})
     assert answer.status_code == 422
     assert "one map's world" in answer.json()["error"]
+
+
+def _geopose(client: TestClient, queries: Path, *readings: dict[str, float]) -> Any:
+    camera = json.loads((queries / "camera.json").read_text())
+    params = {"model": "PINHOLE", "modelParams": [camera["fx"], camera["fy"], camera["cx"] + 0.5, camera["cy"] + 0.5]}
+    picture = {"imageBytes": base64.b64encode((queries / "view02.png").read_bytes()).decode(), "params": params}
+    said = {"cameraReadings": [picture], "geolocationReadings": list(readings)}
+    return client.post("/localize/geopose", json={"id": "1", "sensorReadings": said})
+
+
+def test_geopose_asks_the_atlas_and_only_tiles_near_the_device(client: TestClient, own_atlas: Path, room_map: Path, queries: Path):
+    assert _geopose(client, queries).status_code == 409
+    with TopoMetricMap.load(room_map) as topomap:
+        turned = Rigid3(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.zeros(3))
+        placed = replace(topomap, georeference=Georeference(GeoPoint(50.87, 4.70, 30.0), turned, "origin"))
+        placed.save(own_atlas.parent / "room.topo")
+    add_tiles(str(own_atlas), new_tiles([str(own_atlas.parent / "room.topo")]), replaces=True)
+    native = _asked(client, "/v1/maps/room/localize", queries)
+    near, away = ({"latitude": lat, "longitude": 4.70, "accuracy": 10.0} for lat in (50.8701, 50.9))
+    unknown = {"latitude": 0.0, "longitude": 0.0, "accuracy": 0.0}
+    for readings in ([], [near], [unknown], [{}]):
+        answer = _geopose(client, queries, *readings)
+        assert answer.status_code == 200, answer.text
+        for part in ("position", "quaternion"):
+            assert answer.json()["geopose"][part] == pytest.approx(native["geopose"][part], abs=1e-9)  # pyright: ignore
+    refused = _geopose(client, queries, away)
+    assert (refused.status_code, refused.json()["reason"]) == (404, "not_in_map")
+    assert "no tile lies within 130 m of 50.9" in refused.json()["ERROR"]
+    answer = client.post("/v1/localize", files={"image": (queries / "view02.png").open("rb")}, data={"near": "50.9,4.7,10"})
+    assert answer.json()["localized"] is False
+
+
+@pytest.mark.parametrize("near", ["here", "50,4", "100,0,5", "50,4,0"])
+def test_near_must_be_a_place(client: TestClient, queries: Path, near: str):
+    answer = client.post("/v1/localize", files={"image": (queries / "view02.png").open("rb")}, data={"near": near})
+    assert answer.status_code == 422
+    assert answer.json()["error"].startswith("near: ")

@@ -12,7 +12,7 @@ import pytest
 from hand_made import MAP_INFO, answer, elsewhere, lost, two_nodes
 
 from topoloc.errors import TopolocError, UnreadableImageError
-from topoloc.evaluation.map_figure import _horizontal_axes, _with_gaps, draw_map
+from topoloc.evaluation.map_figure import _with_gaps, draw_map, horizontal_axes
 from topoloc.evaluation.metrics import Answer, summarize
 from topoloc.evaluation.query_gallery import gallery, typical_queries, worst_queries
 from topoloc.evaluation.report import write_report
@@ -177,7 +177,7 @@ def test_the_path_is_broken_where_the_recording_jumps():
 )
 def test_the_map_is_seen_from_above(down: list[float], across: int, up: int, is_mirrored: bool):
     points = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]])
-    axes = _horizontal_axes(points, np.array([down, down]))
+    axes = horizontal_axes(points, np.array([down, down]))
     assert axes == (across, up, is_mirrored)
 
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,6 +22,7 @@ from topoloc.localization.map_facts.building import build_map
 from topoloc.localization.result import Localization
 from topoloc.map.build import BuildConfig
 from topoloc.map.checking import damages
+from topoloc.map.edit import editing
 
 ON = np.arange(3.0, 24.0, 0.75)
 ELSEWHERE = Rigid3(exp_so3(np.array([0.3, -0.2, 1.1])), np.array([5.0, -3.0, 2.0]))
@@ -143,18 +147,48 @@ def test_a_changed_room_is_learnt_from_a_single_camera(map_file: Path, tmp_path:
 
 
 def test_a_session_that_does_not_fit_changes_nothing(map_file: Path, second_half: Path, tmp_path: Path, complaint: Callable[..., str]):
+    before = map_file.read_bytes()
     other = write_stereo_recording(tmp_path / "other", seed=4)
     assert "recognises 0 of" in complaint("update", map_file, other)
     larger = _in_another_world(shutil.copytree(second_half, tmp_path / "larger"), scale=1.3)
     assert "a metre of its poses is 0.77 m of the map" in complaint("update", map_file, larger, "--poses", "unchecked")
     few = write_stereo_recording(tmp_path / "few", indices=[1.0, 1.5, 2.0])
-    assert "recognises" in complaint("update", map_file, few)
+    assert "too few to join: it takes 5" in complaint("update", map_file, few)
+    fx, _, cx, cy = CAMERA.params
+    wrong = complaint("update", map_file, second_half, "--camera", f"{1.1 * fx},{1.1 * fx},{cx},{cy}", "--poses", "unchecked")
+    assert "its calibration is not that of its camera: the map recognises 7 of 7 pictures where the focal length is about 260" in wrong
     assert "nothing to undo" in complaint("undo", map_file)
     assert "at least one recording" in complaint("update", map_file, status=2)
+    assert map_file.read_bytes() == before
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no such permissions")
+def test_a_map_that_is_read_only_stays_as_it_is(map_file: Path, second_half: Path, complaint: Callable[..., str]):
+    before = map_file.read_bytes()
+    map_file.chmod(0o444)
+    for words in (("update", map_file, second_half), ("prune", map_file), ("undo", map_file)):
+        assert "it is read-only" in complaint(*words)
+    assert map_file.read_bytes() == before
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no locks")
+def test_the_second_of_two_updates_at_once_waits_and_says_so(map_file: Path, second_half: Path):
+    words = [sys.executable, "-m", "topoloc", "update", str(map_file), str(second_half)]
+    with editing(map_file) as edit:
+        second = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        assert second.stderr is not None
+        assert second.stderr.readline() == "another process edits this map; waiting for it ...\n"
+        edit.commit(edit.topomap, "the first")
+    printed, complaints = second.communicate(timeout=120)
+    assert (second.returncode, complaints) == (0, "")
+    assert "joins as session 1" in printed
+    with TopoMetricMap.load(map_file) as topomap:
+        assert [edit.name for edit in topomap.edits] == ["build", "the first", "update on"]
 
 
 def test_the_same_session_is_not_doubled(map_file: Path, second_half: Path, tiny_recording: Path, complaint: Callable[..., str]):
     assert "in the map already, as session 0" in complaint("update", map_file, f"{tiny_recording}@0:7")
+    assert "in the map already, as session 0" in complaint("update", map_file, f"{tiny_recording}@3:10"), "frames 3 to 6 are"
     assert main(["update", str(map_file), str(second_half)]) == 0
     assert "in the map already, as session 1" in complaint("update", map_file, second_half)
 
@@ -168,7 +202,9 @@ def test_another_day_of_the_same_name_and_clock_is_another_session(map_file: Pat
 
 
 def test_the_history_tells_what_was_done(map_file: Path, second_half: Path, capsys: pytest.CaptureFixture[str]):
-    assert main(["update", str(map_file), str(second_half)]) == 0
+    assert main(["update", str(map_file), str(second_half), "--light", "evening"]) == 0
+    with TopoMetricMap.load(map_file) as topomap:
+        assert [session.light_name for session in topomap.sessions] == [None, "evening"]
     capsys.readouterr()
     assert main(["history", str(map_file)]) == 0
     lines = capsys.readouterr().out.splitlines()

@@ -50,7 +50,7 @@ def test_a_map_whose_parts_lie_on_disk_while_it_is_made_is_the_same(
     tiny_recording: Path, tiny_map: TopoMetricMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     replace(tiny_map, shared_errors=None, repetitions=None).save(tmp_path / "memory.topo")
-    monkeypatch.setattr("topoloc.map.shelf.DEFAULT_BYTES", 0)
+    monkeypatch.setattr("topoloc.shelf.DEFAULT_BYTES", 0)
     build_map(topoloc.open_sequence(f"{tiny_recording}@0::2"), tiny_map.config).save(tmp_path / "disk.topo")
     assert (tmp_path / "disk.topo").read_bytes() == (tmp_path / "memory.topo").read_bytes()
 

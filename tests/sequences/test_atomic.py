@@ -17,8 +17,8 @@ from topoloc.sequences.atomic import remove_all_leftovers, remove_leftovers, rep
 WRITER = """
 import sys
 from pathlib import Path
-from topoloc.sequences.atomic import replaced_file
-with replaced_file(Path(sys.argv[1])) as temporary:
+from topoloc.sequences import atomic
+with getattr(atomic, sys.argv[2])(Path(sys.argv[1])) as temporary:
     temporary.write_bytes(b"half")
     print(temporary.name, flush=True)
     sys.stdin.readline()
@@ -60,9 +60,9 @@ def test_threads_and_processes_that_write_one_file_leave_a_whole_one(tmp_path: P
     assert list(tmp_path.iterdir()) == [path]
 
 
-def begun(path: Path) -> tuple[subprocess.Popen[str], Path]:
+def begun(path: Path, by: str = "replaced_file") -> tuple[subprocess.Popen[str], Path]:
     """A process in the middle of writing, and what it writes to."""
-    child = subprocess.Popen([sys.executable, "-c", WRITER, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    child = subprocess.Popen([sys.executable, "-c", WRITER, str(path), by], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert child.stdout is not None
     return child, path.parent / child.stdout.readline().strip()
 
@@ -112,6 +112,22 @@ def test_leftovers_of_older_versions_go_too(tmp_path: Path):
     (tmp_path / ".map.topo.1234.part-journal").write_bytes(b"")
     remove_leftovers(tmp_path / "map.topo")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_tried_out_beside_a_file_goes_also_when_its_process_was_killed(tmp_path: Path):
+    path = tmp_path / "map.topo"
+    write_bytes(path, b"old")
+    with scratch_file(path) as scratch:
+        scratch.write_bytes(b"tried")
+        write_bytes(path, b"new")
+        assert scratch.read_bytes() == b"tried", "a living process's stays"
+    assert list(tmp_path.iterdir()) == [path]
+    killed, left = begun(path, "scratch_file")
+    os.kill(killed.pid, signal.SIGKILL)
+    killed.wait()
+    assert left.is_file()
+    write_bytes(path, b"newer")
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def write_half(path: Path) -> None:

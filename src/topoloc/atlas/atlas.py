@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 from topoloc.atlas.index import AtlasIndex
+from topoloc.atlas.index_files import OpenedIndex, index_folder, open_index
 from topoloc.atlas.manifest import Manifest, Tile
 from topoloc.atlas.place_vectors import PlaceVectors, read_vectors
 from topoloc.atlas.store import MANIFEST, FolderStore, Store, sha256_of
@@ -57,26 +58,26 @@ class Atlas:
         return self.store.local(tile.map.name, tile.map.sha256)
 
     @cached_property
-    def _places(self) -> tuple[dict[str, PlaceVectors], dict[str, str]]:
-        """Place vectors by tile; and what is wrong with those that cannot be read."""
-        vectors, problems = dict[str, PlaceVectors](), dict[str, str]()
-        for tile in self.manifest.tiles:
-            try:
-                vectors[tile.tile_id] = read_vectors(self.store.local(tile.places.name, tile.places.sha256), tile.vocabularies)
-            except AtlasError as error:
-                problems[tile.tile_id] = str(error)
-        return vectors, problems
+    def _opened(self) -> OpenedIndex:
+        return open_index(self.manifest.tiles, self._places_of, index_folder(self.store.where))
+
+    def _places_of(self, tile: Tile) -> PlaceVectors:
+        return read_vectors(self.store.local(tile.places.name, tile.places.sha256), tile.vocabularies)
 
     @property
     def problems(self) -> dict[str, str]:
         """Why tiles cannot be ranked, by their ids; they are asked last."""
-        return self._places[1]
+        return self._opened.problems
 
-    @cached_property
+    @property
+    def notes(self) -> list[str]:
+        """What was wrong with the files of the index; it answers all the same."""
+        return self._opened.notes
+
+    @property
     def index(self) -> AtlasIndex:
-        """Of all tiles whose place vectors can be read."""
-        vectors = self._places[0]
-        return AtlasIndex(list(vectors), list(vectors.values()))
+        """Of all tiles whose place vectors can be had."""
+        return self._opened.index
 
 
 def tile_problem(atlas: Atlas, tile: Tile) -> str | None:

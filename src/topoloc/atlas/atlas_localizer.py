@@ -9,14 +9,16 @@ well (`verdict.py`): aliasing grows with the number of places.
 
 from __future__ import annotations
 
+import copy
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.config import AtlasConfig
+from topoloc.atlas.near import Near, tiles_in_reach
 from topoloc.atlas.open_maps import Maps
 from topoloc.atlas.verdict import Heard, joint_result
 from topoloc.bounds import check_bounds
@@ -94,9 +96,27 @@ class AtlasLocalizer:
         if not atlas.manifest.tiles:
             raise AtlasError(f"the atlas {atlas.store.where} has no tiles; `topoloc atlas add` adds them")
         self.problems: dict[str, str] = {}
+        for note in atlas.notes:
+            self._warn(note)
         for tile_id, problem in atlas.problems.items():
             self._warn(f"tile {tile_id} is asked after all others: {problem}")
+        self._reached: Mapping[str, Rigid3 | None] | None = None
+        self._nowhere = ""
         self._focal = max(tile.focal_px for tile in atlas.manifest.tiles)
+
+    def near(self, near: Near | None, placed_only: bool = False) -> AtlasLocalizer:
+        """One that asks only tiles in reach of where somebody knows the camera to be (`near.py`); a pose that is given is tried, too.
+
+        Args:
+            placed_only: only tiles that know where on earth they lie.
+
+        Raises:
+            AtlasError: no tile is of the world that is named.
+        """
+        other = copy.copy(self)
+        other._reached = tiles_in_reach(self.atlas.manifest, near, placed_only)
+        other._nowhere = f"no tile lies {near}" if near is not None else "no tile knows where on earth it lies"
+        return other
 
     def localize(
         self,
@@ -124,6 +144,8 @@ class AtlasLocalizer:
         picture = Picture(image, camera or unknown_camera(image))
         if prior is not None and tile_id is None:
             raise AtlasError("a prior is a pose in one tile's world: name the tile")
+        if tile_id is None and self._reached is not None and not self._reached:
+            return self.completed(NotLocalized("not_in_map", detail=self._nowhere), t_ns)
         clock = StageClock()
         hearing = _Hearing(picture, [] if tile_id is not None else self.rank(picture, clock), deadline)
         ranked = clock.times_ms()
@@ -151,10 +173,10 @@ class AtlasLocalizer:
             assert vocabulary is not None
             query = Query(image, lens, 1.0, FeatureConfig(kind=kind), clock or StageClock(), shared=picture.features)
             vectors[kind] = vocabulary.vector(query.features, lens.width, lens.height)
-            ranking = index.rank(vectors, self.config.num_ranked)
+            ranking = index.rank(vectors, self.config.num_ranked, self._reached)
             if _gap(ranking) >= self.config.settled_gap:
                 break
-        return ranking + [(tile_id, 0.0) for tile_id in self.atlas.problems]
+        return ranking + [(tile_id, 0.0) for tile_id in self.atlas.problems if self._reached is None or tile_id in self._reached]
 
     @cached_property
     def _ranked_by(self) -> list[str]:
@@ -204,7 +226,8 @@ class AtlasLocalizer:
         try:
             with self._maps.lent(tile_id, self.atlas.map_path(tile)) as opened:
                 localizer: Localizer = opened.localizer if is_full else opened.localizer.at_first_glance
-                result, named = localizer.ask(hearing.picture, prior, hearing.left_ms)
+                known = prior if prior is not None or self._reached is None else self._reached.get(tile_id)
+                result, named = localizer.ask(hearing.picture, known, hearing.left_ms)
         except MapError as error:
             self.problems[tile_id] = str(error)
             hearing.heard.pop(tile_id, None)

@@ -2,42 +2,56 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from typing import Protocol
 
 import numpy as np
-from jaxtyping import Float32, Int
+from jaxtyping import Bool, Float32, Int
 
+from topoloc.atlas.place_shard import PlaceShard
 from topoloc.atlas.place_vectors import PlaceVectors
-from topoloc.places.coarse import NodeScore
-from topoloc.places.neighbours import PlaceIndex
 from topoloc.places.place_kernels import multiply_rows
 
-MAX_EXACT_VECTORS = 100_000
+
+class _Places(Protocol):
+    def rank(
+        self, vector: Float32[np.ndarray, " d"], num_tiles: int, is_asked: Bool[np.ndarray, " t"]
+    ) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
+        """The numbers of the tiles with the most similar places, and how similar these are; `is_asked` says of each tile whether it may be
+        named."""
+        ...
 
 
 class AtlasIndex:
-    """Ranks tiles by the likeness of their most similar place; exact up to 10^5 places, by an inverted file beyond.
+    """Ranks tiles by the likeness of their most similar place: those of shards by codes, all others exactly.
 
     Args:
-        vectors: the place vectors of each tile; `tile_ids` says which.
+        vectors: the place vectors of each tile that are compared exactly; `tile_ids` says which.
+        shards: further places of these tiles (`place_shard.py`); each with the number in `tile_ids` of each of its tiles, -1 of one that is
+            never named.
     """
 
-    def __init__(self, tile_ids: Sequence[str], vectors: Sequence[PlaceVectors]) -> None:
-        self._tile_ids = list(tile_ids)
-        self._by_kind: dict[str, _ExactTiles | PlaceIndex] = {}
-        for kind in sorted({kind for one in vectors for kind in one}):
+    def __init__(
+        self, tile_ids: Sequence[str], vectors: Sequence[PlaceVectors], shards: Sequence[tuple[PlaceShard, Sequence[int]]] = ()
+    ) -> None:
+        self._tile_ids, self._all = list(tile_ids), np.ones(len(tile_ids), bool)
+        self._by_kind: dict[str, list[_Places]] = {}
+        for kind in {kind for one in vectors for kind in one}:
             rows = [number for number, one in enumerate(vectors) if kind in one and len(one[kind]) > 0]
-            stacked = np.concatenate([vectors[row][kind] for row in rows])
             of_tile = np.repeat(rows, [len(vectors[row][kind]) for row in rows])
-            is_few = len(stacked) <= MAX_EXACT_VECTORS
-            self._by_kind[kind] = _ExactTiles(stacked, of_tile) if is_few else PlaceIndex(stacked, of_tile, MAX_EXACT_VECTORS)
+            if len(rows) > 0:
+                self._by_kind.setdefault(kind, []).append(_ExactTiles(np.concatenate([vectors[row][kind] for row in rows]), of_tile))
+        for shard, numbers in shards:
+            self._by_kind.setdefault(shard.kind, []).append(_NumberedShard(shard, np.array(numbers)))
 
     @property
     def kinds(self) -> list[str]:
         """The kinds of features that tiles can be ranked by."""
-        return list(self._by_kind)
+        return sorted(self._by_kind)
 
-    def rank(self, by_kind: Mapping[str, Float32[np.ndarray, " _"]], num_tiles: int) -> list[tuple[str, float]]:
+    def rank(
+        self, by_kind: Mapping[str, Float32[np.ndarray, " _"]], num_tiles: int, among: Collection[str] | None = None
+    ) -> list[tuple[str, float]]:
         """Up to `num_tiles` tiles, the likeliest first, each with the likeness (at most 1) of its best place.
 
         Where the picture was described with several kinds of features, the last one counts that a tile has; how far a tile stays behind the
@@ -45,16 +59,25 @@ class AtlasIndex:
 
         Args:
             by_kind: the picture's place vector by each kind that it was described with, the one that tells most the last.
+            among: only these tiles are named; None: all.
         """
+        is_asked = self._all if among is None else np.array([tile_id in among for tile_id in self._tile_ids], bool)
         likeness: dict[int, float] = {}
         for kind, vector in by_kind.items():
-            if kind not in self._by_kind:
+            found = self._found(kind, np.ascontiguousarray(vector, np.float32), num_tiles, is_asked)
+            if not found:
                 continue
-            found = self._by_kind[kind].rank_nodes(vector, num_tiles)
-            shift = found[0].score - max(likeness.values(), default=found[0].score)
-            likeness = {row: before + shift for row, before in likeness.items()} | {tile.node_id: tile.score for tile in found}
+            best = max(found.values())
+            shift = best - max(likeness.values(), default=best)
+            likeness = {row: before + shift for row, before in likeness.items()} | found
         ranked = sorted(((value, -row) for row, value in likeness.items()), reverse=True)
         return [(self._tile_ids[-row], value) for value, row in ranked[:num_tiles]]
+
+    def _found(self, kind: str, vector: Float32[np.ndarray, " d"], num_tiles: int, is_asked: Bool[np.ndarray, " t"]) -> dict[int, float]:
+        """The likeness of the likeliest tiles by one kind of features; a tile lies in one part of the index."""
+        pairs = [part.rank(vector, num_tiles, is_asked) for part in self._by_kind.get(kind, ())]
+        found = sorted(((float(value), -int(row)) for rows, values in pairs for row, value in zip(rows, values, strict=True)), reverse=True)
+        return {-row: value for value, row in found[:num_tiles]}
 
 
 class _ExactTiles:
@@ -64,10 +87,25 @@ class _ExactTiles:
         self._vectors = np.ascontiguousarray(vectors)
         self._tiles, self._firsts = np.unique(of_tile, return_index=True)
 
-    def rank_nodes(self, vector: Float32[np.ndarray, " d"], num_candidates: int) -> list[NodeScore]:
-        """As `PlaceIndex.rank_nodes`, of tiles."""
+    def rank(
+        self, vector: Float32[np.ndarray, " d"], num_tiles: int, is_asked: Bool[np.ndarray, " t"]
+    ) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
         similarities = np.empty(len(self._vectors), np.float32)
-        multiply_rows(self._vectors, np.ascontiguousarray(vector), similarities)
+        multiply_rows(self._vectors, vector, similarities)
         best = np.maximum.reduceat(similarities, self._firsts)
-        order = np.argsort(-best, kind="stable")[:num_candidates]
-        return [NodeScore(int(self._tiles[k]), float(best[k])) for k in order]
+        order = np.argsort(-best, kind="stable")
+        order = order[is_asked[self._tiles[order]]][:num_tiles]
+        return self._tiles[order], best[order]
+
+
+class _NumberedShard:
+    """A shard whose tiles go by the numbers of the index; those of none are never named."""
+
+    def __init__(self, shard: PlaceShard, numbers: Int[np.ndarray, " s"]) -> None:
+        self._shard, self._numbers = shard, numbers
+
+    def rank(
+        self, vector: Float32[np.ndarray, " d"], num_tiles: int, is_asked: Bool[np.ndarray, " t"]
+    ) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
+        tiles, similarities = self._shard.rank(vector, num_tiles, (self._numbers >= 0) & is_asked[self._numbers])
+        return self._numbers[tiles], similarities

@@ -106,6 +106,17 @@ class Manifest:
     def by_id(self) -> dict[str, Tile]:
         return {tile.tile_id: tile for tile in self.tiles}
 
+    @cached_property
+    def geo_boxes(self) -> Float[np.ndarray, "t 4"]:
+        """The `geo_box` of each tile, NaN of those that have none."""
+        unknown = (math.nan,) * 4
+        return np.array([tile.geo_box or unknown for tile in self.tiles], np.float64).reshape(-1, 4)
+
+    @cached_property
+    def world_boxes(self) -> Float[np.ndarray, "t 2 3"]:
+        """The `box_world` of each tile."""
+        return np.array([tile.box_world for tile in self.tiles], np.float64).reshape(-1, 2, 3)
+
     @property
     def files(self) -> set[str]:
         """Names of all files that the tiles consist of."""

@@ -23,6 +23,8 @@ from topoloc.features.network_files import cache_folder
 from topoloc.sequences.atomic import replaced_file
 
 _MANIFESTS, _KEPT = "manifests", 16
+S3_TRIES, S3_CLIENT = 2, {"connect_timeout": 5.0, "read_timeout": 15.0, "retries": {"total_max_attempts": 2}}
+"""Seconds that S3 is waited for, and how often it is asked again: a store that is silent is given up after a minute, not after minutes."""
 
 
 class ObjectStore:
@@ -40,29 +42,41 @@ class ObjectStore:
             raise MissingExtraError(f"{where}: object stores need {error.name}: pip install 'topoloc[cluster]'") from error
         self.where = where.rstrip("/")
         try:
-            self._files, self._root = fsspec.core.url_to_fs(self.where)
+            self._files, self._root = fsspec.core.url_to_fs(self.where, use_listings_cache=False, **_options(fsspec, self.where))
         except ImportError as error:
             raise MissingExtraError(f"{where}: {' '.join(str(error).split())[:200]}") from error
         except ValueError as error:
             raise AtlasError(f"{where}: {' '.join(str(error).split())[:200]}") from error
+        if _is_s3(fsspec, self.where):
+            self._files.retries = S3_TRIES
 
     def manifest(self) -> bytes | None:
         with self._told():
-            names = self._manifests()
-            return self._files.cat_file(names[-1]) if names else None
+            return self._newest()[1]
 
     def commit(self, before: bytes | None, after: bytes) -> bool:
         with self._told():
-            names = self._manifests()
-            if (self._files.cat_file(names[-1]) if names else None) != before:
+            names, newest = self._newest()
+            if newest != before:
                 return False
             number = int(Path(names[-1]).stem) + 1 if names else 1
-            try:
-                self._files.pipe_file(f"{self._root}/{_MANIFESTS}/{number:09d}.json", after, mode="create")
-            except FileExistsError:
+            if not self._created(f"{self._root}/{_MANIFESTS}/{number:09d}.json", after):
                 return False
             for name in names[:-_KEPT]:
                 self.remove(f"{_MANIFESTS}/{Path(name).name}")
+        return True
+
+    def _created(self, name: str, data: bytes) -> bool:
+        """Create an object; False where another writer was faster. One that holds these very bytes is ours: the client asks again where an
+        answer was lost."""
+        try:
+            self._files.pipe_file(name, data, mode="create")
+        except FileExistsError:
+            return self._files.cat_file(name) == data
+        except OSError as error:
+            if "ConditionalRequestConflict" not in f"{error} {error.__cause__}":  # S3, while another one is writing
+                raise
+            return False
         return True
 
     def put(self, name: str, path: Path) -> None:
@@ -83,25 +97,34 @@ class ObjectStore:
     def ages(self) -> dict[str, float]:
         now = time.time()
         with self._told():
-            return {f"{TILES}/{Path(name).name}": now - self._modified(name) for name in self._names(TILES)}
+            return {f"{TILES}/{Path(entry['name']).name}": now - self._modified(entry) for entry in self._entries(TILES)}
 
     def remove(self, name: str) -> None:
         with self._told(), suppress(FileNotFoundError):  # another writer was here
             self._files.rm_file(f"{self._root}/{name}")
 
-    def _manifests(self) -> list[str]:
-        return sorted(name for name in self._names(_MANIFESTS) if Path(name).suffix == ".json" and Path(name).stem.isdecimal())
+    def _newest(self) -> tuple[list[str], bytes | None]:
+        """The names of all manifests, and what the newest holds. Old ones are removed, also between a listing and its reading."""
+        for _ in range(3):
+            names = self._manifests()
+            with suppress(FileNotFoundError):
+                return names, self._files.cat_file(names[-1]) if names else None
+        raise AtlasError(f"{self.where} is written faster than it can be read")
 
-    def _names(self, folder: str) -> list[str]:
+    def _manifests(self) -> list[str]:
+        names = [entry["name"] for entry in self._entries(_MANIFESTS)]
+        return sorted(name for name in names if Path(name).suffix == ".json" and Path(name).stem.isdecimal())
+
+    def _entries(self, folder: str) -> list[dict[str, Any]]:
         self._files.invalidate_cache()
         try:
-            return [str(name) for name in self._files.ls(f"{self._root}/{folder}", detail=False)]
+            return [entry for entry in self._files.ls(f"{self._root}/{folder}", detail=True) if entry.get("type") == "file"]
         except FileNotFoundError:
             return []
 
-    def _modified(self, name: str) -> float:
-        """Seconds of Unix time."""
-        when: Any = self._files.modified(name)
+    def _modified(self, entry: dict[str, Any]) -> float:
+        """Seconds of Unix time; S3 says it with the names, others are asked."""
+        when: Any = entry.get("LastModified") or self._files.modified(entry["name"])
         return when.timestamp() if isinstance(when, datetime) else float(when)
 
     @contextmanager
@@ -121,3 +144,15 @@ def _made(path: Path) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     with replaced_file(path) as temporary:
         yield temporary
+
+
+def _is_s3(fsspec: Any, where: str) -> bool:
+    return fsspec.utils.get_protocol(where) in ("s3", "s3a")
+
+
+def _options(fsspec: Any, where: str) -> dict[str, Any]:
+    """What the store's client is told; what the user's own configuration of fsspec says of it counts."""
+    if not _is_s3(fsspec, where):
+        return {}
+    said = fsspec.config.conf.get(fsspec.utils.get_protocol(where), {})
+    return {"config_kwargs": S3_CLIENT | dict(said.get("config_kwargs", {}))}

@@ -1,4 +1,4 @@
-"""topoloc evaluate MAP|ATLAS SEQ [SEQ ...]."""
+"""topoloc evaluate MAP|ATLAS SEQ [SEQ ...], topoloc evaluate MAP --against-itself."""
 
 from __future__ import annotations
 
@@ -13,11 +13,13 @@ import tyro
 
 from topoloc.atlas.config import AtlasConfig
 from topoloc.atlas.judged_tile import JudgedTile
+from topoloc.cli.against_itself import evaluate_against_itself
 from topoloc.cli.features_option import ASKED_FEATURES
 from topoloc.cli.map_or_atlas import localizer_at
 from topoloc.cli.output import (
     CameraOption,
     File,
+    Flag,
     Format,
     Topics,
     UsageError,
@@ -58,10 +60,12 @@ class Command:
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="SEQ", help_behavior_hint="(may be given several times)")
     ] = ()
     """A recording of another place: every pose given for one of its images counts as a false accept."""
+    against_itself: Flag = False
+    """No recording is needed: which parts of the map are weakly held, and where to walk next. Each node is asked of the rest of the map."""
     map_from_truth: File = None
     """A JSON file with the 4x4 matrix (metres) that takes the world of the recordings' truth into the map's, where they differ."""
     fit_map_from_truth: File = None
-    """Where errors are explained by one rigid transform between the two worlds, write that to this file, for --map-from-truth."""
+    """Where one rigid transform between the two worlds explains the errors, write it to this file; --map-from-truth reads it."""
     coarse: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")] = None
     """Coarse localizer that is asked; `topoloc info` names those of the map."""
     features: ASKED_FEATURES = None
@@ -84,8 +88,12 @@ class Command:
     """All other settings: a TOML file, as `topoloc config evaluate` prints it."""
 
     def run(self) -> int:
+        if self.against_itself:
+            self._refuse_beside_itself()
+            outputs = {"json": self.json, "report": self.report}
+            return evaluate_against_itself(self.map, self.coarse, self.features, outputs, self.config)
         if not self.sequences and not self.elsewhere:
-            raise UsageError("evaluate takes a map and at least one recording, with truth or --elsewhere")
+            raise UsageError("evaluate takes a map and at least one recording, with truth or --elsewhere, or --against-itself")
         if self.fit_map_from_truth and (self.map_from_truth or len(self.sequences) != 1):
             raise UsageError("--fit-map-from-truth is of one recording, without --map-from-truth")
         inputs = [path for path in (self.map, self.map_from_truth, self.config) if path]
@@ -122,6 +130,13 @@ class Command:
                 print(f"report: {self.report}")
         self._write_fit(fits)
         return 0
+
+    def _refuse_beside_itself(self) -> None:
+        """Hold that nothing is given that is of recordings."""
+        names = ("elsewhere", "tile", "map_from_truth", "fit_map_from_truth", "format", "camera", "poses", "topics")
+        given = ["recordings"] * bool(self.sequences) + [f"--{name.replace('_', '-')}" for name in names if getattr(self, name)]
+        if given:
+            raise UsageError(f"--against-itself asks the map alone, without {', '.join(given)}")
 
     def _judged(self, settings: Settings, config: LocalizerConfig) -> Localizer | JudgedTile:
         """The map; or the atlas, in the world of the tile that the recordings' truth is given in."""

@@ -8,6 +8,7 @@ from typing import Annotated
 import tyro
 
 from topoloc.cli.output import File, print_facts, write_json
+from topoloc.lifelong.earlier_recall import described
 from topoloc.map.edit import undoable_edits
 from topoloc.map.topomap import TopoMetricMap
 
@@ -38,5 +39,7 @@ class Command:
 
 def _said(changes) -> str:
     """What an edit changed, in the words of its numbers."""
-    shown = {name.replace("_", " "): value for name, value in (changes or {}).items() if value not in ([], None, "")}
-    return "" if not shown else ": " + ", ".join(f"{name} {value}" for name, value in shown.items())
+    recall, numbers = described(changes or {}), (changes or {}).items()
+    shown = {name.replace("_", " "): value for name, value in numbers if value not in ([], None, "") and not name.startswith("earlier_")}
+    said = [f"{name} {value}" for name, value in shown.items()] + ([recall] if recall else [])
+    return "" if not said else ": " + ", ".join(said)

@@ -13,6 +13,7 @@ import tyro
 
 from topoloc.atlas.atlas_localizer import AtlasLocalizer
 from topoloc.atlas.config import AtlasConfig
+from topoloc.atlas.near import NearPlace
 from topoloc.cli.features_option import ASKED_FEATURES
 from topoloc.cli.live_answers import NEEDS_CALIBRATION, live_answers, live_input
 from topoloc.cli.map_or_atlas import camera_for, is_atlas, localizer_at
@@ -29,8 +30,8 @@ from topoloc.cli.output import (
     write_text,
 )
 from topoloc.cli.query_answers import QueryAnswer, answer_line, exit_status, say_verdicts, stream_summary, trajectory_of
-from topoloc.cli.settings_file import read_settings, with_option
-from topoloc.errors import CalibrationError, QueryError, TopolocError, UnreadableImageError
+from topoloc.cli.settings_file import Settings, read_settings, with_option
+from topoloc.errors import AtlasError, CalibrationError, QueryError, TopolocError, UnreadableImageError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.localizer import Localizer, LocalizerConfig
@@ -95,6 +96,8 @@ class Command:
     """Which of the map's features are asked; of several, the next where the one before leaves the pose unclear."""
     max_ms: Annotated[float | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: no limit)")] = None
     """After so many milliseconds no further hypothesis is sought for an image; the first one is always tried."""
+    near: Annotated[str | None, tyro.conf.arg(metavar="LAT,LON,METRES", help_behavior_hint="(atlases only)")] = None
+    """Of an atlas: tiles that are known to lie further from this place on earth are not asked."""
     json: File = None
     """Write one JSON line a query to this file (- for standard output)."""
     tum: File = None
@@ -108,11 +111,9 @@ class Command:
             raise UsageError("localize takes a map and at least one image, folder or recording")
         self._check_usage()
         check_outputs([self.json, self.tum], inputs=[path for path in (self.map, *self.inputs, self.streams.odometry, self.config) if path])
-        settings = read_settings(self.config)
-        config = with_option(settings.of(LocalizerConfig), "coarse", self.coarse, "--coarse")
-        config = with_option(config, "max_ms", self.max_ms, "--max-ms")
+        near, settings = self._near, read_settings(self.config)
         tracking = self._tracking(settings.of(TrackerConfig))
-        localizer = localizer_at(self.map, config, self.features, settings.of(AtlasConfig))
+        localizer = self._localizer(settings, near)
         camera = None if self.camera is None or self._stereo_calibration else camera_for(localizer, self.camera)
         live = live_input(self.inputs)
         queries = [] if live else [self._open(path) for path in self.inputs]
@@ -143,6 +144,21 @@ class Command:
             print(stream_summary(answers, time.perf_counter() - start))
         say_verdicts(answers)
         return exit_status(answers)
+
+    def _localizer(self, settings: Settings, near: NearPlace | None) -> Localizer | AtlasLocalizer:
+        config = with_option(settings.of(LocalizerConfig), "coarse", self.coarse, "--coarse")
+        config = with_option(config, "max_ms", self.max_ms, "--max-ms")
+        localizer = localizer_at(self.map, config, self.features, settings.of(AtlasConfig))
+        return localizer.near(near) if isinstance(localizer, AtlasLocalizer) and near is not None else localizer
+
+    @property
+    def _near(self) -> NearPlace | None:
+        if self.near is not None and not is_atlas(self.map):
+            raise UsageError("--near is of an atlas: a map is one place")
+        try:
+            return None if self.near is None else NearPlace.parse(self.near)
+        except AtlasError as error:
+            raise UsageError(f"--near: {error}") from None
 
     def _check_usage(self) -> None:
         if self.streams.stream and self.streams.single:

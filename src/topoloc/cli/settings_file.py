@@ -30,6 +30,7 @@ TABLES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "track": ("topoloc.tracking.tracker", "TrackerConfig", ("localize", "serve", "follow")),
     "slam": ("topoloc.slam.slam", "SlamConfig", ("slam", "build", "update")),
     "update": ("topoloc.lifelong.update", "UpdateConfig", ("update", "merge")),
+    "against_itself": ("topoloc.lifelong.weak_parts", "WeakPartsConfig", ("evaluate",)),
     "prune": ("topoloc.lifelong.prune", "PruneConfig", ("prune",)),
     "serve": ("topoloc.service.config", "ServiceConfig", ("serve",)),
     "cluster": ("topoloc.cluster.config", "ClusterConfig", ("build",)),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,6 +15,7 @@ from topoloc.geometry.pose_conventions import PoseReading
 from topoloc.lifelong.update import UpdateConfig, update_map
 from topoloc.localization.localizer import LocalizerConfig
 from topoloc.map.edit import editing
+from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.trajectory import Trajectory, as_read, with_trajectory, write_tum
 from topoloc.slam.pose_checks import check_poses
@@ -48,6 +49,8 @@ class Command:
     """Calibration of the recordings instead of their own: camera.json, OpenCV's or Kalibr's YAML, SN*.conf, or `fx,fy,cx,cy`."""
     topics: Topics = None
     """Of a bag, which topic is what: left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom."""
+    light: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: as its pictures show)")] = None
+    """What the recordings' light is called, such as `evening`: sessions of one name count for one light, of two names for two."""
     joined: Annotated[str | None, tyro.conf.arg(metavar="FILE.tum", help_behavior_hint="")] = None
     """Write where the frames of the (one) recording were taken, in the map's world, to this TUM file."""
     json: File = None
@@ -60,6 +63,8 @@ class Command:
             raise UsageError("update takes a map and at least one recording")
         if self.joined and len(self.paths) > 2:
             raise UsageError("--joined takes the frames of one recording")
+        if self.light is not None and not self.light.strip():
+            raise UsageError("--light is a name, such as evening")
         target, *recordings = self.paths
         check_outputs([self.json, self.joined], inputs=[path for path in (target, self.config) if path])
         settings = read_settings(self.config)
@@ -71,7 +76,7 @@ class Command:
                 posed, poses_from = self._posed(sequence, settings, progress)
                 update = update_map(edit.topomap, posed, poses_from, config, settings.of(LocalizerConfig), progress)
                 changes = update.changes | {"bytes_before": edit.path.stat().st_size}
-                edit.commit(update.topomap, f"update {sequence.name}", changes)
+                edit.commit(self._named(update.topomap), f"update {sequence.name}", changes)
             changes["bytes"] = Path(target).stat().st_size
             if self.joined:
                 known = [(t_ns, pose) for t_ns, pose in zip(update.sequence.t_ns, update.sequence.poses, strict=True) if pose is not None]
@@ -81,6 +86,11 @@ class Command:
             done.append(changes)
         write_json(self.json, {"map": target, "updates": done})
         return 0
+
+    def _named(self, topomap: TopoMetricMap) -> TopoMetricMap:
+        """The map with the name of its last session's light."""
+        *others, last = topomap.sessions
+        return topomap if self.light is None else replace(topomap, sessions=[*others, replace(last, light_name=self.light)])
 
     def _posed(self, sequence: StereoSequence, settings: Settings, progress: Any) -> tuple[StereoSequence, str]:
         """The recording with its own motion, and where that comes from."""

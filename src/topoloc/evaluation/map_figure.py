@@ -32,9 +32,9 @@ def draw_map(answers: Sequence[Answer], topomap: TopoMetricMap) -> str:
     centres = np.array([s.world_from_cam.translation for s in topomap.summaries])
     truths = [a.world_from_cam.translation for a in with_truth if a.world_from_cam is not None]
     known = np.concatenate([centres, np.array(truths).reshape(-1, 3)])
-    across, up, is_mirrored = _horizontal_axes(known, np.array([s.world_from_cam.rotation[:, 1] for s in topomap.summaries]))
+    across, up, is_mirrored = horizontal_axes(known, np.array([s.world_from_cam.rotation[:, 1] for s in topomap.summaries]))
     axes_idx = [across, up]
-    low, high = _frame(known[:, axes_idx])
+    low, high = frame_around(known[:, axes_idx])
     width, height = high - low
     groups = by_recording(with_truth)
     colours = recording_colours(list(groups))
@@ -55,7 +55,7 @@ def draw_map(answers: Sequence[Answer], topomap: TopoMetricMap) -> str:
         return svg_text(figure, "map from above")
 
 
-def _horizontal_axes(points: Float[np.ndarray, "n 3"], downs: Float[np.ndarray, "m 3"]) -> tuple[int, int, bool]:
+def horizontal_axes(points: Float[np.ndarray, "n 3"], downs: Float[np.ndarray, "m 3"]) -> tuple[int, int, bool]:
     """The world's axes to draw across and up, and whether the latter must point down so that the map is not seen from below.
 
     The vertical is the axis that the cameras' y agrees on; where they agree on none, that of least extent.
@@ -68,7 +68,7 @@ def _horizontal_axes(points: Float[np.ndarray, "n 3"], downs: Float[np.ndarray, 
     return across, up, bool(towards_viewer @ down > 0)
 
 
-def _frame(points: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+def frame_around(points: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """(low, high) corners around all points, with a margin, neither very flat nor very high."""
     low, high = points.min(axis=0), points.max(axis=0)
     size = high - low + 0.12 * max(float((high - low).max()), 0.1)

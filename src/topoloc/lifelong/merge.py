@@ -15,6 +15,7 @@ from topoloc.bounds import check_bounds
 from topoloc.errors import MapError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.lifelong.coarse_models import PlaceView, with_place_views
+from topoloc.lifelong.earlier_recall import earlier_recall
 from topoloc.lifelong.overlay import Overlay
 from topoloc.lifelong.session_poses import Progress, SessionPoses, held_by
 from topoloc.lifelong.update import UpdateConfig, is_well_held
@@ -69,7 +70,8 @@ def merge_maps(
         "agreeing": len(held.agreeing),
         "nodes_added": len(added),
     }
-    return MergedMap(with_map_facts(merged, progress), changes)
+    merged = with_map_facts(merged, progress)
+    return MergedMap(merged, changes | earlier_recall(first, merged, config.earlier_asked, localizer_config))
 
 
 def _held(

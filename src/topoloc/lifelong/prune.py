@@ -8,7 +8,6 @@ landmarks as fit: those with the best chance to be seen again, spread over the p
 from __future__ import annotations
 
 import sqlite3
-import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -20,11 +19,13 @@ from jaxtyping import Bool, Float, Int
 
 from topoloc.bounds import AtLeast, Between, check_bounds
 from topoloc.errors import MapError
+from topoloc.lifelong.earlier_recall import earlier_recall
 from topoloc.lifelong.overlay import Overlay
 from topoloc.localization.map_facts.building import with_map_facts
 from topoloc.map.sums import LandmarkSums
 from topoloc.map.topomap import TopoMetricMap, TopoNode
 from topoloc.map.writing import write_map
+from topoloc.sequences.atomic import scratch_file
 
 _PAGES = 4096  # what an entry in the history may take
 _POINT_COLUMNS = ("points_img", "shapes", "descriptors", "points_cam", "sqrt_covs")
@@ -44,6 +45,8 @@ class PruneConfig:
     """Landmarks that a node keeps at least; a budget that asks for fewer is refused."""
     max_gone_share: Annotated[float, AtLeast(0)] = 0.7
     """Of a node's landmarks at most this share is taken for gone."""
+    earlier_asked: Annotated[int, Between(0, 10_000)] = 24
+    """Nodes, at most, that the map is asked before and after, for its history to tell what the edit cost; 0: none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +79,8 @@ def prune_map(topomap: TopoMetricMap, path: Path, max_bytes: int | None = None, 
         if most >= largest and not any(of_node.any() for of_kind in gone.values() for of_node in of_kind):
             return PrunedMap(topomap, {"landmarks_gone": 0, "landmarks_dropped": 0})
         pruned = _with_fewer(topomap, gone, most, config)
-        if max_bytes is None or budget is None or (size := _bytes_of(pruned.topomap)) <= max_bytes:
-            return pruned
+        if max_bytes is None or budget is None or (size := _bytes_of(pruned.topomap, path)) <= max_bytes:
+            return replace(pruned, changes=pruned.changes | earlier_recall(topomap, pruned.topomap, config.earlier_asked))
         budget -= round(1.1 * (size - max_bytes)) + _PAGES  # how well bytes pack is known only now
 
 
@@ -98,12 +101,14 @@ def _with_fewer(topomap: TopoMetricMap, gone: Mapping[str, list[np.ndarray]], mo
     return PrunedMap(with_map_facts(smaller), {"landmarks_gone": num_gone, "landmarks_dropped": num_dropped})
 
 
-def _bytes_of(topomap: TopoMetricMap) -> int:
-    """Of its file, with an entry for one more edit."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "tried.topo"
-        write_map(topomap, path)
-        return path.stat().st_size + _PAGES
+def _bytes_of(topomap: TopoMetricMap, path: Path) -> int:
+    """Of its file, which is to be at `path`, with an entry for one more edit. Raises MapError."""
+    try:
+        with scratch_file(path) as tried:
+            write_map(topomap, tried)
+            return tried.stat().st_size + _PAGES
+    except OSError as error:
+        raise MapError(f"cannot write beside map {path}: {error.strerror}") from error
 
 
 def with_points(node: TopoNode, kept: Int[np.ndarray, " k"]) -> TopoNode:

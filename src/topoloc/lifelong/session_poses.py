@@ -18,8 +18,9 @@ from jaxtyping import Bool, Float
 from topoloc.bounds import Above, AtLeast, Between
 from topoloc.errors import CalibrationError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3, covariance_of_inverse
+from topoloc.lifelong.session_calibration import check_by_other_focal_lengths, check_calibration
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.result import Localization
+from topoloc.localization.result import Localization, NotLocalized
 from topoloc.map.config import MapConfig
 from topoloc.map.nodes import place_nodes
 from topoloc.sequences.frame import StereoSequence
@@ -28,7 +29,6 @@ from topoloc.tracking.tracker import Tracker
 
 Progress = Callable[[str, int, int], None]
 """Called with a stage's name, steps done and steps in all."""
-_MIN_SPREAD_M = 0.5  # the scale of what hardly moves says nothing
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,8 @@ class SessionPosesConfig:
     """How a session is held in place, and when it is refused."""
 
     max_scale: Annotated[float, Above(0)] = 0.03
-    """A metre of the motion may be off by this share of a metre of the map, beside three sigmas of what the answers say of it."""
+    """A metre of the motion may be off by this share of a metre of the map, beside three sigmas of what the answers say of it, and beside
+    the share that one sigma of an answer is of the way between the furthest."""
     max_drift: Annotated[float, Between(0, 1)] = 0.03
     """Of two answers of the map that agree, the motion between them may be off by this share of the way ..."""
     max_turn_drift_deg: Annotated[float, AtLeast(0)] = 0.3
@@ -75,6 +76,7 @@ def poses_by_motion(
 
     Raises:
         TrajectoryError: the map recognises too little of it, or not as its poses say.
+        CalibrationError: the pictures contradict their calibration.
         UnreadableImageError, QueryError: from its pictures.
     """
     d_thresh = of_map.nodes.d_thresh
@@ -83,11 +85,15 @@ def poses_by_motion(
     indices = list(own)
     asked = [indices[k] for k in place_nodes(list(own.values()), of_map.nodes)]
     answers: dict[int, Localization | None] = {}
+    results = list[Localization | NotLocalized]()
     for done, index in enumerate(asked):
         frame = sequence[index]
-        result = localizer.localize(frame.image, frame.camera)
+        results.append(result := localizer.localize(frame.image, frame.camera))
         answers[index] = result if isinstance(result, Localization) else None
         progress(f"localizing {sequence.name}", done + 1, len(asked))
+    check_calibration(sequence.name, results)
+    if config.min_agreeing > sum(result.localized for result in results) and len(asked) >= config.min_agreeing:
+        check_by_other_focal_lengths(sequence, asked, localizer)
     return held_by(sequence.name, own, answers, d_thresh, config)
 
 
@@ -111,22 +117,26 @@ def poses_by_map(
 
     Raises:
         TrajectoryError: the map recognises too little of it.
+        CalibrationError: it has none, or the pictures contradict it.
         UnreadableImageError, QueryError: from its pictures.
     """
-    poses = list[Rigid3 | None]()
+    poses, results = list[Rigid3 | None](), list[Localization | NotLocalized]()
     seen: dict[int, Localization] = {}
     for index, t_ns in enumerate(sequence.t_ns):
         frame = sequence[index]
         if frame.camera is None:
             raise CalibrationError(f"{sequence.name}: a session that the map is asked for needs a calibration (--camera)")
         found = tracker.process(frame.image, frame.camera, t_ns)
+        results.append(found.result)
         is_known = found.state in ("localized", "tracked")
         poses.append(found.smoothed if is_known else None)
         if is_known and isinstance(found.result, Localization):
             seen[index] = found.result
         progress(f"localizing {sequence.name}", index + 1, len(sequence))
+    check_calibration(sequence.name, results)
     known = [index for index, pose in enumerate(poses) if pose is not None]
     if len(known) < config.min_agreeing:
+        check_by_other_focal_lengths(sequence, range(len(sequence)), tracker.localizer)
         raise TrajectoryError(f"{sequence.name}: the map recognises {len(known)} of its {len(sequence)} pictures: too few to join")
     asked = [known[k] for k in place_nodes([pose for pose in poses if pose is not None], of_map.nodes)]
     return SessionPoses(poses, {index: seen.get(index) for index in asked}, [index for index in asked if index in seen])
@@ -137,11 +147,13 @@ def _agreeing(
 ) -> list[int]:
     """The largest set of answers that one transform of the motion explains."""
     indices = list(localized)
+    if num_asked < config.min_agreeing:
+        raise TrajectoryError(f"{name}: {_too_few(num_asked, config)}; the map stays as it is")
     if len(indices) < config.min_agreeing:
         raise TrajectoryError(
             f"{name}: the map recognises {len(indices)} of {num_asked} pictures asked: another place, or changed; the map stays as it is"
         )
-    _check_scale(name, own, localized, config.max_scale)
+    _check_scale(name, own, localized, config)
     ways, slack_m = _ways(own), config.slack * d_thresh
     agrees = np.array([_agree_with(k, own, localized, ways, slack_m, config) for k in indices])
     best = agrees[int(np.argmax(agrees.sum(axis=1)))]
@@ -171,19 +183,27 @@ def _agree_with(
     return np.array(agrees)
 
 
-def _check_scale(name: str, own: Mapping[int, Rigid3], localized: Mapping[int, Localization], max_scale: float) -> None:
+def _too_few(num_asked: int, config: SessionPosesConfig) -> str:
+    found = f"{num_asked} of its pictures are" if num_asked > 1 else "one of its pictures is"
+    return f"{found} as far apart as nodes of the map, too few to join: it takes {config.min_agreeing}"
+
+
+def _check_scale(name: str, own: Mapping[int, Rigid3], localized: Mapping[int, Localization], config: SessionPosesConfig) -> None:
     """Hold that a metre of the motion is one of the map, by the distances between what was localized."""
     a = np.array([own[k].translation for k in localized])
     b = np.array([answer.world_from_cam.translation for answer in localized.values()])
     rows, columns = np.triu_indices(len(a), 1)
     own_lengths, lengths = np.linalg.norm(a[rows] - a[columns], axis=1), np.linalg.norm(b[rows] - b[columns], axis=1)
-    far = lengths > 0.5 * lengths.max()  # the scale of what hardly moves says nothing
-    if lengths.max() < _MIN_SPREAD_M or (own_lengths[far] == 0.0).any():
+    far = lengths > 0.5 * lengths.max()
+    if (own_lengths[far] == 0.0).any():
         return
     ratios = lengths[far] / own_lengths[far]
     scale = float(np.median(ratios))
     spread = 1.4826 * float(np.median(np.abs(ratios - scale)))
-    if abs(scale - 1.0) > max_scale + 3.0 * spread / np.sqrt(len(a)):
+    # the answers are wrong together, too, which their spread does not show; of what hardly moves that is all there is
+    sigma_m = float(np.median([answer.position_sigma_m for answer in localized.values()]))
+    doubt = 3.0 * spread / np.sqrt(len(a)) + sigma_m / lengths.max()
+    if abs(scale - 1.0) > config.max_scale + doubt:
         raise TrajectoryError(f"{name}: a metre of its poses is {scale:.3g} m of the map; the map stays as it is")
 
 

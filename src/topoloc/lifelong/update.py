@@ -21,6 +21,7 @@ from topoloc.bounds import Above, Between, check_bounds
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.rigid import covariance_of_inverse, position_covariance
 from topoloc.lifelong.coarse_models import PlaceView, with_place_views
+from topoloc.lifelong.earlier_recall import earlier_recall
 from topoloc.lifelong.overlay import Overlay
 from topoloc.lifelong.session_poses import Progress, SessionPoses, SessionPosesConfig, poses_by_map, poses_by_motion
 from topoloc.localization.localizer import Localizer, LocalizerConfig
@@ -50,6 +51,8 @@ class UpdateConfig:
     """A picture that the map localizes with at least so many inliers ..."""
     max_sigma: Annotated[float, Above(0)] = 0.1
     """... and to within so many D_thresh (a sigma of its position) needs no node."""
+    earlier_asked: Annotated[int, Between(0, 10_000)] = 24
+    """Nodes of earlier sessions, at most, that the map is asked before and after, for its history to tell what the edit cost; 0: none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +125,8 @@ def update_map(
         "place_images_added": len(joined.images),
         "not_taught": sorted({name.partition("@")[0] for name in topomap.coarse_models if not name.startswith("surf-vlad")}),
     }
-    return MapUpdate(with_map_facts(changed, progress), posed, changes)
+    changed = with_map_facts(changed, progress)
+    return MapUpdate(changed, posed, changes | earlier_recall(topomap, changed, config.earlier_asked, localizer_config))
 
 
 def _refuse_known(topomap: TopoMetricMap, sequence: StereoSequence) -> None:
@@ -135,19 +139,23 @@ def _refuse_known(topomap: TopoMetricMap, sequence: StereoSequence) -> None:
             continue
         if min(times[1], session.end_ns) < max(times[0], session.start_ns):
             continue
-        is_same_file = path is not None and path == session.recording and (session.start_ns, session.end_ns) == times
-        if is_same_file or _shows_the_same(topomap, session.session_id, sequence):
+        is_there = path is not None and path == session.recording
+        is_same_file = is_there and (session.start_ns, session.end_ns) == times
+        if is_same_file or _shows_the_same(topomap, session.session_id, sequence, is_there):
             raise TrajectoryError(f"{sequence.name}: it is in the map already, as session {session.session_id}; the map stays as it is")
 
 
-def _shows_the_same(topomap: TopoMetricMap, session_id: int, sequence: StereoSequence) -> bool:
-    """Whether pictures of one name are one picture, by what the map keeps of them."""
+def _shows_the_same(topomap: TopoMetricMap, session_id: int, sequence: StereoSequence, is_there: bool) -> bool:
+    """Whether pictures of one name are one picture, by what the map keeps of them. Of the same folder (`is_there`) other pictures of the
+    same time are the same session, too: every second frame, and then those between."""
     rows = {name: index for index, name in enumerate(sequence.names)}
-    common = [image for image in topomap.place_images if image.session_id == session_id and image.name in rows]
-    tried = [common[k] for k in np.unique(np.linspace(0, len(common) - 1, _PICTURES_COMPARED).astype(int))] if common else []
+    kept = [image for image in topomap.place_images if image.session_id == session_id]
+    common = [image for image in kept if image.name in rows]
+    if not common:
+        return is_there and bool(kept)
+    tried = [common[k] for k in np.unique(np.linspace(0, len(common) - 1, _PICTURES_COMPARED).astype(int))]
     side = topomap.config.place_side_px
-    same = [small_jpeg(frame_view(sequence[rows[image.name]], False).picture, side, PLACE_QUALITY) == image.jpeg for image in tried]
-    return any(same)
+    return any(small_jpeg(frame_view(sequence[rows[image.name]], False).picture, side, PLACE_QUALITY) == image.jpeg for image in tried)
 
 
 def _joined(

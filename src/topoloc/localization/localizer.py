@@ -138,6 +138,17 @@ class Localizer:
         other._kinds, other.config = [replace(first, config=brief)], brief
         return other
 
+    def without(self, node_ids: Iterable[int]) -> Localizer:
+        """The same map as if nobody had stood at these nodes: a picture that was taken there is then asked of the rest of the map.
+
+        At least one node is left; the walls along the way are not asked. Raises KeyError where the map has no node of such an id.
+        """
+        rows, other = [self.topomap.row_of(node_id) for node_id in node_ids], copy.copy(self)
+        other._kinds = [replace(kind, map=kind.map.without(rows)) for kind in self._kinds]
+        other.map = other._kinds[0].map
+        other.__dict__.pop("at_first_glance", None)
+        return other
+
     def completed(self, result: R, camera: Camera | RoughCamera | None = None, t_ns: int | None = None) -> R:
         """The result with the map that it is of, where on earth that is, the picture's camera, and its time (nanoseconds)."""
         if isinstance(camera, RoughCamera):

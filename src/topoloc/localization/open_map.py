@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import copy
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from topoloc.errors import EmptyMapError
+from topoloc.features.features import Features
 from topoloc.features.kinds import find_kind
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
@@ -19,7 +21,7 @@ from topoloc.localization.walls.wall_index import WallIndex
 from topoloc.map.memory import RememberedNodes
 from topoloc.map.nodes import NodePoses, node_distances
 from topoloc.map.topomap import TopoMetricMap, TopoNode, open_coarse_of
-from topoloc.places.coarse import CoarseLocalizer, NodeScore
+from topoloc.places.coarse import CoarseLocalizer, Image, NodeScore
 from topoloc.places.vlad import SurfVlad
 
 _NO_MOVES = np.zeros((0, 4, 4))
@@ -54,6 +56,15 @@ class OpenMap:
         self._known_moves = _known_moves(topomap)
         self.focal = _finest_focal(topomap)
         self._expected: tuple[Camera, RememberedNodes[Float32[np.ndarray, "n 5"]]] | None = None
+        self._hidden = list[int]()
+
+    def without(self, rows: Iterable[int]) -> OpenMap:
+        """The same map as if nobody had stood at these nodes, whose rows stay theirs; what was read is shared. Its walls are not asked."""
+        other = copy.copy(self)
+        other._hidden = sorted(set(rows))
+        other.coarse = _Without(self.coarse, frozenset(other._hidden))
+        other.__dict__["walls"] = None
+        return other
 
     @cached_property
     def walls(self) -> WallIndex | None:
@@ -130,11 +141,25 @@ class OpenMap:
 
     def distances(self, world_from_cam: Rigid3) -> Float[np.ndarray, " nodes"]:
         """D_total of Eq. 1 (metres) between a camera and each node, whichever side of the camera is up."""
-        return viewing_distances(world_from_cam, self.node_poses, self.lambda_rot)
+        distances = viewing_distances(world_from_cam, self.node_poses, self.lambda_rot)
+        distances[self._hidden] = np.inf
+        return distances
 
     def nearest(self, world_from_cam: Rigid3, num_nodes: int) -> Int[np.ndarray, " n"]:
         """The rows of the nodes nearest to a camera, the nearest first."""
-        return np.argsort(self.distances(world_from_cam), kind="stable")[:num_nodes]
+        return np.argsort(self.distances(world_from_cam), kind="stable")[: min(num_nodes, len(self.node_ids) - len(self._hidden))]
+
+
+class _Without:
+    """A coarse localizer that does not name some nodes, by their rows."""
+
+    def __init__(self, coarse: CoarseLocalizer, hidden: frozenset[int]) -> None:
+        self._coarse, self._hidden = coarse, hidden
+
+    def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
+        """See `CoarseLocalizer.rank`."""
+        ranked = self._coarse.rank(image, features, num_candidates + len(self._hidden))
+        return [candidate for candidate in ranked if candidate.node_id not in self._hidden][:num_candidates]
 
 
 def _known_moves(topomap: TopoMetricMap) -> Mapping[int, Float[np.ndarray, "k 4 4"]] | None:

@@ -73,7 +73,7 @@ def propose_more(search: Search) -> Iterator[Proposal]:
 def _near(search: Search, world_from_cam: Rigid3) -> list[NodeScore]:
     """As many nodes as the coarse step would name; nearer ones (Eq. 1) score higher."""
     distances = search.map.distances(world_from_cam)
-    rows = np.argsort(distances, kind="stable")[: search.config.num_candidates]
+    rows = search.map.nearest(world_from_cam, search.config.num_candidates)
     search.ranked = [NodeScore(int(row), -float(distances[row])) for row in rows]
     return search.ranked
 

@@ -24,12 +24,12 @@ from topoloc.map.mapping_frames import MappingFrame, PointLocator, mapping_image
 from topoloc.map.nodes import NearestNodes, NodeConfig, NodePoses, place_nodes
 from topoloc.map.schema import SCHEMA_VERSION
 from topoloc.map.sessions import Edit, Light, Session, mean_light, path_of, poses_source_of, today
-from topoloc.map.shelf import Shelf
 from topoloc.map.side_nodes import gather_sides, nodes_with_sides
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.coarse import CoarseModel
 from topoloc.places.vlad import SurfVlad, learn_words_of, placed, vlad
 from topoloc.sequences.frame import StereoSequence
+from topoloc.shelf import Shelf
 
 BuildConfig = MapConfig
 Progress = Callable[[str, int, int], None]

@@ -14,9 +14,9 @@ from topoloc.map.config import MapConfig
 from topoloc.map.entries import NodeSummary, TopoNode
 from topoloc.map.landmarks import Observations, observe_points, refine_points, session_sums
 from topoloc.map.mapping_frames import MappingFrame, MappingImage, PointLocator, small_jpeg
-from topoloc.map.shelf import Shelf
 from topoloc.map.side_nodes import describe_sides
 from topoloc.places.vlad import placed
+from topoloc.shelf import Shelf
 from topoloc.slam.metric_points import keypoint_sigmas
 
 

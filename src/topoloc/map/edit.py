@@ -7,6 +7,7 @@ after it.
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
@@ -26,6 +27,8 @@ try:
     import fcntl
 except ImportError:  # Windows: of two edits at once the last one wins whole
     fcntl = None
+
+_WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 
 Waits = Callable[[], None]
 """Called where another process edits the map, before this one waits for it."""
@@ -68,7 +71,7 @@ def editing(path: str | Path, waits: Waits | None = None) -> Iterator[MapEdit]:
     """
     path = Path(os.path.realpath(path))
     with _locked(path, waits):
-        if not os.access(path, os.W_OK):
+        if not os.access(path, os.W_OK) or not path.stat().st_mode & _WRITABLE:  # nobody's to write, though root may
             raise MapError(f"cannot write map {path}: it is read-only")
         with TopoMetricMap.load(path) as topomap:
             yield MapEdit(path, topomap)

@@ -6,10 +6,9 @@ import threading
 import weakref
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass
 from typing import Any, Generic, TypeVar
 
-import numpy as np
+from topoloc.shelf import bytes_of
 
 T = TypeVar("T")
 
@@ -99,18 +98,3 @@ class RememberedNodes(Generic[T]):
             value = self._read(row)
             self._memory.put(self._owner, row, value, bytes_of(value))
         return value
-
-
-def bytes_of(value: Any) -> int:
-    """Bytes of the arrays and byte strings in a value, its fields and items, those of mappings too."""
-    if isinstance(value, np.ndarray):
-        return value.nbytes
-    if isinstance(value, bytes):
-        return len(value)
-    if isinstance(value, list | tuple):
-        return sum(bytes_of(item) for item in value)
-    if isinstance(value, dict):
-        return sum(bytes_of(item) for item in value.values())
-    if is_dataclass(value) and not isinstance(value, type):
-        return sum(bytes_of(getattr(value, item.name)) for item in fields(value))
-    return 0

@@ -41,7 +41,7 @@ class Session:
 
     `session_id` never changes and is never used again; two sessions may have one name. `recording` is the folder or file, as far as known.
     `poses_from` is `truth`, `slam`, the name of a trajectory file, or `given` where the caller brought the poses. Times are those of
-    the first and the last mapping image, nanoseconds of the recording's clock.
+    the first and the last mapping image, nanoseconds of the recording's clock. `light` is measured, `light_name` what the user calls it.
     """
 
     session_id: int
@@ -52,6 +52,7 @@ class Session:
     end_ns: int | None = None
     camera: Camera | None = None
     light: Light | None = None
+    light_name: str | None = None
 
     @property
     def start_date(self) -> str | None:

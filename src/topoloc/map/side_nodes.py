@@ -21,9 +21,9 @@ from topoloc.features.side_views import SideView, SideViewConfig, side_views
 from topoloc.geometry.rigid import Rigid3
 from topoloc.map.entries import NodeSummary, SideNodes, TopoNode
 from topoloc.map.nodes import NodeConfig, place_nodes
-from topoloc.map.shelf import Shelf
 from topoloc.places.vlad import SurfVlad, VladConfig, learn_words_of, placed, vlad
 from topoloc.sequences.frame_view import FrameView
+from topoloc.shelf import Shelf
 from topoloc.slam.metric_points import MetricPointsConfig, locate_points
 
 

@@ -22,9 +22,10 @@ from topoloc.map.contents import MapContents
 from topoloc.map.entries import Edge, NodeSummary, PlaceImage, Repetitions, SharedErrors, SideNodes, TopoNode
 from topoloc.map.file import MapFile
 from topoloc.map.reading import open_map
+from topoloc.map.session_light import light_of_nodes
 from topoloc.map.sessions import Edit, Session
 from topoloc.map.writing import save_map
-from topoloc.places.coarse import CoarseLocalizer, CoarseModel, open_coarse
+from topoloc.places.coarse import ByVectors, CoarseLocalizer, CoarseModel, open_coarse
 
 __all__ = [
     "Edge",
@@ -123,13 +124,16 @@ def _opened(read: tuple[MapContents, MapFile]) -> TopoMetricMap:
 
 
 def open_coarse_of(topomap: TopoMetricMap, name: str) -> CoarseLocalizer:
-    """A map's coarse localizer, which names nodes by their rows. Raises MapError where the map has none of this name, or it is damaged."""
+    """A map's coarse localizer, which names nodes by their rows. In `surf-vlad` what sets lights apart counts for less, where the map's
+    sessions were taken in several. Raises MapError where the map has none of this name, or it is damaged."""
     if (of_kind := f"{name}@{topomap.kind}") in topomap.coarse_models:
         name = of_kind
     if name not in topomap.coarse_models:
         available = ", ".join(name for name in topomap.coarse_models if "@" not in name) or "none"
         raise MapError(f"the map has no coarse localizer {name!r} (it has: {available})")
-    return open_coarse(in_rows(topomap.coarse_models[name], [summary.node_id for summary in topomap.summaries]))
+    coarse = open_coarse(in_rows(topomap.coarse_models[name], [summary.node_id for summary in topomap.summaries]))
+    lights = light_of_nodes(topomap.summaries, topomap.sessions) if len(topomap.sessions) > 1 else None
+    return coarse.with_less_between(lights) if isinstance(coarse, ByVectors) and lights is not None and lights.any() else coarse
 
 
 def in_rows(model: CoarseModel, ids: Sequence[int]) -> CoarseModel:

@@ -8,7 +8,6 @@ between writing the one file and the other, the next edit sees it and drops the 
 from __future__ import annotations
 
 import sqlite3
-import tempfile
 import zlib
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -20,7 +19,7 @@ from topoloc.errors import MapError
 from topoloc.map.file import MapFile, check_header
 from topoloc.map.schema import ORDER, SCHEMA_VERSION, TABLES, checksum_of, creation_of
 from topoloc.map.writing import copy_in_order
-from topoloc.sequences.atomic import remove_leftovers, replaced_file
+from topoloc.sequences.atomic import remove_leftovers, replaced_file, scratch_file
 
 _APPLICATION_ID = 0x544F5055  # "TOPU"
 _WIDTH = 1 + max(len(columns) for columns in TABLES.values())  # with the checksum
@@ -149,8 +148,7 @@ def _leads_back(log: sqlite3.Connection, depth: int, path: Path, changed: Path) 
     """Whether what is kept makes the file at `path` of the changed one, to the byte."""
     if check_header(path) != SCHEMA_VERSION:
         return False
-    with tempfile.TemporaryDirectory() as folder:
-        tried = Path(folder) / "before.topo"
+    with scratch_file(path_of_log(path)) as tried:
         _write_before(log, depth, changed, tried)
         return tried.read_bytes() == path.read_bytes()
 

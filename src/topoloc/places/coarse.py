@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Int, UInt8
 
 from topoloc.bounds import value_from
 from topoloc.errors import ConfigError, MapError, MissingExtraError
@@ -69,6 +69,15 @@ class CoarseLocalizer(Protocol):
     def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
         """Up to `num_candidates` distinct nodes by their rows in the map, best first. `features` are those of `image` that the fine
         step uses too."""
+        ...
+
+
+@runtime_checkable
+class ByVectors(CoarseLocalizer, Protocol):
+    """One that compares vectors of pictures."""
+
+    def with_less_between(self, group_of_node: Int[np.ndarray, " nodes"]) -> CoarseLocalizer:
+        """The same with less of what sets groups of nodes, by their rows, apart on the whole."""
         ...
 
 

@@ -26,6 +26,8 @@ from topoloc.places.neighbours import PlaceIndex, learn_whitening, visual_words
 from topoloc.places.place_kernels import add_residuals, multiply_rows
 
 _BLOCK = 1024  # vectors whitened at a time
+_LEAST_OF_GROUP = 8  # images whose mean vector says something of them all
+_LEFT_OUT = 0.5  # of what sets groups apart; all of it costs more where every group covers the whole place (docs/journal.md)
 
 
 @dataclass(frozen=True)
@@ -111,6 +113,28 @@ class SurfVlad:
         grid = self._grid.with_cells(np.stack(cells)) if self._grid is not None and len(cells) == len(pictures) else None
         all_ids = np.concatenate([self._node_ids, node_ids.astype(self._node_ids.dtype)])
         return SurfVlad(self._words, self._mean, self._projection, np.concatenate([self._vectors, vectors]), all_ids, self._config, grid)
+
+    def with_less_between(self, group_of_node: Int[np.ndarray, " nodes"]) -> SurfVlad:
+        """The same with less of what sets groups of nodes apart on the whole, such as the light in which they were taken: all vectors are
+        halved along the directions between the mean vectors of the groups' images.
+
+        A picture would else be like all pictures of its light before it is like any of its place. Groups of fewer than eight images say
+        nothing sure of theirs.
+
+        Args:
+            group_of_node: the group of each node that `node_ids` may name.
+        """
+        groups = group_of_node[self._node_ids]
+        numbers, counts = np.unique(groups, return_counts=True)
+        means = [self._vectors[groups == number].mean(axis=0) for number in numbers[counts >= _LEAST_OF_GROUP]]
+        if len(means) < 2:
+            return self
+        _, lengths, axes = np.linalg.svd(np.stack(means[1:]) - means[0], full_matrices=False)
+        axes = axes[lengths > 1e-4].astype(np.float32)
+        projection = np.ascontiguousarray(self._projection - _LEFT_OUT * axes.T @ (axes @ self._projection))
+        vectors = self._vectors - _LEFT_OUT * (self._vectors @ axes.T) @ axes
+        vectors = np.ascontiguousarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-6))
+        return SurfVlad(self._words, self._mean, projection, vectors, self._node_ids, self._config, self._grid)
 
     def to_model(self) -> CoarseModel:
         """What the map file keeps: vectors as half floats, a quarter of a kilobyte to half of one an image."""

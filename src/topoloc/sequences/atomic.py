@@ -67,8 +67,9 @@ def scratch_file(path: Path) -> Iterator[Path]:
     Raises:
         OSError: the folder cannot be written.
     """
-    remove_leftovers(path)
-    temporary, lock = _own_file(path)
+    target = _target(path)
+    remove_leftovers(target)
+    temporary, lock = _own_file(target)
     try:
         yield temporary
     finally:

@@ -62,6 +62,7 @@ class Answerer:
             raise QueryError("a prior is a pose in one map's world: ask that map")
         image = decoded_picture(asked.picture, self.max_pixels)
         camera = camera_named(asked.camera, asked.picture, (image.shape[1], image.shape[0]), None)
+        localizer = localizer if asked.near is None else localizer.near(asked.near)
         return localizer.localize(image, camera, max_ms=asked.max_ms)
 
     def explain(self, name: str, asked: Asked, as_page: bool) -> str:

@@ -14,7 +14,8 @@ from starlette.datastructures import UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import ClientDisconnect, Request
 
-from topoloc.errors import ResultError
+from topoloc.atlas.near import NearPlace
+from topoloc.errors import AtlasError, ResultError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization import checked_json
 from topoloc.sequences.pictures import PictureBytes
@@ -30,6 +31,7 @@ class Said(BaseModel):
 
     camera: str | None = Field(None, description="as the form's field `camera`", max_length=20_000, examples=CAMERA_EXAMPLES)
     prior: str | None = Field(None, description="as the form's field `prior`", max_length=2_000, examples=[PRIOR_EXAMPLE])
+    near: str | None = Field(None, description="as the form's field `near`", max_length=200, examples=["50.8775,4.7043,200"])
     max_ms: float | None = Field(None, description="milliseconds after which no further pose is tried", gt=0, le=600_000)
     name: str | None = Field(None, description="what the answer calls the picture", max_length=200)
 
@@ -39,13 +41,14 @@ class Asked:
     """A picture and what is said of it.
 
     `camera` is as `query_cameras.camera_named` reads it, None where nothing is said; `prior` is world_from_cam; `max_ms` is that of
-    `Localizer.localize`.
+    `Localizer.localize`; tiles of atlases that are known to lie elsewhere than `near` are not asked.
     """
 
     picture: PictureBytes
     camera: str | None = None
     prior: Rigid3 | None = None
     max_ms: float | None = None
+    near: NearPlace | None = None
 
 
 async def read_asked(request: Request, said: Said) -> Asked:
@@ -66,7 +69,8 @@ async def read_asked(request: Request, said: Said) -> Asked:
     name = fields.get("name", name)[:200]
     if not data:
         raise Refusal(400, f"{name}: the picture is empty")
-    return Asked(PictureBytes(name, data, PurePath(name).suffix), fields.get("camera"), _prior(fields), _max_ms(fields))
+    picture = PictureBytes(name, data, PurePath(name).suffix)
+    return Asked(picture, fields.get("camera"), _prior(fields), _max_ms(fields), _near(fields))
 
 
 async def read_body(request: Request) -> bytes:
@@ -116,6 +120,13 @@ def json_of(text: str, what: str) -> Any:
         return json.loads(text)
     except (ValueError, RecursionError):
         raise Refusal(422, f"{what}: not JSON") from None
+
+
+def _near(fields: Mapping[str, str]) -> NearPlace | None:
+    try:
+        return NearPlace.parse(fields["near"]) if "near" in fields else None
+    except AtlasError as error:
+        raise Refusal(422, f"near: {error}") from None
 
 
 def _max_ms(fields: Mapping[str, str]) -> float | None:

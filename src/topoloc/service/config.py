@@ -27,6 +27,9 @@ class ServiceConfig:
     """Seconds in which a request must be there whole, and in which a client must take its answer."""
     answer_s: Annotated[float, Above(0)] = 30.0
     """Seconds in which a request is answered, waiting included; then it is told that it took too long."""
+    geolocation_m: Annotated[float, Above(0)] = 100.0
+    """Where a request of the GeoPose Protocol says where the device is, tiles of atlases are not asked that lie further from there than
+    so many metres and three times the accuracy that the device claims."""
     max_sessions: Annotated[int, Between(0, 100_000)] = 64
     """Streams at a time."""
     session_idle_s: Annotated[float, Above(0)] = 60.0

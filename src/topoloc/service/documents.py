@@ -22,6 +22,10 @@ _CAMERA = {
     'a JSON object as camera.json, or COLMAP\'s `{"model": "OPENCV", "params": [...]}` (centre of the top-left pixel at 0.5, 0.5)',
 }
 _PRIOR = {"type": "string", "description": "about where the camera is, world_from_cam as results write it (JSON)"}
+_NEAR = {
+    "type": "string",
+    "description": "`LAT,LON,METRES`: tiles of atlases that are known to lie further from this place on earth are not asked; maps are",
+}
 CAMERA_EXAMPLES = ["unknown", "380,380,319.5,199.5", '{"model": "OPENCV", "params": [380, 380, 320, 200, 0.01, 0, 0, 0]}']
 PRIOR_EXAMPLE = '{"translation": [0.2, 0.0, 1.4], "quat_wxyz": [1, 0, 0, 0]}'
 _REFUSED = {
@@ -47,6 +51,7 @@ _FORM = {
         "image": {"type": "string", "format": "binary", "description": "PNG, JPEG, BMP, PNM, TIFF or WebP; HEIC with the extra heic"},
         "camera": _CAMERA,
         "prior": _PRIOR,
+        "near": _NEAR,
         "max_ms": {"type": "number", "exclusiveMinimum": 0, "maximum": 600000},
         "name": {"type": "string", "maxLength": 200},
     },

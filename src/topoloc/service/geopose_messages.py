@@ -10,17 +10,21 @@ import base64
 import binascii
 import math
 import re
-from typing import Any
+from contextlib import suppress
+from typing import Any, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
+from topoloc.atlas.near import NearPlace
+from topoloc.errors import AtlasError
 from topoloc.geometry.geodesy import Georeference
 from topoloc.localization.result import Localization
 from topoloc.sequences.frame import Image
 from topoloc.sequences.pictures import PictureBytes
 from topoloc.service.refusals import Refusal
 
+R = TypeVar("R", bound=BaseModel)
 MEDIA_TYPE = "application/vnd.oscp+json"
 _RAW_CHANNELS = {"RGBA32": 4, "GRAY8": 1}
 _VERSION = re.compile(r"version=\"?([0-9]+(?:\.[0-9]+)?)")
@@ -69,10 +73,19 @@ class CameraReading(BaseModel):
     params: CameraParam | None = None
 
 
+class GeolocationReading(BaseModel):
+    """Where the device takes itself to be: degrees, and metres of which two thirds of all readings are closer to the truth."""
+
+    latitude: float | None = None
+    longitude: float | None = None
+    accuracy: float | None = None
+
+
 class SensorReadings(BaseModel):
     """Version 2."""
 
     cameraReadings: list[CameraReading] | None = None
+    geolocationReadings: list[GeolocationReading] | None = None
 
 
 class SensorReading(BaseModel):
@@ -101,11 +114,26 @@ class GeoPoseRequest(BaseModel):
         if isinstance(readings, SensorReadings):
             found = readings.cameraReadings or []
         else:
-            found = [_flat_reading(one) for one in readings if "imageBytes" in (one.reading or {})]
+            found = [_flat_reading(one, CameraReading) for one in readings if "imageBytes" in (one.reading or {})]
         if not found:
             raise Refusal(400, "the request has no reading of a camera")
         params = {sensor.id: sensor.params for sensor in self.sensors}
         return found[0].model_copy(update={"params": found[0].params or params.get(found[0].sensorId)})
+
+    def near(self, slack_m: float) -> NearPlace | None:
+        """Where the device takes itself to be, by the first reading that says how exactly, with three times that and `slack_m` metres
+        around it. None where no reading says so, or one makes no sense: then nothing is known."""
+        readings = self.sensorReadings
+        if isinstance(readings, SensorReadings):
+            found = readings.geolocationReadings or []
+        else:
+            found = [_flat_reading(one, GeolocationReading) for one in readings if "latitude" in (one.reading or {})]
+        for one in found:
+            if one.latitude is None or one.longitude is None or not one.accuracy or one.accuracy < 0.0:  # some send 0 for "unknown"
+                continue
+            with suppress(AtlasError):
+                return NearPlace(one.latitude, one.longitude, 3.0 * one.accuracy + slack_m)
+        return None
 
 
 class Accuracy(BaseModel):
@@ -220,9 +248,9 @@ def reply_to(request: GeoPoseRequest, result: Localization, georeference: Georef
     )
 
 
-def _flat_reading(one: SensorReading) -> CameraReading:
+def _flat_reading(one: SensorReading, kind: type[R]) -> R:
     try:
-        return CameraReading.model_validate({**(one.reading or {}), "sensorId": one.sensorId})
+        return kind.model_validate({**(one.reading or {}), "sensorId": one.sensorId})
     except ValidationError as error:
         first = error.errors(include_input=False, include_url=False)[0]
-        raise Refusal(400, f"no camera reading: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        raise Refusal(400, f"no reading of this kind: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None

@@ -1,4 +1,4 @@
-"""POST /localize/geopose: the OSCP GeoPose Protocol, by all maps that know their place on earth."""
+"""POST /localize/geopose: the OSCP GeoPose Protocol, by all maps and atlases that know their place on earth."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from fastapi import APIRouter, Query, Request
 from fastapi.responses import JSONResponse, Response
 
 from topoloc.geometry.camera import Camera
+from topoloc.geometry.geodesy import Georeference
 from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.map.topomap import TopoMetricMap
@@ -79,28 +80,41 @@ async def localize_geopose(request: Request, only: MapOnly = None) -> Response:
 
 
 def _replied(service: Service, body: bytes, only: str | None) -> tuple[GeoPoseReply | None, dict[str, Localization | NotLocalized]]:
-    """The work of a request: the answer of each map, and the reply where they agree on one."""
+    """The work of a request: the answer of each map, and of each atlas; and the reply where they agree on one place."""
     asked = read_request(body)
     reading = asked.camera_reading()
     picture = picture_of(reading)
     image = decoded_picture(picture, service.answerer.max_pixels) if isinstance(picture, PictureBytes) else picture
-    results, georeferences = {}, {}
-    for name in [only] if only is not None else service.maps.paths():
+    localizers = [] if only is not None else service.answerer.atlases.localizers()
+    tiles = {tile_id for localizer in localizers for tile_id in localizer.atlas.manifest.by_id}
+    localizers = [] if only is not None else service.answerer.atlases.localizers()
+    tiles = {tile_id for localizer in localizers for tile_id in localizer.atlas.manifest.by_id}
+    results, georeferences = dict[str, Localization | NotLocalized](), dict[str, Georeference]()
+    for name in [only] if only is not None else [name for name in service.maps.paths() if name not in tiles]:
         with service.maps.lent(name) as opened:
             topomap = opened.localizer.topomap
             if topomap.georeference is not None:
                 camera = _camera_of(reading, picture, image, topomap)
                 results[name] = opened.localizer.localize(image, camera, max_ms=service.answerer.max_ms)
                 georeferences[name] = topomap.georeference
+    near = asked.near(service.config.geolocation_m)
+    for localizer in localizers:
+        known = {tile.tile_id: tile.georeference for tile in localizer.atlas.manifest.tiles if tile.georeference is not None}
+        if known:
+            camera = _camera_of(reading, picture, image, None)
+            result = localizer.near(near, placed_only=True).localize(image, camera, max_ms=service.answerer.max_ms)
+            results[result.provenance.tile or ""] = result
+            georeferences |= known
     if not results:
         raise Refusal(409, "no map here knows where on earth it lies; `topoloc georeference` tells it")
-    best = _agreed({name: result for name, result in results.items() if isinstance(result, Localization)})
+    found = {name: result for name, result in results.items() if isinstance(result, Localization)}
+    best = _agreed(found)
     if best is None:
         return None, results
-    return reply_to(asked, results[best], georeferences[best], 1e3 * time.time()), results
+    return reply_to(asked, found[best], georeferences[best], 1e3 * time.time()), results
 
 
-def _camera_of(reading: CameraReading, picture: PictureBytes | Image, image: Image, topomap: TopoMetricMap) -> Camera | RoughCamera:
+def _camera_of(reading: CameraReading, picture: PictureBytes | Image, image: Image, topomap: TopoMetricMap | None) -> Camera | RoughCamera:
     """What the request says of the camera, else the picture's file, else any usual lens."""
     height, width = image.shape[:2]
     told = camera_json(reading)

@@ -129,11 +129,12 @@ def _add_link_landmarks(
     link: Link, keyframes: Sequence[KeyFrame], landmarks: Landmarks, landmark_of: dict[tuple[int, int], int], config: GlobalMapConfig
 ) -> None:
     source = keyframes[link.source]
-    assert source.place is not None
+    place = source.place
+    assert place is not None
     for source_row, target_row in zip(link.match.source_rows.tolist(), link.match.target_rows.tolist(), strict=True):
         known = landmark_of.get((link.source, source_row))
         if known is None:
-            point = source.cam_from_world.inverse().apply(source.place.points.points_cam[source_row][None])
+            point = source.cam_from_world.inverse().apply(place.points.points_cam[source_row][None])
             known = int(landmarks.add(point)[0])
             landmark_of[link.source, source_row] = known
             source.observations.append(_feature_observation(source, source_row, known, config))

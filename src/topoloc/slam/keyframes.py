@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.shelf import Shelf
 from topoloc.slam.metric_points import MetricPoints
 
 
@@ -99,7 +100,7 @@ class Motion:
 class KeyFrame:
     """A frame that SLAM keeps. `cam_from_world` is that of the rectified view and changes as the map is optimised.
 
-    `motion` is None for the first of a sub-map.
+    `motion` is None for the first of a sub-map. How it looks lies on a shelf that it shares with others (`places`), at `place_row`.
     """
 
     recording: int
@@ -111,7 +112,23 @@ class KeyFrame:
     observations: Observations
     bias: DisparityBias
     motion: Motion | None = None
-    place: PlaceView | None = None
+    places: Shelf[PlaceView] = field(default_factory=lambda: Shelf[PlaceView]())
+    place_row: int | None = None
+
+    @property
+    def has_place(self) -> bool:
+        """Whether it is known how it looks."""
+        return self.place_row is not None
+
+    @property
+    def place(self) -> PlaceView | None:
+        """How it looks, where that is known."""
+        return None if self.place_row is None else self.places[self.place_row]
+
+    @place.setter
+    def place(self, view: PlaceView) -> None:
+        self.place_row = len(self.places)
+        self.places.append(view)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,15 +7,17 @@ as it does (of equal panels, one is as good as the next), and a second one besid
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
 
 from topoloc.bounds import Above, AtLeast, Between
+from topoloc.features.features import Features
 from topoloc.geometry.rigid import Rigid3
-from topoloc.places.vlad import SurfVlad, VladConfig, learn_words, vlad
+from topoloc.places.vlad import SurfVlad, VladConfig, learn_words_of, vlad
+from topoloc.shelf import Shelf
 from topoloc.slam.keyframes import KeyFrame
 from topoloc.slam.place_matching import PlaceMatch, PlaceMatchingConfig, match_places
 
@@ -61,7 +63,7 @@ def find_links(
     keyframes: Sequence[KeyFrame], config: LoopConfig, progress: Callable[[str, int, int], None] = lambda stage, done, total: None
 ) -> list[Link]:
     """All links that passed the guards, in the order of their targets."""
-    places = [i for i, keyframe in enumerate(keyframes) if keyframe.place is not None]
+    places = [i for i, keyframe in enumerate(keyframes) if keyframe.has_place]
     if len(places) < 2:
         return []
     proposals = _propose(keyframes, places, config)
@@ -89,16 +91,22 @@ def _propose(keyframes: Sequence[KeyFrame], places: list[int], config: LoopConfi
     return sorted(pairs)
 
 
-def rank_places(keyframes: Sequence[KeyFrame], config: VladConfig) -> list[list[int]]:
+def rank_places(keyframes: Sequence[KeyFrame], config: VladConfig) -> Iterator[list[int]]:
     """For each key frame, which must have places, all of them (rows) by how much they look like it; nothing where there are no features."""
-    features = [keyframe.place.features for keyframe in keyframes if keyframe.place is not None]
-    descriptors = np.concatenate([f.descriptors for f in features])
-    if len(descriptors) == 0:
-        return []
-    words = learn_words(descriptors, config)
-    localizer = SurfVlad.fit(words, np.stack([vlad(f.descriptors, words) for f in features]), np.arange(len(features)), config)
-    blank = np.zeros((1, 1), np.uint8)
-    return [[score.node_id for score in localizer.rank(blank, own, len(features))] for own in features]
+
+    def features(row: int) -> Features:
+        place = keyframes[row].place
+        assert place is not None
+        return place.features
+
+    num_features = [len(features(row)) for row in range(len(keyframes))]
+    if sum(num_features) == 0:
+        return
+    words = learn_words_of(num_features, lambda row: features(row).descriptors, config)
+    vlads = Shelf(vlad(features(row).descriptors, words) for row in range(len(keyframes)))
+    localizer, blank = SurfVlad.fit(words, vlads, np.arange(len(keyframes)), config), np.zeros((1, 1), np.uint8)
+    for row in range(len(keyframes)):
+        yield [score.node_id for score in localizer.rank(blank, features(row), len(keyframes))]
 
 
 def _may_be_loop(keyframes: Sequence[KeyFrame], places: list[int], a: int, b: int, config: LoopConfig) -> bool:

@@ -9,14 +9,17 @@ steps and the motion does not tell which.
 
 from __future__ import annotations
 
+from itertools import islice
+
 import numpy as np
 
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.frame import StereoFrame
+from topoloc.shelf import Shelf
 from topoloc.slam.bundle import adjust_bundle
 from topoloc.slam.disparity import MeasuredView, measure_disparities, measured_view
 from topoloc.slam.input_checks import InputChecks
-from topoloc.slam.keyframes import DisparityBias, FramePose, KeyFrame, Landmarks, Motion, Observations
+from topoloc.slam.keyframes import DisparityBias, FramePose, KeyFrame, Landmarks, Motion, Observations, PlaceView
 from topoloc.slam.motion_prediction import MotionHistory, expected_one
 from topoloc.slam.place_matching import match_places, place_view
 from topoloc.slam.steps import LastFrame, OdometryConfig, Step, StepSeeker, Tracks
@@ -39,6 +42,7 @@ class Odometry:
         self._history = MotionHistory(config.prediction)
         self._repeats: list[Rigid3] = []  # of the last frame before the camera was lost
         self._bias = DisparityBias()
+        self._places = Shelf[PlaceView]()
 
     def process(self, frame_idx: int, frame: StereoFrame) -> list[FramePose]:
         """Where this frame is, and those before it whose place is known only now; nothing where that is not known."""
@@ -140,6 +144,7 @@ class Odometry:
             self._observations(ids, values[rows], sigmas[rows]),
             self._bias,
             motion,
+            self._places,
         )
         self._keyframes.append(keyframe)
         self._chain.append(keyframe)
@@ -188,7 +193,7 @@ class Odometry:
         if self._reference is None:
             return []
         candidates = (k for k in reversed(self._keyframes) if k.recording == self._recording and k.submap == self._reference.submap)
-        return [keyframe for keyframe in candidates if keyframe.place is not None][:num]
+        return list(islice((keyframe for keyframe in candidates if keyframe.has_place), num))
 
     def _lost(self, frame_idx: int, frame: StereoFrame, measured: MeasuredView) -> list[FramePose]:
         """Seek the camera in the last places; after a while begin again."""
@@ -242,8 +247,9 @@ class Odometry:
         here = place_view(measured.view, self._config.places)
         prediction = self._history.predict(frame.t_ns)
         for keyframe in self._last_places(self._config.places_asked):
-            assert keyframe.place is not None
-            match = match_places(keyframe.place, here, measured.stereo, self._config.places)
+            place = keyframe.place
+            assert place is not None
+            match = match_places(place, here, measured.stereo, self._config.places)
             if match is None:
                 continue
             cam_from_world = match.target_from_source @ keyframe.cam_from_world

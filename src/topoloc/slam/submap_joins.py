@@ -81,7 +81,7 @@ class _Ends:
 def find_joins(keyframes: Sequence[KeyFrame], links: Sequence[Link], look: Look, config: JoinConfig, loops: LoopConfig) -> list[Link]:
     """Links that join sub-maps which `links` leave apart; key frames that are compared get their place."""
     groups = group_submaps(keyframes, links)
-    places = [i for i, keyframe in enumerate(keyframes) if keyframe.place is not None]
+    places = [i for i, keyframe in enumerate(keyframes) if keyframe.has_place]
     if len(set(groups.values())) < 2 or len(places) < 2:
         return []
     joins: list[Link] = []
@@ -91,7 +91,7 @@ def find_joins(keyframes: Sequence[KeyFrame], links: Sequence[Link], look: Look,
         seeds = sorted(found, key=lambda link: -len(link.match.source_rows))[: config.num_seeds]
         around = _around(seeds, keyframes, config) - set(pairs)
         for i in sorted({i for pair in around for i in pair}):
-            if keyframes[i].place is None:
+            if not keyframes[i].has_place:
                 keyframes[i].place = look(keyframes[i])
         found += _matched(sorted(around), keyframes, config, loops)
         joins += _agreeing([link for link in found if _is_distinct(link, keyframes, repeated, config)], keyframes, config)
@@ -238,9 +238,7 @@ def _near_views(
     first_from_second: Rigid3, keyframes: Sequence[KeyFrame], ends: _Ends, config: JoinConfig
 ) -> list[tuple[int, int, Int[np.ndarray, " n"]]]:
     """Source, target and the source's features that are seen alike, of the pairs of places that have most of these; both ways."""
-    ones, others = (
-        [i for i, k in enumerate(keyframes) if k.submap == end.submap and k.place is not None] for end in (ends.first, ends.second)
-    )
+    ones, others = ([i for i, k in enumerate(keyframes) if k.submap == end.submap and k.has_place] for end in (ends.first, ends.second))
     first_from_ones = [ends.first.cam_from_world @ keyframes[a].cam_from_world.inverse() for a in ones]
     first_from_others = [first_from_second @ ends.second.cam_from_world @ keyframes[b].cam_from_world.inverse() for b in others]
     places, other_places = (np.array([pose.translation for pose in poses]) for poses in (first_from_ones, first_from_others))
@@ -258,9 +256,10 @@ def _near_views(
 
 def _alike(source: KeyFrame, target: KeyFrame, target_from_source: Rigid3, config: JoinConfig) -> Int[np.ndarray, " n"]:
     """Which features of `source` lie within the picture of `target`, and are seen from about the same side and as far away."""
-    assert source.place is not None
-    valid = np.flatnonzero(source.place.points.valid)
-    points = target_from_source.apply(source.place.points.points_cam[valid])
+    place = source.place
+    assert place is not None
+    valid = np.flatnonzero(place.points.valid)
+    points = target_from_source.apply(place.points.points_cam[valid])
     pixels, camera = target.stereo.project(points)[:, :2], target.stereo.camera
     with np.errstate(invalid="ignore"):
         is_inside = np.all((pixels > 0.0) & (pixels < [camera.width - 1.0, camera.height - 1.0]), axis=1)

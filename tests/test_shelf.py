@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from topoloc.errors import MapError
-from topoloc.map import shelf
-from topoloc.map.shelf import Shelf
+from topoloc import shelf
+from topoloc.errors import TopolocError
+from topoloc.shelf import Shelf
 
 
 @dataclass(eq=False)
@@ -80,5 +80,5 @@ def test_a_full_disk_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch):
             raise sqlite3.OperationalError("database or disk is full")
 
     monkeypatch.setattr(shelf.sqlite3, "connect", lambda *_, **__: Full())
-    with pytest.raises(MapError, match=r"TMPDIR.*disk is full"):
+    with pytest.raises(TopolocError, match=r"TMPDIR.*disk is full"):
         Shelf([np.zeros(5)], max_bytes=0)

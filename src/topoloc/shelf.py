@@ -9,10 +9,12 @@ import threading
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
 from typing import Any, TypeVar, overload
 
-from topoloc.errors import MapError
-from topoloc.map.memory import bytes_of
+import numpy as np
+
+from topoloc.errors import TopolocError
 
 T = TypeVar("T")
 
@@ -30,7 +32,7 @@ class Shelf(Sequence[T]):
         by_reference: objects that stay in memory in any case; entries that refer to them refer to these same objects when they come back.
 
     Raises:
-        MapError: the folder of temporary files has no room left; from whatever adds entries or looks at them.
+        TopolocError: the folder of temporary files has no room left; from whatever adds entries or looks at them.
     """
 
     def __init__(self, entries: Iterable[T] = (), max_bytes: int | None = None, by_reference: Sequence[object] = ()) -> None:
@@ -117,7 +119,7 @@ class Shelf(Sequence[T]):
         try:
             yield
         except sqlite3.OperationalError as error:
-            raise MapError(f"the folder of temporary files (TMPDIR) does not hold the map in the making: {error}") from error
+            raise TopolocError(f"the folder of temporary files (TMPDIR) does not hold what is in the making: {error}") from error
 
 
 class _Pickler(pickle.Pickler):
@@ -136,3 +138,18 @@ class _Unpickler(pickle.Unpickler):
 
     def persistent_load(self, pid: Any) -> object:
         return self._referred[pid]
+
+
+def bytes_of(value: Any) -> int:
+    """Bytes of the arrays and byte strings in a value, its fields and items, those of mappings too."""
+    if isinstance(value, np.ndarray):
+        return value.nbytes
+    if isinstance(value, bytes):
+        return len(value)
+    if isinstance(value, list | tuple):
+        return sum(bytes_of(item) for item in value)
+    if isinstance(value, dict):
+        return sum(bytes_of(item) for item in value.values())
+    if is_dataclass(value) and not isinstance(value, type):
+        return sum(bytes_of(getattr(value, item.name)) for item in fields(value))
+    return 0

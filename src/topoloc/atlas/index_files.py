@@ -1,0 +1,212 @@
+"""The index of an atlas, made once: shards of places in the cache folder, used again as long as their tiles are the atlas's.
+
+A shard holds tiles by their ids and the checksums of their place vectors. Whoever opens an atlas takes the shards that are there, without
+reading the vectors of their tiles again. Tiles that came since are compared exactly while they are few, else they become a shard, together
+with the small ones. Tiles that were removed or replaced stay in their shard unseen, until they are a quarter of it. So an index is never
+older than the manifest, and the cache folder may be emptied at any time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float16
+
+from topoloc.atlas.index import AtlasIndex
+from topoloc.atlas.manifest import Tile
+from topoloc.atlas.place_shard import PlaceShard, ShardTile
+from topoloc.atlas.place_vectors import PlaceVectors
+from topoloc.errors import AtlasError
+from topoloc.features.network_files import cache_folder
+from topoloc.places.shared_vocabulary import shared_vocabulary
+
+MAX_EXACT_PLACES, SHARD_PLACES = 20_000, 1 << 20
+"""So many places that lie in no shard are compared one by one; so many places a shard holds, but for those of one tile."""
+_MAX_UNSEEN, _UNUSED_S = 0.25, 86_400.0
+ReadPlaces = Callable[[Tile], PlaceVectors]
+_Rows = tuple[ShardTile, Float16[np.ndarray, "_ _"]]
+
+
+@dataclass(frozen=True, eq=False)
+class OpenedIndex:
+    """The index; why tiles cannot be ranked, by their ids; and what was wrong with its files."""
+
+    index: AtlasIndex
+    problems: dict[str, str]
+    notes: list[str]
+
+
+@dataclass(frozen=True, eq=False)
+class _Kept:
+    """A shard, and which of its tiles count."""
+
+    shard: PlaceShard
+    is_live: list[bool]
+
+    @property
+    def live(self) -> list[ShardTile]:
+        return [tile for tile, is_live in zip(self.shard.tiles, self.is_live, strict=True) if is_live]
+
+    @property
+    def num_live(self) -> int:
+        return sum(tile.num_rows for tile in self.live)
+
+    def rows(self) -> list[_Rows]:
+        """The tiles that count, with their vectors."""
+        bounds, tiles = self.shard.bounds, enumerate(self.shard.tiles)
+        return [(tile, self.shard.vectors[bounds[k] : bounds[k + 1]]) for k, tile in tiles if self.is_live[k]]
+
+
+def index_folder(where: str) -> Path:
+    """Where the shards of the atlas there lie on this machine."""
+    place = where if "://" in where else str(Path(where).resolve())
+    return cache_folder() / "indexes" / hashlib.sha256(place.encode()).hexdigest()[:16]
+
+
+def open_index(tiles: Sequence[Tile], read: ReadPlaces, folder: Path) -> OpenedIndex:
+    """The index over these tiles by what lies in `folder`; what is lacking there is made, and kept there where that can be written.
+
+    Args:
+        read: the place vectors of a tile; raises AtlasError where they cannot be had.
+    """
+    work = _Opening(tiles, folder)
+    kept = {kind: work.kept(kind) for kind in work.versions}
+    few = work.read_rest(kept, read)
+    for kind, vectors in few.items():
+        if sum(len(rows) for _, rows in vectors) > MAX_EXACT_PLACES:
+            kept[kind] = work.with_new_shards(kind, kept[kind], vectors)
+    work.remove_unused(kept)
+    ids = [tile.tile_id for tile in tiles]
+    exact = dict[str, dict[str, np.ndarray]]()
+    for kind, vectors in few.items():
+        for tile, rows in vectors:
+            exact.setdefault(tile.tile_id, {})[kind] = rows.astype(np.float32)
+    numbers = {tile_id: number for number, tile_id in enumerate(ids)}
+    shards = [
+        (one.shard, [numbers[tile.tile_id] if live else -1 for tile, live in zip(one.shard.tiles, one.is_live, strict=True)])
+        for of_kind in kept.values()
+        for one in of_kind
+    ]
+    return OpenedIndex(AtlasIndex(ids, [exact.get(tile_id, {}) for tile_id in ids], shards), work.problems, work.notes)
+
+
+@dataclass(eq=False)
+class _Opening:
+    """The work of opening an index."""
+
+    tiles: Sequence[Tile]
+    folder: Path
+    notes: list[str] = field(default_factory=list)
+    problems: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._checksums = {tile.tile_id: tile.places.sha256 for tile in self.tiles}
+        vocabularies = {kind: shared_vocabulary(kind) for tile in self.tiles for kind in tile.vocabularies}
+        self.versions = {kind: vocabulary.version for kind, vocabulary in sorted(vocabularies.items()) if vocabulary is not None}
+
+    @cached_property
+    def stored(self) -> list[PlaceShard]:
+        """The shards that lie in the folder, the largest first. One that is damaged is removed, and made anew where it is lacking."""
+        shards = list[PlaceShard]()
+        for path in sorted(self.folder.glob("*.index")):
+            try:
+                shards.append(PlaceShard.open(path))
+            except AtlasError as error:
+                self.notes.append(f"the index is made anew: {error}")
+                with suppress(OSError):
+                    path.unlink()
+        return sorted(shards, key=lambda shard: (-len(shard.vectors), shard.name))
+
+    def kept(self, kind: str) -> list[_Kept]:
+        """The shards of this kind most of whose tiles are the atlas's, as they are now; a tile counts in the first one that has it."""
+        kept, seen = list[_Kept](), set[str]()
+        for shard in self.stored:
+            if (shard.kind, shard.vocabulary) != (kind, self.versions[kind]):
+                continue
+            is_live = [self._checksums.get(tile.tile_id) == tile.sha256 and tile.tile_id not in seen for tile in shard.tiles]
+            one = _Kept(shard, is_live)
+            if one.num_live >= (1.0 - _MAX_UNSEEN) * len(shard.vectors):
+                kept.append(one)
+                seen.update(tile.tile_id for tile in one.live)
+        return kept
+
+    def read_rest(self, kept: dict[str, list[_Kept]], read: ReadPlaces) -> dict[str, list[_Rows]]:
+        """The place vectors, by kind, of tiles that lie in no shard of it; as soon as they fill one they are made one of those `kept`."""
+        known = {kind: {tile.tile_id for one in of_kind for tile in one.live} for kind, of_kind in kept.items()}
+        rest, num_rows = {kind: list[_Rows]() for kind in kept}, dict.fromkeys(kept, 0)
+        for tile in self.tiles:
+            ours = [kind for kind, version in tile.vocabularies.items() if self.versions.get(kind) == version]
+            lacking = [kind for kind in ours if tile.tile_id not in known[kind]]
+            if ours and not lacking:
+                continue
+            try:
+                vectors = read(tile)
+            except AtlasError as error:
+                self.problems[tile.tile_id] = str(error)
+                continue
+            for kind in lacking:
+                if len(rows := vectors.get(kind, np.zeros((0, 1)))) > 0:
+                    rest[kind].append((ShardTile(tile.tile_id, tile.places.sha256, len(rows)), rows.astype(np.float16)))
+                    num_rows[kind] += len(rows)
+                if num_rows[kind] >= SHARD_PLACES:
+                    kept[kind].append(self._new_shard(kind, rest[kind]))
+                    num_rows[kind] = sum(one.num_rows for one, _ in rest[kind])
+        return rest
+
+    def with_new_shards(self, kind: str, kept: Sequence[_Kept], rest: list[_Rows]) -> list[_Kept]:
+        """All of them in shards; those that are less than half full are made one with the rest, which is emptied."""
+        full = [one for one in kept if one.num_live >= SHARD_PLACES // 2]
+        pending = [row for one in kept if one not in full for row in one.rows()] + rest
+        rest.clear()
+        while pending:
+            full.append(self._new_shard(kind, pending))
+        return full
+
+    def _new_shard(self, kind: str, pending: list[_Rows]) -> _Kept:
+        """A shard of the first of these tiles, as many as it holds, which are taken out of the list."""
+        sizes = np.cumsum([tile.num_rows for tile, _ in pending])
+        count = max(1, int(np.searchsorted(sizes, SHARD_PLACES, "right")))
+        tiles = [tile for tile, _ in pending[:count]]
+        shard = PlaceShard(kind, self.versions[kind], tiles, _taken(pending, count))
+        return _Kept(self._saved(shard), [True] * count)
+
+    def _saved(self, shard: PlaceShard) -> PlaceShard:
+        """As it lies in its file, of which only pages that are asked come into memory; where that cannot be written, as it is."""
+        try:
+            return PlaceShard.open(shard.save(self.folder))
+        except (OSError, AtlasError) as error:
+            text = "the index stays in memory, and is made at each opening: cannot write"
+            if not any(note.startswith(text) for note in self.notes):
+                self.notes.append(f"{text} {self.folder}: {getattr(error, 'strerror', None) or error}")
+            return shard
+
+    def remove_unused(self, kept: dict[str, list[_Kept]]) -> None:
+        """Files that nobody has opened for a day; of those used now it is said that they are."""
+        used = {one.shard.name for of_kind in kept.values() for one in of_kind}
+        for path in self.folder.glob("*.index"):
+            with suppress(OSError):
+                if path.name in used:
+                    os.utime(path)
+                elif time.time() - path.stat().st_mtime > _UNUSED_S:
+                    path.unlink()
+
+
+def _taken(pending: list[_Rows], count: int) -> Float16[np.ndarray, "n d"]:
+    """The vectors of the first tiles, which are let go of one by one: they are half of a gigabyte."""
+    num_rows = sum(tile.num_rows for tile, _ in pending[:count])
+    stacked, first = np.empty((num_rows, pending[0][1].shape[1]), np.float16), 0
+    for number in range(count):
+        tile, rows = pending[number]
+        stacked[first : first + tile.num_rows] = rows
+        first += tile.num_rows
+        pending[number] = tile, rows[:0].copy()
+    del pending[:count]
+    return stacked
