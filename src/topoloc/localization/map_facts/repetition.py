@@ -14,9 +14,10 @@ all of them (`refine.py`). What tells them apart is what does not repeat itself,
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from topoloc.features.matching import MatchingConfig, match_features
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
@@ -64,18 +65,18 @@ def shifts_of(node: LocalMap, around: LocalMap, min_share: float = 0.5) -> Float
     far = np.linalg.norm(shifts, axis=1) > LEAST_SHIFT
     rows, shifts = rows[far], shifts[far]
     found: list[Float[np.ndarray, " 3"]] = []
-    least = max(_MIN_VOTES, min_share * len(points))
-    while len(shifts) and len(found) < _MAX_SHIFTS:
-        centre = _densest(shifts, rows)
-        near = np.linalg.norm(shifts - centre, axis=1) < 1.5 * _CELL
+    least, left = max(_MIN_VOTES, min_share * len(points)), np.ones(len(shifts), np.bool_)
+    grids = [_Votes.of(shifts, rows, offset) for offset in (0.0, 0.5)]  # that overlap: no shift lies at the borders of both
+    while left.any() and len(found) < _MAX_SHIFTS:
+        _, voters = max((grid.densest(left) for grid in grids), key=lambda most: most[0])
+        near = left & (np.linalg.norm(shifts - np.median(shifts[voters], axis=0), axis=1) < 1.5 * _CELL)
         votes = len(np.unique(rows[near]))
         if votes < least:
             break
         if not found:
             least = max(_MIN_VOTES, 0.5 * votes)
         found.append(np.median(shifts[near], axis=0))
-        kept = np.linalg.norm(shifts - found[-1], axis=1) > 3.0 * _CELL
-        rows, shifts = rows[kept], shifts[kept]
+        left &= np.linalg.norm(shifts - found[-1], axis=1) > 3.0 * _CELL
     return np.array(found).reshape(-1, 3)
 
 
@@ -99,18 +100,29 @@ def copy_of(node: TopoNode, others: LocalMap) -> Rigid3 | None:
     return move if float(np.median(way)) > LEAST_SHIFT else None
 
 
-def _densest(shifts: Float[np.ndarray, "n 3"], rows: np.ndarray) -> Float[np.ndarray, " 3"]:
-    """The middle of the cell that most points vote for, of two grids that overlap."""
-    best, most = shifts[0], 0
-    for offset in (0.0, 0.5):
-        cells = np.floor(shifts / (2.0 * _CELL) + offset).astype(np.int64) + _HALF
-        keys = (cells[:, 0] * 2 * _HALF + cells[:, 1]) * 2 * _HALF + cells[:, 2]
-        votes = np.unique(keys * _NUM_POINTS + rows) // _NUM_POINTS  # of each point once a cell
-        found, counts = np.unique(votes, return_counts=True)
-        if counts.max() > most:
-            most = int(counts.max())
-            best = np.median(shifts[keys == found[counts.argmax()]], axis=0)
-    return best
+@dataclass(frozen=True, eq=False)
+class _Votes:
+    """Shifts by the cells of a grid that they lie in: `order` sorts them by cell and point, `cells` and `points` are sorted so."""
+
+    order: Int[np.ndarray, " n"]
+    cells: Int[np.ndarray, " n"]
+    points: Int[np.ndarray, " n"]
+
+    @staticmethod
+    def of(shifts: Float[np.ndarray, "n 3"], rows: Int[np.ndarray, " n"], offset: float) -> _Votes:
+        x, y, z = (np.floor(shifts / (2.0 * _CELL) + offset).astype(np.int64) + _HALF).T
+        keys = ((x * 2 * _HALF + y) * 2 * _HALF + z) * _NUM_POINTS + rows
+        order = np.argsort(keys, kind="stable")
+        return _Votes(order, *np.divmod(keys[order], _NUM_POINTS))
+
+    def densest(self, left: Bool[np.ndarray, " n"]) -> tuple[int, Int[np.ndarray, " k"]]:
+        """The most points that vote for one cell, and the shifts that lie in it, of those that are left (some are)."""
+        is_left = left[self.order]
+        cells, points = self.cells[is_left], self.points[is_left]
+        begins = np.append(True, cells[1:] != cells[:-1])
+        votes = np.add.reduceat(begins | np.append(True, points[1:] != points[:-1]), np.flatnonzero(begins), dtype=np.int64)
+        cell = cells[begins][votes.argmax()]
+        return int(votes.max()), self.order[is_left & (self.cells == cell)]
 
 
 def folded(points_world: Float[np.ndarray, "n 3"], shifts: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "n 3"]:
