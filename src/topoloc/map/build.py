@@ -6,7 +6,8 @@ with their 3-D positions. All mapping images, labelled with their node, teach th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
 
@@ -29,6 +30,7 @@ from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.coarse import CoarseModel
 from topoloc.places.vlad import SurfVlad, learn_words_of, placed, vlad
 from topoloc.sequences.frame import StereoSequence
+from topoloc.sequences.frame_view import FrameView
 from topoloc.shelf import Shelf
 
 BuildConfig = MapConfig
@@ -142,8 +144,8 @@ def _visit_all_images(
     nodes = NearestNodes(NodePoses.of(drafts.world_from_nodes), node_config.lambda_rot)
     images: list[PlaceImage] = []
     lights, vlads, cells = [], {kind: Shelf[np.ndarray]() for kind in config.kinds}, {kind: [] for kind in config.kinds}
-    for done, frame in enumerate(frames):
-        image = drafts.image(frame) or mapping_image(frame, frame.view(with_depth=False), config)
+    for done, (frame, view) in enumerate(_read_ahead(frames, drafts)):
+        image = drafts.image(frame) if view is None else mapping_image(frame, view, config)
         nearest = nodes.rows(image.world_from_cam, max(1, config.landmarks.nodes_per_image)).tolist()
         for row in nearest[: config.landmarks.nodes_per_image]:
             draft = drafts.shelf[row]
@@ -162,6 +164,21 @@ def _visit_all_images(
     learnt = {kind: (words[kind], vlads[kind], node_ids, config.vlad_of(kind), cells[kind]) for kind in config.kinds}
     first, models = config.features.kind, {kind: SurfVlad.fit(*of_kind).to_model() for kind, of_kind in learnt.items()}
     return images, lights, [model if kind == first else replace(model, name=f"{model.name}@{kind}") for kind, model in models.items()]
+
+
+def _read_ahead(frames: list[MappingFrame], drafts: Drafts) -> Iterator[tuple[MappingFrame, FrameView | None]]:
+    """The frames, each read while the one before is worked on; None of those that are nodes: they are known already."""
+    with ThreadPoolExecutor(max_workers=1) as reader:
+
+        def begin(frame: MappingFrame) -> Future[FrameView | None]:
+            return reader.submit(lambda: None if frame in drafts.rows else frame.view(with_depth=False))
+
+        coming = begin(frames[0])
+        for frame, after in zip(frames, [*frames[1:], None], strict=True):
+            view = coming.result()
+            if after is not None:
+                coming = begin(after)
+            yield frame, view
 
 
 def _words(drafts: Drafts, kind: str, config: BuildConfig) -> Float32[np.ndarray, "k d"]:

@@ -65,9 +65,9 @@ class Drafts:
             self.num_points.setdefault(kind, []).append(len(points.features))
         self.shelf.append(draft)
 
-    def image(self, frame: MappingFrame) -> MappingImage | None:
-        """What was found in a frame that became a node."""
-        return self.shelf[self.rows[frame]].image if frame in self.rows else None
+    def image(self, frame: MappingFrame) -> MappingImage:
+        """What was found in a frame that became a node. Raises KeyError of any other."""
+        return self.shelf[self.rows[frame]].image
 
 
 def draft_node(frame: MappingFrame, locator: PointLocator, with_sides: bool, config: MapConfig) -> NodeDraft:
