@@ -159,7 +159,7 @@ def test_every_module_loads_without_extras_but_learned_classifiers_and_figures()
     assert "topoloc.localization.localizer" in modules
     assert "topoloc.places.cnn_fc" in learning
     assert "topoloc.places.network_config" not in learning
-    drawing = {f"topoloc.evaluation.{name}" for name in ("figures", "map_figure", "report", "weak_parts_figure")}
+    drawing = {f"topoloc.evaluation.{name}" for name in ("figures", "map_figure", "report", "weak_parts_figure", "weak_parts_page")}
     others = [name for name in learning if not name.startswith(("topoloc.places.", "topoloc.service.")) and name not in drawing]
     assert others == ["topoloc.export.ros_messages", "topoloc.sequences.bags.mcap_file"]
     assert not {"topoloc.service.client", "topoloc.service.config", "topoloc.atlas.open_maps"} & set(learning), (
