@@ -19,6 +19,7 @@ from topoloc.shelf import Shelf
 @dataclass(eq=False)
 class Frame:
     name: str
+    picture: np.ndarray | None = None
 
 
 @dataclass(eq=False)
@@ -45,7 +46,7 @@ def test_it_is_a_list_whatever_lies_on_disk(changes: list[tuple[int, int]], max_
 
 
 def test_only_so_much_stays_in_memory():
-    frames = [Frame(str(k)) for k in range(50)]
+    frames = [Frame(str(k), np.zeros(5000)) for k in range(50)]  # what is referred to does not count
     there = Shelf(entries(50, frames), max_bytes=8_000, by_reference=frames)
     assert len(there._kept) == 10
     assert there[0].values[0][0] == 0.0

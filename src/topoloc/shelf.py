@@ -7,7 +7,7 @@ import pickle
 import sqlite3
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from typing import Any, TypeVar, overload
@@ -87,7 +87,7 @@ class Shelf(Sequence[T]):
         """In memory, as the entry used last; others give way. An entry beyond the whole budget is written at once."""
         if row in self._kept:
             self._num_bytes -= self._kept.pop(row)[1]
-        size = bytes_of(entry)
+        size = bytes_of(entry, self._numbers)
         self._kept[row] = entry, size, is_written
         self._num_bytes += size
         while self._num_bytes > self._max_bytes and self._kept:
@@ -140,16 +140,18 @@ class _Unpickler(pickle.Unpickler):
         return self._referred[pid]
 
 
-def bytes_of(value: Any) -> int:
-    """Bytes of the arrays and byte strings in a value, its fields and items, those of mappings too."""
+def bytes_of(value: Any, apart: Container[int] = ()) -> int:
+    """Bytes of the arrays and byte strings in a value, its fields and items, those of mappings too; objects of these `id` do not count."""
+    if id(value) in apart:
+        return 0
     if isinstance(value, np.ndarray):
         return value.nbytes
     if isinstance(value, bytes):
         return len(value)
-    if isinstance(value, list | tuple):
-        return sum(bytes_of(item) for item in value)
     if isinstance(value, dict):
-        return sum(bytes_of(item) for item in value.values())
+        return sum(bytes_of(item, apart) for item in value.values())
+    if isinstance(value, list | tuple):
+        return sum(bytes_of(item, apart) for item in value)
     if is_dataclass(value) and not isinstance(value, type):
-        return sum(bytes_of(getattr(value, item.name)) for item in fields(value))
+        return sum(bytes_of(getattr(value, item.name), apart) for item in fields(value))
     return 0
