@@ -80,3 +80,47 @@ def test_unknown_disparities_do_no_harm():
         keyframe.observations.weights[::2, 2] = 0.0
     adjust_bundle(keyframes, [], landmarks, BundleConfig())
     assert pose_errors(keyframes, poses).max() < 0.01
+
+
+def walk_around(num: int, num_new: int) -> tuple[list[KeyFrame], Landmarks, list[Rigid3]]:
+    """Twice around a ring; each key frame sees what lies before it and the two before it. The poses drift at first."""
+    rng = np.random.default_rng(7)
+    step = Rigid3.exp(np.array([0.0, 0.0, -0.3, 0.0, 4.0 * np.pi / num, 0.0]))
+    poses = [Rigid3.exp(np.zeros(6))]
+    while len(poses) < num:
+        poses.append(step @ poses[-1])
+    lap = num // 2
+    ahead = np.stack([rng.uniform(-2, 2, (lap, num_new)), rng.uniform(-1, 1, (lap, num_new)), rng.uniform(3, 6, (lap, num_new))], -1)
+    points = np.array([pose.inverse().apply(group) for pose, group in zip(poses[:lap], ahead, strict=True)])
+    landmarks, keyframes, drift = Landmarks(), [], Rigid3.identity()
+    ids = landmarks.add((points + rng.normal(0, 0.02, points.shape)).reshape(-1, 3)).reshape(lap, num_new)
+    for k, pose in enumerate(poses):
+        groups = [(k - back) % lap for back in range(3) if k >= back]
+        measured = STEREO.project(pose.apply(points[groups].reshape(-1, 3))) + rng.normal(0, NOISE_PX, (len(groups) * num_new, 3))
+        seen = Observations(ids[groups].ravel(), measured, np.full(measured.shape, 1.0 / NOISE_PX), np.ones(len(measured), np.bool_))
+        drift = Rigid3.exp(rng.normal(0, 0.002, 6)) @ drift if k else drift
+        keyframes.append(KeyFrame(0, k, 100_000_000 * k, 0, STEREO, drift @ pose, seen, DisparityBias(0.0, 1.0)))
+    return keyframes, landmarks, poses
+
+
+def test_part_by_part_is_the_same_as_all_at_once():
+    whole, parts = (walk_around(24, 20) for _ in range(2))
+    for keyframe in (*whole[0], *parts[0]):
+        keyframe.observations.measured[0, 0] += 40.0
+    adjust_bundle(whole[0], [], whole[1], BundleConfig())
+    adjust_bundle(parts[0], [], parts[1], BundleConfig(part_observations=37))
+    for a, b in zip(whole[0], parts[0], strict=True):
+        np.testing.assert_allclose(a.cam_from_world.matrix(), b.cam_from_world.matrix(), atol=1e-9)
+        np.testing.assert_array_equal(a.observations.active, b.observations.active)
+        assert not a.observations.active[0]
+    np.testing.assert_allclose(whole[1].positions[: whole[1].num], parts[1].positions[: parts[1].num], atol=1e-7)
+
+
+@pytest.mark.slow
+def test_a_walk_of_many_key_frames_is_adjusted_whole():
+    """More of them than a dense matrix was ever allowed."""
+    keyframes, landmarks, poses = walk_around(700, 8)
+    before = pose_errors(keyframes, poses)
+    adjust_bundle(keyframes, [], landmarks, BundleConfig(max_steps=12, part_observations=5000))
+    assert before.max() > 0.05
+    assert pose_errors(keyframes, poses).max() < 0.5 * before.max()

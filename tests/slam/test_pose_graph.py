@@ -6,7 +6,6 @@ import numpy as np
 
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.slam.pose_graph import Edge, PoseGraphConfig, optimise_graph, residuals_in_sigma
-from topoloc.slam.pose_graph_kernels import solve_graph
 
 NUM = 40
 COVARIANCE = np.diag([1e-4] * 3 + [1e-5] * 3)
@@ -50,22 +49,3 @@ def test_a_wrong_loop_is_outvoted_and_stands_out():
     assert errors(with_wrong, without).max() < 0.1
     lengths = residuals_in_sigma(with_wrong, [*right, wrong])
     assert lengths[-1] > PoseGraphConfig().max_residual > lengths[:-1].max()
-
-
-def test_the_solver_agrees_with_a_dense_one():
-    rng = np.random.default_rng(0)
-    num = 12
-    firsts = np.array([*range(num - 1), 0, 3, 9])
-    seconds = np.array([*range(1, num), 11, 8, 2])
-    dense, blocks = np.zeros((6 * num, 6 * num)), []
-    for i, j in zip(firsts, seconds, strict=True):
-        a, b = rng.normal(size=(2, 6, 6))
-        jacobian = np.zeros((6, 6 * num))
-        jacobian[:, 6 * i : 6 * i + 6], jacobian[:, 6 * j : 6 * j + 6] = a, b
-        dense += jacobian.T @ jacobian
-        blocks.append(a.T @ b)
-    dense += 0.1 * np.eye(6 * num)
-    diagonal = np.array([dense[6 * n : 6 * n + 6, 6 * n : 6 * n + 6] for n in range(num)])
-    right = rng.normal(size=(num, 6))
-    x = solve_graph(diagonal, firsts, seconds, np.array(blocks), right, 500, 1e-10)
-    np.testing.assert_allclose(x.ravel(), np.linalg.solve(dense, right.ravel()), rtol=1e-5, atol=1e-7)

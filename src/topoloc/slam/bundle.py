@@ -1,7 +1,8 @@
 """Bundle adjustment: key frames and the landmarks they see, moved to where they explain pixels and disparities best.
 
 Levenberg-Marquardt with the points eliminated (Triggs et al., *Bundle adjustment: a modern synthesis*, 2000, section 6) and Cauchy's
-loss. The reduced system is dense: right for the window of the odometry and for some hundred key frames.
+loss. What is left of the poses is sparse (`block_system`), and observations are gone through part by part (`bundle_parts`): the window
+of the odometry and a walk of kilometres are one problem, whose time and memory grow with its length.
 """
 
 from __future__ import annotations
@@ -13,9 +14,11 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Float, Int
 
-from topoloc.bounds import Above, Between
+from topoloc.bounds import Above, AtLeast, Between
 from topoloc.geometry.rigid import Rigid3
-from topoloc.slam.bundle_kernels import eliminate_points, move_points, robust_cost, squared_residuals
+from topoloc.slam.block_system import BlockPattern, solve_blocks
+from topoloc.slam.bundle_kernels import count_ties, eliminate_points, move_points, robust_cost, squared_residuals, tied_frames
+from topoloc.slam.bundle_parts import BundleParts, Part
 from topoloc.slam.keyframes import DisparityBias, KeyFrame, Landmarks
 
 
@@ -31,45 +34,45 @@ class BundleConfig:
     """A step that lowers the cost by less than this share of it is the last one."""
     outlier_square: Annotated[float, Above(0)] = 25.0
     """Squared residual, summed over x, y and disparity, from which on an observation is wrong and used no more."""
+    part_observations: Annotated[int, AtLeast(1)] = 100_000
+    """Observations that are laid side by side at once, about; of longer walks one part after the other."""
 
 
-@dataclass(eq=False)
-class _Problem:
-    """Poses, points and observations as arrays, the observations sorted by point."""
+@dataclass(frozen=True, eq=False)
+class _State:
+    """What is moved. A camera is (fx, fy, cx, cy, bf, bias of the disparities)."""
 
     rotations: Float[np.ndarray, "k 3 3"]
     translations: Float[np.ndarray, "k 3"]
     cameras: Float[np.ndarray, "k 6"]
+    points: Float[np.ndarray, "n 3"]
+
+    def squares(self, part: Part) -> Float[np.ndarray, " m"]:
+        """Squared residuals of the part's observations."""
+        squares = np.empty(len(part.frames))
+        points = self.points[part.first : part.last]
+        squared_residuals(
+            self.rotations, self.translations, self.cameras, points, part.frames, part.rows, part.measured, part.weights, squares
+        )  # fmt: skip
+        return squares
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """What does not move: the observations, which poses are free (`slots`, by the order of elimination; -1: held), and whose bias is."""
+
+    parts: BundleParts
+    pattern: BlockPattern
     slots: Int[np.ndarray, " k"]
     columns: Int[np.ndarray, " k"]
     biases: list[DisparityBias]
-    points: Float[np.ndarray, "n 3"]
-    starts: Int[np.ndarray, " n1"]
-    frames: Int[np.ndarray, " m"]
-    rows: Int[np.ndarray, " m"]
-    measured: Float[np.ndarray, "m 3"]
-    weights: Float[np.ndarray, "m 3"]
 
-    def cost(self, rotations: np.ndarray, translations: np.ndarray, points: np.ndarray, cameras: np.ndarray, scale: float) -> float:
-        """Robust cost of the observations, and of biases other than expected."""
-        prior = sum(bias.information * (cameras[k, 5] - bias.value_px) ** 2 for bias, k in self.first_of_biases())
-        return float(robust_cost(self.squares(rotations, translations, points, cameras), scale**2)) + prior
-
-    def squares(self, rotations: np.ndarray, translations: np.ndarray, points: np.ndarray, cameras: np.ndarray) -> Float[np.ndarray, " m"]:
-        squares = np.empty(len(self.frames))
-        squared_residuals(rotations, translations, cameras, points, self.frames, self.rows, self.measured, self.weights, squares)
-        return squares
+    def bias_cost(self, state: _State) -> float:
+        """Of biases other than expected."""
+        return float(sum(bias.information * (state.cameras[k, 5] - bias.value_px) ** 2 for bias, k in self.first_of_biases()))
 
     def first_of_biases(self) -> list[tuple[DisparityBias, int]]:
-        first_column = 6 * int(self.slots.max() + 1)
-        return [(bias, int(np.argmax(self.columns == first_column + i))) for i, bias in enumerate(self.biases)]
-
-    def add_priors(self, matrix: np.ndarray, vector: np.ndarray) -> None:
-        """What is known of the biases already."""
-        for bias, k in self.first_of_biases():
-            column = self.columns[k]
-            matrix[column, column] += bias.information
-            vector[column] += bias.information * (bias.value_px - self.cameras[k, 5])
+        return [(bias, int(np.argmax(self.columns == i))) for i, bias in enumerate(self.biases)]
 
 
 def adjust_bundle(free: Sequence[KeyFrame], held: Sequence[KeyFrame], landmarks: Landmarks, config: BundleConfig) -> None:
@@ -83,59 +86,30 @@ def adjust_bundle(free: Sequence[KeyFrame], held: Sequence[KeyFrame], landmarks:
         return
     keyframes = [*free, *held]
     ids = _landmarks_of(free if len(free) > 1 else keyframes)
-    problem, sources = _assemble(keyframes, len(free), ids, landmarks)
-    if len(problem.frames) == 0:
+    parts = BundleParts(keyframes, ids, config.part_observations)
+    if parts.num_observations == 0:
         return
-    _optimise(problem, config)
+    problem = _problem(parts, keyframes, len(free))
+    state = _State(
+        rotations=np.array([k.cam_from_world.rotation for k in keyframes]),
+        translations=np.array([k.cam_from_world.translation for k in keyframes]),
+        cameras=np.array([_camera_row(k) for k in keyframes]),
+        points=landmarks.positions[ids],
+    )
+    state = _optimised(problem, state, config)
     for k, keyframe in enumerate(free):
-        keyframe.cam_from_world = Rigid3(problem.rotations[k].copy(), problem.translations[k].copy())
-    landmarks.positions[ids] = problem.points
+        keyframe.cam_from_world = Rigid3(state.rotations[k].copy(), state.translations[k].copy())
+    landmarks.positions[ids] = state.points
     for bias, k in problem.first_of_biases():
-        bias.value_px = float(problem.cameras[k, 5])
-    wrong = problem.squares(problem.rotations, problem.translations, problem.points, problem.cameras) > config.outlier_square
-    for k, keyframe in enumerate(keyframes):
-        keyframe.observations.active[sources[wrong & (problem.frames == k)]] = False
+        bias.value_px = float(state.cameras[k, 5])
+    for part in parts:
+        wrong = np.flatnonzero(state.squares(part) > config.outlier_square)
+        for k, row in zip(part.frames[wrong].tolist(), part.sources[wrong].tolist(), strict=True):
+            keyframes[k].observations.active[row] = False
 
 
 def _landmarks_of(keyframes: Sequence[KeyFrame]) -> Int[np.ndarray, " n"]:
     return np.unique(np.concatenate([k.observations.landmark_ids[k.observations.active] for k in keyframes]))
-
-
-def _assemble(
-    keyframes: Sequence[KeyFrame], num_free: int, ids: Int[np.ndarray, " n"], landmarks: Landmarks
-) -> tuple[_Problem, Int[np.ndarray, " m"]]:
-    """The problem, and of each observation its row in its key frame."""
-    frames, rows, sources = [], [], []
-    for k, keyframe in enumerate(keyframes):
-        seen = keyframe.observations
-        place = np.searchsorted(ids, seen.landmark_ids)
-        place[place == len(ids)] = 0
-        chosen = np.flatnonzero(seen.active & (ids[place] == seen.landmark_ids)) if len(ids) else np.zeros(0, np.int64)
-        frames.append(np.full(len(chosen), k))
-        rows.append(place[chosen])
-        sources.append(chosen)
-    all_rows = np.concatenate(rows)
-    order = np.argsort(all_rows, kind="stable")
-    measured = np.concatenate([k.observations.measured[s] for k, s in zip(keyframes, sources, strict=True)])[order]
-    weights = np.concatenate([k.observations.weights[s] for k, s in zip(keyframes, sources, strict=True)])[order]
-    slots = np.arange(len(keyframes))
-    slots[num_free:] = -1
-    biases = list(dict.fromkeys(k.bias for k in keyframes if np.isfinite(k.bias.information)))
-    problem = _Problem(
-        rotations=np.array([k.cam_from_world.rotation for k in keyframes]),
-        translations=np.array([k.cam_from_world.translation for k in keyframes]),
-        cameras=np.array([_camera_row(k) for k in keyframes]),
-        slots=slots,
-        columns=np.array([6 * num_free + biases.index(k.bias) if k.bias in biases else -1 for k in keyframes]),
-        biases=biases,
-        points=landmarks.positions[ids],
-        starts=np.searchsorted(all_rows[order], np.arange(len(ids) + 1)),
-        frames=np.concatenate(frames)[order],
-        rows=all_rows[order],
-        measured=np.where(weights > 0.0, measured, 0.0),
-        weights=weights,
-    )
-    return problem, np.concatenate(sources)[order]
 
 
 def _camera_row(keyframe: KeyFrame) -> list[float]:
@@ -143,34 +117,80 @@ def _camera_row(keyframe: KeyFrame) -> list[float]:
     return [camera.fx, camera.fy, camera.cx, camera.cy, keyframe.stereo.bf, keyframe.bias.value_px]
 
 
-def _optimise(problem: _Problem, config: BundleConfig) -> None:
-    p, num_free = problem, int(problem.slots.max() + 1)
-    cost = p.cost(p.rotations, p.translations, p.points, p.cameras, config.cauchy_scale)
+def _problem(parts: BundleParts, keyframes: Sequence[KeyFrame], num_free: int) -> _Problem:
+    slots = np.arange(len(keyframes))
+    slots[num_free:] = -1
+    ties = np.zeros(0, np.int64)
+    for part in parts:
+        keys = np.empty(count_ties(part.starts, part.frames, slots), np.int64)
+        tied_frames(part.starts, part.frames, slots, num_free, keys)
+        ties = np.union1d(ties, keys)
+    pattern = BlockPattern.of(num_free, zip((ties // num_free).tolist(), (ties % num_free).tolist(), strict=True))
+    slots[:num_free] = pattern.ranks
+    biases = list(dict.fromkeys(k.bias for k in keyframes if np.isfinite(k.bias.information)))
+    columns = np.array([biases.index(k.bias) if k.bias in biases else -1 for k in keyframes])
+    return _Problem(parts, pattern, slots, columns, biases)
+
+
+def _optimised(problem: _Problem, state: _State, config: BundleConfig) -> _State:
+    scale = config.cauchy_scale**2
+    cost = problem.bias_cost(state) + sum(float(robust_cost(state.squares(part), scale)) for part in problem.parts)
     damping = 1e-4
-    num_points, size = len(p.points), 6 * num_free + len(p.biases)
-    couplings, inverses = np.empty((len(p.frames), 6, 3)), np.empty((num_points, 3, 3))
-    gradients, bias_couplings, moved = (np.empty((num_points, 3)) for _ in range(3))
     for _ in range(config.max_steps):
-        matrix, vector = np.zeros((size, size)), np.zeros(size)
-        eliminate_points(
-            p.rotations, p.translations, p.cameras, p.slots, p.columns, p.points, p.starts, p.frames, p.measured, p.weights,
-            config.cauchy_scale**2, damping, matrix, vector, couplings, inverses, gradients, bias_couplings,
-        )  # fmt: skip
-        p.add_priors(matrix, vector)
-        matrix[np.diag_indices(size)] += damping * np.diag(matrix) + 1e-9
-        steps = np.linalg.solve(matrix, vector)
-        move_points(p.slots, p.columns, p.starts, p.frames, couplings, bias_couplings, inverses, gradients, steps, p.points, moved)
-        rotations, translations, cameras = p.rotations.copy(), p.translations.copy(), p.cameras.copy()
-        for k in range(num_free):
-            new = Rigid3.exp(steps[6 * k : 6 * k + 6]) @ Rigid3(rotations[k], translations[k])
-            rotations[k], translations[k] = new.rotation, new.translation
-        cameras[p.columns >= 0, 5] += steps[p.columns[p.columns >= 0]]
-        new_cost = p.cost(rotations, translations, moved, cameras, config.cauchy_scale)
+        steps, bias_steps = _steps(problem, state, scale, damping)
+        moved, new_cost = _moved(problem, state, (steps, bias_steps), scale, damping)
         if not new_cost < cost:
             damping *= 10.0
             continue
-        p.rotations, p.translations, p.points, p.cameras = rotations, translations, moved.copy(), cameras
-        finished = cost - new_cost < config.min_decrease * cost
+        state, finished = moved, cost - new_cost < config.min_decrease * cost
         cost, damping = new_cost, max(damping / 5.0, 1e-7)
         if finished:
             break
+    return state
+
+
+def _steps(problem: _Problem, state: _State, scale: float, damping: float) -> tuple[Float[np.ndarray, "f 6"], Float[np.ndarray, " c"]]:
+    """Of the free poses in the order of elimination, and of the biases: the reduced system made and solved."""
+    p, pattern = problem, problem.pattern
+    blocks, vector = pattern.empty(), np.zeros((len(pattern.ranks), 6))
+    border, corner = np.zeros((len(p.biases), *vector.shape)), np.zeros((len(p.biases), 2))
+    for part in p.parts:
+        eliminate_points(
+            state.rotations, state.translations, state.cameras, p.slots, p.columns, state.points[part.first : part.last],
+            part.starts, part.frames, part.measured, part.weights, scale, damping,
+            pattern.starts, pattern.rows, blocks, vector, border, corner,
+        )  # fmt: skip
+    for row, (bias, k) in enumerate(p.first_of_biases()):  # what is known of the biases already
+        corner[row] += [bias.information, bias.information * (bias.value_px - state.cameras[k, 5])]
+    along = np.arange(6)
+    blocks[pattern.diagonal[:, None], along, along] *= 1.0 + damping
+    blocks[pattern.diagonal[:, None], along, along] += 1e-9
+    own = np.diag((1.0 + damping) * corner[:, 0] + 1e-9)
+    solved = solve_blocks(pattern, blocks, np.concatenate([vector[None], border]))
+    flat, of_border = border.reshape(len(border), vector.size), solved[1:].reshape(len(border), vector.size)
+    bias_steps = np.linalg.solve(own - flat @ of_border.T, corner[:, 1] - flat @ solved[0].ravel())
+    return solved[0] - np.tensordot(bias_steps, solved[1:], 1), bias_steps
+
+
+def _moved(
+    problem: _Problem, state: _State, steps: tuple[Float[np.ndarray, "f 6"], Float[np.ndarray, " c"]], scale: float, damping: float
+) -> tuple[_State, float]:
+    """All after these steps, and what it costs."""
+    p, (of_poses, of_biases) = problem, steps
+    rotations, translations, cameras = state.rotations.copy(), state.translations.copy(), state.cameras.copy()
+    for k in np.flatnonzero(p.slots >= 0).tolist():
+        new = Rigid3.exp(of_poses[p.slots[k]]) @ Rigid3(rotations[k], translations[k])
+        rotations[k], translations[k] = new.rotation, new.translation
+    cameras[p.columns >= 0, 5] += of_biases[p.columns[p.columns >= 0]]
+    moved = _State(rotations, translations, cameras, np.empty_like(state.points))
+    cost = p.bias_cost(moved)
+    nothing = np.empty((0, 6, 6)), np.empty((0, *of_poses.shape)), np.empty((0, 2))
+    for part in p.parts:
+        rows = slice(part.first, part.last)
+        move_points(
+            state.rotations, state.translations, state.cameras, p.slots, p.columns, state.points[rows],
+            part.starts, part.frames, part.measured, part.weights, scale, damping,
+            p.pattern.starts, *nothing, of_poses, of_biases, moved.points[rows],
+        )  # fmt: skip
+        cost += float(robust_cost(moved.squares(part), scale))
+    return moved, cost

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from topoloc.compiled import kernel
+from topoloc.slam.block_kernels import place_of_block
 
 _OPTIONS = {"error_model": "numpy"}
 _MIN_DEPTH = 0.02
@@ -87,119 +88,182 @@ def _invert_symmetric(m, inverse):
 
 
 @kernel(**_OPTIONS)
-def _subtract_point(n, first, last, column, slots, frames, couplings, inverses, bias_couplings, step, product, matrix, vector):
-    """Take point n out of the system: what the poses and the bias that it ties together still know without it."""
-    if column >= 0:
+def count_ties(starts, frames, slots):
+    """How many pairs of free key frames `tied_frames` says, repetitions included."""
+    total = 0
+    for n in range(len(starts) - 1):
+        free = 0
+        for k in range(starts[n], starts[n + 1]):
+            free += slots[frames[k]] >= 0
+        total += free * (free - 1) // 2
+    return total
+
+
+@kernel(**_OPTIONS)
+def tied_frames(starts, frames, slots, num_free, keys):
+    """Into `keys`, i * num_free + j for all slots i and j that see a point in common, as often as they do."""
+    at = 0
+    for n in range(len(starts) - 1):
+        for k in range(starts[n], starts[n + 1]):
+            for other in range(starts[n], k):
+                i, j = slots[frames[k]], slots[frames[other]]
+                if i >= 0 and j >= 0:
+                    keys[at] = max(i, j) * num_free + min(i, j)
+                    at += 1
+
+
+@kernel(**_OPTIONS)
+def _look_at_point(
+    point, rotations, translations, cameras, slots, column, frames, measured, weights, scale_squared, damping, is_adding,
+    pattern_starts, blocks, vector, border, corner, couplings, inverse, gradient, bias_coupling,
+):  # fmt: skip
+    """What the observations of one point say of it, and where `is_adding` what they say of the poses and the bias that see it.
+
+    Filled: `couplings` (k, 6, 3) with the poses, the `inverse` (3, 3) of the point's own block, its `gradient` and `bias_coupling` (3,).
+    """
+    residual, seen = np.empty(3), np.empty(3)
+    by_pose, by_point, block = np.empty((3, 6)), np.empty((3, 3)), np.zeros((3, 3))
+    gradient[:] = 0.0
+    bias_coupling[:] = 0.0
+    for k in range(len(frames)):
+        f = frames[k]
+        couplings[k] = 0.0
+        square = _residual(rotations[f], translations[f], cameras[f], point, measured[k], weights[k], residual, seen)
+        if square < 0.0:
+            continue
+        robust = 1.0 / (1.0 + square / scale_squared)
+        _jacobians(rotations[f], cameras[f], seen, weights[k], by_pose, by_point)
         for r in range(3):
-            vector[column] -= bias_couplings[n, r] * step[r]
             for s in range(3):
-                matrix[column, column] -= bias_couplings[n, r] * inverses[n, r, s] * bias_couplings[n, s]
-    for k in range(first, last):
+                gradient[r] += robust * by_point[s, r] * residual[s]
+                for q in range(3):
+                    block[r, s] += robust * by_point[q, r] * by_point[q, s]
+        slot = slots[f]
+        if column >= 0:
+            for r in range(3):
+                bias_coupling[r] += robust * weights[k, 2] * by_point[2, r]
+        if slot >= 0:
+            for r in range(6):
+                for q in range(3):
+                    for s in range(3):
+                        couplings[k, r, s] += robust * by_pose[q, r] * by_point[q, s]
+        if is_adding:
+            _add_observation(
+                slot, column, robust, weights[k, 2], residual, by_pose, pattern_starts, blocks, vector, border, corner
+            )  # fmt: skip
+    for r in range(3):
+        block[r, r] += damping * block[r, r] + 1e-9
+    _invert_symmetric(block, inverse)
+
+
+@kernel(**_OPTIONS)
+def _add_observation(slot, column, robust, disparity_weight, residual, by_pose, pattern_starts, blocks, vector, border, corner):
+    """What one observation says of the pose in `slot` and of the bias in `column`, -1 where these are held."""
+    if column >= 0:
+        corner[column, 0] += robust * disparity_weight**2
+        corner[column, 1] += robust * disparity_weight * residual[2]
+    if slot < 0:
+        return
+    block = blocks[pattern_starts[slot]]
+    for r in range(6):
+        if column >= 0:
+            border[column, slot, r] += robust * disparity_weight * by_pose[2, r]
+        for q in range(3):
+            vector[slot, r] += robust * by_pose[q, r] * residual[q]
+            for s in range(6):
+                block[r, s] += robust * by_pose[q, r] * by_pose[q, s]
+
+
+@kernel(**_OPTIONS)
+def _subtract_point(
+    slots, column, frames, couplings, inverse, gradient, bias_coupling, pattern_starts, pattern_rows, blocks, vector, border, corner
+):  # fmt: skip
+    """Take a point out of the system: what the poses and the bias that it ties together still know without it."""
+    step, product = inverse @ gradient, np.empty((6, 3))
+    if column >= 0:
+        corner[column, 0] -= bias_coupling @ (inverse @ bias_coupling)
+        corner[column, 1] -= bias_coupling @ step
+    for k in range(len(frames)):
         i = slots[frames[k]]
         if i < 0:
             continue
+        coupling = couplings[k]
         for r in range(6):
             for s in range(3):
-                product[r, s] = (
-                    couplings[k, r, 0] * inverses[n, 0, s] + couplings[k, r, 1] * inverses[n, 1, s] + couplings[k, r, 2] * inverses[n, 2, s]
-                )
-            vector[6 * i + r] -= couplings[k, r, 0] * step[0] + couplings[k, r, 1] * step[1] + couplings[k, r, 2] * step[2]
+                product[r, s] = coupling[r, 0] * inverse[0, s] + coupling[r, 1] * inverse[1, s] + coupling[r, 2] * inverse[2, s]
+            vector[i, r] -= coupling[r, 0] * step[0] + coupling[r, 1] * step[1] + coupling[r, 2] * step[2]
             if column >= 0:
-                shared = product[r, 0] * bias_couplings[n, 0] + product[r, 1] * bias_couplings[n, 1] + product[r, 2] * bias_couplings[n, 2]
-                matrix[6 * i + r, column] -= shared
-                matrix[column, 6 * i + r] -= shared
-        for other in range(first, last):
+                border[column, i, r] -= (
+                    product[r, 0] * bias_coupling[0] + product[r, 1] * bias_coupling[1] + product[r, 2] * bias_coupling[2]
+                )
+        for other in range(len(frames)):
             j = slots[frames[other]]
-            if j < 0:
+            if j < 0 or j > i:
                 continue
+            block, coupled = blocks[place_of_block(pattern_starts, pattern_rows, i, j)], couplings[other]
             for r in range(6):
                 for s in range(6):
-                    matrix[6 * i + r, 6 * j + s] -= (
-                        product[r, 0] * couplings[other, s, 0]
-                        + product[r, 1] * couplings[other, s, 1]
-                        + product[r, 2] * couplings[other, s, 2]
-                    )
+                    block[r, s] -= product[r, 0] * coupled[s, 0] + product[r, 1] * coupled[s, 1] + product[r, 2] * coupled[s, 2]
 
 
 @kernel(**_OPTIONS)
 def eliminate_points(
     rotations, translations, cameras, slots, columns, points, starts, frames, measured, weights, scale_squared, damping,
-    matrix, vector, couplings, inverses, gradients, bias_couplings,
+    pattern_starts, pattern_rows, blocks, vector, border, corner,
 ):  # fmt: skip
-    """The reduced system of the free poses and biases (`matrix` (s, s) and `vector`, zero at the call), point by point.
+    """Add to the reduced system of the free poses and biases what the observations of some points say, these points eliminated.
 
-    `slots[k]` is the place of key frame k among the free ones, -1 where it is held; `columns[k]` that of its disparity's bias
-    in the system, -1 where that is held; the key frames that see a point share it. Observations are sorted by point: those
-    of point n are starts[n] .. starts[n + 1] - 1. `couplings` (m, 6, 3), `inverses` (n, 3, 3), `gradients` (n, 3) and
-    `bias_couplings` (n, 3) are kept for `move_points`.
+    `slots[f]` is the place of key frame f among the free ones in the order of elimination, -1 where it is held; `columns[f]` that of its
+    disparity's bias among the biases, -1 where that is held; the key frames that see a point share it. Observations are sorted by
+    point: those of point n are starts[n] .. starts[n + 1] - 1. The system: the `blocks` (b, 6, 6) of the pattern and the right-hand side
+    `vector` (k, 6) of the poses, their `border` (c, k, 6) with the biases, and of each bias its own information and right-hand
+    side, `corner` (c, 2).
     """
-    residual, seen = np.empty(3), np.empty(3)
-    by_pose, by_point = np.empty((3, 6)), np.empty((3, 3))
-    product = np.empty((6, 3))
-    block, step = np.empty((3, 3)), np.empty(3)
+    longest = 0
+    for n in range(len(points)):
+        longest = max(longest, starts[n + 1] - starts[n])
+    couplings = np.empty((longest, 6, 3))
+    inverse, gradient, bias_coupling = np.empty((3, 3)), np.empty(3), np.empty(3)
     for n in range(len(points)):
         first, last = starts[n], starts[n + 1]
-        block[:] = 0.0
-        gradients[n] = 0.0
-        bias_couplings[n] = 0.0
         column = columns[frames[first]] if last > first else -1
-        for k in range(first, last):
-            f = frames[k]
-            couplings[k] = 0.0
-            square = _residual(rotations[f], translations[f], cameras[f], points[n], measured[k], weights[k], residual, seen)
-            if square < 0.0:
-                continue
-            robust = 1.0 / (1.0 + square / scale_squared)
-            _jacobians(rotations[f], cameras[f], seen, weights[k], by_pose, by_point)
-            for r in range(3):
-                for s in range(3):
-                    gradients[n, r] += robust * by_point[s, r] * residual[s]
-                    for q in range(3):
-                        block[r, s] += robust * by_point[q, r] * by_point[q, s]
-            slot = slots[f]
-            if column >= 0:
-                vector[column] += robust * weights[k, 2] * residual[2]
-                matrix[column, column] += robust * weights[k, 2] ** 2
-                for r in range(3):
-                    bias_couplings[n, r] += robust * weights[k, 2] * by_point[2, r]
-                if slot >= 0:
-                    for r in range(6):
-                        matrix[6 * slot + r, column] += robust * weights[k, 2] * by_pose[2, r]
-                        matrix[column, 6 * slot + r] += robust * weights[k, 2] * by_pose[2, r]
-            if slot < 0:
-                continue
-            for r in range(6):
-                for q in range(3):
-                    vector[6 * slot + r] += robust * by_pose[q, r] * residual[q]
-                    for s in range(6):
-                        matrix[6 * slot + r, 6 * slot + s] += robust * by_pose[q, r] * by_pose[q, s]
-                    for s in range(3):
-                        couplings[k, r, s] += robust * by_pose[q, r] * by_point[q, s]
-        for r in range(3):
-            block[r, r] += damping * block[r, r] + 1e-9
-        _invert_symmetric(block, inverses[n])
-        for r in range(3):
-            step[r] = inverses[n, r, 0] * gradients[n, 0] + inverses[n, r, 1] * gradients[n, 1] + inverses[n, r, 2] * gradients[n, 2]
-        _subtract_point(n, first, last, column, slots, frames, couplings, inverses, bias_couplings, step, product, matrix, vector)
+        _look_at_point(
+            points[n], rotations, translations, cameras, slots, column, frames[first:last], measured[first:last], weights[first:last],
+            scale_squared, damping, True, pattern_starts, blocks, vector, border, corner, couplings, inverse, gradient, bias_coupling,
+        )  # fmt: skip
+        _subtract_point(
+            slots, column, frames[first:last], couplings, inverse, gradient, bias_coupling, pattern_starts, pattern_rows,
+            blocks, vector, border, corner,
+        )  # fmt: skip
 
 
 @kernel(**_OPTIONS)
-def move_points(slots, columns, starts, frames, couplings, bias_couplings, inverses, gradients, steps, points, moved):
-    """The points after the `steps` (s,) of poses and biases, into `moved`."""
-    rest = np.empty(3)
+def move_points(
+    rotations, translations, cameras, slots, columns, points, starts, frames, measured, weights, scale_squared, damping,
+    pattern_starts, blocks, border, corner, steps, bias_steps, moved,
+):  # fmt: skip
+    """The points after the `steps` (k, 6) of poses and those of biases, into `moved`; all else as in `eliminate_points`."""
+    longest = 0
+    for n in range(len(points)):
+        longest = max(longest, starts[n + 1] - starts[n])
+    couplings = np.empty((longest, 6, 3))
+    inverse, rest, bias_coupling = np.empty((3, 3)), np.empty(3), np.empty(3)
     for n in range(len(points)):
         first, last = starts[n], starts[n + 1]
-        rest[:] = gradients[n]
         column = columns[frames[first]] if last > first else -1
+        _look_at_point(
+            points[n], rotations, translations, cameras, slots, column, frames[first:last], measured[first:last], weights[first:last],
+            scale_squared, damping, False, pattern_starts, blocks, steps, border, corner, couplings, inverse, rest, bias_coupling,
+        )  # fmt: skip
         if column >= 0:
             for s in range(3):
-                rest[s] -= bias_couplings[n, s] * steps[column]
+                rest[s] -= bias_coupling[s] * bias_steps[column]
         for k in range(first, last):
             slot = slots[frames[k]]
             if slot < 0:
                 continue
             for s in range(3):
                 for r in range(6):
-                    rest[s] -= couplings[k, r, s] * steps[6 * slot + r]
+                    rest[s] -= couplings[k - first, r, s] * steps[slot, r]
         for r in range(3):
-            moved[n, r] = points[n, r] + inverses[n, r, 0] * rest[0] + inverses[n, r, 1] * rest[1] + inverses[n, r, 2] * rest[2]
+            moved[n, r] = points[n, r] + inverse[r, 0] * rest[0] + inverse[r, 1] * rest[1] + inverse[r, 2] * rest[2]

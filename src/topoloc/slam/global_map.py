@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Int
 
-from topoloc.bounds import Above, AtLeast
+from topoloc.bounds import Above
 from topoloc.geometry.rigid import Rigid3
 from topoloc.slam.bundle import BundleConfig, adjust_bundle
 from topoloc.slam.keyframes import KeyFrame, Landmarks, Observations
@@ -23,8 +23,6 @@ class GlobalMapConfig:
 
     graph: PoseGraphConfig = field(default_factory=PoseGraphConfig)
     bundle: BundleConfig = field(default_factory=lambda: BundleConfig(max_steps=12, min_decrease=1e-4))
-    max_bundle_keyframes: Annotated[int, AtLeast(0)] = 600
-    """Beyond these the pose graph has the last word: the time of adjusting all together grows with the cube."""
     motion_sigma: Annotated[float, Above(0)] = 0.004
     """Uncertainty of a motion between two key frames: this share of its length ..."""
     motion_sigma_deg: Annotated[float, Above(0)] = 0.02
@@ -114,15 +112,12 @@ def _move_keyframes(keyframes: Sequence[KeyFrame], poses: Sequence[Rigid3], land
         keyframe.cam_from_world = pose
 
 
-def adjust_all(keyframes: Sequence[KeyFrame], links: Sequence[Link], landmarks: Landmarks, config: GlobalMapConfig) -> bool:
-    """Bundle adjustment of everything, links included as landmarks that both of their key frames see; False if that is too much."""
-    if len(keyframes) > config.max_bundle_keyframes:
-        return False
+def adjust_all(keyframes: Sequence[KeyFrame], links: Sequence[Link], landmarks: Landmarks, config: GlobalMapConfig) -> None:
+    """Bundle adjustment of everything, links included as landmarks that both of their key frames see."""
     landmark_of: dict[tuple[int, int], int] = {}
     for link in links:
         _add_link_landmarks(link, keyframes, landmarks, landmark_of, config)
     adjust_bundle(keyframes, [], landmarks, config.bundle)
-    return True
 
 
 def _add_link_landmarks(

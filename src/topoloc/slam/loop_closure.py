@@ -83,16 +83,18 @@ def find_links(
 
 def _propose(keyframes: Sequence[KeyFrame], places: list[int], config: LoopConfig) -> list[tuple[int, int]]:
     """(target, source) of pairs that look alike, source the earlier one."""
-    pairs = set()
-    for number, ranked in enumerate(rank_places([keyframes[i] for i in places], config.vlad)):
+    pairs, num = set(), config.num_candidates + 2 * config.min_places_between  # itself and its neighbours may come first
+    for number, ranked in enumerate(rank_places([keyframes[i] for i in places], config.vlad, num)):
         others = (other for other in ranked if _may_be_loop(keyframes, places, other, number, config))
         for _, other in zip(range(config.num_candidates), others, strict=False):
             pairs.add((places[max(number, other)], places[min(number, other)]))
     return sorted(pairs)
 
 
-def rank_places(keyframes: Sequence[KeyFrame], config: VladConfig) -> Iterator[list[int]]:
-    """For each key frame, which must have places, all of them (rows) by how much they look like it; nothing where there are no features."""
+def rank_places(keyframes: Sequence[KeyFrame], config: VladConfig, num: int | None = None) -> Iterator[list[int]]:
+    """For each key frame, which must have places, the `num` of them (rows; else all) that look most like it, in this order; nothing
+    where there are no features.
+    """
 
     def features(row: int) -> Features:
         place = keyframes[row].place
@@ -106,7 +108,7 @@ def rank_places(keyframes: Sequence[KeyFrame], config: VladConfig) -> Iterator[l
     vlads = Shelf(vlad(features(row).descriptors, words) for row in range(len(keyframes)))
     localizer, blank = SurfVlad.fit(words, vlads, np.arange(len(keyframes)), config), np.zeros((1, 1), np.uint8)
     for row in range(len(keyframes)):
-        yield [score.node_id for score in localizer.rank(blank, features(row), len(keyframes))]
+        yield [score.node_id for score in localizer.rank(blank, features(row), num or len(keyframes))]
 
 
 def _may_be_loop(keyframes: Sequence[KeyFrame], places: list[int], a: int, b: int, config: LoopConfig) -> bool:

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from topoloc.bounds import Above, AtLeast, Between
 from topoloc.geometry.rigid import Rigid3
-from topoloc.slam.pose_graph_kernels import solve_graph
+from topoloc.slam.block_system import BlockPattern, solve_blocks
 
 
 @dataclass(frozen=True)
@@ -46,24 +46,26 @@ def optimise_graph(cam_from_worlds: Sequence[Rigid3], edges: Sequence[Edge], con
     """The poses, the first one unmoved."""
     poses = list(cam_from_worlds)
     informations = [np.linalg.inv(edge.covariance) for edge in edges]
-    firsts, seconds = np.array([e.first for e in edges]), np.array([e.second for e in edges])
+    pattern = BlockPattern.of(len(poses), [(edge.first, edge.second) for edge in edges])
+    places = [pattern.place(edge.first, edge.second) for edge in edges]
+    ranks = pattern.ranks
     for _ in range(config.max_steps):
-        diagonal, right = np.tile(1e-6 * np.eye(6), (len(poses), 1, 1)), np.zeros((len(poses), 6))
-        blocks = np.empty((len(edges), 6, 6))
-        diagonal[0] += 1e12 * np.eye(6)
-        for k, (edge, information) in enumerate(zip(edges, informations, strict=True)):
+        blocks, right = pattern.empty(), np.zeros((len(poses), 6))
+        blocks[pattern.diagonal] = 1e-6 * np.eye(6)
+        blocks[pattern.diagonal[ranks[0]]] += 1e12 * np.eye(6)
+        for edge, information, (place, is_first_above) in zip(edges, informations, places, strict=True):
             predicted = poses[edge.second] @ poses[edge.first].inverse()
             residual = (predicted @ edge.second_from_first.inverse()).log()
             if edge.is_loop:
                 information = information / (1.0 + residual @ information @ residual / config.cauchy_scale**2)
             adjoint = predicted.adjoint()
             weighted = adjoint.T @ information
-            diagonal[edge.second] += information
-            diagonal[edge.first] += weighted @ adjoint
-            blocks[k] = -weighted
-            right[edge.second] -= information @ residual
-            right[edge.first] += weighted @ residual
-        steps = solve_graph(diagonal, firsts, seconds, blocks, right, 300, 1e-6)
+            blocks[pattern.diagonal[ranks[edge.second]]] += information
+            blocks[pattern.diagonal[ranks[edge.first]]] += weighted @ adjoint
+            blocks[place] -= weighted.T if is_first_above else weighted
+            right[ranks[edge.second]] -= information @ residual
+            right[ranks[edge.first]] += weighted @ residual
+        steps = solve_blocks(pattern, blocks, right[None])[0][ranks]
         poses = [Rigid3.exp(step) @ pose for step, pose in zip(steps, poses, strict=True)]
         if np.abs(steps).max() < config.min_step:
             break

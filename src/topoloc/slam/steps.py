@@ -126,8 +126,8 @@ class StepSeeker:
 
     def seek(self, predicted: Rigid3) -> Step | None:
         """The step that is found from a predicted cam_from_world."""
-        tracks = self._follow(predicted)
-        pose = self._estimate_pose(tracks)
+        tracks = self.follow(predicted)
+        pose = self.estimate(tracks)
         if pose is None:
             return None
         should = max(int(np.count_nonzero(self._in_picture(pose.cam_from_world))), 1)
@@ -187,7 +187,8 @@ class StepSeeker:
         with np.errstate(invalid="ignore"):
             return np.all((points[:, :2] > 8.0) & (points[:, :2] < [camera.width - 9.0, camera.height - 9.0]), axis=1)
 
-    def _follow(self, predicted: Rigid3) -> Tracks:
+    def follow(self, predicted: Rigid3) -> Tracks:
+        """The points found again from a predicted cam_from_world, where they look as in the last key frame."""
         config, tracks, measured = self.config.tracking, self.tracks, self.measured
         points_world = self.landmarks.positions[tracks.landmark_ids]
         before, after = (measured.stereo.project(pose.apply(points_world))[:, :2] for pose in (self.last.cam_from_world, predicted))
@@ -205,7 +206,8 @@ class StepSeeker:
         before, now = (pose.apply(points_world)[:, 2] for pose in (self.reference.cam_from_world, predicted))
         return np.clip(before / np.maximum(now, 1e-3), 0.5, 2.0).astype(np.float32)
 
-    def _estimate_pose(self, tracks: Tracks) -> AbsolutePose | None:
+    def estimate(self, tracks: Tracks) -> AbsolutePose | None:
+        """The pose that enough of the points agree on."""
         config, stereo = self.config, self.measured.stereo
         if len(tracks.landmark_ids) < config.min_tracked:
             return None

@@ -26,7 +26,7 @@ from topoloc.localization.map_facts.building import build_map
 from topoloc.localization.walls.wall_poses import agreeing_pose
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.frame import DepthImage, StereoFrame
-from topoloc.slam.pose_graph_kernels import solve_graph
+from topoloc.slam.block_kernels import solve_factored
 from topoloc.tracking.tracker import Tracker
 
 Progress = Callable[[str, int, int], None]
@@ -39,7 +39,7 @@ _WALL_Z, _WALL_SLOPE = 2.0, 0.4  # the wall: z = 2 m + 0.4 x
 
 def is_warm() -> bool:
     """Whether the machine code of what answers is kept: of kernels with which a search begins and ends, and of the last in streams."""
-    return all(map(is_kept, (integral_image, match_projections, solve_graph)))
+    return all(map(is_kept, (integral_image, match_projections, solve_factored)))
 
 
 def warm_up(progress: Progress | None = None) -> None:

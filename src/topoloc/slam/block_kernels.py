@@ -1,0 +1,96 @@
+"""Numba kernels of `block_system`: Cholesky's factor of a matrix of 6x6 blocks, column by column, and what it solves."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from topoloc.compiled import kernel
+
+_OPTIONS = {"error_model": "numpy"}
+
+
+@kernel(**_OPTIONS)
+def place_of_block(starts, rows, row, column):
+    """Where block (row, column) lies, row not above column; it must be there."""
+    low, high = starts[column], starts[column + 1]
+    while high - low > 1:
+        middle = (low + high) // 2
+        if rows[middle] <= row:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@kernel(**_OPTIONS)
+def _cholesky(matrix):
+    """The lower triangle becomes the factor."""
+    for i in range(6):
+        for j in range(i + 1):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = np.sqrt(max(total, 1e-12)) if i == j else total / matrix[j, j]
+
+
+@kernel(**_OPTIONS)
+def _solve_lower(factor, vector):
+    for i in range(6):
+        for k in range(i):
+            vector[i] -= factor[i, k] * vector[k]
+        vector[i] /= factor[i, i]
+
+
+@kernel(**_OPTIONS)
+def _solve_upper(factor, vector):
+    """With the transpose of `factor`."""
+    for i in range(5, -1, -1):
+        for k in range(i + 1, 6):
+            vector[i] -= factor[k, i] * vector[k]
+        vector[i] /= factor[i, i]
+
+
+@kernel(**_OPTIONS)
+def _subtract_product(block, a, b):
+    """block - a b'."""
+    for r in range(6):
+        for s in range(6):
+            total = 0.0
+            for k in range(6):
+                total += a[r, k] * b[s, k]
+            block[r, s] -= total
+
+
+@kernel(**_OPTIONS)
+def factor_blocks(starts, rows, blocks):
+    """In place: `blocks` (b, 6, 6), of which the upper triangles on the diagonal are left as they are."""
+    for p in range(len(starts) - 1):
+        first, last = starts[p], starts[p + 1]
+        _cholesky(blocks[first])
+        for k in range(first + 1, last):
+            for r in range(6):
+                _solve_lower(blocks[first], blocks[k, r])
+        for k in range(first + 1, last):
+            at = starts[rows[k]]
+            for other in range(k, last):
+                while rows[at] != rows[other]:
+                    at += 1
+                _subtract_product(blocks[at], blocks[other], blocks[k])
+
+
+@kernel(**_OPTIONS)
+def solve_factored(starts, rows, blocks, vector):
+    """`vector` (n, 6) becomes the solution."""
+    num = len(starts) - 1
+    for p in range(num):
+        _solve_lower(blocks[starts[p]], vector[p])
+        for k in range(starts[p] + 1, starts[p + 1]):
+            for r in range(6):
+                for s in range(6):
+                    vector[rows[k], r] -= blocks[k, r, s] * vector[p, s]
+    for p in range(num - 1, -1, -1):
+        for k in range(starts[p] + 1, starts[p + 1]):
+            for r in range(6):
+                for s in range(6):
+                    vector[p, s] -= blocks[k, r, s] * vector[rows[k], r]
+        _solve_upper(blocks[starts[p]], vector[p])
