@@ -140,6 +140,8 @@ def test_a_changed_room_is_learnt_from_a_single_camera(map_file: Path, tmp_path:
     after = _answers(map_file, asked, panels)
     with TopoMetricMap.load(map_file) as topomap:
         assert topomap.sessions[-1].poses_from == "map"
+        assert topomap.edits[-1].changes is not None
+        assert topomap.edits[-1].changes["frames_with_pose"] == len(indices)
     inliers = [[0 if answer is None else answer.num_inliers for answer in answers] for answers in (before, after)]
     assert np.median(inliers[1]) > 1.3 * np.median(inliers[0]) + 20
     assert max(_off(after, asked)) < 0.02

@@ -38,7 +38,7 @@ class Command:
         ),
     ] = None
     """How the camera moved: `truth` (the recording's own poses, in any metric world), `slam` (of stereo or RGB-D), or a TUM or KITTI file.
-    With `map` the map is asked where each picture was taken, as in a stream."""
+    With `map` the map is asked where each picture was taken, as in a stream, and odometry goes on where it does not know."""
     poses: Annotated[
         str | None, tyro.conf.arg(metavar="CONVENTION[,CONVENTION]", help_behavior_hint="(default: world_from_cam, metres)")
     ] = None
@@ -113,9 +113,18 @@ def describe_update(changes: dict[str, Any]) -> str:
     """What a session changed, in one line."""
     c = changes
     seen = f"{c['recording']} joins as session {c['session']}: {c['frames_with_pose']} of {c['frames']} frames"
+    if c["poses_from"] == "map":
+        carried, without = c["frames_by_odometry"], c["frames"] - c["frames_with_pose"]
+        seen = f"{seen} ({c['frames_with_pose'] - carried} by the map, {carried} by odometry, {without} without a pose)"
     asked = f"{c['localized']} of {c['asked']} pictures asked were recognised"
     added = f"{c['nodes_added']} nodes added"
-    untaught = (
-        f"; {', '.join(c['not_taught'])} knows nothing of them, `topoloc train` teaches it" if c["not_taught"] and c["nodes_added"] else ""
-    )
-    return f"{seen}, {asked}, {added}, {c['bytes_before'] / 1e6:.2f} to {c['bytes'] / 1e6:.2f} MB{untaught}"
+    return f"{seen}, {asked}, {added}, {c['bytes_before'] / 1e6:.2f} to {c['bytes'] / 1e6:.2f} MB{describe_untaught(changes)}"
+
+
+def describe_untaught(changes: dict[str, Any]) -> str:
+    """Which coarse localizers know nothing of new nodes, and what to do about it."""
+    if not changes["not_taught"] or not changes["nodes_added"]:
+        return ""
+    ways = {"cnn-fc": "`topoloc train --coarse cnn-fc --weights map` teaches it"}
+    named = [f"{name} knows nothing of them: {ways.get(name, 'PyTorch is missing here')}" for name in changes["not_taught"]]
+    return "".join(f"; {line}" for line in named)

@@ -1,13 +1,13 @@
 """Where a new session was taken, in the world of a map: the pictures that the map localizes hold the session's own motion in place.
 
-The session's motion is that of its poses (given, or SLAM's) in any world of their own; of a single camera without poses, the map itself is
-asked for every picture, as a stream. One rigid transform must explain most of what the map answers, but for a drift; the motion and
+The session's motion is that of its poses (given, or SLAM's) in any world of their own; of a single camera without poses, see
+`single_camera_poses.py`. One rigid transform must explain most of what the map answers, but for a drift; the motion and
 the answers are then brought to agree as a pose graph, in which the map stands still.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Annotated
@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from topoloc.bounds import Above, AtLeast, Between
-from topoloc.errors import CalibrationError, TrajectoryError
+from topoloc.errors import TrajectoryError
 from topoloc.geometry.rigid import Rigid3, covariance_of_inverse
+from topoloc.lifelong.scale_of_motion import ScaleConfig
 from topoloc.lifelong.session_calibration import check_by_other_focal_lengths, check_calibration
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
@@ -25,7 +26,7 @@ from topoloc.map.config import MapConfig
 from topoloc.map.nodes import place_nodes
 from topoloc.sequences.frame import StereoSequence
 from topoloc.slam.pose_graph import Edge, PoseGraphConfig, optimise_graph
-from topoloc.tracking.tracker import Tracker
+from topoloc.slam.single_camera import SingleCameraConfig
 
 Progress = Callable[[str, int, int], None]
 """Called with a stage's name, steps done and steps in all."""
@@ -57,6 +58,8 @@ class SessionPosesConfig:
     widened: Annotated[float, Above(0)] = 3.0
     """The map's answers are trusted as if their sigmas were so many times as large: neighbours share errors of the map."""
     graph: PoseGraphConfig = field(default_factory=PoseGraphConfig)
+    odometry: SingleCameraConfig = field(default_factory=SingleCameraConfig)
+    scale: ScaleConfig = field(default_factory=ScaleConfig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +70,8 @@ class SessionPoses:
     world_from_cams: list[Rigid3 | None]
     answers: Mapping[int, Localization | None]
     agreeing: list[int]
+    carried: Sequence[int] = ()
+    """Of a single camera, the frames that odometry gave their pose, and not the map."""
 
 
 def poses_by_motion(
@@ -108,38 +113,6 @@ def held_by(
     localized = {index: result for index, result in answers.items() if result is not None}
     agreeing = _agreeing(name, own, localized, len(answers), d_thresh, config)
     return SessionPoses(_held(max(own) + 1, own, {k: localized[k] for k in agreeing}, config), answers, agreeing)
-
-
-def poses_by_map(
-    sequence: StereoSequence, tracker: Tracker, of_map: MapConfig, config: SessionPosesConfig, progress: Progress
-) -> SessionPoses:
-    """Of a session without poses: where the map localizes its pictures, as a stream. Frames so far apart as nodes are the answers.
-
-    Raises:
-        TrajectoryError: the map recognises too little of it.
-        CalibrationError: it has none, or the pictures contradict it.
-        UnreadableImageError, QueryError: from its pictures.
-    """
-    poses, results = list[Rigid3 | None](), list[Localization | NotLocalized]()
-    seen: dict[int, Localization] = {}
-    for index, t_ns in enumerate(sequence.t_ns):
-        frame = sequence[index]
-        if frame.camera is None:
-            raise CalibrationError(f"{sequence.name}: a session that the map is asked for needs a calibration (--camera)")
-        found = tracker.process(frame.image, frame.camera, t_ns)
-        results.append(found.result)
-        is_known = found.state in ("localized", "tracked")
-        poses.append(found.smoothed if is_known else None)
-        if is_known and isinstance(found.result, Localization):
-            seen[index] = found.result
-        progress(f"localizing {sequence.name}", index + 1, len(sequence))
-    check_calibration(sequence.name, results)
-    known = [index for index, pose in enumerate(poses) if pose is not None]
-    if len(known) < config.min_agreeing:
-        check_by_other_focal_lengths(sequence, range(len(sequence)), tracker.localizer)
-        raise TrajectoryError(f"{sequence.name}: the map recognises {len(known)} of its {len(sequence)} pictures: too few to join")
-    asked = [known[k] for k in place_nodes([pose for pose in poses if pose is not None], of_map.nodes)]
-    return SessionPoses(poses, {index: seen.get(index) for index in asked}, [index for index in asked if index in seen])
 
 
 def _agreeing(

@@ -20,15 +20,17 @@ from jaxtyping import Int
 from topoloc.bounds import Above, Between, check_bounds
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.rigid import covariance_of_inverse, position_covariance
-from topoloc.lifelong.coarse_models import PlaceView, with_place_views
+from topoloc.lifelong.coarse_models import PlaceView, taught_places
 from topoloc.lifelong.earlier_recall import earlier_recall
+from topoloc.lifelong.observed_nodes import observe_node
 from topoloc.lifelong.overlay import Overlay
-from topoloc.lifelong.session_poses import Progress, SessionPoses, SessionPosesConfig, poses_by_map, poses_by_motion
+from topoloc.lifelong.session_poses import Progress, SessionPoses, SessionPosesConfig, poses_by_motion
+from topoloc.lifelong.single_camera_poses import poses_by_map
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.building import with_map_facts
 from topoloc.localization.result import Localization
 from topoloc.map.drafts import NodeDraft, draft_node, finish_node, observe
-from topoloc.map.landmarks import Observations, counted_again, observe_points
+from topoloc.map.landmarks import Observations, counted_again
 from topoloc.map.mapping_frames import PLACE_QUALITY, MappingFrame, MappingImage, PointLocator, mapping_image, posed_frames, small_jpeg
 from topoloc.map.nodes import NodePoses, node_distances
 from topoloc.map.sessions import Light, Session, mean_light, path_of
@@ -36,7 +38,6 @@ from topoloc.map.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.frame_view import frame_view
 from topoloc.sequences.recording import SequenceView
-from topoloc.slam.metric_points import keypoint_sigmas
 from topoloc.tracking.tracker import Tracker
 
 _PICTURES_COMPARED = 3
@@ -110,23 +111,24 @@ def update_map(
     frames = posed_frames(posed, session_id)
     joined = _joined(topomap, frames, held, config, progress)
     session = _session(session_id, sequence, frames, joined, poses_from)
-    changed = _with_session(topomap, session, frames, joined)
-    first = joined.nodes[topomap.kind]
-    changes = {
-        "session": session_id,
-        "recording": sequence.name,
-        "frames": len(sequence),
-        "frames_with_pose": len(frames),
+    taught = taught_places(topomap, joined.views, joined.images)
+    changed = replace(_with_session(topomap, session, frames, joined), coarse_models=taught.models)
+    changes = {"session": session_id, "recording": sequence.name, "frames": len(sequence), "frames_with_pose": len(frames)}
+    changes |= {"poses_from": poses_from} | _counts(held, joined, topomap.kind) | {"not_taught": taught.not_taught}
+    changed = with_map_facts(changed, progress)
+    return MapUpdate(changed, posed, changes | earlier_recall(topomap, changed, config.earlier_asked, localizer_config))
+
+
+def _counts(held: SessionPoses, joined: _Joined, kind: str) -> dict[str, Any]:
+    return {
+        "frames_by_odometry": len(held.carried),
         "asked": len(held.answers),
         "localized": sum(answer is not None for answer in held.answers.values()),
         "agreeing": len(held.agreeing),
-        "nodes_added": len(first),
-        "points_added": sum(len(node.features) for node in first),
+        "nodes_added": len(joined.nodes[kind]),
+        "points_added": sum(len(node.features) for node in joined.nodes[kind]),
         "place_images_added": len(joined.images),
-        "not_taught": sorted({name.partition("@")[0] for name in topomap.coarse_models if not name.startswith("surf-vlad")}),
     }
-    changed = with_map_facts(changed, progress)
-    return MapUpdate(changed, posed, changes | earlier_recall(topomap, changed, config.earlier_asked, localizer_config))
 
 
 def _refuse_known(topomap: TopoMetricMap, sequence: StereoSequence) -> None:
@@ -222,11 +224,7 @@ def _see_again(topomap: TopoMetricMap, image: MappingImage, session_id: int, nea
         cam_from_node = image.world_from_cam.inverse() @ topomap.summaries[row].world_from_cam
         for kind, features in image.features.items():
             node = topomap.nodes_of(kind)[row]
-            roots = np.zeros((len(node.features), 3, 3))
-            roots[:, *np.tril_indices(3)] = node.point_sqrt_covs
-            known = (node.features, node.points_cam.astype(np.float64), roots @ roots.transpose(0, 2, 1))
-            seen_by = (features, keypoint_sigmas(features, config.points), image.camera, cam_from_node)
-            joined.seen[kind, row].append(observe_points(*known, *seen_by, config.landmarks, session_id))
+            joined.seen[kind, row].append(observe_node(node, features, image.camera, cam_from_node, config, session_id))
 
 
 def _teach(joined: _Joined, frame: MappingFrame, image: MappingImage, node_id: int) -> None:
@@ -252,7 +250,6 @@ def _with_session(topomap: TopoMetricMap, session: Session, frames: Sequence[Map
         other_kinds=nodes,
         edges=sorted({*topomap.edges, *_edges(topomap, summaries, frames)}, key=lambda edge: (edge.source_id, edge.target_id)),
         place_images=Overlay(topomap.place_images, {}, joined.images),
-        coarse_models=with_place_views(topomap, joined.views),
         length_m=topomap.length_m + float(sum(np.linalg.norm(step) for step in steps)),
         sessions=[*topomap.sessions, session],
     )

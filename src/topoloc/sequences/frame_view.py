@@ -54,6 +54,31 @@ def frame_view(frame: StereoFrame, with_depth: bool = True) -> FrameView:
     raise RecordingError(f"{frame.name}: stereo pairs or depth images are needed, this recording has single pictures only")
 
 
+def single_view(frame: StereoFrame, max_side_px: int) -> FrameView:
+    """The frame's own picture without distortion, smaller where a side is longer than `max_side_px`.
+
+    Raises:
+        CalibrationError: the frame has no camera.
+    """
+    view = frame_view(frame, with_depth=False)
+    camera, grey = view.camera, view.grey
+    scale = max_side_px / max(grey.shape)
+    if scale < 1.0:
+        width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
+        grey, camera = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA), camera.rescaled(width, height)
+    if camera.is_distorted:
+        grey, camera = _remapped(grey, _undistortion(camera)), camera.undistorted()
+    return FrameView(grey, grey, camera, view.view_from_cam)
+
+
+@lru_cache(maxsize=4)
+def _undistortion(camera: Camera) -> Float32[np.ndarray, "h w 2"]:
+    pinhole = camera.undistorted()
+    normalized = _normalized_pixels(pinhole, camera.width, camera.height)
+    points_img = camera.img_from_cam(np.column_stack([normalized, np.ones(len(normalized))]))
+    return np.nan_to_num(points_img, nan=-1.0).astype(np.float32).reshape(camera.height, camera.width, 2)
+
+
 def _stereo_view(image: Image, right: Image | None, rig: StereoRig) -> FrameView:
     right_grey = None if right is None else grey_image(right)
     if rig.is_rectified:

@@ -1,0 +1,24 @@
+"""What a picture shows of a node that is in the map: its landmarks sought where they must be seen."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from topoloc.features.features import Features
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.map.config import MapConfig
+from topoloc.map.landmarks import Observations, observe_points
+from topoloc.map.topomap import TopoNode
+from topoloc.slam.metric_points import keypoint_sigmas
+
+
+def observe_node(
+    node: TopoNode, features: Features, camera: Camera, cam_from_node: Rigid3, config: MapConfig, session_id: int = 0
+) -> Observations:
+    """See `observe_points`; `features` are what the picture shows, of the kind of the node's."""
+    roots = np.zeros((len(node.features), 3, 3))
+    roots[:, *np.tril_indices(3)] = node.point_sqrt_covs
+    known = (node.features, node.points_cam.astype(np.float64), roots @ roots.transpose(0, 2, 1))
+    seen_by = (features, keypoint_sigmas(features, config.points), camera, cam_from_node)
+    return observe_points(*known, *seen_by, config.landmarks, session_id)

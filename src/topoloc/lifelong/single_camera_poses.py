@@ -1,0 +1,88 @@
+"""Where a session of a single camera was taken: what the map answers to its pictures as a stream holds the camera's own odometry.
+
+The map gives a stretch of odometry (`slam/single_camera.py`) its metres and its place; the odometry carries the poses into what the map
+does not know, and answers that contradict it count for nothing. A stretch that too few answers hold has no odometry: of its frames those
+have a pose whose answers agree with one another under it. Where there is no odometry at all, the map is believed as a stream.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from topoloc.errors import CalibrationError, TrajectoryError
+from topoloc.geometry.rigid import Rigid3
+from topoloc.lifelong.scale_of_motion import in_metres, largest_agreement
+from topoloc.lifelong.session_calibration import check_by_other_focal_lengths, check_calibration
+from topoloc.lifelong.session_poses import Progress, SessionPoses, SessionPosesConfig, held_by
+from topoloc.localization.result import Localization, NotLocalized
+from topoloc.map.config import MapConfig
+from topoloc.map.nodes import place_nodes
+from topoloc.sequences.frame import StereoSequence
+from topoloc.slam.single_camera import SingleCameraOdometry
+from topoloc.tracking.tracker import Tracker
+
+_REFITTED = 3
+
+
+def poses_by_map(
+    sequence: StereoSequence, tracker: Tracker, of_map: MapConfig, config: SessionPosesConfig, progress: Progress
+) -> SessionPoses:
+    """Of a session without poses. Frames so far apart as nodes are the answers.
+
+    Raises:
+        TrajectoryError: the map recognises too little of it.
+        CalibrationError: it has none, or the pictures contradict it.
+        UnreadableImageError, QueryError: from its pictures.
+    """
+    by_map, seen, results = dict[int, Rigid3](), dict[int, Localization](), list[Localization | NotLocalized]()
+    odometry = SingleCameraOdometry(config.odometry)
+    for index, t_ns in enumerate(sequence.t_ns):
+        frame = sequence[index]
+        if frame.camera is None:
+            raise CalibrationError(f"{sequence.name}: a session that the map is asked for needs a calibration (--camera)")
+        odometry.process(index, frame)
+        found = tracker.process(frame.image, frame.camera, t_ns)
+        results.append(found.result)
+        if found.state in ("localized", "tracked") and found.smoothed is not None and isinstance(found.result, Localization):
+            by_map[index], seen[index] = found.smoothed, found.result
+        progress(f"localizing {sequence.name}", index + 1, len(sequence))
+    check_calibration(sequence.name, results)
+    if len(by_map) < config.min_agreeing:
+        check_by_other_focal_lengths(sequence, range(len(sequence)), tracker.localizer)
+        raise TrajectoryError(f"{sequence.name}: the map recognises {len(by_map)} of its {len(sequence)} pictures: too few to join")
+    assert of_map.nodes.d_thresh is not None, "a map's own configuration is resolved"
+    poses: list[Rigid3 | None] = [by_map.get(index) for index in range(len(sequence))]
+    for stretch in odometry.own_from_cams():
+        held, agreeing = held_stretch(sequence.name, stretch, seen, of_map.nodes.d_thresh, config)
+        for index in stretch:
+            if index not in agreeing:
+                seen.pop(index, None)
+            poses[index] = by_map.get(index) if index in agreeing else None
+            if held is not None:
+                poses[index] = held[index] if index < len(held) else None
+    known = [(index, pose) for index, pose in enumerate(poses) if pose is not None]
+    asked = [known[k][0] for k in place_nodes([pose for _, pose in known], of_map.nodes)]
+    answers = {index: seen.get(index) for index in asked}
+    carried = [index for index, _ in known if index not in seen]
+    return SessionPoses(poses, answers, [index for index in asked if index in seen], carried)
+
+
+def held_stretch(
+    name: str, own: Mapping[int, Rigid3], seen: Mapping[int, Localization], d_thresh: float, config: SessionPosesConfig
+) -> tuple[list[Rigid3 | None] | None, list[int]]:
+    """A stretch of odometry in the map's world, world_from_cam by frame, None where too few answers hold it; and the frames of the answers
+    that agree with it."""
+    of_it = {index: answer for index, answer in seen.items() if index in own}
+    agreeing = largest_agreement(own, of_it, config.slack * d_thresh, config.slack_deg, config.scale)
+    held = None
+    for _ in range(_REFITTED):  # what agrees but for the drift of the unit agrees once that is known
+        metric = in_metres(own, {index: of_it[index] for index in agreeing}, config.scale) if len(agreeing) >= config.min_agreeing else {}
+        within = {index: answer for index, answer in of_it.items() if index in metric}
+        if len(within) < config.min_agreeing:
+            return None, agreeing
+        try:
+            held = held_by(name, metric, within, d_thresh, config)
+        except TrajectoryError:
+            return None, agreeing
+        agreeing = held.agreeing
+    return (None if held is None else held.world_from_cams), agreeing

@@ -1,0 +1,295 @@
+"""Odometry of a single camera: its motion in a unit of its own, stretch by stretch.
+
+Read from `SingleCameraOdometry.process`. Two pictures with enough parallax begin a stretch (five-point method), and their distance is its
+unit. From there on points are followed and give each frame's pose as in the odometry of stereo (`steps.py`); what has not shown its depth
+yet is followed beside them, and becomes a landmark as soon as its rays meet at an angle. The last key frames are adjusted together.
+Where too few points are left a stretch ends, and another one begins with a unit of its own: nothing is guessed in between. What a unit is
+in metres is not known here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+
+from topoloc.bounds import Above, AtLeast, Between
+from topoloc.geometry.relative_pose import estimate_relative_pose
+from topoloc.geometry.rigid import Rigid3
+from topoloc.sequences.frame import StereoFrame
+from topoloc.sequences.frame_view import single_view
+from topoloc.slam.bundle import BundleConfig, adjust_bundle
+from topoloc.slam.disparity import MeasuredView
+from topoloc.slam.keyframes import DisparityBias, FramePose, KeyFrame, Landmarks, Motion, Observations, StereoCamera
+from topoloc.slam.motion_prediction import MotionHistory
+from topoloc.slam.steps import LastFrame, OdometryConfig, Step, StepSeeker, Tracks
+from topoloc.slam.tracking import TrackingConfig, find_corners, follow
+from topoloc.slam.triangulation import is_clear, triangulate
+
+
+@dataclass(frozen=True)
+class SingleCameraConfig:
+    """When a stretch begins, and when a point has shown its depth."""
+
+    odometry: OdometryConfig = field(
+        default_factory=lambda: OdometryConfig(
+            tracking=TrackingConfig(num_corners=1500, patch_half_px=7),
+            bundle=BundleConfig(max_steps=12),
+            window=20,
+            held=10,
+            min_tracked=15,
+        )
+    )
+    """More is followed than by a stereo camera, for few corners live until they have shown their depth; and what is adjusted together
+    reaches further back, for nothing but that holds the unit."""
+    max_side_px: Annotated[int, Between(64, 16_384)] = 800
+    """Points are followed in pictures reduced to this width or height."""
+    start_motion: Annotated[float, Above(0)] = 0.03
+    """A stretch may begin where points have moved by this share of the picture's width (median) ..."""
+    start_points: Annotated[int, AtLeast(8)] = 50
+    """... and so many of them show their depth."""
+    start_share: Annotated[float, Between(0, 1)] = 0.2
+    """With fewer of its points left, the first picture is given up for a later one."""
+    max_beginning: Annotated[int, Between(2, 10_000)] = 60
+    """... as it is after so many frames: who stands still shows no depth."""
+    max_return_px: Annotated[float, Above(0)] = 0.7
+    """A point followed there and back must come back to within so many pixels."""
+    min_parallax_deg: Annotated[float, Above(0)] = 1.0
+    """Angle between rays from which on a point is a landmark ..."""
+    min_rays: Annotated[int, Between(2, 100)] = 2
+    """... if so many key frames have seen it ..."""
+    max_triangulation_px: Annotated[float, Above(0)] = 1.5
+    """... and its rays meet to within so many pixels in all of them."""
+
+
+@dataclass(eq=False)
+class _Beginning:
+    """The first picture of a stretch that has not begun yet, the points still followed from it, and the frames since, with their points."""
+
+    frames: list[tuple[int, StereoFrame, MeasuredView, Tracks]]
+    tracks: Tracks
+
+
+class SingleCameraOdometry:
+    """The state of one recording's odometry. `stretches` are those so far: each frame's place, relative to key frames."""
+
+    def __init__(self, config: SingleCameraConfig) -> None:
+        self._config = config
+        self._landmarks, self._bias = Landmarks(), DisparityBias()
+        self._history = MotionHistory(config.odometry.prediction)
+        self.stretches: list[list[FramePose]] = []
+        self._beginning: _Beginning | None = None
+        self._reference: KeyFrame | None = None
+        self._reference_picture: Float32[np.ndarray, "h w"] = np.zeros((0, 0), np.float32)
+        self._last: LastFrame | None = None
+        self._tracks, self._waiting = _no_tracks(), _no_tracks()
+        self._chain: list[KeyFrame] = []
+        self._num_lost = 0
+
+    def process(self, frame_idx: int, frame: StereoFrame) -> None:
+        """The next frame."""
+        measured = _measured(frame, self._config.max_side_px)
+        if self._reference is None:
+            self._begin(frame_idx, frame, measured)
+        elif self._follow(frame_idx, frame, measured):
+            self._num_lost = 0
+        else:
+            self._num_lost += 1
+            if self._num_lost > self._config.odometry.max_lost_tracked:
+                self._reference, self._last, self._num_lost = None, None, 0
+                self._history.stop()
+                self._begin(frame_idx, frame, measured)
+
+    def own_from_cams(self) -> list[dict[int, Rigid3]]:
+        """Of each stretch, world_from_cam of its frames in its own world and unit, by their numbers."""
+        return [{pose.frame_idx: pose.world_from_cam() for pose in stretch} for stretch in self.stretches]
+
+    def _begin(self, frame_idx: int, frame: StereoFrame, measured: MeasuredView) -> None:
+        """Follow the corners of a first picture until two pictures show a motion."""
+        if self._beginning is not None:
+            tracks = self._followed_back(self._beginning, measured)
+            left = len(tracks.landmark_ids) / max(len(self._beginning.tracks.landmark_ids), 1)
+            self._beginning.frames.append((frame_idx, frame, measured, tracks))
+            if left >= self._config.start_share and len(self._beginning.frames) <= self._config.max_beginning:
+                moved = np.median(np.linalg.norm(tracks.points_img - tracks.points_ref, axis=1)) if len(tracks.landmark_ids) else 0.0
+                if moved > self._config.start_motion * measured.view.camera.width:
+                    self._start(self._beginning)
+                return
+        corners = find_corners(measured.view.grey, np.zeros((0, 2)), self._config.odometry.tracking)
+        tracks = Tracks(np.arange(len(corners)), corners, corners)
+        self._beginning = _Beginning([(frame_idx, frame, measured, tracks)], tracks)
+
+    def _followed_back(self, beginning: _Beginning, measured: MeasuredView) -> Tracks:
+        """The points that are found in the next picture, and from there again where they were."""
+        _, _, before, tracks = beginning.frames[-1]
+        config = self._config.odometry.tracking
+        found, there = follow(before.view.grey, measured.view.grey, tracks.points_img, tracks.points_img, config)
+        back, again = follow(measured.view.grey, before.view.grey, found, tracks.points_img, config)
+        returned = np.linalg.norm(back - tracks.points_img, axis=1) < self._config.max_return_px
+        return Tracks(tracks.landmark_ids, found, tracks.points_ref).select(np.flatnonzero(there & again & returned))
+
+    def _start(self, beginning: _Beginning) -> None:
+        """A stretch begins if the first picture and the last one show a motion."""
+        config, (_, _, first, all_tracks), (_, _, last, tracks) = self._config, beginning.frames[0], beginning.frames[-1]
+        motion = estimate_relative_pose(
+            tracks.points_ref.astype(np.float64), first.view.camera, tracks.points_img.astype(np.float64), last.view.camera
+        )
+        if motion is None or np.count_nonzero(motion.inliers) < config.start_points:
+            return
+        self._chain, self._landmarks = [], Landmarks()
+        self._landmarks.add(np.full((len(all_tracks.landmark_ids), 3), np.nan))
+        agreeing = tracks.select(motion.inliers)
+        poses = (Rigid3.identity(), motion.second_from_first)
+        for row, cam_from_world, points_img in ((0, poses[0], agreeing.points_ref), (-1, poses[1], agreeing.points_img)):
+            frame_idx, frame, measured, _ = beginning.frames[row]
+            seen = self._observations(agreeing.landmark_ids, points_img, np.zeros(len(points_img), np.bool_))
+            self._chain.append(self._keyframe(frame_idx, frame.t_ns, measured, cam_from_world, seen))
+        known = self._settle(agreeing.landmark_ids, 2)
+        if len(known) < config.start_points:
+            self._chain = []
+            return
+        adjust_bundle(self._chain, [], self._landmarks, config.odometry.bundle)
+        self.stretches.append([])
+        self._beginning, self._last = None, None
+        self._history.stop()
+        for frame_idx, frame, measured, of_frame in beginning.frames[:-1]:
+            self._place_again(frame_idx, frame, measured, of_frame, known)
+        frame_idx, frame, measured, _ = beginning.frames[-1]
+        self._follow_from(self._chain[-1], measured, agreeing.select(~np.isin(agreeing.landmark_ids, known)))
+        self._remember(frame.t_ns, measured, self._chain[-1].cam_from_world)
+        self.stretches[-1].append(FramePose(frame_idx, self._chain[-1], Rigid3.identity(), measured.view.view_from_cam))
+
+    def _place_again(
+        self, frame_idx: int, frame: StereoFrame, measured: MeasuredView, tracks: Tracks, known: Int[np.ndarray, " n"]
+    ) -> None:
+        """Where a frame of the beginning was, now that its points are known."""
+        first = self._chain[0]
+        if frame_idx == first.frame_idx:
+            pose = Rigid3.identity()
+        else:
+            of_it = tracks.select(np.isin(tracks.landmark_ids, known))
+            found = self._seeker(LastFrame(measured, first.cam_from_world), first, of_it, measured).estimate(of_it)
+            if found is None:
+                return
+            pose = found.cam_from_world
+        self._remember(frame.t_ns, measured, pose)
+        self.stretches[-1].append(FramePose(frame_idx, first, pose @ first.cam_from_world.inverse(), measured.view.view_from_cam))
+
+    def _follow(self, frame_idx: int, frame: StereoFrame, measured: MeasuredView) -> bool:
+        """Where the frame is, by its step from the last one."""
+        step = self._step(frame, measured)
+        if step is None or self._last is None or self._reference is None:
+            return False
+        waiting = self._seeker(self._last, self._reference, self._waiting, measured).follow(step.cam_from_world)
+        self._tracks, self._waiting = step.tracks, waiting
+        self._remember(frame.t_ns, measured, step.cam_from_world)
+        if self._is_keyframe_due(measured):
+            self._add_keyframe(frame_idx, frame, measured, step)
+        relative = self._last.cam_from_world @ self._reference.cam_from_world.inverse()
+        self.stretches[-1].append(FramePose(frame_idx, self._reference, relative, measured.view.view_from_cam))
+        return True
+
+    def _step(self, frame: StereoFrame, measured: MeasuredView) -> Step | None:
+        prediction = self._history.predict(frame.t_ns)
+        assert self._last is not None
+        assert self._reference is not None
+        seeker = self._seeker(self._last, self._reference, self._tracks, measured)
+        predicted = prediction.cam_from_world if prediction is not None else self._last.cam_from_world
+        return seeker.seek(predicted) or seeker.seek(self._last.cam_from_world)
+
+    def _seeker(self, last: LastFrame, reference: KeyFrame, tracks: Tracks, measured: MeasuredView) -> StepSeeker:
+        return StepSeeker(last, reference, self._reference_picture, tracks, self._landmarks, measured, self._config.odometry)
+
+    def _remember(self, t_ns: int, measured: MeasuredView, cam_from_world: Rigid3) -> None:
+        moved = cam_from_world @ self._last.cam_from_world.inverse() if self._last is not None else None
+        self._history.remember(t_ns, cam_from_world, moved)
+        self._last = LastFrame(measured, cam_from_world)
+
+    def _is_keyframe_due(self, measured: MeasuredView) -> bool:
+        assert self._reference is not None
+        tracks, config = self._tracks, self._config.odometry
+        if len(tracks.landmark_ids) < config.keyframe_share * np.count_nonzero(self._reference.observations.active):
+            return True
+        motion = np.median(np.linalg.norm(tracks.points_img - tracks.points_ref, axis=1))
+        return bool(motion > config.keyframe_motion * measured.view.camera.width)
+
+    def _add_keyframe(self, frame_idx: int, frame: StereoFrame, measured: MeasuredView, step: Step) -> None:
+        """Make the frame a key frame: what has shown its depth becomes a landmark, new corners wait for theirs, the window is adjusted."""
+        config, tracks, waiting = self._config.odometry, self._tracks, self._waiting
+        occupied = np.concatenate([tracks.points_img, waiting.points_img])
+        corners = find_corners(measured.view.grey, occupied, config.tracking)
+        fresh = Tracks(self._landmarks.add(self._guessed(corners, measured, step.cam_from_world)), corners, corners)
+        ids = np.concatenate([tracks.landmark_ids, waiting.landmark_ids, fresh.landmark_ids])
+        points_img = np.concatenate([occupied, corners])
+        seen = self._observations(ids, points_img, np.arange(len(ids)) < len(tracks.landmark_ids))
+        motion = Motion(self._reference, step.covariance) if self._reference is not None else None
+        keyframe = self._keyframe(frame_idx, frame.t_ns, measured, step.cam_from_world, seen, motion)
+        self._chain.append(keyframe)
+        known = self._settle(np.sort(waiting.landmark_ids), self._config.min_rays)
+        free, held = self._chain[-config.window :], self._chain[: -config.window][-config.held :]
+        adjust_bundle(free, held, self._landmarks, config.bundle)
+        del self._chain[: -(config.window + config.held)]
+        still = waiting.select(~np.isin(waiting.landmark_ids, known))
+        still = still.select(np.flatnonzero(np.isfinite(self._landmarks.positions[still.landmark_ids]).all(axis=1)))
+        left = Tracks(*(np.concatenate(pair) for pair in zip(vars(still).values(), vars(fresh).values(), strict=True)))
+        self._follow_from(keyframe, measured, left)
+
+    def _settle(self, ids: Int[np.ndarray, " n"], min_rays: int) -> Int[np.ndarray, " k"]:
+        """Those of the points with these ids (ascending) that have shown their depth, and are landmarks now. One whose rays do not meet is
+        no point: it has no place any more."""
+        if len(ids) == 0:
+            return ids
+        config, found = self._config, triangulate(self._chain, ids)
+        clear = is_clear(found, min_rays, np.deg2rad(config.min_parallax_deg), config.max_triangulation_px)
+        self._landmarks.positions[ids[clear]] = found.points[clear]
+        with np.errstate(invalid="ignore"):
+            wrong = (found.num_rays >= min_rays) & (found.parallax >= np.deg2rad(config.min_parallax_deg)) & ~clear
+        self._landmarks.positions[ids[wrong]] = np.nan
+        for keyframe in self._chain:
+            seen = keyframe.observations
+            seen.active[np.isin(seen.landmark_ids, ids[clear])] = True
+        return ids[clear]
+
+    def _guessed(self, corners: Float32[np.ndarray, "n 2"], measured: MeasuredView, cam_from_world: Rigid3) -> Float[np.ndarray, "n 3"]:
+        """Where corners may be, as far away as the landmarks next to them in the picture: good enough to follow them."""
+        nearest = 5
+        depths = cam_from_world.apply(self._landmarks.positions[self._tracks.landmark_ids])[:, 2]
+        apart = np.linalg.norm(corners[:, None] - self._tracks.points_img[None], axis=2)
+        rows = np.argsort(apart, axis=1, kind="stable")[:, :nearest]
+        z = np.median(depths[rows], axis=1) if len(corners) else np.zeros(0)
+        normalized = measured.view.camera.normalized_from_img(corners.astype(np.float64))
+        return cam_from_world.inverse().apply(np.column_stack([normalized * z[:, None], z]))
+
+    def _observations(
+        self, ids: Int[np.ndarray, " n"], points_img: Float32[np.ndarray, "n 2"], active: Bool[np.ndarray, " n"]
+    ) -> Observations:
+        weights = np.full((len(ids), 3), 1.0 / self._config.odometry.sigma_px)
+        weights[:, 2] = 0.0
+        return Observations(ids, np.column_stack([points_img.astype(np.float64), np.full(len(ids), np.nan)]), weights, active)
+
+    def _keyframe(
+        self, frame_idx: int, t_ns: int, measured: MeasuredView, cam_from_world: Rigid3, seen: Observations, motion: Motion | None = None
+    ) -> KeyFrame:
+        return KeyFrame(0, frame_idx, t_ns, len(self.stretches), measured.stereo, cam_from_world, seen, self._bias, motion)
+
+    def _follow_from(self, keyframe: KeyFrame, measured: MeasuredView, waiting: Tracks) -> None:
+        seen = keyframe.observations
+        points = np.ascontiguousarray(seen.measured[seen.active, :2], np.float32)
+        self._tracks = Tracks(seen.landmark_ids[seen.active], points, points)
+        self._waiting = Tracks(waiting.landmark_ids, waiting.points_img, waiting.points_img)
+        self._reference, self._reference_picture = keyframe, measured.left
+        if self._last is not None:
+            self._last.cam_from_world = keyframe.cam_from_world
+            self._history.move(keyframe.cam_from_world)
+
+
+def _measured(frame: StereoFrame, max_side_px: int) -> MeasuredView:
+    """A single picture as odometry of stereo would look at it. Its unit takes the place of the baseline."""
+    view = single_view(frame, max_side_px)
+    return MeasuredView(view, StereoCamera(view.camera, view.camera.fx), view.grey.astype(np.float32), None)
+
+
+def _no_tracks() -> Tracks:
+    return Tracks(np.zeros(0, np.int64), np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32))

@@ -1,0 +1,82 @@
+"""Points seen by several key frames, put where their rays meet: what a single camera knows of depth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from topoloc.slam.keyframes import KeyFrame
+
+
+@dataclass(frozen=True, eq=False)
+class Triangulated:
+    """Of each point: where its rays come nearest to each other (world), how many there are, the widest angle between the first of them and
+    another (radians), and the largest distance (pixels) from where a key frame sees it; infinite behind one. NaN where one ray is all."""
+
+    points: Float[np.ndarray, "n 3"]
+    num_rays: Int[np.ndarray, " n"]
+    parallax: Float[np.ndarray, " n"]
+    worst_px: Float[np.ndarray, " n"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """All observations of the points sought: row of the point, key frame, pixel, centre and unit direction of the ray in the world."""
+
+    rows: Int[np.ndarray, " m"]
+    frames: Int[np.ndarray, " m"]
+    points_img: Float[np.ndarray, "m 2"]
+    centres: Float[np.ndarray, "m 3"]
+    directions: Float[np.ndarray, "m 3"]
+
+
+def triangulate(keyframes: Sequence[KeyFrame], ids: Int[np.ndarray, " n"]) -> Triangulated:
+    """The points with these ids (in ascending order) by all that the key frames observe of them, active or not."""
+    seen, num = _gather(keyframes, ids), len(ids)
+    across = np.eye(3) - seen.directions[:, :, None] * seen.directions[:, None, :]
+    normal, right = np.zeros((num, 3, 3)), np.zeros((num, 3))
+    np.add.at(normal, seen.rows, across)
+    np.add.at(right, seen.rows, np.einsum("mij,mj->mi", across, seen.centres))
+    num_rays = np.bincount(seen.rows, minlength=num)
+    solvable = (num_rays > 1) & (np.abs(np.linalg.det(normal)) > 1e-12)
+    points = np.full((num, 3), np.nan)
+    points[solvable] = np.linalg.solve(normal[solvable], right[solvable, :, None])[:, :, 0]
+    first = np.zeros((num, 3))
+    first[seen.rows[::-1]] = seen.directions[::-1]
+    parallax, worst = np.zeros(num), np.where(solvable, 0.0, np.nan)
+    cosines = np.clip(np.sum(first[seen.rows] * seen.directions, axis=1), -1.0, 1.0)
+    np.maximum.at(parallax, seen.rows, np.arccos(cosines))
+    np.maximum.at(worst, seen.rows, _distances_px(keyframes, seen, points))
+    return Triangulated(points, num_rays, parallax, worst)
+
+
+def _gather(keyframes: Sequence[KeyFrame], ids: Int[np.ndarray, " n"]) -> _Seen:
+    parts: list[tuple[np.ndarray, ...]] = []
+    for number, keyframe in enumerate(keyframes):
+        observed = keyframe.observations
+        chosen = np.flatnonzero(np.isin(observed.landmark_ids, ids))
+        points_img = observed.measured[chosen, :2]
+        world_from_cam = keyframe.cam_from_world.inverse()
+        directions = keyframe.stereo.camera.rays_from_img(points_img) @ world_from_cam.rotation.T
+        centres = np.tile(world_from_cam.translation, (len(chosen), 1))
+        rows = np.searchsorted(ids, observed.landmark_ids[chosen])
+        parts.append((rows, np.full(len(chosen), number), points_img, centres, directions))
+    return _Seen(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _distances_px(keyframes: Sequence[KeyFrame], seen: _Seen, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " m"]:
+    distances = np.full(len(seen.rows), np.inf)
+    for number, keyframe in enumerate(keyframes):
+        of_it = np.flatnonzero(seen.frames == number)
+        projected = keyframe.stereo.project(keyframe.cam_from_world.apply(points[seen.rows[of_it]]))[:, :2]
+        distances[of_it] = np.nan_to_num(np.linalg.norm(projected - seen.points_img[of_it], axis=1), nan=np.inf)
+    return distances
+
+
+def is_clear(found: Triangulated, min_rays: int, min_parallax: float, max_px: float) -> Bool[np.ndarray, " n"]:
+    """Which points are known well enough to be believed."""
+    with np.errstate(invalid="ignore"):
+        return (found.num_rays >= min_rays) & (found.parallax >= min_parallax) & (found.worst_px <= max_px)

@@ -1,0 +1,64 @@
+"""The metres of a motion in a unit of its own: found by answers of a map, of which some are wrong, while the unit drifts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.lifelong.scale_of_motion import ScaleConfig, in_metres, largest_agreement
+from topoloc.lifelong.session_poses import SessionPosesConfig
+from topoloc.lifelong.single_camera_poses import held_stretch
+from topoloc.localization.result import Localization
+
+WORLD_FROM_OWN = Rigid3(exp_so3(np.array([0.4, -0.3, 1.0])), np.array([3.0, -2.0, 1.0]))
+TRUTH = [Rigid3(exp_so3(np.array([0.0, 0.0, 0.02 * k])), np.array([0.2 * k, 0.5 * np.sin(0.1 * k), 0.0])) for k in range(80)]
+WRONG = Rigid3(np.eye(3), np.array([2.0, 1.0, 0.0]))
+
+
+def _motion(drift: float) -> dict[int, Rigid3]:
+    """The motion in units of about half a metre, which grow by `drift` over the whole way."""
+    position, own = np.zeros(3), {0: TRUTH[0]}
+    for k in range(1, len(TRUTH)):
+        position = position + (TRUTH[k].translation - TRUTH[k - 1].translation) * 2.0 * (1.0 + drift * k / len(TRUTH))
+        own[k] = Rigid3(TRUTH[k].rotation, position)
+    return own
+
+
+def _answer(k: int) -> Localization:
+    covariance = np.diag([1e-5] * 3 + [1e-10] * 3)
+    return Localization(WORLD_FROM_OWN @ TRUTH[k], covariance, 0.99, 0, [], 100, 80)
+
+
+def _answers(numbers: list[int], wrong: list[int]) -> dict[int, Localization]:
+    answers = {k: _answer(k) for k in numbers}
+    for k in wrong:
+        answers[k] = Localization(WRONG @ answers[k].world_from_cam, answers[k].covariance, 0.99, 0, [], 100, 80)
+    return answers
+
+
+def test_wrong_answers_are_left_out():
+    answers = _answers(list(range(0, 80, 4)), [8, 40, 64])
+    agreeing = largest_agreement(_motion(0.05), answers, 0.2, 2.0, ScaleConfig())
+    assert agreeing == [k for k in answers if k not in (8, 40, 64)]
+
+
+def test_a_drifting_unit_is_held_between_answers_and_wrong_ones_bend_nothing():
+    answers = _answers([*range(0, 20, 2), 40, *range(60, 80, 2)], [40])
+    poses, agreeing = held_stretch("walk", _motion(0.1), answers, 0.6, SessionPosesConfig())
+    assert poses is not None
+    assert agreeing == [k for k in answers if k != 40]
+    off = [np.linalg.norm(poses[k].translation - (WORLD_FROM_OWN @ TRUTH[k]).translation) for k in range(80)]  # pyright: ignore[reportOptionalMemberAccess]
+    assert max(off) < 0.1
+
+
+def test_too_few_answers_hold_nothing():
+    poses, _ = held_stretch("walk", _motion(0.0), _answers([0, 30, 60], []), 0.6, SessionPosesConfig())
+    assert poses is None
+
+
+def test_where_the_unit_is_not_known_there_are_no_poses():
+    config = ScaleConfig(drift=0.1, max_sigma=0.2)
+    metric = in_metres(_motion(0.0), _answers(list(range(0, 20, 2)), []), config)
+    assert 0 in metric
+    assert 25 in metric
+    assert 79 not in metric
