@@ -10,7 +10,7 @@ import topoloc
 from topoloc.geometry.rigid import Rigid3
 from topoloc.map.entries import TopoNode
 from topoloc.map.landmarks import LandmarkConfig, Observations, refine_points, session_sums
-from topoloc.map.sums import PointSums
+from topoloc.map.sums import LandmarkSums, PointSums, with_counts_together
 from topoloc.map.topomap import TopoMetricMap
 
 
@@ -76,3 +76,25 @@ def test_every_node_of_a_map_has_sums_of_its_session(tiny_recording: Path):
     for node in topomap.nodes:
         (sums,) = node.sums
         np.testing.assert_array_equal(sums.rows, np.arange(len(node.features)))
+
+
+def _counts(session_id: int, rows: list[int], expected: int, seen: list[int]) -> LandmarkSums:
+    num = len(rows)
+    return LandmarkSums.of(session_id, np.array(rows), np.zeros((num, 3, 3)), np.zeros((num, 3)), np.full(num, expected), np.array(seen))
+
+
+def test_sessions_that_only_counted_take_the_room_of_two():
+    """Those of another light, which saw next to nothing again, stay apart from those that saw the rest."""
+    own = LandmarkSums.of(0, np.arange(3), np.tile(np.eye(3), (3, 1, 1)), np.full((3, 3), 0.1), np.ones(3, int), np.ones(3, int))
+    sums = [own, _counts(1, [0, 1], 4, [4, 2]), _counts(2, [0, 2], 5, [0, 0]), _counts(3, [1, 2], 3, [3, 1]), _counts(4, [2], 2, [0])]
+    together = with_counts_together(sums, 0.3)
+    assert [part.session_id for part in together] == [0, 3, 4]
+    assert together[0] is own
+    assert together[1].rows.tolist() == [0, 1, 2]
+    assert together[1].expected.tolist() == [4, 7, 3]
+    assert together[1].seen.tolist() == [4, 5, 1]
+    assert together[2].expected.tolist() == [5, 7]
+    before, after = PointSums.over(sums, 3), PointSums.over(together, 3)
+    np.testing.assert_array_equal(before.expected, after.expected)
+    np.testing.assert_array_equal(before.seen, after.seen)
+    np.testing.assert_allclose(before.information, after.information, atol=1e-5)

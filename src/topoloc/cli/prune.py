@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -22,7 +23,7 @@ class Command:
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP")]
     """The map file, which is replaced."""
     max_mb: Annotated[float | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: only what is gone is dropped)")] = None
-    """Megabytes that the file may have: every node keeps the landmarks that add most."""
+    """Megabytes that the file may have: every node keeps the landmarks that add most, and nodes that others hold go before it keeps few."""
     json: File = None
     """Write what was dropped to this file (- for standard output)."""
     config: File = None
@@ -37,11 +38,20 @@ class Command:
             before = edit.path.stat().st_size
             pruned = prune_map(edit.topomap, edit.path, None if self.max_mb is None else round(self.max_mb * 1e6), config)
             changes = pruned.changes | {"bytes_before": before}
+            walked_km = edit.topomap.length_m / 1e3
             if pruned.topomap is not edit.topomap:
                 edit.commit(pruned.topomap, "prune" if self.max_mb is None else f"prune to {self.max_mb:g} MB", changes)
         changes["bytes"] = Path(self.map).stat().st_size
         if self.json != "-":
-            dropped = f"{changes['landmarks_gone']} landmarks are gone, {changes['landmarks_dropped']} more dropped"
-            print(f"{self.map}: {dropped}, {before / 1e6:.2f} to {changes['bytes'] / 1e6:.2f} MB")
+            print(f"{self.map}: {describe_prune(changes, walked_km)}")
         write_json(self.json, {"map": self.map} | changes)
         return 0
+
+
+def describe_prune(changes: Mapping[str, Any], walked_km: float) -> str:
+    """What was dropped, in one line."""
+    c = changes
+    nodes = f"{c['nodes_dropped']} nodes that others hold, " if c["nodes_dropped"] else ""
+    dropped = f"{c['landmarks_gone']} landmarks are gone, {nodes}{c['landmarks_dropped']} more landmarks dropped"
+    per_km = f" ({c['bytes'] / 1e6 / walked_km:.0f} MB a km walked)" if walked_km > 0 else ""
+    return f"{dropped}, {c['bytes_before'] / 1e6:.2f} to {c['bytes'] / 1e6:.2f} MB{per_km}"

@@ -55,13 +55,15 @@ def ask_left_out(
     d_threshs: float,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[int, LeftOutAnswer]:
-    """What a map says of nodes of `stored`, which is this map or an earlier version of it, by their rows there; both hold these nodes."""
+    """What a map says of nodes of `stored`, which is this map or an earlier version of it, by their rows there."""
+    known = {summary.node_id for summary in localizer.topomap.summaries}
     poses = NodePoses.of([summary.world_from_cam for summary in stored.summaries])
     answers = dict[int, LeftOutAnswer]()
     for done, row in enumerate(rows):
         node = stored.nodes_of(stored.kind)[row]
         features = {kind: stored.nodes_of(kind)[row].features for kind in stored.kinds}
-        hidden = [stored.summaries[int(k)].node_id for k in beside(stored, row, d_threshs, poses)]
+        near = [stored.summaries[int(k)].node_id for k in beside(stored, row, d_threshs, poses)]
+        hidden = [node_id for node_id in near if node_id in known]
         is_all = len(hidden) == len(localizer.topomap.summaries)
         result = None if is_all else localizer.without(hidden).ask(Picture.of_features(features, node.camera))[0]
         answers[row] = _judged(result, node.summary.world_from_cam) if isinstance(result, Localization) else LeftOutAnswer(False, False, 0)

@@ -1,7 +1,8 @@
 """A map made smaller: read from `prune_map`. What is gone goes first, then what adds least.
 
-A landmark is gone where pictures that found their other landmarks again never found this one. For a budget, every node then keeps so many
-landmarks as fit: those with the best chance to be seen again, spread over the picture, for a landmark beside others tells less
+A landmark is gone where pictures that found their other landmarks again never found this one. For a budget, nodes that others hold are
+left out while else every node would keep few landmarks (`fewer_nodes.py`). Every node that stays then keeps so many as fit: those with
+the best chance to be seen again, spread over the picture, for a landmark beside others tells less
 (submodular coverage: a cell of the picture counts as the root of the chances in it; Krause & Golovin 2014, greedy choice).
 """
 
@@ -20,9 +21,10 @@ from jaxtyping import Bool, Float, Int
 from topoloc.bounds import AtLeast, Between, check_bounds
 from topoloc.errors import MapError
 from topoloc.lifelong.earlier_recall import earlier_recall
-from topoloc.lifelong.overlay import Overlay
+from topoloc.lifelong.fewer_nodes import fewest_dropped, holds_of, without_nodes
+from topoloc.lifelong.overlay import Changed, Overlay
 from topoloc.localization.map_facts.building import with_map_facts
-from topoloc.map.sums import LandmarkSums
+from topoloc.map.sums import LandmarkSums, with_counts_together
 from topoloc.map.topomap import TopoMetricMap, TopoNode
 from topoloc.map.writing import write_map
 from topoloc.sequences.atomic import scratch_file
@@ -39,14 +41,66 @@ class PruneConfig:
     """Pictures of later sessions that should have shown a landmark, before it can be taken for gone."""
     min_seen_share: Annotated[float, Between(0, 1)] = 0.3
     """Only sessions count that saw at least this share of a node's landmarks again: in another light none are seen."""
+    max_chance: Annotated[float, Between(1e-9, 1)] = 0.02
+    """A landmark is gone only where one that is there stayed unseen in so many pictures with this chance at most, by the shares that the
+    sessions saw of its node."""
     cells: Annotated[int, Between(1, 100)] = 8
     """The picture's columns of cells, over which the landmarks that are kept are spread."""
     min_points: Annotated[int, Between(10, 100_000)] = 100
     """Landmarks that a node keeps at least; a budget that asks for fewer is refused."""
+    few_points: Annotated[int, Between(10, 100_000)] = 200
+    """Where a budget leaves a node fewer landmarks than so many, nodes that others hold go first ..."""
+    min_held: Annotated[int, Between(1, 100_000)] = 60
+    """... none of whose place another one recognises fewer landmarks than so many."""
+    num_compared: Annotated[int, Between(1, 1000)] = 12
+    """Nodes near a node that may hold it."""
     max_gone_share: Annotated[float, AtLeast(0)] = 0.7
     """Of a node's landmarks at most this share is taken for gone."""
     earlier_asked: Annotated[int, Between(0, 10_000)] = 24
     """Nodes, at most, that the map is asked before and after, for its history to tell what the edit cost; 0: none."""
+
+
+@dataclass(frozen=True)
+class _FileSize:
+    """Bytes of a map's file: all of it, of a landmark of each kind, and what else goes with a node on the average: its template, its walls,
+    its pictures but for one."""
+
+    size: int
+    of_point: dict[str, float]
+    of_node: float
+
+    @staticmethod
+    def of(path: Path, kinds: Sequence[str]) -> _FileSize:
+        lengths = " + ".join(f"total(length({name}))" for name in _POINT_COLUMNS)
+        counted = "SELECT count(*), total(length(jpeg)) FROM"
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)) as database:
+            of_point = {}
+            for kind in kinds:
+                points = f"SELECT {lengths}, total(num_points) FROM node_points WHERE kind = ?"
+                num_bytes, num = database.execute(points, (kind,)).fetchone()
+                of_sums = database.execute("SELECT total(length(sums)) FROM landmark_sums WHERE kind = ?", (kind,)).fetchone()[0]
+                of_point[kind] = (num_bytes + of_sums) / max(num, 1)
+            num, of_templates = database.execute(f"{counted} node_templates").fetchone()
+            num_pictures, of_pictures = database.execute(f"{counted} place_images").fetchone()
+            of_walls = database.execute(f"SELECT {lengths} FROM side_node_points").fetchone()[0]
+        of_pictures *= max(1.0 - num / max(num_pictures, 1), 0.0)
+        return _FileSize(path.stat().st_size, of_point, (of_templates + of_walls + of_pictures) / max(num, 1))
+
+    def without_points(self, topomap: TopoMetricMap) -> float:
+        """Bytes of the map, whose file this is, without its landmarks."""
+        return self.size - sum(
+            of_one * sum(len(node.features) for node in topomap.nodes_of(kind)) for kind, of_one in self.of_point.items()
+        )
+
+
+def _as_written(topomap: TopoMetricMap, path: Path) -> _FileSize:
+    """Of the map's file, which is to be at `path`. Raises MapError."""
+    try:
+        with scratch_file(path) as tried:
+            write_map(topomap, tried)
+            return _FileSize.of(tried, topomap.kinds)
+    except OSError as error:
+        raise MapError(f"cannot write beside map {path}: {error.strerror}") from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,19 +123,56 @@ def prune_map(topomap: TopoMetricMap, path: Path, max_bytes: int | None = None, 
     """
     config = config or PruneConfig()
     check_bounds(config)
+    counted = _with_counts_together(topomap, config)
+    file = _FileSize.of(path, topomap.kinds) if counted is topomap else _as_written(counted, path)
+    fewer = counted if max_bytes is None else _with_fewer_nodes(counted, file, max_bytes, config)
+    file = file if fewer is counted else _as_written(fewer, path)
+    return _with_landmarks(topomap, fewer, path, file, max_bytes, config)
+
+
+def _with_counts_together(topomap: TopoMetricMap, config: PruneConfig) -> TopoMetricMap:
+    """Sessions that only counted made two, where there are more; else the map itself."""
+
+    def together(node: TopoNode) -> TopoNode:
+        return replace(node, sums=with_counts_together(node.sums, config.min_seen_share))
+
+    if not any(len(list(node.sums)) > len(list(together(node).sums)) for kind in topomap.kinds for node in topomap.nodes_of(kind)):
+        return topomap
+    nodes = {kind: Changed(topomap.nodes_of(kind), together) for kind in topomap.kinds}
+    return replace(topomap, nodes=nodes.pop(topomap.kind), other_kinds=nodes)
+
+
+def _with_fewer_nodes(topomap: TopoMetricMap, file: _FileSize, max_bytes: int, config: PruneConfig) -> TopoMetricMap:
+    """Without the nodes that go before any keeps fewer than `few_points`; the map itself where none needs to."""
+    left = {kind: np.array([(~_gone(node, config)).sum() for node in topomap.nodes_of(kind)]) for kind in topomap.kinds}
+    with_few = sum((np.minimum(left[kind], config.few_points) * file.of_point[kind] for kind in topomap.kinds), np.zeros(1))
+    too_much = file.without_points(topomap) + float(with_few.sum()) - max_bytes
+    if too_much <= 0:
+        return topomap
+    of_node, holds = with_few + file.of_node, holds_of(topomap, config.num_compared)
+    chosen = fewest_dropped(holds, config.min_held, lambda rows: float(of_node[rows].sum()) >= too_much)
+    return topomap if chosen is None else without_nodes(topomap, *chosen)
+
+
+def _with_landmarks(
+    before: TopoMetricMap, topomap: TopoMetricMap, path: Path, file: _FileSize, max_bytes: int | None, config: PruneConfig
+) -> PrunedMap:
+    """The map without what is gone, and within its budget; `before` is what it was made of, `file` the size that it has."""
     gone = {kind: [_gone(node, config) for node in topomap.nodes_of(kind)] for kind in topomap.kinds}
     left = {kind: [int((~of_node).sum()) for of_node in gone[kind]] for kind in topomap.kinds}
     largest = max(max(of_kind) for of_kind in left.values())
-    most, budget = largest, max_bytes
+    most, budget, rest = largest, max_bytes, file.without_points(topomap)
+    num_nodes = len(before.summaries) - len(topomap.summaries)
     while True:
         if budget is not None:
-            most = min(most, _most_points(left, _point_bytes(path, topomap.kinds), path.stat().st_size, budget, config))
-        if most >= largest and not any(of_node.any() for of_kind in gone.values() for of_node in of_kind):
-            return PrunedMap(topomap, {"landmarks_gone": 0, "landmarks_dropped": 0})
+            most = min(most, _most_points(left, file.of_point, rest, budget, config))
+        if topomap is before and most >= largest and not any(of_node.any() for of_kind in gone.values() for of_node in of_kind):
+            return PrunedMap(before, {"nodes_dropped": 0, "landmarks_gone": 0, "landmarks_dropped": 0})
         pruned = _with_fewer(topomap, gone, most, config)
-        if max_bytes is None or budget is None or (size := _bytes_of(pruned.topomap, path)) <= max_bytes:
-            return replace(pruned, changes=pruned.changes | earlier_recall(topomap, pruned.topomap, config.earlier_asked))
-        budget -= round(1.1 * (size - max_bytes)) + _PAGES  # how well bytes pack is known only now
+        if max_bytes is None or budget is None or (written := _as_written(pruned.topomap, path).size + _PAGES) <= max_bytes:
+            changes = {"nodes_dropped": num_nodes} | pruned.changes
+            return replace(pruned, changes=changes | earlier_recall(before, pruned.topomap, config.earlier_asked))
+        budget -= round(1.1 * (written - max_bytes)) + _PAGES  # how well bytes pack is known only now
 
 
 def _with_fewer(topomap: TopoMetricMap, gone: Mapping[str, list[np.ndarray]], most: int, config: PruneConfig) -> PrunedMap:
@@ -99,16 +190,6 @@ def _with_fewer(topomap: TopoMetricMap, gone: Mapping[str, list[np.ndarray]], mo
     nodes = pruned.pop(topomap.kind)
     smaller = replace(topomap, summaries=[node.summary for node in nodes], nodes=nodes, other_kinds=pruned)
     return PrunedMap(with_map_facts(smaller), {"landmarks_gone": num_gone, "landmarks_dropped": num_dropped})
-
-
-def _bytes_of(topomap: TopoMetricMap, path: Path) -> int:
-    """Of its file, which is to be at `path`, with an entry for one more edit. Raises MapError."""
-    try:
-        with scratch_file(path) as tried:
-            write_map(topomap, tried)
-            return tried.stat().st_size + _PAGES
-    except OSError as error:
-        raise MapError(f"cannot write beside map {path}: {error.strerror}") from error
 
 
 def with_points(node: TopoNode, kept: Int[np.ndarray, " k"]) -> TopoNode:
@@ -134,15 +215,18 @@ def with_points(node: TopoNode, kept: Int[np.ndarray, " k"]) -> TopoNode:
 
 
 def _gone(node: TopoNode, config: PruneConfig) -> Bool[np.ndarray, " n"]:
-    """The landmarks that later sessions never saw though they saw the rest."""
+    """The landmarks that later sessions never saw though they saw the rest, and so often that a landmark that is there hardly stays
+    unseen: a session that finds a third of what is in view misses four pictures in a row by chance, one of five times."""
     num = len(node.features)
-    expected, seen = np.zeros(num, np.int64), np.zeros(num, np.int64)
+    expected, seen, log_missed = np.zeros(num, np.int64), np.zeros(num, np.int64), np.zeros(num)
     for sums in node.sums:
         later = sums.session_id != node.summary.session_id
-        if later and sums.seen.sum(dtype=np.int64) >= config.min_seen_share * sums.expected.sum(dtype=np.int64):
+        if later and sums.is_seen_again(config.min_seen_share):
+            share = sums.seen.sum(dtype=np.int64) / max(int(sums.expected.sum(dtype=np.int64)), 1)
             expected[sums.rows] += sums.expected
             seen[sums.rows] += sums.seen
-    gone = (expected >= config.min_expected) & (seen == 0)
+            log_missed[sums.rows] += sums.expected * np.log1p(-min(share, 0.99))
+    gone = (expected >= config.min_expected) & (seen == 0) & (log_missed <= np.log(config.max_chance))
     return gone if gone.sum() <= config.max_gone_share * num else np.zeros(num, bool)
 
 
@@ -169,30 +253,15 @@ def _chosen(node: TopoNode, rows: Int[np.ndarray, " m"], most: int, config: Prun
     return np.sort(np.argsort(-gains, kind="stable")[:most])
 
 
-def _point_bytes(path: Path, kinds: Sequence[str]) -> dict[str, float]:
-    """Bytes that a landmark of each kind takes in the file."""
-    lengths = " + ".join(f"sum(length({name}))" for name in _POINT_COLUMNS)
-    query = f"SELECT {lengths}, sum(num_points) FROM node_points WHERE kind = ?"
-    sums = "SELECT total(length(sums)) FROM landmark_sums WHERE kind = ?"
-    with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)) as database:
-        of_kind = {}
-        for kind in kinds:
-            num_bytes, num = database.execute(query, (kind,)).fetchone()
-            of_kind[kind] = (num_bytes + database.execute(sums, (kind,)).fetchone()[0]) / max(num, 1)
-    return of_kind
-
-
-def _most_points(left: dict[str, list[int]], of_point: dict[str, float], size: int, max_bytes: int, config: PruneConfig) -> int:
-    """Landmarks a node of each kind so that the file fits."""
-    everything = sum(sum(of_kind) * of_point[kind] for kind, of_kind in left.items())
-    rest = max(size - everything, 0.0)
+def _most_points(left: dict[str, list[int]], of_point: dict[str, float], rest: float, max_bytes: int, config: PruneConfig) -> int:
+    """Landmarks a node of each kind so that a file fits whose bytes without landmarks are `rest`."""
 
     def bytes_with(most: int) -> float:
         return rest + sum(sum(min(n, most) for n in of_kind) * of_point[kind] for kind, of_kind in left.items())
 
     if bytes_with(config.min_points) > max_bytes:
-        least = bytes_with(config.min_points) / 1e6
-        raise MapError(f"map of {size / 1e6:.2f} MB: with {config.min_points} landmarks a node it takes {least:.2f} MB; nothing is dropped")
+        least, num = bytes_with(config.min_points) / 1e6, max(len(of_kind) for of_kind in left.values())
+        raise MapError(f"with {config.min_points} landmarks each its {num} nodes take {least:.2f} MB; nothing is dropped")
     low, high = config.min_points, max(max(of_kind) for of_kind in left.values())
     while low < high:
         middle = (low + high + 1) // 2

@@ -12,7 +12,7 @@ the number of its observations: points that are gone are expected and no longer 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +23,8 @@ from topoloc.map.validation import Damage, array_from, unpacked
 PULL_SCALE = 1024.0
 """Pulls are kept as L^-1 g with A = L L', which has no unit and is about 1, in steps of one part in so many."""
 MAX_COUNT = 65535
+_NO_INFORMATION = 1e-6  # 1 / square metres: on the diagonal, so that the root of no information is defined
+_NO_ROOT = 1.01 * _NO_INFORMATION**0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +54,7 @@ class LandmarkSums:
         """From information (1 / square metres) and pulls (1 / metres). Points of which the session knows nothing have information 0."""
         # what three pixels of noise leave unknown is no information: a little on the diagonal keeps the root defined
         scale = np.einsum("mii->m", information) / 3.0
-        lower = np.linalg.cholesky(information + (1e-9 * scale + 1e-6)[:, None, None] * np.eye(3))
+        lower = np.linalg.cholesky(information + (1e-9 * scale + _NO_INFORMATION)[:, None, None] * np.eye(3))
         whitened = np.linalg.solve(lower, pulls[:, :, None])[:, :, 0]
         return LandmarkSums(
             session_id,
@@ -62,6 +64,15 @@ class LandmarkSums:
             np.minimum(expected, MAX_COUNT).astype(np.uint16),
             np.minimum(seen, MAX_COUNT).astype(np.uint16),
         )
+
+    @property
+    def is_count_alone(self) -> bool:
+        """Whether the session says nothing of where the points are."""
+        return len(self.rows) > 0 and not self.pulls.any() and float(np.abs(self.roots).max()) <= _NO_ROOT
+
+    def is_seen_again(self, min_seen_share: float) -> bool:
+        """Whether the session saw at least this share of what it should have seen."""
+        return bool(self.seen.sum(dtype=np.int64) >= min_seen_share * self.expected.sum(dtype=np.int64))
 
     def information(self) -> Float[np.ndarray, "m 3 3"]:
         """A of each point, 1 / square metres."""
@@ -110,6 +121,33 @@ class PointSums:
         """Positions (metres) and covariances of points kept at `points_cam`, as these sums have them."""
         covariances = np.linalg.inv(self.information)
         return points_cam - (covariances @ self.pulls[:, :, None])[:, :, 0], covariances
+
+
+def with_counts_together(sums: Iterable[LandmarkSums], min_seen_share: float) -> list[LandmarkSums]:
+    """The same with the sessions that only counted as two at most, under the ids of the last of each: those that saw at least this share of
+    what they should have seen, and the others (another light). A node then takes the same room however many sessions passed by it."""
+    kept, counted = list[LandmarkSums](), dict[bool, list[LandmarkSums]]()
+    for of_session in sums:
+        if of_session.is_count_alone:
+            counted.setdefault(of_session.is_seen_again(min_seen_share), []).append(of_session)
+        else:
+            kept.append(of_session)
+    return sorted([*kept, *map(_added_up, counted.values())], key=lambda part: part.session_id)
+
+
+def _added_up(parts: Sequence[LandmarkSums]) -> LandmarkSums:
+    """Counts of several sessions as those of the last one."""
+    last = max(parts, key=lambda part: part.session_id)
+    if len(parts) == 1:
+        return last
+    num = 1 + max(int(part.rows[-1]) for part in parts)
+    expected, seen = np.zeros(num, np.int64), np.zeros(num, np.int64)
+    for part in parts:
+        expected[part.rows] += part.expected
+        seen[part.rows] += part.seen
+    rows = np.flatnonzero(expected > 0)
+    nothing = np.zeros((len(rows), 3, 3)), np.zeros((len(rows), 3))
+    return LandmarkSums.of(last.session_id, rows, *nothing, expected[rows], seen[rows])
 
 
 def sums_bytes(sums: LandmarkSums) -> bytes:
