@@ -10,6 +10,7 @@ import tyro
 
 from topoloc.cli.output import File, UsageError, check_outputs, progress_bar, write_json
 from topoloc.cli.settings_file import read_settings
+from topoloc.cli.update import describe_untaught
 from topoloc.lifelong.merge import merge_maps
 from topoloc.lifelong.update import UpdateConfig
 from topoloc.localization.localizer import LocalizerConfig
@@ -45,6 +46,6 @@ class Command:
         c = merged.changes | {"bytes": Path(self.out).stat().st_size}
         if self.json != "-":
             recognised = f"{c['agreeing']} of {c['nodes_of_second']} nodes of {self.second} were recognised in {self.first}"
-            print(f"{self.out}: {recognised}, {c['nodes_added']} added, {c['bytes'] / 1e6:.2f} MB")
+            print(f"{self.out}: {recognised}, {c['nodes_added']} added, {c['bytes'] / 1e6:.2f} MB{describe_untaught(c)}")
         write_json(self.json, {"map": self.out} | c)
         return 0

@@ -1,4 +1,4 @@
-"""Coarse localizers learn the pictures of a new session: k-NN adds vectors, under the vocabulary that is there."""
+"""Coarse localizers learn the pictures of a new session: k-NN adds vectors, under the vocabulary or the network that is there."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from topoloc.errors import MissingExtraError
 from topoloc.features.features import Features
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.coarse import CoarseModel
+from topoloc.map.topomap import PlaceImage, TopoMetricMap
+from topoloc.places.coarse import CoarseModel, GrowsByPictures, open_coarse
+from topoloc.places.network_pictures import decode_picture
 from topoloc.places.vlad import SurfVlad
 
 
@@ -23,14 +25,47 @@ class PlaceView:
     node_id: int
 
 
-def with_place_views(topomap: TopoMetricMap, views: Mapping[str, Sequence[PlaceView]]) -> dict[str, CoarseModel]:
-    """The map's coarse localizers, those by local features with these pictures, by their kinds; others know none of them."""
-    models = dict(topomap.coarse_models)
-    for kind, of_kind in views.items():
-        name = SurfVlad.name if kind == topomap.kind else f"{SurfVlad.name}@{kind}"
-        if name in models and of_kind:
-            grown = SurfVlad.from_model(models[name]).with_images(
-                [(view.features, view.width, view.height) for view in of_kind], np.array([view.node_id for view in of_kind])
-            )
-            models[name] = replace(grown.to_model(), name=name)
-    return models
+@dataclass(frozen=True, eq=False)
+class Taught:
+    """A map's coarse localizers with what was added, and the names of those that could not learn it."""
+
+    models: dict[str, CoarseModel]
+    not_taught: list[str]
+
+
+def taught_places(topomap: TopoMetricMap, views: Mapping[str, Sequence[PlaceView]], images: Sequence[PlaceImage]) -> Taught:
+    """The map's coarse localizers with new places: those by local features learn `views`, by their kinds, and those that compare a
+    network's vectors the small pictures `images`. One with an output a node (cnn-fc) is to be trained, and without PyTorch no network is
+    asked.
+
+    Raises:
+        MapError: a coarse localizer of the map, or a picture, is damaged.
+    """
+    models, not_taught = dict(topomap.coarse_models), []
+    for name, model in models.items():
+        of_name, _, of_kind = name.partition("@")
+        if of_name == SurfVlad.name:
+            models[name] = _with_views(model, views.get(of_kind or topomap.kind, []))
+        elif images:
+            grown = _with_pictures(model, images)
+            models[name] = grown or model
+            not_taught += [] if grown else [name]
+    return Taught(models, sorted(not_taught))
+
+
+def _with_views(model: CoarseModel, views: Sequence[PlaceView]) -> CoarseModel:
+    if not views:
+        return model
+    described = [(view.features, view.width, view.height) for view in views]
+    grown = SurfVlad.from_model(model).with_images(described, np.array([view.node_id for view in views]))
+    return replace(grown.to_model(), name=model.name)
+
+
+def _with_pictures(model: CoarseModel, images: Sequence[PlaceImage]) -> CoarseModel | None:
+    try:
+        localizer = open_coarse(model)
+    except MissingExtraError:
+        return None
+    if not isinstance(localizer, GrowsByPictures):
+        return None
+    return localizer.with_pictures([decode_picture(image.jpeg) for image in images], np.array([image.node_id for image in images]))

@@ -15,7 +15,8 @@ def earlier_recall(
     before: TopoMetricMap, after: TopoMetricMap, max_asked: int, localizer_config: LocalizerConfig | None = None
 ) -> dict[str, int]:
     """How many of the earlier nodes each of two versions of a map localizes, by the names that the history has for it; empty where none
-    is to be asked. `after` has all nodes of `before`. Raises as `Localizer`, and MapError from reading."""
+    is to be asked.
+    Raises as `Localizer`, and MapError from reading."""
     rows = evenly(range(len(before.summaries)), max_asked)
     if not rows:
         return {}

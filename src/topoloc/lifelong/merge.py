@@ -14,7 +14,7 @@ from typing import Any
 from topoloc.bounds import check_bounds
 from topoloc.errors import MapError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.lifelong.coarse_models import PlaceView, with_place_views
+from topoloc.lifelong.coarse_models import PlaceView, taught_places
 from topoloc.lifelong.earlier_recall import earlier_recall
 from topoloc.lifelong.overlay import Overlay
 from topoloc.lifelong.session_poses import Progress, SessionPoses, held_by
@@ -63,12 +63,13 @@ def merge_maps(
     assert d_thresh is not None, "a map's own configuration is resolved"
     added = [row for row, answer in held.answers.items() if not is_well_held(answer, d_thresh, config)]
     poses = {row: pose for row, pose in enumerate(held.world_from_cams) if pose is not None}
-    merged = _with_nodes(first, second, added, poses)
+    merged, not_taught = _with_nodes(first, second, added, poses)
     changes = {
         "nodes_of_second": len(second.summaries),
         "localized": sum(answer is not None for answer in held.answers.values()),
         "agreeing": len(held.agreeing),
         "nodes_added": len(added),
+        "not_taught": not_taught,
     }
     merged = with_map_facts(merged, progress)
     return MergedMap(merged, changes | earlier_recall(first, merged, config.earlier_asked, localizer_config))
@@ -94,31 +95,34 @@ def _held(
         raise TrajectoryError(str(error).replace("the map stays as it is", "nothing is merged")) from None
 
 
-def _with_nodes(first: TopoMetricMap, second: TopoMetricMap, added: Sequence[int], poses: Mapping[int, Rigid3]) -> TopoMetricMap:
+def _with_nodes(
+    first: TopoMetricMap, second: TopoMetricMap, added: Sequence[int], poses: Mapping[int, Rigid3]
+) -> tuple[TopoMetricMap, list[str]]:
+    """The first map with these nodes of the second, and the coarse localizers that could not learn them."""
     base = first.free_ids.session
     sessions = {session.session_id: replace(session, session_id=base + k) for k, session in enumerate(second.sessions)}
     session_ids = {old: session.session_id for old, session in sessions.items()}
     first_id = first.free_ids.node
     new_id = {row: first_id + k for k, row in enumerate(added)}
     nodes = {kind: [_moved(second.nodes_of(kind)[row], new_id[row], poses[row], session_ids) for row in added] for kind in first.kinds}
-    views = {
-        kind: [PlaceView(n.features, n.camera.width, n.camera.height, n.summary.node_id) for n in of_kind]
-        for kind, of_kind in nodes.items()
-    }
+    views = {kind: [_view(node) for node in of_kind] for kind, of_kind in nodes.items()}
     summaries = [*first.summaries, *(node.summary for node in nodes[first.kind])]
     grown = {kind: Overlay(first.nodes_of(kind), {}, nodes[kind]) for kind in first.kinds}
-    return replace(
+    images = _images(second, new_id, poses, session_ids)
+    taught = taught_places(first, views, images)
+    merged = replace(
         first,
         summaries=summaries,
         nodes=grown.pop(first.kind),
         other_kinds=grown,
         edges=sorted({*first.edges, *_edges(first, second, new_id, poses)}, key=lambda edge: (edge.source_id, edge.target_id)),
-        place_images=Overlay(first.place_images, {}, _images(second, new_id, poses, session_ids)),
-        coarse_models=with_place_views(first, views),
+        place_images=Overlay(first.place_images, {}, images),
+        coarse_models=taught.models,
         length_m=first.length_m + second.length_m * len(added) / max(len(second.summaries), 1),
         sessions=[*first.sessions, *sessions.values()],
         sides=_sides(first, second, new_id, poses, summaries),
     )
+    return merged, taught.not_taught
 
 
 def _view(node: TopoNode) -> PlaceView:

@@ -1,5 +1,5 @@
-"""The networks that the learned coarse localizers stand on: VGG-11, VGG-16 (Simonyan & Zisserman 2014) and SqueezeNet 1.1
-(Iandola et al. 2016), and a small one of our own for training from nothing, in PyTorch.
+"""The networks that the learned coarse localizers stand on: VGG-11, VGG-16 (Simonyan & Zisserman 2014), SqueezeNet 1.1
+(Iandola et al. 2016), EfficientNet-lite0 (`efficientnet.py`), and a small one of our own for training from nothing, in PyTorch.
 
 Layers of the first three carry torchvision's names and order, so that the ImageNet weights that torchvision publishes load as they are.
 """
@@ -11,6 +11,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from topoloc.places.efficientnet import NUM_CHANNELS as EFFICIENTNET_CHANNELS
+from topoloc.places.efficientnet import efficientnet_features
 from topoloc.places.network_config import BackboneName
 
 # Of ImageNet, which all these networks were trained on: input is (RGB in [0, 1] - mean) / deviation.
@@ -86,12 +88,16 @@ class _Fire(nn.Module):
 def _num_channels(layer: nn.Module) -> int:
     if isinstance(layer, _Fire):
         return layer.expand1x1.out_channels + layer.expand3x3.out_channels
-    return layer.out_channels if isinstance(layer, nn.Conv2d) else 0
+    if isinstance(layer, nn.Sequential):
+        return max(_num_channels(part) for part in layer)
+    return getattr(layer, "out_channels", 0)
 
 
 def _features(name: BackboneName) -> nn.Sequential:
     if name == "compact":
         return _compact_features()
+    if name == "efficientnet_lite0":
+        return efficientnet_features(IMAGENET_MEAN, IMAGENET_DEVIATION)
     return _squeezenet_features() if name == "squeezenet1_1" else _vgg_features(_VGG_LAYERS[name])
 
 
@@ -133,6 +139,8 @@ def _classifier(name: BackboneName, num_outputs: int) -> nn.Sequential:
         return nn.Sequential(nn.Dropout(0.5), nn.Conv2d(NUM_CHANNELS, num_outputs, 1), nn.ReLU(True), nn.AdaptiveAvgPool2d(1))
     if name == "compact":
         return nn.Sequential(nn.Dropout(0.5), nn.Conv2d(_COMPACT_LAYERS[-1], num_outputs, 1), nn.AdaptiveAvgPool2d(1))
+    if name == "efficientnet_lite0":
+        return nn.Sequential(nn.Dropout(0.2), nn.Conv2d(EFFICIENTNET_CHANNELS, num_outputs, 1), nn.AdaptiveAvgPool2d(1))
     wide = 4096
     hidden = [nn.Linear(512 * VGG_GRID**2, wide), nn.ReLU(True), nn.Dropout(0.5), nn.Linear(wide, wide), nn.ReLU(True), nn.Dropout(0.5)]
     return nn.Sequential(*hidden, nn.Linear(wide, num_outputs))

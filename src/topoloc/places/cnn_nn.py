@@ -14,7 +14,7 @@ from topoloc.places.network_config import BackboneName, PooledNetwork
 from topoloc.places.vector_search import VectorSearch
 
 # Deeper layers know more of things and less of places: the fifth and sixth of SqueezeNet's fire modules rank nodes best.
-DEPTHS: dict[BackboneName, int | None] = {"squeezenet1_1": 11, "vgg11": None, "vgg16": None, "compact": None}
+DEPTHS: dict[BackboneName, int | None] = {"squeezenet1_1": 11, "vgg11": None, "vgg16": None, "efficientnet_lite0": 11, "compact": None}
 
 
 class PooledFeatures(nn.Module):

@@ -7,7 +7,7 @@ Every coarse localizer answers the same question behind `CoarseLocalizer.rank`; 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
@@ -78,6 +78,15 @@ class ByVectors(CoarseLocalizer, Protocol):
 
     def with_less_between(self, group_of_node: Int[np.ndarray, " nodes"]) -> CoarseLocalizer:
         """The same with less of what sets groups of nodes, by their rows, apart on the whole."""
+        ...
+
+
+@runtime_checkable
+class GrowsByPictures(CoarseLocalizer, Protocol):
+    """One that learns a picture by its vector alone."""
+
+    def with_pictures(self, pictures: Sequence[Image], node_ids: Int[np.ndarray, " n"]) -> CoarseModel:
+        """The stored model with these pictures, each of the node with this id."""
         ...
 
 

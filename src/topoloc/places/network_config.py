@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from topoloc.bounds import Between
 
-BackboneName = Literal["squeezenet1_1", "vgg11", "vgg16", "compact"]
+BackboneName = Literal["squeezenet1_1", "vgg11", "vgg16", "efficientnet_lite0", "compact"]
 
 
 @dataclass(frozen=True)

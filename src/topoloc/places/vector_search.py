@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int
 from torch import nn
 
 from topoloc.errors import MapError
@@ -15,6 +16,8 @@ from topoloc.places.inference import Predictor, from_arrays
 from topoloc.places.neighbours import PlaceIndex, Whitening
 from topoloc.places.network_config import PictureConfig
 from topoloc.places.network_pictures import PictureShape, network_pictures
+
+_CHUNK = 64  # pictures that go through the network together
 
 
 class VectorSearch:
@@ -30,7 +33,7 @@ class VectorSearch:
             self._predict = Predictor(from_arrays(network, model.arrays))
         except (KeyError, RuntimeError, ValueError) as error:
             raise MapError(f"the map's coarse localizer {model.name!r} is damaged: {' '.join(str(error).split())[:200]}") from error
-        self._name, mean = model.name, model_array(model, "mean", "f", (None,)).astype(np.float32, copy=False)
+        self._model, mean = model, model_array(model, "mean", "f", (None,)).astype(np.float32, copy=False)
         projection = model_array(model, "projection", "f", (None, len(mean))).astype(np.float32)
         vectors = model_array(model, "vectors", "f", (None, len(projection))).astype(np.float32)
         self._whitening = Whitening(mean, projection)
@@ -44,9 +47,17 @@ class VectorSearch:
         """`rank` of many images, which go through the network together."""
         return [self._index.rank_nodes(vector, num_candidates) for vector in self.vectors(images)]
 
+    def with_pictures(self, pictures: Sequence[Image], node_ids: Int[np.ndarray, " n"]) -> CoarseModel:
+        """See `GrowsByPictures`: their vectors join, under the whitening that is there."""
+        known = self._model.arrays
+        parts = [self.vectors(pictures[k : k + _CHUNK]) for k in range(0, len(pictures), _CHUNK)]
+        vectors = np.concatenate([known["vectors"], *(part.astype(known["vectors"].dtype) for part in parts)])
+        of_nodes = np.concatenate([known["node_ids"], node_ids.astype(known["node_ids"].dtype)])
+        return replace(self._model, arrays={**known, "vectors": vectors, "node_ids": of_nodes})
+
     def vectors(self, images: Sequence[Image]) -> Float32[np.ndarray, "n d"]:
         """The images' unit vectors."""
         raw = self._predict(network_pictures(images, self._shape, self._picture))
         if raw.shape[1] != len(self._whitening.mean):
-            raise MapError(f"the map's coarse localizer {self._name!r} is damaged: its whitening is not that of its network")
+            raise MapError(f"the map's coarse localizer {self._model.name!r} is damaged: its whitening is not that of its network")
         return self._whitening.apply(raw)

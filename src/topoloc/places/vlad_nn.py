@@ -15,7 +15,7 @@ from topoloc.places.network_config import BackboneName, VladNetworkConfig
 from topoloc.places.vector_search import VectorSearch
 
 # NetVLAD takes VGG's last convolution before its rectifier and pooling, as the public checkpoints do.
-DEPTHS: dict[BackboneName, int | None] = {"squeezenet1_1": 11, "vgg11": 19, "vgg16": 29, "compact": None}
+DEPTHS: dict[BackboneName, int | None] = {"squeezenet1_1": 11, "vgg11": 19, "vgg16": 29, "efficientnet_lite0": 11, "compact": None}
 
 
 class NetVlad(nn.Module):

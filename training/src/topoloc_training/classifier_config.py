@@ -66,6 +66,8 @@ class CnnFcConfig(ClassifierNetwork):
     learns as a whole."""
     num_copies: Annotated[int, Between(1, 10_000)] = 8
     """Varied copies of each picture that the layers that do not learn see, once; fewer where what they make of them would exceed 1 GB."""
+    tuning_epochs: Annotated[int, Between(1, 100_000)] = 8
+    """Times that every image is shown where it begins with what the map's own cnn-fc knows."""
     label_spread: Annotated[float, AtLeast(0)] = 1.0
     """An image belongs to its nearest node and, by a bell curve of D_total - D_nearest over this share of D_thresh, to those
     about as near; 0 is the paper's single label."""

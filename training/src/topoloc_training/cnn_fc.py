@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +32,7 @@ def train(
     progress: Progress,
     checkpoint: Path | None = None,
 ) -> CoarseModel:
-    """Train on all mapping images but those held out.
+    """Train on all mapping images but those held out. Weights of the map's own cnn-fc are tuned for a few epochs.
 
     Raises:
         TrainingError: see `fit`.
@@ -40,6 +40,8 @@ def train(
     """
     if training_set.num_nodes < 1:
         raise TrainingError(f"{NAME}: the map has no nodes")
+    if weights is not None and weights.num_outputs is not None:
+        config = _for_tuning(config)
     torch.manual_seed(config.training.seed)
     network = NodeClassifier(backbone, training_set.num_nodes)
     in_channels_last(network)
@@ -68,7 +70,7 @@ def train(
     temperature = calibrated_temperature(_outputs(network, plain, len(trunk)), labels) if held_out.any() else 1.0
     facts = {"backbone": backbone, "weights": describe(weights), "config": asdict(config), "picture_shape": [shape.width, shape.height]}
     ended = {"epochs": len(done.scores), "best_epoch": done.best_epoch, "stopped_by": done.stopped_by}
-    trained = ended | {"num_held_out": int(held_out.sum())}
+    trained = ended | {"num_held_out": int(held_out.sum()), "widened_from": None if weights is None else weights.num_outputs}
     settings = facts | {"trained": trained, "num_nodes": training_set.num_nodes, "temperature": temperature}
     return CoarseModel(NAME, settings, to_arrays(network))
 
@@ -114,8 +116,16 @@ def _freeze(network: NodeClassifier, num_tuned: int) -> nn.Sequential:
 
 
 def _load(network: NodeClassifier, weights: Weights) -> list[nn.Parameter]:
-    """Put in all weights that fit, which are all but the output layer's; the parameters that got one."""
-    parameters = dict(network.backbone.named_parameters())
+    """Put in all weights that fit, which are all but the output layer's where they are not the map's own; the parameters that got one,
+    without those that learn at the full rate."""
+    parameters = {name.removeprefix("backbone."): value for name, value in network.named_parameters()}
     fitting = {name: value for name, value in weights.tensors.items() if name in parameters and parameters[name].shape == value.shape}
-    network.backbone.load_state_dict(fitting, strict=False)
-    return [parameters[name] for name in fitting if "classifier.6" not in name]
+    with torch.no_grad():
+        for name, value in fitting.items():
+            parameters[name].copy_(value)
+    return [parameters[name] for name in fitting if not name.startswith(("classifier.6", "head."))]
+
+
+def _for_tuning(config: CnnFcConfig) -> CnnFcConfig:
+    num_epochs = min(config.tuning_epochs, config.training.max_epochs)
+    return replace(config, num_copies=min(config.num_copies, num_epochs), training=replace(config.training, max_epochs=num_epochs))

@@ -40,7 +40,7 @@ def train_coarse(
     """Train the coarse localizer `name` (cnn-fc, cnn-nn or vlad-nn) for this map.
 
     Args:
-        weights: a file, ``scratch``, or None for the published weights of the backbone.
+        weights: a file, ``scratch``, ``map`` for what the map's own cnn-fc knows, or None for the published weights of the backbone.
         checkpoint: cnn-fc writes its state here after each epoch, and goes on from it if it is there.
 
     Raises:
@@ -52,12 +52,15 @@ def train_coarse(
     if name == "surf-vlad":
         raise TrainingError("surf-vlad learns from the recording's local features: `topoloc build` makes it")
     from topoloc_training.weights import find_weights  # PyTorch takes its time
+    from topoloc_training.widening import MAP, weights_of_map
 
+    if weights == MAP and name != "cnn-fc":
+        raise TrainingError(f"{name} learns new pictures as they join the map; only cnn-fc begins with what it knows")
     module = importlib.import_module(f"topoloc_training.{name.replace('-', '_')}")
     config = config or CoarseTrainingConfig()
     check_bounds(config)
     of_name = {"cnn-fc": config.cnn_fc, "cnn-nn": config.cnn_nn, "vlad-nn": config.vlad_nn}[name]
-    found = find_weights(backbone, weights)
+    found = weights_of_map(topomap, backbone) if weights == MAP else find_weights(backbone, weights)
     arguments = (training_set_of(topomap), backbone, found, of_name, progress or (lambda stage, done, total: None))
     model = module.train(*arguments, checkpoint) if name == "cnn-fc" else module.train(*arguments)
     return in_ids(model, [summary.node_id for summary in topomap.summaries])

@@ -30,8 +30,9 @@ class Command:
     """The coarse localizer to train."""
     backbone: BackboneName = "squeezenet1_1"
     """The network it stands on."""
-    weights: Annotated[str | None, tyro.conf.arg(metavar="FILE|scratch", help_behavior_hint="(default: the published)")] = None
-    """The network's weights: a PyTorch file of torchvision's or NetVLAD's layout, or `scratch` for random ones."""
+    weights: Annotated[str | None, tyro.conf.arg(metavar="FILE|scratch|map", help_behavior_hint="(default: the published)")] = None
+    """The network's weights: a PyTorch file of torchvision's or NetVLAD's layout, `scratch` for random ones, `map` (cnn-fc) for
+    what the map's own one knows: its output is widened by new nodes, and tuned."""
     default: Flag = False
     """From now on it answers where --coarse is not given."""
     out: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: MAP itself)")] = None
@@ -58,11 +59,16 @@ class Command:
         (facts,) = [facts for facts in list_coarse(target) if facts["name"] == self.coarse]
         facts |= {"seconds": round(time.perf_counter() - start, 1), "default": self.default}
         if self.json != "-":
-            print(f"{target}: {self.coarse} on {self.backbone}, {facts['bytes'] / 1e6:.2f} MB, {facts['seconds']:.0f} s")
+            print(f"{target}: {self.coarse} on {self.backbone}{_widened(model)}, {facts['bytes'] / 1e6:.2f} MB, {facts['seconds']:.0f} s")
         for warning in warnings_of(model):
             print(f"warning: {warning}", file=sys.stderr)
         write_json(self.json, facts)
         return 0
+
+
+def _widened(model: CoarseModel) -> str:
+    before = (model.settings.get("trained") or {}).get("widened_from")
+    return "" if before is None else f", widened from {before} to {model.settings['num_nodes']} nodes"
 
 
 def warnings_of(model: CoarseModel) -> list[str]:

