@@ -165,10 +165,11 @@ def test_two_writers_at_once_lose_nothing(somewhere: str, room_map: Path, monkey
 
 
 def _one_object_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """fsspec's store in memory looks first and writes then, unlike S3; here both are one step."""
+    """fsspec's store in memory looks first and writes then, and lists what goes meanwhile, unlike S3; here each is one step."""
     from fsspec.implementations.memory import MemoryFileSystem
 
-    lock, write = threading.Lock(), MemoryFileSystem.pipe_file
+    lock, write = threading.RLock(), MemoryFileSystem.pipe_file
+    listed, removed = MemoryFileSystem.ls, MemoryFileSystem._rm  # pyright: ignore[reportPrivateUsage]
 
     def at_once(self: MemoryFileSystem, path: str, value: bytes, mode: str = "overwrite", **kwargs: object) -> None:
         with lock:
@@ -176,7 +177,17 @@ def _one_object_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
                 raise FileExistsError(path)
             write(self, path, value, "overwrite")
 
+    def whole_list(self: MemoryFileSystem, *args: object, **kwargs: object) -> object:
+        with lock:
+            return listed(self, *args, **kwargs)
+
+    def gone_at_once(self: MemoryFileSystem, path: str) -> None:
+        with lock:
+            removed(self, path)
+
     monkeypatch.setattr(MemoryFileSystem, "pipe_file", at_once)
+    monkeypatch.setattr(MemoryFileSystem, "ls", whole_list)
+    monkeypatch.setattr(MemoryFileSystem, "_rm", gone_at_once)
 
 
 def test_a_writer_that_comes_too_late_begins_anew(room_map: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

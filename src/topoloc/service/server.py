@@ -21,6 +21,8 @@ from topoloc.service.guard import App
 from topoloc.service.logs import log_json
 
 _MAX_CONNECTIONS = 1000
+_KEEP_ALIVE_S = 75
+"""A connection is kept for longer than clients and load balancers keep theirs (5 to 60 s): else a request now and then meets one that is being closed."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,7 @@ def serve(app: App, address: Address, limits: ServiceConfig) -> None:
         server_header=False,
         proxy_headers=address.behind_proxy,
         limit_concurrency=_MAX_CONNECTIONS,
+        timeout_keep_alive=_KEEP_ALIVE_S,
         timeout_graceful_shutdown=round(limits.drain_s),
         ssl_certfile=address.tls_cert,
         ssl_keyfile=address.tls_key,
@@ -95,7 +98,7 @@ class _Patient(H11Protocol):
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
-        self._wait_for_head()
+        self._wait_for_head(self.head_s)
 
     def connection_lost(self, exc: Exception | None) -> None:
         super().connection_lost(exc)
@@ -105,11 +108,11 @@ class _Patient(H11Protocol):
     def on_response_complete(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
-        self._wait_for_head()
+        self._wait_for_head(_KEEP_ALIVE_S + self.head_s)
         super().on_response_complete()
 
-    def _wait_for_head(self) -> None:
-        self._timer = self.loop.call_later(self.head_s, self._give_up, self.cycle)
+    def _wait_for_head(self, seconds: float) -> None:
+        self._timer = self.loop.call_later(seconds, self._give_up, self.cycle)
 
     def _give_up(self, before: Any) -> None:
         if self.cycle is before and self.transport.get_protocol() is self and not self.transport.is_closing():
