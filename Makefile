@@ -15,7 +15,7 @@ CANDIDATES := $(PYTHON) python3.13 python3.12 python3.11 python3
 # Without a look at the network for a newer pyright; its node comes from the package index.
 PYRIGHT := PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright
 
-.PHONY: demo install test test-slow lint docs clean
+.PHONY: demo install test test-slow lint kernels docs clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed-core
@@ -23,8 +23,13 @@ demo: $(VENV)/installed-core
 
 install: $(VENV)/installed-all
 
-test: lint
+# The type checker keeps one processor busy: beside it, another compiles once what the tests' processes would each compile.
+test: $(VENV)/installed-test
+	@$(MAKE) --no-print-directory --jobs 2 lint kernels
 	@$(BIN)/pytest --numprocesses auto --maxprocesses 4
+
+kernels: $(VENV)/installed-test
+	@$(BIN)/python -c 'import topoloc; topoloc.warm_up()'
 
 test-slow: $(VENV)/installed-test
 	@$(BIN)/pytest -m slow

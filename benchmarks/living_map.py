@@ -1,92 +1,159 @@
-"""A map that takes recordings of a changing place in and forgets what is gone, beside the same map never updated.
+"""A map that takes recordings of a changing place in, by the commands that a user has, beside maps that do not.
 
-    python benchmarks/living_map.py MAP_SEQ WALK [WALK ...] [--step 4] [--sizes 12 8 6]
+    python benchmarks/living_map.py MAP_SEQ [WALK ...] --ask NAME=SEQ [NAME=SEQ ...] [--step 1]
+        [--trajectory slam] [--prune] [--budget 1.5] [--unlimited] [--alone] [--ask-each] [--features surf,topoloc-net]
 
-Builds a map of MAP_SEQ; each WALK then joins it (of a single camera by the map's answers, else by its poses) and what is gone is pruned.
-Prints for each walk how many of every `step`-th of its pictures the map localizes that was never updated, the living one before the walk
-joins, and after: localized, wrong (off by more than 0.5 m or 5 degrees), median error; and the living map's bytes. With `--sizes`
-the last map is pruned to each of these sizes (MB), and asked of the last walk.
+`topoloc build` maps MAP_SEQ by its own poses; each WALK then joins by `topoloc update`: of stereo or RGB-D by `--trajectory` (slam, as a
+user has it who carries a camera and nothing else), of a single camera by the map's answers. WALK=LIGHT names the light. With `--prune` the
+map is pruned after each, with `--budget F` to F times the bytes of the map as it was built. Beside it stand the map never updated and,
+with `--unlimited`, the same map that is never pruned.
+
+Printed for each walk: bytes, nodes, processor time and the memory at most of `update` and of `prune`; with `--alone` what building the
+walk alone takes. At the end (with `--ask-each` after each walk, too) every `step`-th picture of each NAME is asked as a single picture:
+localized, wrong (off by more than 0.5 m or 5 degrees), median errors. The folder `--keep` keeps maps and what was printed, and maps that
+are there go on from where they stand.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
+import subprocess
+import sys
 import tempfile
-import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from topoloc import Localizer, TopoMetricMap, build_map, open_sequence
-from topoloc.errors import MapError
+from topoloc import Localizer, TopoMetricMap, open_sequence
 from topoloc.geometry.alignment import rotation_error, translation_error
-from topoloc.lifelong.prune import prune_map
-from topoloc.lifelong.update import update_map
 from topoloc.localization.result import Localization
-from topoloc.map.edit import editing
-from topoloc.sequences.frame import StereoSequence
+
+_WRONG_M, _WRONG_DEG = 0.5, 5.0
 
 
-def asked(path: Path, sequence: StereoSequence, step: int) -> str:
-    """How the map does on every `step`-th picture, in one line."""
-    errors, wrong, num = list[float](), 0, 0
+@dataclass(frozen=True)
+class Cost:
+    """Of one command: seconds of processor time, megabytes at most."""
+
+    seconds: float
+    peak_mb: float
+
+    def __str__(self) -> str:
+        return f"{self.seconds:.1f} s, {self.peak_mb:.0f} MB"
+
+
+def run(*words: str | Path) -> Cost:
+    """A command of topoloc's in a process of its own. Ends the benchmark where it fails."""
+    process = subprocess.Popen([sys.executable, "-m", "topoloc", *map(str, words)], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    assert process.stderr is not None
+    said = process.stderr.read().decode()
+    _, status, used = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode != 0:
+        sys.exit(f"topoloc {' '.join(map(str, words))}: {said.strip()}")
+    return Cost(used.ru_utime + used.ru_stime, used.ru_maxrss / 1024)
+
+
+def asked(path: Path, pictures: Path, step: int) -> str:
+    """How a map does on every `step`-th picture of a recording, in one line."""
+    metres, degrees, num = list[float](), list[float](), 0
+    sequence = open_sequence(pictures)
     with TopoMetricMap.load(path) as topomap:
         localizer = Localizer(topomap)
-        for index in range(1, len(sequence), step):
+        for index in range(0, len(sequence), step):
             frame = sequence[index]
             result = localizer.localize(frame.image, frame.camera)
             num += 1
             if isinstance(result, Localization) and frame.world_from_cam is not None:
-                errors.append(translation_error(frame.world_from_cam, result.world_from_cam))
-                degrees = np.degrees(rotation_error(frame.world_from_cam, result.world_from_cam))
-                wrong += errors[-1] > 0.5 or degrees > 5.0
-    return f"{len(errors)} of {num}, {wrong} wrong, {100 * float(np.median(errors or [np.nan])):.2f} cm"
+                metres.append(translation_error(frame.world_from_cam, result.world_from_cam))
+                degrees.append(float(np.degrees(rotation_error(frame.world_from_cam, result.world_from_cam))))
+    wrong = sum(m > _WRONG_M or d > _WRONG_DEG for m, d in zip(metres, degrees, strict=True))
+    medians = f"{100 * np.median(metres or [np.nan]):.2f} cm, {np.median(degrees or [np.nan]):.3f} deg"
+    return f"{len(metres)} of {num}, {wrong} wrong, {medians}"
+
+
+def size(path: Path) -> str:
+    with TopoMetricMap.load(path) as topomap:
+        nodes, kilometres = topomap.summaries, topomap.length_m / 1e3
+        of_session = [sum(node.session_id == session.session_id for node in nodes) for session in topomap.sessions]
+        num_points = sum(node.num_points for node in nodes) / len(nodes)
+    at = f"{len(nodes)} nodes {of_session}, {num_points:.0f} landmarks a node"
+    return f"{path.stat().st_size / 1e6:.2f} MB ({path.stat().st_size / 1e6 / kilometres:.0f} MB a km walked), {at}"
+
+
+class LivingMap:
+    """The maps of one run: never updated, living, and the living one that is never pruned."""
+
+    def __init__(self, args: argparse.Namespace, folder: Path) -> None:
+        self.args, self.folder = args, folder
+        self.never, self.living, self.unlimited = (folder / f"{name}.topo" for name in ("never", "living", "unlimited"))
+        self.features = ["--features", args.features] if args.features else []
+        self.updated = [self.living, self.unlimited] if args.unlimited else [self.living]
+        if not self.never.exists():
+            self.say(f"build {args.map_sequence}: {run('build', args.map_sequence, self.never, *self.features)}; {size(self.never)}")
+        for path in self.updated:
+            if not path.exists():
+                path.write_bytes(self.never.read_bytes())
+        self.budget = None if args.budget is None else args.budget * self.never.stat().st_size / 1e6
+
+    def say(self, line: str) -> None:
+        print(line, flush=True)
+        with open(self.folder / "said.txt", "a") as said:
+            said.write(line + "\n")
+
+    def join(self, walk: str) -> None:
+        path, _, light = walk.partition("=")
+        first = open_sequence(path)[0]
+        trajectory = "map" if first.right is None and first.depth is None else self.args.trajectory
+        words = ["--trajectory", trajectory, *(["--light", light] if light else [])]
+        costs = list[Cost]()
+        for topo in self.updated:
+            costs.append(run("update", topo, path, *words))
+            self.say(f"{topo.stem} + {path} by {trajectory}: {costs[-1]}; {size(topo)}")
+        if self.args.alone and trajectory != "map":
+            alone = run("build", path, self.folder / "alone.topo", "--trajectory", trajectory, *self.features)
+            self.say(f"  alone: {alone}; update / build {costs[0].seconds / alone.seconds:.2f}")
+        if self.args.prune or self.budget is not None:
+            words = [] if self.budget is None else ["--max-mb", f"{self.budget:.3f}"]
+            cost = run("prune", self.living, *words)
+            self.say(f"  pruned {' '.join(words)}: {cost}; {size(self.living)}, {self.share():.2f} of the first map's bytes")
+
+    def share(self) -> float:
+        return self.living.stat().st_size / self.never.stat().st_size
+
+    def ask(self) -> None:
+        for name, pictures in (entry.split("=", 1) for entry in self.args.ask):
+            for topo in (self.never, *self.updated):
+                self.say(f"  {name}, {topo.stem}: {asked(topo, Path(pictures), self.args.step)}")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("map_sequence")
-    parser.add_argument("walks", nargs="+")
-    parser.add_argument("--step", type=int, default=4)
-    parser.add_argument("--sizes", type=float, nargs="*", default=[])
+    parser.add_argument("walks", nargs="*", metavar="WALK[=LIGHT]")
+    parser.add_argument("--ask", nargs="+", default=[], metavar="NAME=SEQ")
+    parser.add_argument("--step", type=int, default=1)
+    parser.add_argument("--trajectory", default="slam")
+    parser.add_argument("--features")
+    parser.add_argument("--prune", action="store_true")
+    parser.add_argument("--budget", type=float)
+    parser.add_argument("--unlimited", action="store_true")
+    parser.add_argument("--alone", action="store_true")
+    parser.add_argument("--ask-each", action="store_true")
+    parser.add_argument("--keep", type=Path)
     args = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        never, living = Path(folder) / "never.topo", Path(folder) / "living.topo"
-        start = time.process_time()
-        topomap = build_map(open_sequence(args.map_sequence))
-        seconds = time.process_time() - start
-        topomap.save(never)
-        topomap.save(living)
-        print(f"map: {living.stat().st_size / 1e6:.2f} MB, {len(topomap.summaries)} nodes, {seconds:.0f} s of processor time", flush=True)
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = args.keep or Path(scratch)
+        folder.mkdir(parents=True, exist_ok=True)
+        maps = LivingMap(args, folder)
         for walk in args.walks:
-            sequence = open_sequence(walk)
-            print(f"{walk}: never updated {asked(never, sequence, args.step)}; before {asked(living, sequence, args.step)}", flush=True)
-            start = time.process_time()
-            joined(living, sequence)
-            seconds = time.process_time() - start
-            print(f"  joined and pruned in {seconds:.0f} s of processor time: {asked(living, sequence, args.step)}")
-            print(f"  {living.stat().st_size / 1e6:.2f} MB", flush=True)
-        for size in args.sizes:
-            with editing(living) as edit:
-                try:
-                    smaller = prune_map(edit.topomap, living, round(size * 1e6))
-                except MapError as error:
-                    print(f"{size:g} MB: {error}")
-                    continue
-                edit.commit(smaller.topomap, f"prune to {size:g} MB")
-            print(f"{living.stat().st_size / 1e6:.2f} MB: {asked(living, open_sequence(args.walks[-1]), args.step)}", flush=True)
-
-
-def joined(path: Path, sequence: StereoSequence) -> None:
-    """The walk joins, then what is gone is dropped."""
-    first = sequence[0]
-    is_single = first.right is None and first.depth is None
-    with editing(path) as edit:
-        update = update_map(edit.topomap, sequence, "map" if is_single else "truth")
-        edit.commit(update.topomap, "update", update.changes)
-    with editing(path) as edit:
-        pruned = prune_map(edit.topomap, path)
-        edit.commit(pruned.topomap, "prune", pruned.changes)
+            maps.join(walk)
+            if args.ask_each:
+                maps.ask()
+        if not args.ask_each:
+            maps.ask()
 
 
 if __name__ == "__main__":
