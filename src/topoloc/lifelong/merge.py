@@ -16,6 +16,7 @@ from topoloc.errors import MapError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.lifelong.coarse_models import PlaceView, taught_places
 from topoloc.lifelong.earlier_recall import earlier_recall
+from topoloc.lifelong.grown_sides import grown_sides
 from topoloc.lifelong.overlay import Overlay
 from topoloc.lifelong.session_poses import Progress, SessionPoses, held_by
 from topoloc.lifelong.update import UpdateConfig, is_well_held
@@ -24,7 +25,6 @@ from topoloc.localization.map_facts.building import with_map_facts
 from topoloc.localization.query import Picture
 from topoloc.localization.result import Localization
 from topoloc.map.nodes import NodePoses, node_distances
-from topoloc.map.side_nodes import gather_sides
 from topoloc.map.sums import LandmarkSums
 from topoloc.map.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
 
@@ -173,7 +173,7 @@ def _sides(first: TopoMetricMap, second: TopoMetricMap, new_id: Mapping[int, int
     if first.sides is None or second.sides is None or first.sides.kind != second.sides.kind:
         return first.sides
     row_of = {summary.node_id: row for row, summary in enumerate(second.summaries)}
-    nodes = list(first.sides.nodes)
+    nodes = list[TopoNode]()
     known = {summary.node_id: summary for summary in summaries}
     for side in second.sides.nodes:
         row = None if side.summary.of_node is None else row_of[side.summary.of_node]
@@ -182,4 +182,4 @@ def _sides(first: TopoMetricMap, second: TopoMetricMap, new_id: Mapping[int, int
             moved = poses[row] @ second.summaries[row].world_from_cam.inverse() @ side.summary.world_from_cam
             summary = replace(side.summary, of_node=of_node.node_id, session_id=of_node.session_id, world_from_cam=moved)
             nodes.append(replace(side, summary=summary))
-    return gather_sides(nodes, first.sides.kind, first.config.sides)
+    return grown_sides(first, nodes)

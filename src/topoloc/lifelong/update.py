@@ -22,6 +22,7 @@ from topoloc.errors import TrajectoryError
 from topoloc.geometry.rigid import covariance_of_inverse, position_covariance
 from topoloc.lifelong.coarse_models import PlaceView, taught_places
 from topoloc.lifelong.earlier_recall import earlier_recall
+from topoloc.lifelong.grown_sides import grown_sides, new_walls
 from topoloc.lifelong.observed_nodes import observe_node
 from topoloc.lifelong.overlay import Overlay
 from topoloc.lifelong.session_poses import Progress, SessionPoses, SessionPosesConfig, poses_by_motion
@@ -67,10 +68,11 @@ class MapUpdate:
 
 @dataclass(frozen=True, eq=False)
 class _Joined:
-    """What the session brings: its nodes by kind of features, its pictures with the nodes that they belong to, what it saw of nodes that
-    were there, and its light."""
+    """What the session brings: its nodes by kind of features and their side nodes, its pictures with the nodes that they belong to, what it
+    saw of nodes that were there, and its light."""
 
     nodes: dict[str, list[TopoNode]]
+    sides: list[TopoNode]
     images: list[PlaceImage]
     views: dict[str, list[PlaceView]]
     seen: dict[tuple[str, int], list[Observations]]
@@ -126,6 +128,7 @@ def _counts(held: SessionPoses, joined: _Joined, kind: str) -> dict[str, Any]:
         "localized": sum(answer is not None for answer in held.answers.values()),
         "agreeing": len(held.agreeing),
         "nodes_added": len(joined.nodes[kind]),
+        "side_nodes_added": len(joined.sides),
         "points_added": sum(len(node.features) for node in joined.nodes[kind]),
         "place_images_added": len(joined.images),
     }
@@ -170,14 +173,15 @@ def _joined(
     locator = PointLocator(frames, of_map)
     by_index = {frame.index: frame for frame in frames}
     wanted = [by_index[k] for k, answer in held.answers.items() if k in by_index and not is_well_held(answer, d_thresh, config)]
+    with_sides = new_walls(topomap, [frame.world_from_cam for frame in wanted])
     drafts = list[NodeDraft]()
     for done, frame in enumerate(wanted):
-        draft = draft_node(frame, locator, False, of_map)
+        draft = draft_node(frame, locator, done in with_sides, of_map)
         if len(draft.points[topomap.kind].features) >= of_map.min_node_points:
             drafts.append(draft)
         progress("new nodes", done + 1, len(wanted))
     covered = {by_index[k] for k in held.answers if k in by_index} - {draft.frame for draft in drafts}
-    joined = _Joined({kind: [] for kind in topomap.kinds}, [], {kind: [] for kind in topomap.kinds}, defaultdict(list), [])
+    joined = _Joined({kind: [] for kind in topomap.kinds}, [], [], {kind: [] for kind in topomap.kinds}, defaultdict(list), [])
     old = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
     new = NodePoses.of([draft.image.world_from_cam for draft in drafts]) if drafts else None
     drafted = {draft.frame: draft.image for draft in drafts}
@@ -197,6 +201,8 @@ def _joined(
         progress(f"pictures of {frame.sequence.name}", done + 1, len(frames))
     for kind in topomap.kinds:
         joined.nodes[kind] = [finish_node(first_id + k, draft, kind, of_map) for k, draft in enumerate(drafts)]
+    for k, draft in enumerate(drafts):
+        joined.sides.extend(replace(side, summary=replace(side.summary, of_node=first_id + k)) for side in draft.sides)
     return joined
 
 
@@ -250,6 +256,7 @@ def _with_session(topomap: TopoMetricMap, session: Session, frames: Sequence[Map
         other_kinds=nodes,
         edges=sorted({*topomap.edges, *_edges(topomap, summaries, frames)}, key=lambda edge: (edge.source_id, edge.target_id)),
         place_images=Overlay(topomap.place_images, {}, joined.images),
+        sides=grown_sides(topomap, joined.sides),
         length_m=topomap.length_m + float(sum(np.linalg.norm(step) for step in steps)),
         sessions=[*topomap.sessions, session],
     )
