@@ -62,3 +62,16 @@ def test_where_the_unit_is_not_known_there_are_no_poses():
     assert 0 in metric
     assert 25 in metric
     assert 79 not in metric
+
+
+def test_where_the_map_and_the_motion_contradict_each_other_nothing_is_said():
+    """The motion's beginning is wrong, and the map knows: four answers to it, and a picture among them that it does not know."""
+    motion = _motion(0.0)
+    for k in range(5):
+        motion[k] = Rigid3(motion[k].rotation, motion[k].translation + np.array([0.0, 0.0, 0.6 - 0.1 * k]))
+    answers = _answers([0, 1, 3, 4, *range(6, 60, 2)], [])
+    poses, agreeing = held_stretch("walk", motion, answers, 0.6, SessionPosesConfig())
+    assert poses is not None
+    assert min(agreeing) >= 4
+    assert poses[:4] == [None] * 4
+    assert all(pose is not None for pose in poses[6:])

@@ -7,7 +7,7 @@ import pytest
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.slam.bundle import BundleConfig, adjust_bundle
+from topoloc.slam.bundle import Anchor, BundleConfig, adjust_bundle
 from topoloc.slam.keyframes import DisparityBias, KeyFrame, Landmarks, Observations, StereoCamera
 
 STEREO = StereoCamera(Camera.pinhole(640, 400, 380.0, 380.0, 319.5, 199.5), 45.0)
@@ -124,3 +124,13 @@ def test_a_walk_of_many_key_frames_is_adjusted_whole():
     adjust_bundle(keyframes, [], landmarks, BundleConfig(max_steps=12, part_observations=5000))
     assert before.max() > 0.05
     assert pose_errors(keyframes, poses).max() < 0.5 * before.max()
+
+
+def test_anchors_hold_all_poses_and_a_wrong_one_bends_nothing():
+    keyframes, landmarks, poses, _ = world(8)
+    shift = Rigid3.exp(np.array([0.3, -0.2, 0.1, 0.05, 0.02, -0.04]))
+    there = [pose @ shift for pose in poses]
+    told = [Anchor(keyframes[k], there[k], 1e6 * np.eye(6)) for k in (0, 2, 4, 5, 7)]
+    told.append(Anchor(keyframes[6], Rigid3.exp(np.full(6, 0.4)) @ there[6], 1e6 * np.eye(6)))
+    adjust_bundle(keyframes, [], landmarks, BundleConfig(max_steps=60, min_decrease=1e-9), told)
+    assert pose_errors(keyframes, there).max() < 0.005

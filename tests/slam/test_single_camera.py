@@ -7,20 +7,22 @@ import numpy as np
 from tiny_world import CAMERA, path_pose, render, room
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.sequences.frame import StereoFrame
-from topoloc.slam.single_camera import SingleCameraConfig, SingleCameraOdometry
+from topoloc.slam.single_camera import SingleCameraOdometry, Stretch
+from topoloc.slam.single_camera_config import SingleCameraConfig
 
 
-def _stretches(world_from_cams: list[Rigid3]) -> list[dict[int, Rigid3]]:
+def _stretches(world_from_cams: list[Rigid3]) -> list[Stretch]:
     odometry, panels = SingleCameraOdometry(SingleCameraConfig()), room()
     for number, pose in enumerate(world_from_cams):
         picture, _ = render(panels, pose, noise_seed=number)
         odometry.process(number, StereoFrame(f"{number}", number * 100_000_000, picture, CAMERA))
-    return odometry.own_from_cams()
+    return odometry.stretches
 
 
 def test_the_motion_is_found_but_for_its_unit():
     truth = [path_pose(0.5 * number) for number in range(16)]
-    (stretch,) = _stretches(truth)
+    (found,) = _stretches(truth)
+    stretch = found.own_from_cams()
     assert list(stretch) == list(range(len(truth)))
     own_from_world = stretch[0] @ truth[0].inverse()
     own = np.array([stretch[k].translation - stretch[0].translation for k in stretch])

@@ -25,8 +25,9 @@ from topoloc.localization.result import Localization, NotLocalized
 from topoloc.map.config import MapConfig
 from topoloc.map.nodes import place_nodes
 from topoloc.sequences.frame import StereoSequence
+from topoloc.slam.bundle import BundleConfig
 from topoloc.slam.pose_graph import Edge, PoseGraphConfig, optimise_graph
-from topoloc.slam.single_camera import SingleCameraConfig
+from topoloc.slam.single_camera_config import SingleCameraConfig
 
 Progress = Callable[[str, int, int], None]
 """Called with a stage's name, steps done and steps in all."""
@@ -57,7 +58,12 @@ class SessionPosesConfig:
     """Sigma of its rotation, radians a metre of the way and a radian of the turn, beside half a milliradian."""
     widened: Annotated[float, Above(0)] = 3.0
     """The map's answers are trusted as if their sigmas were so many times as large: neighbours share errors of the map."""
+    contradiction: Annotated[float, Above(0)] = 0.1
+    """Where the map and a single camera's motion say places that are further apart than so many D_thresh, beside three of the map's sigmas
+    (widened), a frame has no pose."""
     graph: PoseGraphConfig = field(default_factory=PoseGraphConfig)
+    adjustment: BundleConfig = field(default_factory=lambda: BundleConfig(max_steps=30, min_decrease=1e-5, cauchy_scale=1.0))
+    """Of a single camera's walk as a whole."""
     odometry: SingleCameraConfig = field(default_factory=SingleCameraConfig)
     scale: ScaleConfig = field(default_factory=ScaleConfig)
 

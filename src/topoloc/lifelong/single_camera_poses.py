@@ -7,10 +7,14 @@ have a pose whose answers agree with one another under it. Where there is no odo
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence, Set
+from itertools import groupby
+
+import numpy as np
 
 from topoloc.errors import CalibrationError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
+from topoloc.lifelong.adjusted_walk import adjusted_walk
 from topoloc.lifelong.scale_of_motion import in_metres, largest_agreement
 from topoloc.lifelong.session_calibration import check_by_other_focal_lengths, check_calibration
 from topoloc.lifelong.session_poses import Progress, SessionPoses, SessionPosesConfig, held_by
@@ -22,6 +26,7 @@ from topoloc.slam.single_camera import SingleCameraOdometry
 from topoloc.tracking.tracker import Tracker
 
 _REFITTED = 3
+_AROUND = 3
 
 
 def poses_by_map(
@@ -52,9 +57,13 @@ def poses_by_map(
         raise TrajectoryError(f"{sequence.name}: the map recognises {len(by_map)} of its {len(sequence)} pictures: too few to join")
     assert of_map.nodes.d_thresh is not None, "a map's own configuration is resolved"
     poses: list[Rigid3 | None] = [by_map.get(index) for index in range(len(sequence))]
-    for stretch in odometry.own_from_cams():
-        held, agreeing = held_stretch(sequence.name, stretch, seen, of_map.nodes.d_thresh, config)
-        for index in stretch:
+    for stretch in odometry.stretches:
+        own = stretch.own_from_cams()
+        held, agreeing = held_stretch(sequence.name, own, seen, of_map.nodes.d_thresh, config)
+        if held is not None:
+            adjusted = adjusted_walk(stretch, held, {index: seen[index] for index in agreeing}, config.adjustment)
+            held, agreeing = _undisputed(adjusted, seen, agreeing, of_map.nodes.d_thresh, config)
+        for index in own:
             if index not in agreeing:
                 seen.pop(index, None)
             poses[index] = by_map.get(index) if index in agreeing else None
@@ -71,7 +80,7 @@ def held_stretch(
     name: str, own: Mapping[int, Rigid3], seen: Mapping[int, Localization], d_thresh: float, config: SessionPosesConfig
 ) -> tuple[list[Rigid3 | None] | None, list[int]]:
     """A stretch of odometry in the map's world, world_from_cam by frame, None where too few answers hold it; and the frames of the answers
-    that agree with it."""
+    that agree with it. Frames of which the map and the motion say different things, and either may be right, have no pose."""
     of_it = {index: answer for index, answer in seen.items() if index in own}
     agreeing = largest_agreement(own, of_it, config.slack * d_thresh, config.slack_deg, config.scale)
     held = None
@@ -85,4 +94,36 @@ def held_stretch(
         except TrajectoryError:
             return None, agreeing
         agreeing = held.agreeing
-    return (None if held is None else held.world_from_cams), agreeing
+    if held is None:
+        return None, agreeing
+    return _undisputed(held.world_from_cams, of_it, agreeing, d_thresh, config)
+
+
+def _undisputed(
+    poses: Sequence[Rigid3 | None], seen: Mapping[int, Localization], agreeing: Sequence[int], d_thresh: float, config: SessionPosesConfig
+) -> tuple[list[Rigid3 | None], list[int]]:
+    """The poses and the agreeing answers without those of which the map and the motion say different things, and either may be right."""
+    of_it = {index: answer for index, answer in seen.items() if index < len(poses) and poses[index] is not None}
+    apart = {index for index, answer in of_it.items() if _contradicts(answer, poses[index], d_thresh, config)}
+    disputed = _disputed(list(of_it), apart)
+    left = [None if index in disputed else pose for index, pose in enumerate(poses)]
+    return left, [index for index in agreeing if index not in apart]
+
+
+def _contradicts(answer: Localization, pose: Rigid3 | None, d_thresh: float, config: SessionPosesConfig) -> bool:
+    assert pose is not None
+    off = float(np.linalg.norm(answer.world_from_cam.translation - pose.translation))
+    return off > config.contradiction * d_thresh + 3.0 * config.widened * answer.position_sigma_m
+
+
+def _disputed(answered: list[int], apart: Set[int]) -> set[int]:
+    """The frames of several answers in a row that contradict the motion, or of a single one with none before it, or none after it, that
+    holds the motion; and a few around them, but for those beyond an answer that does. Between two that hold it the motion is right."""
+    frames = set[int]()
+    runs = [(is_apart, list(run)) for is_apart, run in groupby(answered, lambda index: index in apart)]
+    for k, (is_apart, run) in enumerate(runs):
+        if is_apart and (len(run) > 1 or k in (0, len(runs) - 1)):
+            after = runs[k - 1][1][-1] if k > 0 else -1
+            before = runs[k + 1][1][0] if k + 1 < len(runs) else run[-1] + 1
+            frames.update(j for index in run for j in range(index - _AROUND, index + _AROUND + 1) if after < j < before)
+    return frames

@@ -7,7 +7,7 @@ of the odometry and a walk of kilometres are one problem, whose time and memory 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -39,6 +39,15 @@ class BundleConfig:
 
 
 @dataclass(frozen=True, eq=False)
+class Anchor:
+    """What is known of a key frame's pose from elsewhere; `information` (6, 6) is that of its left perturbation (metres, radians)."""
+
+    keyframe: KeyFrame
+    cam_from_world: Rigid3
+    information: Float[np.ndarray, "6 6"]
+
+
+@dataclass(frozen=True, eq=False)
 class _State:
     """What is moved. A camera is (fx, fy, cx, cy, bf, bias of the disparities)."""
 
@@ -66,21 +75,36 @@ class _Problem:
     slots: Int[np.ndarray, " k"]
     columns: Int[np.ndarray, " k"]
     biases: list[DisparityBias]
+    anchors: list[tuple[int, Anchor]]
 
-    def bias_cost(self, state: _State) -> float:
-        """Of biases other than expected."""
-        return float(sum(bias.information * (state.cameras[k, 5] - bias.value_px) ** 2 for bias, k in self.first_of_biases()))
+    def prior_cost(self, state: _State, scale_squared: float) -> float:
+        """Of biases other than expected, and of poses other than the anchors say."""
+        of_biases = sum(bias.information * (state.cameras[k, 5] - bias.value_px) ** 2 for bias, k in self.first_of_biases())
+        return float(of_biases + sum(scale_squared * np.log1p(square / scale_squared) for *_, square in self.pulls(state)))
+
+    def pulls(self, state: _State) -> Iterator[tuple[int, Anchor, Float[np.ndarray, "6"], float]]:
+        """Of each anchor: its key frame, how far that one is off, and the square of that in sigma."""
+        for k, anchor in self.anchors:
+            off = (Rigid3(state.rotations[k], state.translations[k]) @ anchor.cam_from_world.inverse()).log()
+            yield k, anchor, off, float(off @ anchor.information @ off)
 
     def first_of_biases(self) -> list[tuple[DisparityBias, int]]:
         return [(bias, int(np.argmax(self.columns == i))) for i, bias in enumerate(self.biases)]
 
 
-def adjust_bundle(free: Sequence[KeyFrame], held: Sequence[KeyFrame], landmarks: Landmarks, config: BundleConfig) -> None:
+def adjust_bundle(
+    free: Sequence[KeyFrame],
+    held: Sequence[KeyFrame],
+    landmarks: Landmarks,
+    config: BundleConfig,
+    anchors: Sequence[Anchor] = (),
+) -> None:
     """Move the poses of `free` and the landmarks that they see; `held` key frames see some of these too, and stay.
 
-    With nothing held, the first of `free` stays. Observations found to be wrong become inactive in all of these key frames.
+    With nothing held, and no anchors of key frames of `free`, the first of `free` stays. Observations found to be wrong become inactive in
+    all of these key frames.
     """
-    if not held:
+    if not held and not anchors:
         free, held = free[1:], free[:1]
     if not free:
         return
@@ -89,7 +113,8 @@ def adjust_bundle(free: Sequence[KeyFrame], held: Sequence[KeyFrame], landmarks:
     parts = BundleParts(keyframes, ids, config.part_observations)
     if parts.num_observations == 0:
         return
-    problem = _problem(parts, keyframes, len(free))
+    number_of = {id(keyframe): k for k, keyframe in enumerate(keyframes)}
+    problem = _problem(parts, keyframes, len(free), [(number_of[id(anchor.keyframe)], anchor) for anchor in anchors])
     state = _State(
         rotations=np.array([k.cam_from_world.rotation for k in keyframes]),
         translations=np.array([k.cam_from_world.translation for k in keyframes]),
@@ -117,7 +142,7 @@ def _camera_row(keyframe: KeyFrame) -> list[float]:
     return [camera.fx, camera.fy, camera.cx, camera.cy, keyframe.stereo.bf, keyframe.bias.value_px]
 
 
-def _problem(parts: BundleParts, keyframes: Sequence[KeyFrame], num_free: int) -> _Problem:
+def _problem(parts: BundleParts, keyframes: Sequence[KeyFrame], num_free: int, anchors: list[tuple[int, Anchor]]) -> _Problem:
     slots = np.arange(len(keyframes))
     slots[num_free:] = -1
     ties = np.zeros(0, np.int64)
@@ -129,12 +154,12 @@ def _problem(parts: BundleParts, keyframes: Sequence[KeyFrame], num_free: int) -
     slots[:num_free] = pattern.ranks
     biases = list(dict.fromkeys(k.bias for k in keyframes if np.isfinite(k.bias.information)))
     columns = np.array([biases.index(k.bias) if k.bias in biases else -1 for k in keyframes])
-    return _Problem(parts, pattern, slots, columns, biases)
+    return _Problem(parts, pattern, slots, columns, biases, anchors)
 
 
 def _optimised(problem: _Problem, state: _State, config: BundleConfig) -> _State:
     scale = config.cauchy_scale**2
-    cost = problem.bias_cost(state) + sum(float(robust_cost(state.squares(part), scale)) for part in problem.parts)
+    cost = problem.prior_cost(state, scale) + sum(float(robust_cost(state.squares(part), scale)) for part in problem.parts)
     damping = 1e-4
     for _ in range(config.max_steps):
         steps, bias_steps = _steps(problem, state, scale, damping)
@@ -160,6 +185,10 @@ def _steps(problem: _Problem, state: _State, scale: float, damping: float) -> tu
             part.starts, part.frames, part.measured, part.weights, scale, damping,
             pattern.starts, pattern.rows, blocks, vector, border, corner,
         )  # fmt: skip
+    for k, anchor, off, square in p.pulls(state):
+        pull = anchor.information / (1.0 + square / scale)
+        blocks[pattern.diagonal[p.slots[k]]] += pull
+        vector[p.slots[k]] -= pull @ off
     for row, (bias, k) in enumerate(p.first_of_biases()):  # what is known of the biases already
         corner[row] += [bias.information, bias.information * (bias.value_px - state.cameras[k, 5])]
     along = np.arange(6)
@@ -183,7 +212,7 @@ def _moved(
         rotations[k], translations[k] = new.rotation, new.translation
     cameras[p.columns >= 0, 5] += of_biases[p.columns[p.columns >= 0]]
     moved = _State(rotations, translations, cameras, np.empty_like(state.points))
-    cost = p.bias_cost(moved)
+    cost = p.prior_cost(moved, scale)
     nothing = np.empty((0, 6, 6)), np.empty((0, *of_poses.shape)), np.empty((0, 2))
     for part in p.parts:
         rows = slice(part.first, part.last)

@@ -104,11 +104,11 @@ class InputChecks:
     ) -> Float[np.ndarray, "n 2"]:
         """Where points of the left picture are in the right one, up and down as well; NaN where not found. Keeps the median height."""
         assert measured.right is not None
-        found, alike = align_with_reference(
+        found = align_with_reference(
             measured.left, measured.right, points, guesses, np.ones(len(points), np.float32), self._config.tracking
         )
-        places = np.where(alike[:, None], found, np.nan).astype(np.float64)
-        if np.count_nonzero(alike) >= max(10, len(points) // 3):
+        places = np.where(found.is_alike[:, None], found.points_img, np.nan).astype(np.float64)
+        if np.count_nonzero(found.is_alike) >= max(10, len(points) // 3):
             self._vertical_px.append(float(np.nanmedian(np.abs(places[:, 1] - points[:, 1]))))
         return places
 

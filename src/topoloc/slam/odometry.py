@@ -35,7 +35,7 @@ class Odometry:
         self._last: LastFrame | None = None
         self._reference: KeyFrame | None = None
         self._reference_picture: np.ndarray = np.zeros((0, 0), np.float32)
-        self._tracks = Tracks(np.zeros(0, np.int64), np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32))
+        self._tracks = Tracks.of(np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
         self._chain: list[KeyFrame] = []  # the key frames since tracking began or began again
         self._num_lost = 0
         self._missed: list[tuple[int, StereoFrame]] = []  # the frames since the camera was lost that may begin a sub-map
@@ -172,7 +172,7 @@ class Odometry:
     def _follow_from(self, keyframe: KeyFrame, measured: MeasuredView) -> None:
         seen = keyframe.observations
         points = np.ascontiguousarray(seen.measured[seen.active, :2], np.float32)
-        self._tracks = Tracks(seen.landmark_ids[seen.active], points, points)
+        self._tracks = Tracks.of(seen.landmark_ids[seen.active], points)
         self._reference, self._reference_picture = keyframe, measured.left
         if self._last is not None:
             self._last.cam_from_world = keyframe.cam_from_world

@@ -9,59 +9,38 @@ in metres is not known here.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Annotated
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float, Float32, Int
 
-from topoloc.bounds import Above, AtLeast, Between
 from topoloc.geometry.relative_pose import estimate_relative_pose
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.frame import StereoFrame
 from topoloc.sequences.frame_view import single_view
-from topoloc.slam.bundle import BundleConfig, adjust_bundle
+from topoloc.slam.bundle import adjust_bundle
 from topoloc.slam.disparity import MeasuredView
 from topoloc.slam.keyframes import DisparityBias, FramePose, KeyFrame, Landmarks, Motion, Observations, StereoCamera
 from topoloc.slam.motion_prediction import MotionHistory
-from topoloc.slam.steps import LastFrame, OdometryConfig, Step, StepSeeker, Tracks
-from topoloc.slam.tracking import TrackingConfig, find_corners, follow
+from topoloc.slam.single_camera_config import SingleCameraConfig
+from topoloc.slam.steps import LastFrame, Step, StepSeeker, Tracks
+from topoloc.slam.tracking import find_corners, follow
 from topoloc.slam.triangulation import is_clear, triangulate
 
+_CLEAREST_AND_LEAST_CLEAR = 0.5, 10.0
 
-@dataclass(frozen=True)
-class SingleCameraConfig:
-    """When a stretch begins, and when a point has shown its depth."""
 
-    odometry: OdometryConfig = field(
-        default_factory=lambda: OdometryConfig(
-            tracking=TrackingConfig(num_corners=1500, patch_half_px=7),
-            bundle=BundleConfig(max_steps=12),
-            window=20,
-            held=10,
-            min_tracked=15,
-        )
-    )
-    """More is followed than by a stereo camera, for few corners live until they have shown their depth; and what is adjusted together
-    reaches further back, for nothing but that holds the unit."""
-    max_side_px: Annotated[int, Between(64, 16_384)] = 800
-    """Points are followed in pictures reduced to this width or height."""
-    start_motion: Annotated[float, Above(0)] = 0.03
-    """A stretch may begin where points have moved by this share of the picture's width (median) ..."""
-    start_points: Annotated[int, AtLeast(8)] = 50
-    """... and so many of them show their depth."""
-    start_share: Annotated[float, Between(0, 1)] = 0.2
-    """With fewer of its points left, the first picture is given up for a later one."""
-    max_beginning: Annotated[int, Between(2, 10_000)] = 60
-    """... as it is after so many frames: who stands still shows no depth."""
-    max_return_px: Annotated[float, Above(0)] = 0.7
-    """A point followed there and back must come back to within so many pixels."""
-    min_parallax_deg: Annotated[float, Above(0)] = 1.0
-    """Angle between rays from which on a point is a landmark ..."""
-    min_rays: Annotated[int, Between(2, 100)] = 2
-    """... if so many key frames have seen it ..."""
-    max_triangulation_px: Annotated[float, Above(0)] = 1.5
-    """... and its rays meet to within so many pixels in all of them."""
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """A motion without a break, in a world and a unit of its own: where its frames are, relative to key frames, and what these see."""
+
+    landmarks: Landmarks
+    frames: list[FramePose] = field(default_factory=list)
+    keyframes: list[KeyFrame] = field(default_factory=list)
+
+    def own_from_cams(self) -> dict[int, Rigid3]:
+        """world_from_cam of its frames in its own world and unit, by their numbers."""
+        return {pose.frame_idx: pose.world_from_cam() for pose in self.frames}
 
 
 @dataclass(eq=False)
@@ -73,13 +52,13 @@ class _Beginning:
 
 
 class SingleCameraOdometry:
-    """The state of one recording's odometry. `stretches` are those so far: each frame's place, relative to key frames."""
+    """The state of one recording's odometry. `stretches` are those so far."""
 
     def __init__(self, config: SingleCameraConfig) -> None:
         self._config = config
         self._landmarks, self._bias = Landmarks(), DisparityBias()
         self._history = MotionHistory(config.odometry.prediction)
-        self.stretches: list[list[FramePose]] = []
+        self.stretches: list[Stretch] = []
         self._beginning: _Beginning | None = None
         self._reference: KeyFrame | None = None
         self._reference_picture: Float32[np.ndarray, "h w"] = np.zeros((0, 0), np.float32)
@@ -102,10 +81,6 @@ class SingleCameraOdometry:
                 self._history.stop()
                 self._begin(frame_idx, frame, measured)
 
-    def own_from_cams(self) -> list[dict[int, Rigid3]]:
-        """Of each stretch, world_from_cam of its frames in its own world and unit, by their numbers."""
-        return [{pose.frame_idx: pose.world_from_cam() for pose in stretch} for stretch in self.stretches]
-
     def _begin(self, frame_idx: int, frame: StereoFrame, measured: MeasuredView) -> None:
         """Follow the corners of a first picture until two pictures show a motion."""
         if self._beginning is not None:
@@ -118,7 +93,7 @@ class SingleCameraOdometry:
                     self._start(self._beginning)
                 return
         corners = find_corners(measured.view.grey, np.zeros((0, 2)), self._config.odometry.tracking)
-        tracks = Tracks(np.arange(len(corners)), corners, corners)
+        tracks = Tracks.of(np.arange(len(corners)), corners)
         self._beginning = _Beginning([(frame_idx, frame, measured, tracks)], tracks)
 
     def _followed_back(self, beginning: _Beginning, measured: MeasuredView) -> Tracks:
@@ -128,7 +103,7 @@ class SingleCameraOdometry:
         found, there = follow(before.view.grey, measured.view.grey, tracks.points_img, tracks.points_img, config)
         back, again = follow(measured.view.grey, before.view.grey, found, tracks.points_img, config)
         returned = np.linalg.norm(back - tracks.points_img, axis=1) < self._config.max_return_px
-        return Tracks(tracks.landmark_ids, found, tracks.points_ref).select(np.flatnonzero(there & again & returned))
+        return replace(tracks, points_img=found).select(np.flatnonzero(there & again & returned))
 
     def _start(self, beginning: _Beginning) -> None:
         """A stretch begins if the first picture and the last one show a motion."""
@@ -144,14 +119,14 @@ class SingleCameraOdometry:
         poses = (Rigid3.identity(), motion.second_from_first)
         for row, cam_from_world, points_img in ((0, poses[0], agreeing.points_ref), (-1, poses[1], agreeing.points_img)):
             frame_idx, frame, measured, _ = beginning.frames[row]
-            seen = self._observations(agreeing.landmark_ids, points_img, np.zeros(len(points_img), np.bool_))
+            seen = self._observations(Tracks.of(agreeing.landmark_ids, points_img), 0)
             self._chain.append(self._keyframe(frame_idx, frame.t_ns, measured, cam_from_world, seen))
         known = self._settle(agreeing.landmark_ids, 2)
         if len(known) < config.start_points:
             self._chain = []
             return
         adjust_bundle(self._chain, [], self._landmarks, config.odometry.bundle)
-        self.stretches.append([])
+        self.stretches.append(Stretch(self._landmarks, keyframes=list(self._chain)))
         self._beginning, self._last = None, None
         self._history.stop()
         for frame_idx, frame, measured, of_frame in beginning.frames[:-1]:
@@ -159,7 +134,7 @@ class SingleCameraOdometry:
         frame_idx, frame, measured, _ = beginning.frames[-1]
         self._follow_from(self._chain[-1], measured, agreeing.select(~np.isin(agreeing.landmark_ids, known)))
         self._remember(frame.t_ns, measured, self._chain[-1].cam_from_world)
-        self.stretches[-1].append(FramePose(frame_idx, self._chain[-1], Rigid3.identity(), measured.view.view_from_cam))
+        self.stretches[-1].frames.append(FramePose(frame_idx, self._chain[-1], Rigid3.identity(), measured.view.view_from_cam))
 
     def _place_again(
         self, frame_idx: int, frame: StereoFrame, measured: MeasuredView, tracks: Tracks, known: Int[np.ndarray, " n"]
@@ -175,7 +150,7 @@ class SingleCameraOdometry:
                 return
             pose = found.cam_from_world
         self._remember(frame.t_ns, measured, pose)
-        self.stretches[-1].append(FramePose(frame_idx, first, pose @ first.cam_from_world.inverse(), measured.view.view_from_cam))
+        self.stretches[-1].frames.append(FramePose(frame_idx, first, pose @ first.cam_from_world.inverse(), measured.view.view_from_cam))
 
     def _follow(self, frame_idx: int, frame: StereoFrame, measured: MeasuredView) -> bool:
         """Where the frame is, by its step from the last one."""
@@ -188,7 +163,7 @@ class SingleCameraOdometry:
         if self._is_keyframe_due(measured):
             self._add_keyframe(frame_idx, frame, measured, step)
         relative = self._last.cam_from_world @ self._reference.cam_from_world.inverse()
-        self.stretches[-1].append(FramePose(frame_idx, self._reference, relative, measured.view.view_from_cam))
+        self.stretches[-1].frames.append(FramePose(frame_idx, self._reference, relative, measured.view.view_from_cam))
         return True
 
     def _step(self, frame: StereoFrame, measured: MeasuredView) -> Step | None:
@@ -220,21 +195,19 @@ class SingleCameraOdometry:
         config, tracks, waiting = self._config.odometry, self._tracks, self._waiting
         occupied = np.concatenate([tracks.points_img, waiting.points_img])
         corners = find_corners(measured.view.grey, occupied, config.tracking)
-        fresh = Tracks(self._landmarks.add(self._guessed(corners, measured, step.cam_from_world)), corners, corners)
-        ids = np.concatenate([tracks.landmark_ids, waiting.landmark_ids, fresh.landmark_ids])
-        points_img = np.concatenate([occupied, corners])
-        seen = self._observations(ids, points_img, np.arange(len(ids)) < len(tracks.landmark_ids))
+        fresh = Tracks.of(self._landmarks.add(self._guessed(corners, measured, step.cam_from_world)), corners)
+        seen = self._observations(_together(tracks, waiting, fresh), len(tracks.landmark_ids))
         motion = Motion(self._reference, step.covariance) if self._reference is not None else None
         keyframe = self._keyframe(frame_idx, frame.t_ns, measured, step.cam_from_world, seen, motion)
         self._chain.append(keyframe)
+        self.stretches[-1].keyframes.append(keyframe)
         known = self._settle(np.sort(waiting.landmark_ids), self._config.min_rays)
         free, held = self._chain[-config.window :], self._chain[: -config.window][-config.held :]
         adjust_bundle(free, held, self._landmarks, config.bundle)
         del self._chain[: -(config.window + config.held)]
         still = waiting.select(~np.isin(waiting.landmark_ids, known))
         still = still.select(np.flatnonzero(np.isfinite(self._landmarks.positions[still.landmark_ids]).all(axis=1)))
-        left = Tracks(*(np.concatenate(pair) for pair in zip(vars(still).values(), vars(fresh).values(), strict=True)))
-        self._follow_from(keyframe, measured, left)
+        self._follow_from(keyframe, measured, _together(still, fresh))
 
     def _settle(self, ids: Int[np.ndarray, " n"], min_rays: int) -> Int[np.ndarray, " k"]:
         """Those of the points with these ids (ascending) that have shown their depth, and are landmarks now. One whose rays do not meet is
@@ -262,12 +235,18 @@ class SingleCameraOdometry:
         normalized = measured.view.camera.normalized_from_img(corners.astype(np.float64))
         return cam_from_world.inverse().apply(np.column_stack([normalized * z[:, None], z]))
 
-    def _observations(
-        self, ids: Int[np.ndarray, " n"], points_img: Float32[np.ndarray, "n 2"], active: Bool[np.ndarray, " n"]
-    ) -> Observations:
-        weights = np.full((len(ids), 3), 1.0 / self._config.odometry.sigma_px)
-        weights[:, 2] = 0.0
-        return Observations(ids, np.column_stack([points_img.astype(np.float64), np.full(len(ids), np.nan)]), weights, active)
+    def _observations(self, tracks: Tracks, num_active: int) -> Observations:
+        """What a key frame sees; only the first of the points are landmarks yet."""
+        num = len(tracks.landmark_ids)
+        weights = np.zeros((num, 3))
+        weights[:, :2] = 1.0 / self._sigmas(tracks)[:, None]
+        measured = np.column_stack([tracks.points_img.astype(np.float64), np.full(num, np.nan)])
+        return Observations(tracks.landmark_ids, measured, weights, np.arange(num) < num_active)
+
+    def _sigmas(self, tracks: Tracks) -> Float[np.ndarray, " n"]:
+        """Pixels; a point that is followed from here on counts as any other."""
+        unclear = np.clip((tracks.sigmas_px.astype(np.float64) / self._config.clear_px) ** 2, *_CLEAREST_AND_LEAST_CLEAR)
+        return self._config.odometry.sigma_px * np.where(tracks.sigmas_px > 0.0, unclear, 1.0)
 
     def _keyframe(
         self, frame_idx: int, t_ns: int, measured: MeasuredView, cam_from_world: Rigid3, seen: Observations, motion: Motion | None = None
@@ -277,8 +256,8 @@ class SingleCameraOdometry:
     def _follow_from(self, keyframe: KeyFrame, measured: MeasuredView, waiting: Tracks) -> None:
         seen = keyframe.observations
         points = np.ascontiguousarray(seen.measured[seen.active, :2], np.float32)
-        self._tracks = Tracks(seen.landmark_ids[seen.active], points, points)
-        self._waiting = Tracks(waiting.landmark_ids, waiting.points_img, waiting.points_img)
+        self._tracks = Tracks.of(seen.landmark_ids[seen.active], points)
+        self._waiting = Tracks.of(waiting.landmark_ids, waiting.points_img)
         self._reference, self._reference_picture = keyframe, measured.left
         if self._last is not None:
             self._last.cam_from_world = keyframe.cam_from_world
@@ -291,5 +270,9 @@ def _measured(frame: StereoFrame, max_side_px: int) -> MeasuredView:
     return MeasuredView(view, StereoCamera(view.camera, view.camera.fx), view.grey.astype(np.float32), None)
 
 
+def _together(*tracks: Tracks) -> Tracks:
+    return Tracks(*(np.concatenate(columns) for columns in zip(*(vars(each).values() for each in tracks), strict=True)))
+
+
 def _no_tracks() -> Tracks:
-    return Tracks(np.zeros(0, np.int64), np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32))
+    return Tracks.of(np.zeros(0, np.int64), np.zeros((0, 2), np.float32))

@@ -84,14 +84,21 @@ class OdometryConfig:
 
 @dataclass(eq=False)
 class Tracks:
-    """The points being followed: where they are in the last frame, where in the last key frame, and their landmarks."""
+    """The points being followed: where they are in the last frame, where in the last key frame, their landmarks, and by how much
+    the first are uncertain, by what does not look alike (pixels)."""
 
     landmark_ids: Int[np.ndarray, " n"]
     points_img: Float32[np.ndarray, "n 2"]
     points_ref: Float32[np.ndarray, "n 2"]
+    sigmas_px: Float32[np.ndarray, " n"]
+
+    @classmethod
+    def of(cls, landmark_ids: Int[np.ndarray, " n"], points_img: Float32[np.ndarray, "n 2"]) -> Tracks:
+        """Points that are followed from here on."""
+        return cls(landmark_ids, points_img, points_img, np.zeros(len(points_img), np.float32))
 
     def select(self, rows: np.ndarray) -> Tracks:
-        return Tracks(self.landmark_ids[rows], self.points_img[rows], self.points_ref[rows])
+        return Tracks(self.landmark_ids[rows], self.points_img[rows], self.points_ref[rows], self.sigmas_px[rows])
 
 
 @dataclass(eq=False)
@@ -195,10 +202,10 @@ class StepSeeker:
         limit = np.array([measured.view.camera.width, measured.view.camera.height]) / 2.0
         guesses = (tracks.points_img + np.clip(np.nan_to_num(after - before), -limit, limit)).astype(np.float32)
         found, is_found = follow(self.last.measured.view.grey, measured.view.grey, tracks.points_img, guesses, config)
-        tracks = Tracks(tracks.landmark_ids, found, tracks.points_ref).select(is_found)
+        tracks = replace(tracks, points_img=found).select(is_found)
         scales = self._patch_scales(tracks.landmark_ids, predicted)
-        refined, alike = align_with_reference(self.reference_picture, measured.left, tracks.points_ref, tracks.points_img, scales, config)
-        return Tracks(tracks.landmark_ids, refined, tracks.points_ref).select(alike)
+        found = align_with_reference(self.reference_picture, measured.left, tracks.points_ref, tracks.points_img, scales, config)
+        return replace(tracks, points_img=found.points_img, sigmas_px=found.sigmas_px).select(found.is_alike)
 
     def _patch_scales(self, landmark_ids: Int[np.ndarray, " n"], predicted: Rigid3) -> Float32[np.ndarray, " n"]:
         """How much larger each landmark's surroundings look than in the last key frame: what is approached grows."""

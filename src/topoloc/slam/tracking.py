@@ -61,6 +61,15 @@ def follow(
     return found, (status[:, 0] > 0) & np.isfinite(found).all(axis=1)
 
 
+@dataclass(frozen=True, eq=False)
+class Aligned:
+    """Where points are found, which look like the reference there, and how uncertain their places are by what does not fit (pixels)."""
+
+    points_img: Float32[np.ndarray, "n 2"]
+    is_alike: Bool[np.ndarray, " n"]
+    sigmas_px: Float32[np.ndarray, " n"]
+
+
 def align_with_reference(
     reference: Float32[np.ndarray, "h w"],
     picture: Float32[np.ndarray, "h w"],
@@ -68,17 +77,18 @@ def align_with_reference(
     points_img: Float32[np.ndarray, "n 2"],
     scales: Float32[np.ndarray, " n"],
     config: TrackingConfig,
-) -> tuple[Float32[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
-    """Points of `picture` moved to where they look most like `points_ref` of the reference enlarged by `scales`; and which do."""
-    refined, scores = np.empty_like(points_img), np.empty(len(points_img), np.float32)
+) -> Aligned:
+    """Points of `picture` moved to where they look most like `points_ref` of the reference enlarged by `scales`."""
+    refined, (scores, sigmas) = np.empty_like(points_img), np.empty((2, len(points_img)), np.float32)
 
     def run(first: int, last: int) -> None:
         refine_tracks(
-            reference, picture, points_ref, points_img, scales, config.patch_half_px, 8, config.max_shift_px, first, last, refined, scores
-        )
+            reference, picture, points_ref, points_img, scales, config.patch_half_px, 8, config.max_shift_px, first, last,
+            refined, scores, sigmas,
+        )  # fmt: skip
 
     run_in_bands(run, len(points_img))
-    return refined, scores >= config.min_correlation
+    return Aligned(refined, scores >= config.min_correlation, sigmas)
 
 
 def find_corners(

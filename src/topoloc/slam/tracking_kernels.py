@@ -70,13 +70,14 @@ def _compare(image, x, y, scale, half, patch, window):
 
 
 @kernel(**_OPTIONS)
-def refine_tracks(reference, image, points_ref, points, scales, half, num_iterations, max_shift, first, last, refined, scores):
-    """Fill `refined` and `scores` for the rows first .. last - 1.
+def refine_tracks(reference, image, points_ref, points, scales, half, num_iterations, max_shift, first, last, refined, scores, sigmas):
+    """Fill `refined`, `scores` and `sigmas` for the rows first .. last - 1.
 
     The patch around a point of the image is `scales` times as large as that of the reference. Gauss-Newton on a shift, gain
     and offset of the light eliminated, slopes taken from the reference (inverse compositional alignment, Baker and Matthews,
     IJCV 2004). The score is the normalised correlation at the end; -1 where the point is near a border, has no texture, or
-    wanders further than `max_shift` pixels from where it was.
+    wanders further than `max_shift` pixels from where it was. What does not fit, taken for noise, leaves the shift uncertain by the sigma
+    (pixels, the mean of both directions).
     """
     side = 2 * half + 1
     patch = np.empty((side, side), np.float32)
@@ -96,6 +97,7 @@ def refine_tracks(reference, image, points_ref, points, scales, half, num_iterat
         determinant = a * c - b * b
         if norm < 2.0 * side or determinant < 1e-3 * (a + c) * (a + c):
             continue
+        sigmas[n] = np.inf
         scale = scales[n]
         margin = int(half * scale) + 2
         for _ in range(num_iterations):
@@ -126,3 +128,5 @@ def refine_tracks(reference, image, points_ref, points, scales, half, num_iterat
             scores[n] = np.float32(-1)
         if scores[n] > 0:
             refined[n, 0], refined[n, 1] = x, y
+            noise = norm * norm * max(np.float32(1) - scores[n] * scores[n], np.float32(0)) / (side * side)
+            sigmas[n] = scale * np.sqrt(noise * (a + c) / (2 * determinant))

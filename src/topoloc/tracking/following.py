@@ -103,8 +103,8 @@ class PointFollower:
         depths = [pose.apply(self._seen.points_world[rows])[:, 2] for pose in (self._cam_from_world, guess)]
         scales = np.clip(depths[0] / np.maximum(depths[1], 1e-3), 0.5, 2.0).astype(np.float32)
         points_ref = self._seen.points_img[rows]
-        refined, alike = align_with_reference(self._reference, grey.astype(np.float32), points_ref, found, scales, self._config.tracking)
-        return rows[alike], refined[alike]
+        aligned = align_with_reference(self._reference, grey.astype(np.float32), points_ref, found, scales, self._config.tracking)
+        return rows[aligned.is_alike], aligned.points_img[aligned.is_alike]
 
     def _pose(self, points_img: Float32[np.ndarray, "n 2"], rows: np.ndarray) -> AbsolutePose | None:
         """The pose that enough of the points agree on, found anew: from a prediction that is off the refinement may not get there."""

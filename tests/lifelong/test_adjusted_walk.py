@@ -1,0 +1,58 @@
+"""A walk of a single camera adjusted as a whole: what the map says of its first part tells how long the rest is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tiny_world import CAMERA, path_pose, render, room
+from topoloc.geometry.rigid import Rigid3
+from topoloc.lifelong.adjusted_walk import adjusted_walk
+from topoloc.lifelong.session_poses import SessionPosesConfig
+from topoloc.localization.result import Localization
+from topoloc.sequences.frame import StereoFrame
+from topoloc.slam.single_camera import SingleCameraOdometry, Stretch
+from topoloc.slam.single_camera_config import SingleCameraConfig
+
+TRUTH = [path_pose(0.5 * number) for number in range(20)]
+KNOWN = range(8)
+
+
+@pytest.fixture
+def stretch() -> Stretch:
+    odometry, panels = SingleCameraOdometry(SingleCameraConfig()), room()
+    for number, pose in enumerate(TRUTH):
+        odometry.process(number, StereoFrame(f"{number}", number * 100_000_000, render(panels, pose, noise_seed=number)[0], CAMERA))
+    (found,) = odometry.stretches
+    return found
+
+
+def _too_long(by: float) -> list[Rigid3 | None]:
+    """The truth, but what lies beyond the known part is stretched."""
+    last = TRUTH[KNOWN[-1]].translation
+    beyond = [Rigid3(pose.rotation, last + by * (pose.translation - last)) for pose in TRUTH[len(KNOWN) :]]
+    return [*TRUTH[: len(KNOWN)], *beyond]
+
+
+def _off(poses: list[Rigid3 | None]) -> float:
+    return max(
+        float(np.linalg.norm(pose.translation - true.translation)) for pose, true in zip(poses, TRUTH, strict=True) if pose is not None
+    )
+
+
+def _answers() -> dict[int, Localization]:
+    covariance = np.diag([1e-5] * 3 + [1e-7] * 3)
+    return {k: Localization(TRUTH[k], covariance, 0.99, 0, [], 100, 80) for k in KNOWN}
+
+
+def test_the_whole_says_how_long_the_rest_is(stretch: Stretch):
+    held = _too_long(1.15)
+    adjusted = adjusted_walk(stretch, held, _answers(), SessionPosesConfig().adjustment)
+    assert _off(held) > 0.08
+    assert _off(adjusted) < 0.03
+
+
+def test_frames_without_a_pose_stay_without(stretch: Stretch):
+    held: list[Rigid3 | None] = [None, *_too_long(1.02)[1:15]]
+    adjusted = adjusted_walk(stretch, held, _answers(), SessionPosesConfig().adjustment)
+    assert [pose is None for pose in adjusted] == [True] + [False] * 14
