@@ -108,13 +108,24 @@ def _first_far_apart(joins: Iterable[Join], worlds: Mapping[str, str], atlas_fro
     return None
 
 
+@dataclass(frozen=True, eq=False)
+class _Way:
+    """From a world to the world `to`: `pose` brings the latter into the former."""
+
+    to: str
+    pose: Rigid3
+    covariance: Float[np.ndarray, "6 6"]
+    num_agreeing: int
+
+
 def _groups(joins: Sequence[Join], worlds: Mapping[str, str], anchored: Mapping[str, Rigid3]) -> dict[str, dict[str, JointPose]]:
-    """The worlds that joins connect, by the name of the one that gives them its coordinates; each lies where the most certain way leads."""
-    ways: dict[str, list[tuple[str, Rigid3, np.ndarray]]] = {}
+    """The worlds that joins connect, by the name of the one that gives them its coordinates; each lies where the ways that most pictures speak for
+    lead."""
+    ways: dict[str, list[_Way]] = {}
     for join in joins:
         one, other, pose = worlds[join.first], worlds[join.second], join.first_from_second
-        ways.setdefault(one, []).append((other, pose, join.covariance))
-        ways.setdefault(other, []).append((one, pose.inverse(), covariance_of_inverse(pose, join.covariance)))
+        ways.setdefault(one, []).append(_Way(other, pose, join.covariance, join.num_agreeing))
+        ways.setdefault(other, []).append(_Way(one, pose.inverse(), covariance_of_inverse(pose, join.covariance), join.num_agreeing))
     groups, seen = dict[str, dict[str, JointPose]](), set[str]()
     for anchor in sorted(ways, key=lambda name: (name not in anchored, name)):
         if anchor not in seen:
@@ -123,10 +134,10 @@ def _groups(joins: Sequence[Join], worlds: Mapping[str, str], anchored: Mapping[
     return groups
 
 
-def _reached(anchor: str, ways: Mapping[str, Sequence[tuple[str, Rigid3, np.ndarray]]]) -> dict[str, JointPose]:
-    """Every world that joins lead to, by the way of the least variance."""
+def _reached(anchor: str, ways: Mapping[str, Sequence[_Way]]) -> dict[str, JointPose]:
+    """Every world that joins lead to, each time by the join from what is reached that most pictures speak for."""
     places = dict[str, JointPose]()
-    queue = [(0.0, 0, anchor, JointPose(anchor, Rigid3.identity()))]
+    queue = [(0, 0, anchor, JointPose(anchor, Rigid3.identity()))]
     count = 0
     while queue:
         _, _, name, place = heapq.heappop(queue)
@@ -134,18 +145,18 @@ def _reached(anchor: str, ways: Mapping[str, Sequence[tuple[str, Rigid3, np.ndar
             continue
         places[name] = place
         adjoint = place.joint_from_world.adjoint()
-        for other, pose, covariance in ways[name]:
-            if other not in places:
-                further = JointPose(anchor, place.joint_from_world @ pose, place.covariance + adjoint @ covariance @ adjoint.T)
+        for way in ways[name]:
+            if way.to not in places:
+                covariance = place.covariance + adjoint @ way.covariance @ adjoint.T
                 count += 1
-                heapq.heappush(queue, (float(np.trace(further.covariance)), count, other, further))
+                heapq.heappush(queue, (-way.num_agreeing, count, way.to, JointPose(anchor, place.joint_from_world @ way.pose, covariance)))
     return places
 
 
 def _optimised(
     joins: Sequence[Join], worlds: Mapping[str, str], anchored: Mapping[str, Rigid3], config: PoseGraphConfig
 ) -> dict[str, JointPose]:
-    """Where each world lies, all joins adjusted; the covariance is that of the most certain way alone, which is no less."""
+    """Where each world lies, all joins adjusted; the covariance is that of one way alone, which is no less."""
     placed = dict[str, JointPose]()
     for anchor, group in _groups(joins, worlds, anchored).items():
         names = [anchor, *(name for name in group if name != anchor)]

@@ -139,6 +139,12 @@ class Manifest:
         """The `box_world` of each tile."""
         return np.array([tile.box_world for tile in self.tiles], np.float64).reshape(-1, 2, 3)
 
+    def georeference_of(self, tile: Tile) -> Georeference | None:
+        """Where on earth a tile's world lies: its map's own word, else what follows from other tiles."""
+        if tile.georeference is not None or tile.atlas_from_world is None or self.origin is None:
+            return tile.georeference
+        return Georeference(self.origin, tile.atlas_from_world, "joined")
+
     @property
     def files(self) -> set[str]:
         """Names of all files that the tiles consist of."""

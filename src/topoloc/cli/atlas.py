@@ -113,9 +113,10 @@ def joined_neighbours(where: str, tile_ids: Sequence[str], settings: Settings, i
         found = one.found
         row: dict[str, Any] = {"first": one.first, "second": one.second, "joined": isinstance(found, Found)}
         if isinstance(found, Found):
-            row |= {"num_agreeing": found.num_agreeing, "num_near": found.num_near, "num_recognised": found.num_recognised}
-            row |= {"even": round(found.even, 3)}
-            said = f"joined, {found.num_agreeing} nodes agree, {found.num_recognised} of {found.num_near} that must be recognised are"
+            row |= {"num_agreeing": found.num_agreeing, "same_pictures": found.is_by_shared}
+            row |= {"num_near": found.num_near, "num_recognised": found.num_recognised, "agreeing": round(found.agreeing, 3)}
+            asked = f"{found.num_agreeing} nodes agree, {found.num_recognised} of {found.num_near} that must be recognised are"
+            said = f"joined, by {found.num_agreeing} pictures that are part of both" if found.is_by_shared else f"joined, {asked}"
         else:
             row |= {"reason": (said := found.reason)}
         rows.append(row)
@@ -175,7 +176,7 @@ def print_atlas(facts: dict[str, Any]) -> None:
 
 
 def _join_line(join: dict[str, Any]) -> str:
-    said = f"{join['first']} and {join['second']}: {join['num_agreeing']} nodes agree"
+    said = f"{join['first']} and {join['second']}: {join['num_agreeing']} pictures agree"
     if join["residual"] is None:
         return f"{said}, but other joins contradict them; not used"
     return f"{said}, {100 * join['sigma_m']:.1f} cm, {join['sigma_deg']:.2f} deg"

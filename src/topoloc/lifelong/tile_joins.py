@@ -1,10 +1,11 @@
 """Do two maps overlap, and how do they lie to each other? Read from `joined`.
 
-Nodes of either are asked of the other as pictures would be, those that look most alike first. Each answer says how the maps lie to each
-other; what enough of them agree on, from pictures of which none counts twice, is taken for true (`transform_consensus.py`) if it stands a
-test: of the nodes that then stand about where one of the other map stands, nearly all must be recognised there, and nearly as evenly over
-the whole picture as by their own map without them. Two corridors of one plan agree by the centimetre on what they share, but in each
-picture there is something that one of them has and the other has not.
+Maps of overlapping pieces of one recording have pictures in common, which say it at once (`shared_pictures.py`). Of all others, nodes of
+either are asked of the other as pictures would be, those that look most alike first. Each answer says how the maps lie to each other; what
+enough of them agree on, from pictures of which none counts twice, is taken for true (`transform_consensus.py`) if it stands a test: of the
+nodes that then stand about where one of the other map stands, nearly all must be recognised there, and nearly all that they match before
+a pose is known must agree with it. Two corridors of one plan agree by the centimetre on what they share; but what one of them has and the
+other has not is matched with something else.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from topoloc.geometry.transform_consensus import (
     find_consensus,
 )
 from topoloc.lifelong.asked_nodes import ask_nodes
+from topoloc.lifelong.shared_pictures import by_shared_pictures
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization
 from topoloc.map.nodes import NodePoses, node_distances
@@ -58,14 +60,15 @@ class TileJoinConfig:
     """Metres by which an answer may be wrong (one sigma), besides, ..."""
     sigma_deg: Annotated[float, Above(0)] = 0.2
     """... and degrees."""
-    near: Annotated[float, Above(0)] = 2.0
+    near: Annotated[float, Above(0)] = 3.0
     """A node that stands so many D_thresh (distance of Eq. 1) from one of the other tile, or nearer, must be recognised."""
-    min_near: Annotated[int, AtLeast(1)] = 6
+    min_near: Annotated[int, AtLeast(1)] = 12
     """Such nodes there must be, of both tiles together; ..."""
-    min_recognised: Annotated[float, Between(0, 1)] = 0.75
+    min_recognised: Annotated[float, Between(0, 1)] = 0.9
     """... this share of them must be recognised where the join has them, ..."""
-    min_even: Annotated[float, Between(0, 2)] = 0.5
-    """... and as evenly over the picture as this share of how their own map recognises them (the median)."""
+    min_agreeing: Annotated[float, Between(0, 1)] = 0.75
+    """... and of three in four of them this share of the matches that no pose guided must agree with the pose: another place of the same
+    plan matches as many, but what differs is matched with something else."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +86,14 @@ class OpenTile:
     def poses(self) -> NodePoses:
         return NodePoses.of([summary.world_from_cam for summary in self.topomap.summaries])
 
+    @property
+    def apart(self) -> tuple[float, float]:
+        """D_thresh and lambda of Eq. 1."""
+        nodes = self.topomap.config.nodes
+        assert nodes.d_thresh is not None, "a map's own configuration is resolved"
+        assert nodes.lambda_rot is not None, "a map's own configuration is resolved"
+        return nodes.d_thresh, nodes.lambda_rot
+
     def world_from_node(self, row: int) -> Rigid3:
         return self.topomap.summaries[row].world_from_cam
 
@@ -91,16 +102,18 @@ class OpenTile:
 class Found:
     """How two maps lie to each other; the covariance is that of the left perturbation of `first_from_second` (m, rad).
 
-    `num_agreeing` answers say so. Of `num_near` nodes that must be recognised `num_recognised` were; `even` is how evenly, compared with
-    their own map.
+    `num_agreeing` pictures say so: the same ones of both maps (`is_by_shared`), or nodes of either that are recognised in the other. Of
+    these, `num_near` must be recognised and `num_recognised` are; in three in four of them at least the share `agreeing` of the matches
+    agrees with the pose.
     """
 
     first_from_second: Rigid3
     covariance: Float[np.ndarray, "6 6"]
     num_agreeing: int
-    num_near: int
-    num_recognised: int
-    even: float
+    num_near: int = 0
+    num_recognised: int = 0
+    agreeing: float = 0.0
+    is_by_shared: bool = False
 
 
 @dataclass(frozen=True)
@@ -126,6 +139,11 @@ def joined(first: OpenTile, second: OpenTile, config: TileJoinConfig) -> Found |
         MapError: a map cannot be read.
         FeatureKindError, MissingExtraError, WeightsError: the maps' features cannot be compared here.
     """
+    shared = by_shared_pictures(first.topomap, second.topomap, config.along, config.consensus)
+    if shared is not None:
+        return Found(*shared, is_by_shared=True)
+    if not any(set(one.topomap.kinds) <= set(other.topomap.kinds) for one, other in ((first, second), (second, first))):
+        return NotJoined("their features are not of the same kinds")
     return _Comparison(first, second, config).verdict()
 
 
@@ -165,8 +183,8 @@ class _Comparison:
                 f"{found.num_agreeing} answers agree, but {found.num_near - found.num_recognised} of {found.num_near} nodes that should be "
                 "recognised are not"
             )
-        if found.even < config.min_even:
-            return NotJoined(f"{found.num_agreeing} answers agree, but much that should be seen there is not ({found.even:.2f})")
+        if found.agreeing < config.min_agreeing:
+            return NotJoined(f"{found.num_agreeing} answers agree, but {1.0 - found.agreeing:.0%} of what is matched there does not")
         return found
 
     def _likeliest(self) -> list[list[int]]:
@@ -224,45 +242,37 @@ class _Comparison:
         """Nodes of the second tile, and of the first, that the join has near one of the other, at most `num_asked` each, evenly."""
         rows = []
         for asked, of, pose in zip(self._tiles, self._tiles[::-1], (first_from_second, first_from_second.inverse()), strict=True):
-            nodes = asked.topomap.config.nodes
-            assert nodes.d_thresh is not None, "a map's own configuration is resolved"
-            assert nodes.lambda_rot is not None, "a map's own configuration is resolved"
-            apart = [node_distances(pose @ summary.world_from_cam, asked.poses, nodes.lambda_rot).min() for summary in of.topomap.summaries]
-            near = np.flatnonzero(np.array(apart) <= self._config.near * nodes.d_thresh)
+            d_thresh, lambda_rot = asked.apart
+            apart = [node_distances(pose @ summary.world_from_cam, asked.poses, lambda_rot).min() for summary in of.topomap.summaries]
+            near = np.flatnonzero(np.array(apart) <= self._config.near * d_thresh)
             chosen = np.unique(np.linspace(0, len(near) - 1, min(len(near), self._config.num_asked)).round().astype(int))
             rows.append(near[chosen].tolist() if len(near) else [])
         return rows
 
     def _tested(self, first_from_second: Rigid3, near: Sequence[Sequence[int]]) -> tuple[int, int, float]:
-        """How many nodes must be recognised, how many are, and how evenly compared with their own map."""
-        num_asked, shares = 0, list[float]()
+        """How many nodes must be recognised, how many are, and what share of the matches agrees with their pose in three in four of all."""
+        num_there, shares = 0, list[float]()
         poses = (first_from_second, first_from_second.inverse())
         for asked, of, known, rows, pose in zip(self._tiles, self._tiles[::-1], self._answers, near, poses, strict=True):
-            d_thresh = asked.topomap.config.nodes.d_thresh
-            assert d_thresh is not None, "a map's own configuration is resolved"
+            d_thresh, _ = asked.apart
             for row in rows:
                 if row not in known:
                     continue
-                num_asked += 1
-                result = known[row]
-                if result is not None and _is_there(result, pose @ of.world_from_node(row), d_thresh):
-                    shares.append(_even_share(result) / max(_own_share(of, row), 1e-3))
-        return num_asked, len(shares), float(np.median(shares)) if shares else 0.0
+                result, world_from_cam = known[row], pose @ of.world_from_node(row)
+                is_there = result is not None and _is_there(result, world_from_cam, d_thresh)
+                num_there += is_there
+                shares.append(_agreeing_share(result) if is_there else 0.0)
+        return len(shares), num_there, float(np.quantile(shares, 0.25)) if shares else 0.0
 
 
-def _is_there(result: Localization, world_from_cam: Rigid3, d_thresh: float) -> bool:
+def _is_there(result: Localization | None, world_from_cam: Rigid3, d_thresh: float) -> bool:
+    if result is None:
+        return False
     off = result.world_from_cam.inverse() @ world_from_cam
-    return float(np.linalg.norm(off.translation)) <= 0.3 * d_thresh and np.degrees(off.angle()) <= 2.0
+    return bool(np.linalg.norm(off.translation) <= 0.3 * d_thresh and np.degrees(off.angle()) <= 2.0)
 
 
-def _even_share(result: Localization) -> float:
-    return result.evidence.even_share if result.evidence is not None else 0.0
-
-
-def _own_share(tile: OpenTile, row: int) -> float:
-    """How evenly a map recognises one of its nodes when it has all but this one."""
-    if len(tile.topomap.summaries) < 2:
-        return 1.0
-    localizer = tile.localizer.without([tile.topomap.summaries[row].node_id])
-    result = ask_nodes(localizer, tile.topomap, [row])[row]
-    return _even_share(result) if result is not None else 1e-3
+def _agreeing_share(result: Localization | None) -> float:
+    """Of the matches that no pose guided, those that agree with the pose."""
+    evidence = None if result is None else result.evidence
+    return 0.0 if evidence is None else evidence.num_inliers / max(evidence.num_matches, 1)
