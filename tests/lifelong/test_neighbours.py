@@ -40,7 +40,7 @@ WORLDS = {
     "middle": Rigid3(exp_so3(np.array([0.1, 0.4, -0.8])), np.array([-4.0, 7.0, 1.0])),
     "right": Rigid3(exp_so3(np.array([-0.3, 0.1, 2.0])), np.array([20.0, -3.0, 0.5])),
 }
-PARTS = {"left": range(8), "middle": range(4, 12), "right": range(7, 15)}
+PARTS = {"left": range(10), "middle": range(4, 14), "right": range(6, 16)}
 FEW = TileJoinConfig(num_probed=4, num_asked=6, min_near=8)
 
 

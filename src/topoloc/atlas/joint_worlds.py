@@ -119,8 +119,8 @@ class _Way:
 
 
 def _groups(joins: Sequence[Join], worlds: Mapping[str, str], anchored: Mapping[str, Rigid3]) -> dict[str, dict[str, JointPose]]:
-    """The worlds that joins connect, by the name of the one that gives them its coordinates; each lies where the ways that most pictures speak for
-    lead."""
+    """The worlds that joins connect, by the name of the one that gives them its coordinates; each lies where the ways lead that most
+    pictures speak for."""
     ways: dict[str, list[_Way]] = {}
     for join in joins:
         one, other, pose = worlds[join.first], worlds[join.second], join.first_from_second

@@ -56,9 +56,8 @@ class Command:
                 found = [f"tile {tile.tile_id}: {problem}" for tile in manifest.tiles if (problem := tile_problem(atlas, tile))]
         else:
             settings = read_settings(self.config)
-            if self.action != "join":
-                manifest = self._written()
-            if self.action == "join" or self.join:
+            manifest = None if self.action == "join" else self._written()
+            if manifest is None or self.join:
                 ids = [tile.tile_id for tile in self._new()] if self.join else self.names
                 manifest, tried = joined_neighbours(self.atlas, ids, settings, is_told=self.json != "-")
         facts = describe(self.atlas, manifest) | ({"check": found or "ok"} if self.check else {})
@@ -102,8 +101,11 @@ class Command:
             raise UsageError("--check belongs to info")
 
 
-def joined_neighbours(where: str, tile_ids: Sequence[str], settings: Settings, is_told: bool) -> tuple[Any, list[dict[str, Any]]]:
-    """The atlas's manifest once these tiles are joined with those that they overlap with, and what was found of each pair; a line each."""
+def joined_neighbours(
+    where: str, tile_ids: Sequence[str], settings: Settings, is_told: bool, pairs: Sequence[tuple[str, str]] | None = None
+) -> tuple[Any, list[dict[str, Any]]]:
+    """The atlas's manifest once these tiles are joined with those that they overlap with, or just these `pairs`, and what was found of
+    each pair; a line each."""
     from topoloc.lifelong.neighbours import Tried, join_tiles
     from topoloc.lifelong.tile_joins import Found, TileJoinConfig
 
@@ -123,7 +125,7 @@ def joined_neighbours(where: str, tile_ids: Sequence[str], settings: Settings, i
         if is_told:
             print(f"{one.first} and {one.second}: {said}", file=sys.stderr)
 
-    return join_tiles(where, tile_ids, settings.of(TileJoinConfig), tell).manifest, rows
+    return join_tiles(where, tile_ids, settings.of(TileJoinConfig), tell, pairs).manifest, rows
 
 
 def describe(where: str, manifest: Any) -> dict[str, Any]:

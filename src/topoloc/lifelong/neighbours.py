@@ -46,12 +46,19 @@ class Neighbours:
     tried: list[Tried]
 
 
-def join_tiles(where: str, tile_ids: Sequence[str] = (), config: TileJoinConfig | None = None, tell: Tell | None = None) -> Neighbours:
+def join_tiles(
+    where: str,
+    tile_ids: Sequence[str] = (),
+    config: TileJoinConfig | None = None,
+    tell: Tell | None = None,
+    pairs: Sequence[tuple[str, str]] | None = None,
+) -> Neighbours:
     """Tiles that overlap joined, those of them that no join connects directly yet.
 
     Args:
         tile_ids: only pairs with one of these; none: all.
         tell: is told of each pair that was compared.
+        pairs: just these are compared, by the ids of the tiles; None: those that look alike.
 
     Raises:
         ConfigError: a setting is out of its bounds.
@@ -64,7 +71,7 @@ def join_tiles(where: str, tile_ids: Sequence[str] = (), config: TileJoinConfig 
     wanted = {atlas.tile(tile_id).tile_id for tile_id in tile_ids} or set(atlas.manifest.by_id)
     maps, manifest, tried = Maps([], Localizer, _MAX_BYTES), atlas.manifest, list[Tried]()
     try:
-        for first, second in likely_pairs(atlas, wanted, config):
+        for first, second in likely_pairs(atlas, wanted, config) if pairs is None else _open_pairs(atlas, pairs):
             try:
                 found = _compared(atlas, maps, first, second, config)
             except (MapError, AtlasError) as error:
@@ -87,6 +94,13 @@ def _compared(atlas: Atlas, maps: Maps, first: Tile, second: Tile, config: TileJ
         maps.lent(second.tile_id, atlas.map_path(second)) as other,
     ):
         return joined(OpenTile(one.localizer, places[0]), OpenTile(other.localizer, places[1]), config)
+
+
+def _open_pairs(atlas: Atlas, pairs: Sequence[tuple[str, str]]) -> list[tuple[Tile, Tile]]:
+    """Those of the pairs, in the order of their ids, that are not joined yet."""
+    ordered = [(min(pair), max(pair)) for pair in pairs]
+    known = {join.pair for join in atlas.manifest.joins}
+    return [(atlas.tile(first), atlas.tile(second)) for first, second in ordered if (first, second) not in known]
 
 
 def likely_pairs(atlas: Atlas, wanted: Collection[str], config: TileJoinConfig) -> list[tuple[Tile, Tile]]:
