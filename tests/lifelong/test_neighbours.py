@@ -27,7 +27,7 @@ from topoloc.lifelong.neighbours import Neighbours, join_tiles, likely_pairs
 from topoloc.lifelong.shared_pictures import by_shared_pictures
 from topoloc.lifelong.tile_joins import NotJoined, TileJoinConfig
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.map_facts.building import Trust, build_map
 from topoloc.localization.result import Localization
 from topoloc.map.build import BuildConfig
 from topoloc.map.topomap import TopoMetricMap
@@ -47,8 +47,12 @@ FEW = TileJoinConfig(num_probed=4, num_asked=6, min_near=8)
 def _map_of(folder: Path, indices: list[float], own_from_room: Rigid3, panels: list[Panel] | None = None) -> Path:
     sequence = open_sequence(write_stereo_recording(folder, indices=indices, panels=panels))
     poses = [own_from_room @ pose for pose in sequence.poses if pose is not None]
-    build_map(SequenceView(sequence, list(range(len(sequence))), poses), BuildConfig(other_kinds=())).save(folder.with_suffix(".topo"))
+    _built(SequenceView(sequence, list(range(len(sequence))), poses)).save(folder.with_suffix(".topo"))
     return folder.with_suffix(".topo")
+
+
+def _built(sequence: SequenceView) -> TopoMetricMap:
+    return build_map(sequence, BuildConfig(other_kinds=()), trust=Trust(poses=True))
 
 
 @pytest.fixture(scope="module")
@@ -161,8 +165,8 @@ def test_one_tile_on_earth_puts_all_there(own: Path, parts: dict[str, Path], tmp
     assert [join.pair for join in replaced.joins] == [("left", "right")]
     assert replaced.by_id["left"].atlas_from_world is None
     remove_tiles(str(own), ["other"])
-    manifest = join_tiles(str(own), ["middle"], FEW).manifest
-    assert len(manifest.joins) == 3
+    manifest = join_tiles(str(own), config=FEW, pairs=[("middle", "left"), ("left", "right")]).manifest
+    assert [join.pair for join in manifest.joins] == [("left", "middle"), ("left", "right")]
     for name in PARTS:
         tile = manifest.by_id[name]
         assert tile.in_joint_world.joint == "middle"
@@ -205,16 +209,16 @@ def test_what_lies_far_apart_on_earth_is_not_even_compared(parts: dict[str, Path
 
 def test_the_command_line(own: Path, parts: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     settings = tmp_path / "few.toml"
-    settings.write_text("[join]\nnum_asked = 6\nmin_near = 8\n")
+    settings.write_text("[join]\nnum_probed = 4\nnum_asked = 6\nmin_near = 8\nmax_pairs = 1\n")
     remove_tiles(str(own), ["other", "middle"])
     shutil.copy(parts["middle"], tmp_path / "centre.topo")
     assert main(["atlas", "add", str(own), str(tmp_path / "centre.topo"), "--join", "--config", str(settings), "--json", "-"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["worlds"] == {"centre": ["centre", "left", "right"]}
-    assert [(join["first"], join["second"]) for join in facts["joins"]] == [("centre", "left"), ("centre", "right"), ("left", "right")]
+    assert [(join["first"], join["second"]) for join in facts["joins"]] == [("centre", "right"), ("left", "right")]
     assert all(0.0 < join["sigma_m"] < 0.05 and 0.0 < join["sigma_deg"] < 2.0 for join in facts["joins"])
-    assert [(one["first"], one["second"], one["joined"]) for one in facts["tried"]] == [("centre", "right", True), ("centre", "left", True)]
-    settings.write_text("[join]\nmin_near = 1000\nnum_asked = 6\n")
+    assert [(one["first"], one["second"], one["joined"]) for one in facts["tried"]] == [("centre", "right", True)]
+    settings.write_text("[join]\nmin_near = 1000\nnum_probed = 4\nnum_asked = 6\nmax_pairs = 1\n")
     remove_tiles(str(own), ["right", "centre"])
     add_tiles(str(own), new_tiles([str(parts["middle"])]))
     assert main(["atlas", "join", str(own), "middle", "--config", str(settings)]) == 0
@@ -242,7 +246,7 @@ def test_pieces_of_one_recording_are_joined_by_the_pictures_that_both_have(parts
     maps = list[TopoMetricMap]()
     for rows, own_from_room in ((range(5), WORLDS["left"]), (range(2, 7), WORLDS["middle"])):
         poses = [own_from_room @ path_pose(float(k)) for k in rows]
-        maps.append(build_map(SequenceView(recording, list(rows), poses), BuildConfig(other_kinds=())))
+        maps.append(_built(SequenceView(recording, list(rows), poses)))
     config = TileJoinConfig()
     found = by_shared_pictures(*maps, config.along, config.consensus)
     assert found is not None
