@@ -92,20 +92,32 @@ def adjusted(joins: Sequence[Join], worlds: Mapping[str, str], atlas_from_worlds
 
 
 def _first_far_apart(joins: Iterable[Join], worlds: Mapping[str, str], atlas_from_worlds: Mapping[str, Rigid3]) -> Join | None:
-    """The first join that, with those before it, says of a world that it lies elsewhere than where on earth it is known to lie."""
+    """The first join that, with those before it, says of a world that it lies elsewhere than where on earth it is known to lie. Looked at
+    are those that bring worlds on earth together, for the ways between worlds do not change by further joins that fewer speak for."""
+    groups: dict[str, set[str]] = {}
     taken: list[Join] = []
     for join in joins:
         taken.append(join)
-        of_join = {worlds[join.first], worlds[join.second]}
-        for anchor, group in _groups(taken, worlds, atlas_from_worlds).items():
-            if not of_join & group.keys() or anchor not in atlas_from_worlds:
-                continue
-            for name, place in group.items():
-                if name in atlas_from_worlds:
-                    apart = (atlas_from_worlds[anchor] @ place.joint_from_world).inverse() @ atlas_from_worlds[name]
-                    if np.linalg.norm(apart.translation) > MAX_APART_M:
-                        return join
+        one, other = (groups.setdefault(worlds[end], {worlds[end]}) for end in join.pair)
+        if one is other:
+            continue
+        both = one | other
+        if not (one.isdisjoint(atlas_from_worlds) or other.isdisjoint(atlas_from_worlds)) and _is_torn(
+            _groups([known for known in taken if worlds[known.first] in both], worlds, atlas_from_worlds), atlas_from_worlds
+        ):
+            return join
+        groups |= dict.fromkeys(both, both)
     return None
+
+
+def _is_torn(groups: Mapping[str, Mapping[str, JointPose]], atlas_from_worlds: Mapping[str, Rigid3]) -> bool:
+    """Does a world lie elsewhere by joins than it is known to?"""
+    for anchor, group in groups.items():
+        for name in group.keys() & atlas_from_worlds.keys():
+            apart = (atlas_from_worlds[anchor] @ group[name].joint_from_world).inverse() @ atlas_from_worlds[name]
+            if np.linalg.norm(apart.translation) > MAX_APART_M:
+                return True
+    return False
 
 
 @dataclass(frozen=True, eq=False)

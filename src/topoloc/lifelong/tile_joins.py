@@ -142,7 +142,8 @@ def joined(first: OpenTile, second: OpenTile, config: TileJoinConfig) -> Found |
     shared = by_shared_pictures(first.topomap, second.topomap, config.along, config.consensus)
     if shared is not None:
         return Found(*shared, is_by_shared=True)
-    if not any(set(one.topomap.kinds) <= set(other.topomap.kinds) for one, other in ((first, second), (second, first))):
+    is_of_kinds = any(set(one.topomap.kinds) <= set(other.topomap.kinds) for one, other in ((first, second), (second, first)))
+    if not is_of_kinds or not first.vectors.keys() & second.vectors.keys():
         return NotJoined("their features are not of the same kinds")
     return _Comparison(first, second, config).verdict()
 
