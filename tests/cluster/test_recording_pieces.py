@@ -59,12 +59,16 @@ def test_what_cannot_be_split_is_said(long_walk: Path, tmp_path: Path):
     with pytest.raises(UsageError, match="takes whole recordings"):
         pieces_of(_making(Path(f"{long_walk}@0::1")), "walk", Split(6, 3))
     for frames, shared in ((6, 4), (6, 2), (0, 0)):
-        with pytest.raises(UsageError, match="--overlap must be"):
+        with pytest.raises(UsageError, match="--split takes the frames of a piece and"):
             Split(frames, shared)
     missing = pieces_of(_making(tmp_path / "none"), "none", Split(6, 3))
     assert len(missing.makings) == 1
     assert main(["build", str(long_walk), str(tmp_path / "a.topo"), "--split", "6"]) == 2
-    assert main(["build", str(long_walk), str(tmp_path / "a"), "--ray", "local", "--overlap", "6"]) == 2
+    for text in ("6,4", "6,", "six", "-6", "6,3,2", "²"):
+        assert main(["build", str(long_walk), str(tmp_path / "a"), "--ray", "local", "--split", text]) == 2
+    assert Split.of("600") == Split(600, 60)
+    assert Split.of("12") == Split(12, 3)
+    assert Split.of("600,90") == Split(600, 90)
 
 
 def _built(capsys: pytest.CaptureFixture[str], *args: object) -> dict[str, Any]:
@@ -75,7 +79,7 @@ def _built(capsys: pytest.CaptureFixture[str], *args: object) -> dict[str, Any]:
 
 def test_pieces_by_slam_are_built_joined_and_found_again(cluster: Any, long_walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     atlas = tmp_path / "campus"
-    args = (long_walk, atlas, "--ray", cluster.address, "--split", 7, "--overlap", 3, "--features", "surf", "--trajectory", "slam")
+    args = (long_walk, atlas, "--ray", cluster.address, "--split", "7,3", "--features", "surf", "--trajectory", "slam")
     built = _built(capsys, *args)
     assert [(one["tile_id"], one["state"]) for one in built["recordings"]] == [("walk_0-7", "built"), ("walk_3-10", "built")]
     assert [(one["first"], one["second"], one["same_pictures"]) for one in built["tried"]] == [("walk_0-7", "walk_3-10", True)]

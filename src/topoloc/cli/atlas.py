@@ -42,7 +42,7 @@ class Command:
     json: File = None
     """Write what the atlas holds afterwards as JSON to this file (- for standard output)."""
     config: File = None
-    """Settings of `join`: a TOML file, as `topoloc config join` prints it."""
+    """Settings of `join`: a TOML file, as `topoloc config atlas` prints it."""
 
     def run(self) -> int:
         self._check_usage()

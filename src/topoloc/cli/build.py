@@ -76,13 +76,10 @@ class Command:
     """With --ray, the world that the poses of all recordings are in."""
     replace: Flag = False
     """With --ray, a tile of the same id that was made of something else, or otherwise, is replaced."""
-    split: Annotated[int | None, tyro.conf.arg(metavar="FRAMES", help_behavior_hint="(default: each whole)")] = None
-    """With --ray, recordings of more frames than this are mapped in pieces of so many, each a tile; they overlap, and have one world by the
-    recording's own poses, or by what is the same in both where SLAM finds the poses of each."""
-    overlap: Annotated[int | None, tyro.conf.arg(metavar="FRAMES", help_behavior_hint="(default: a tenth)")] = None
-    """With --split, frames that a piece shares with the next one, at least."""
+    split: Annotated[str | None, tyro.conf.arg(metavar="FRAMES[,SHARED]", help_behavior_hint="(default: each whole)")] = None
+    """With --ray, longer recordings are mapped in pieces of so many frames, of one world, that share SHARED frames (a tenth)."""
     join: Flag = False
-    """With --ray, then the tiles are joined with those of the atlas that they overlap with, as `topoloc atlas join` does."""
+    """With --ray, tiles that overlap are joined, as by `topoloc atlas join`."""
     json: File = None
     """Write what `topoloc info` says of the new map, or what became of each recording, to this file (- for standard output)."""
     config: File = None
@@ -91,7 +88,7 @@ class Command:
     def run(self) -> int:
         if self.ray is None and (self.world is not None or self.replace or self.join or self.split is not None):
             raise UsageError("--world, --replace, --join and --split belong to --ray")
-        split = Split.of(self.split, self.overlap)
+        split = Split.of(self.split)
         recordings, target = self._split_paths()
         read = [path for path in (*self.trajectory, self.config) if path not in ("truth", "slam", None)]
         check_outputs([str(target) if self.ray is None else None, self.json], inputs=read)

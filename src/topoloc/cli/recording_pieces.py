@@ -29,18 +29,20 @@ class Split:
     def __post_init__(self) -> None:
         if not LEAST_OVERLAP <= self.num_shared <= self.num_frames // 2:
             raise UsageError(
-                f"--overlap must be {LEAST_OVERLAP} frames at least and at most half of the {self.num_frames} of --split, "
-                f"not {self.num_shared}"
+                f"--split takes the frames of a piece and, behind a comma, how many of these the next one shares: {LEAST_OVERLAP} at "
+                f"least and at most half, not {self.num_shared} of {self.num_frames}"
             )
 
     @staticmethod
-    def of(num_frames: int | None, num_shared: int | None) -> Split | None:
-        """As the options say it: a tenth is shared where that is not said. Raises UsageError."""
-        if num_frames is None:
-            if num_shared is not None:
-                raise UsageError("--overlap belongs to --split")
+    def of(text: str | None) -> Split | None:
+        """As the option says it, `500` or `500,50`: a tenth is shared where that is not said. Raises UsageError."""
+        if text is None:
             return None
-        return Split(num_frames, max(num_frames // 10, LEAST_OVERLAP) if num_shared is None else num_shared)
+        parts = text.split(",")
+        if len(parts) > 2 or not all(part.isascii() and part.isdigit() and len(part) < 10 for part in parts):
+            raise UsageError(f"--split takes frames, such as 500 or 500,50, not {text[:40]!r}")
+        num_frames = int(parts[0])
+        return Split(num_frames, int(parts[1]) if len(parts) == 2 else max(num_frames // 10, LEAST_OVERLAP))
 
     def ranges(self, total: int) -> list[tuple[int, int]]:
         """First frame and the one after the last of each piece of so many frames in all; all are of one length."""

@@ -17,7 +17,7 @@ class Provenance:
     """What a result comes from: the map by its id, in which version (the number of its last edit), by which kind of `features`; when the
     picture was taken (nanoseconds), and with which camera. What is not known is None, or empty. `tile` is what the map is called in the
     atlas that was asked, `atlas_from_cam` the camera's pose in the atlas's world; None where no atlas was asked, or that is not known.
-    `joint_world` is the name of the world that the tile shares with those that are joined with it, `joint_from_cam` the pose in that one."""
+    `joint_world` is the name of the world that the tile shares with those joined with it, `joint_from_cam` the pose in that one."""
 
     map_id: str = ""
     map_version: int = 0
