@@ -109,10 +109,10 @@ def tum_line(index: float, world_from_cam: Rigid3) -> str:
     return " ".join(f"{value:.9f}" for value in (index / RATE_HZ, *world_from_cam.translation, x, y, z, w))
 
 
-def write_stereo_recording(folder: Path, seed: int = 0, indices: list[float] | None = None) -> Path:
+def write_stereo_recording(folder: Path, seed: int = 0, indices: list[float] | None = None, panels: list[Panel] | None = None) -> Path:
     """A KITTI-like recording with truth.tum, and the camera.json that a query by its pictures needs; returns `folder`."""
     indices = indices if indices is not None else [float(index) for index in range(NUM_FRAMES)]
-    panels = room(seed)
+    panels = panels or room(seed)
     for side in ("image_0", "image_1"):
         (folder / side).mkdir(parents=True)
     for number, index in enumerate(indices):

@@ -36,7 +36,7 @@ def test_a_command_can_be_named(capsys: pytest.CaptureFixture[str]):
     assert main(["config", "evaluate"]) == 0
     assert list(tomllib.loads(capsys.readouterr().out)) == ["localize", "atlas", "against_itself"]
     assert main(["config", "build"]) == 0
-    assert list(tomllib.loads(capsys.readouterr().out)) == ["build", "slam", "cluster"]
+    assert list(tomllib.loads(capsys.readouterr().out)) == ["build", "slam", "join", "cluster"]
     assert main(["config", "train"]) == 0
     assert list(tomllib.loads(capsys.readouterr().out)) == ["train"]
 

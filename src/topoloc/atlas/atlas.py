@@ -59,9 +59,10 @@ class Atlas:
 
     @cached_property
     def _opened(self) -> OpenedIndex:
-        return open_index(self.manifest.tiles, self._places_of, index_folder(self.store.where))
+        return open_index(self.manifest.tiles, self.places_of, index_folder(self.store.where))
 
-    def _places_of(self, tile: Tile) -> PlaceVectors:
+    def places_of(self, tile: Tile) -> PlaceVectors:
+        """The place vectors of a tile's nodes. Raises AtlasError."""
         return read_vectors(self.store.local(tile.places.name, tile.places.sha256), tile.vocabularies)
 
     @property

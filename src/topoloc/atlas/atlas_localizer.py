@@ -29,7 +29,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.query import Picture, Query, StageClock, reduced_image, unknown_camera
-from topoloc.localization.result import Localization, NotLocalized, at_time
+from topoloc.localization.result import Alternative, Localization, NotLocalized, at_time
 from topoloc.places.coarse import Image
 from topoloc.places.shared_vocabulary import shared_vocabulary
 
@@ -155,9 +155,23 @@ class AtlasLocalizer:
             self._ask(hearing, self.atlas.tile(tile_id).tile_id, 1.0, prior=prior)
         if not hearing.heard:
             raise AtlasError(f"no tile of the atlas {self.atlas.store.where} can be asked: {next(iter(self.problems.values()), 'no time')}")
-        result = joint_result(list(hearing.heard.values()))
+        result = self._on_earth(joint_result(list(hearing.heard.values())))
         result = replace(result, times_ms=_all_times(hearing, ranked) | {"total": 1e3 * (time.perf_counter() - start)})
         return result if t_ns is None else at_time(result, t_ns)
+
+    def _on_earth(self, result: Localization | NotLocalized) -> Localization | NotLocalized:
+        """With the geoposes of tiles that know through others where on earth they lie."""
+        manifest, tile_id = self.atlas.manifest, result.provenance.tile
+        if isinstance(result, NotLocalized):
+            alternatives = [self._alternative_on_earth(one) for one in result.alternatives]
+            return replace(result, alternatives=tuple(alternatives)) if alternatives else result
+        place = manifest.georeference_of(manifest.by_id[tile_id]) if tile_id is not None and result.geopose is None else None
+        return result if place is None else replace(result, geopose=place.geopose(result.world_from_cam))
+
+    def _alternative_on_earth(self, one: Alternative) -> Alternative:
+        manifest = self.atlas.manifest
+        place = manifest.georeference_of(manifest.by_id[one.tile]) if one.tile is not None and one.geopose is None else None
+        return one if place is None else replace(one, geopose=place.geopose(one.world_from_cam))
 
     def completed(self, result: NotLocalized, t_ns: int | None = None) -> NotLocalized:
         """What is said of a picture that could not be asked, with its time (nanoseconds)."""

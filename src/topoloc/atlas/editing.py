@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from topoloc.atlas.atlas import store_at
+from topoloc.atlas.joins import Join
 from topoloc.atlas.manifest import TILES, Manifest, StoredFile, Tile, check_tile_id
 from topoloc.atlas.place_vectors import place_vectors, write_vectors
 from topoloc.atlas.store import MANIFEST, Store, sha256_of
@@ -28,8 +29,8 @@ from topoloc.sequences.atomic import scratch_file
 GRACE_S = 3600.0
 """So long files stay that no manifest names any more: readers may have just read the manifest before."""
 _MAX_TRIES = 1000
-Change = Callable[[Manifest], Mapping[str, Tile]]
-"""From a manifest to the tiles, by their ids, of the next one. May be called several times."""
+Change = Callable[[Manifest, float], Manifest]
+"""From a manifest to the next one, at this time (seconds of Unix time). May be called several times."""
 
 
 @dataclass(frozen=True)
@@ -89,9 +90,9 @@ def add_tiles(where: str, new: Sequence[NewTile], replaces: bool = False, grace_
     _check_free(_read(store, creates)[1], new, replaces)  # before the work begins, and again with each try
     added = {tile.tile_id: tile for tile in _put(store, new)}
 
-    def with_added(manifest: Manifest) -> Mapping[str, Tile]:
+    def with_added(manifest: Manifest, now: float) -> Manifest:
         _check_free(manifest, new, replaces)
-        return manifest.by_id | added
+        return manifest.with_tiles(manifest.by_id | added, now)
 
     after, names = _changed(store, with_added, grace_s, creates), store.ages()
     for one, tile in zip(new, added.values(), strict=True):
@@ -104,13 +105,24 @@ def remove_tiles(where: str, tile_ids: Sequence[str], grace_s: float = GRACE_S) 
     """The manifest without these tiles. Raises AtlasError: no atlas is there, it has no such tile, or cannot be written."""
     store = store_at(where)
 
-    def without(manifest: Manifest) -> Mapping[str, Tile]:
+    def without(manifest: Manifest, now: float) -> Manifest:
         missing = [tile_id for tile_id in tile_ids if tile_id not in manifest.by_id]
         if missing:
             raise AtlasError(f"the atlas {where} has no tile {missing[0][:80]!r}")
-        return {tile_id: tile for tile_id, tile in manifest.by_id.items() if tile_id not in tile_ids}
+        return manifest.with_tiles({tile_id: tile for tile_id, tile in manifest.by_id.items() if tile_id not in tile_ids}, now)
 
     return _changed(store, without, grace_s)
+
+
+def add_joins(where: str, joins: Sequence[Join], between: Mapping[str, Tile], grace_s: float = GRACE_S) -> Manifest:
+    """The manifest with these joins, too, which were found between these tiles; those of tiles are left out whose map is gone by now, or
+    another one. Raises AtlasError: no atlas is there, or it cannot be written."""
+
+    def with_joins(manifest: Manifest, now: float) -> Manifest:
+        there = {name for name, tile in manifest.by_id.items() if name in between and between[name].map.sha256 == tile.map.sha256}
+        return manifest.with_tiles(manifest.by_id, now, [join for join in joins if there.issuperset(join.pair)])
+
+    return _changed(store_at(where), with_joins, grace_s)
 
 
 def tile_of(new: NewTile, store: Store) -> Tile:
@@ -190,7 +202,7 @@ def _changed(store: Store, change: Change, grace_s: float, creates: bool = False
     for _ in range(_MAX_TRIES):
         before, manifest = _read(store, creates)
         now, ages = time.time(), store.ages()
-        after = manifest.with_tiles(change(manifest), now)
+        after = change(manifest, now)
         gone = [name for name, when in after.retired.items() if name not in ages or min(now - when, ages[name]) > grace_s]
         after = replace(after, retired={name: when for name, when in after.retired.items() if name not in gone})
         if store.commit(before, after.to_bytes()):

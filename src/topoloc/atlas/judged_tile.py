@@ -35,8 +35,5 @@ class JudgedTile:
         pose there is right."""
         tile, answered = self.localizer.atlas.tile(self.tile_id), result.provenance.tile
         other = tile if answered is None else self.localizer.atlas.tile(answered)
-        if tile.world == other.world:
-            return world_from_cam
-        if tile.atlas_from_world is None or other.atlas_from_world is None:
-            return None
-        return other.atlas_from_world.inverse() @ tile.atlas_from_world @ world_from_cam
+        other_from_world = other.from_world_of(tile)
+        return None if other_from_world is None else other_from_world @ world_from_cam

@@ -9,14 +9,17 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.atlas.joins import Join, JointPose
+from topoloc.atlas.joint_worlds import placed as placed_tiles
+from topoloc.atlas.manifest_values import ID, count, matching, number, of
 from topoloc.errors import AtlasError, GeoreferenceError, TrajectoryError
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3
@@ -24,11 +27,8 @@ from topoloc.geometry.rigid import Rigid3
 FORMAT, FORMAT_VERSION = "topoloc-atlas", 1
 TILES = "tiles"
 MAX_TILES = 1_000_000
-_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 _FILE = re.compile(rf"{TILES}/[A-Za-z0-9][A-Za-z0-9_.-]{{0,199}}")
 _SHA256, _MAP_ID = re.compile(r"[0-9a-f]{64}"), re.compile(r"[0-9a-f]{16}")
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,9 @@ class Tile:
     `box_world` holds the least and the largest coordinates of its nodes' cameras in the map's own world, metres; `focal_px` the focal
     length of its finest camera. `georeference` is the map's, `geo_box` the least latitude, longitude and the largest ones, degrees;
     both None of a map that knows no place on earth. Tiles of one `world` share their coordinates; it is the tile's own id where nobody said
-    so. `atlas_from_world` brings the map's world into the atlas's, where that is known. `recipe` is a digest of the recording and settings
-    that the map was made of, where it was made for this atlas.
+    so; `joint` says where that world lies among those that pictures join it with (`joins.py`), None where they join it with none.
+    `atlas_from_world` brings the map's world into the atlas's, where that is known, be it through other tiles. `recipe` is a digest of the
+    recording and settings that the map was made of, where it was made for this atlas.
     """
 
     tile_id: str
@@ -70,10 +71,29 @@ class Tile:
     geo_box: tuple[float, float, float, float] | None = None
     atlas_from_world: Rigid3 | None = None
     recipe: str | None = None
+    joint: JointPose | None = None
+
+    @property
+    def in_joint_world(self) -> JointPose:
+        """Where the tile's world lies in the joint one; that is its own where no other is joined with it."""
+        return self.joint or JointPose(self.world, Rigid3.identity())
+
+    def from_world_of(self, other: Tile) -> Rigid3 | None:
+        """Brings the world of another tile's map into that of this one, where the atlas knows how they lie to each other."""
+        if self.world == other.world:
+            return Rigid3.identity()
+        here, there = self.in_joint_world, other.in_joint_world
+        if here.joint == there.joint:
+            return here.joint_from_world.inverse() @ there.joint_from_world
+        if self.atlas_from_world is None or other.atlas_from_world is None:
+            return None
+        return self.atlas_from_world.inverse() @ other.atlas_from_world
 
     def to_json(self) -> dict[str, Any]:
         known = self.georeference
-        made_of = {} if self.recipe is None else {"recipe": self.recipe}
+        made_of: dict[str, Any] = {} if self.recipe is None else {"recipe": self.recipe}
+        if self.joint is not None:
+            made_of["joint"] = self.joint.to_json()
         return made_of | {
             "id": self.tile_id,
             "map": self.map.to_json(),
@@ -95,12 +115,14 @@ class Tile:
 @dataclass(frozen=True, eq=False)
 class Manifest:
     """All tiles in the order of their ids. `origin` is the place on earth at which the atlas's own world touches it (east, north, up), None
-    while no tile is georeferenced. `retired` are files that were named before, and when they were given up (seconds of Unix time)."""
+    while no tile is georeferenced. `retired` are files that were named before, and when they were given up (seconds of Unix time). `joins`
+    say how tiles lie to each other, those that all together contradict among them."""
 
     serial: int = 0
     tiles: tuple[Tile, ...] = ()
     origin: GeoPoint | None = None
     retired: Mapping[str, float] = field(default_factory=dict)
+    joins: tuple[Join, ...] = ()
 
     @cached_property
     def by_id(self) -> dict[str, Tile]:
@@ -117,20 +139,37 @@ class Manifest:
         """The `box_world` of each tile."""
         return np.array([tile.box_world for tile in self.tiles], np.float64).reshape(-1, 2, 3)
 
+    def georeference_of(self, tile: Tile) -> Georeference | None:
+        """Where on earth a tile's world lies: its map's own word, else what follows from other tiles."""
+        if tile.georeference is not None or tile.atlas_from_world is None or self.origin is None:
+            return tile.georeference
+        return Georeference(self.origin, tile.atlas_from_world, "joined")
+
     @property
     def files(self) -> set[str]:
         """Names of all files that the tiles consist of."""
         return {stored.name for tile in self.tiles for stored in (tile.map, tile.places)}
 
-    def with_tiles(self, tiles: Mapping[str, Tile], now: float) -> Manifest:
-        """The next one, of these tiles; files that it does not name any more are retired at `now`."""
+    def with_tiles(self, tiles: Mapping[str, Tile], now: float, joins: Sequence[Join] = ()) -> Manifest:
+        """The next one, of these tiles; files that it does not name any more are retired at `now`.
+
+        Args:
+            joins: further ones, of these tiles. Those that are there stay, but for those of tiles whose map is gone or another one.
+        """
         origin = self.origin
         if origin is None:
             origin = next((tile.georeference.origin for _, tile in sorted(tiles.items()) if tile.georeference is not None), None)
-        placed = tuple(_in_atlas_world(tiles[tile_id], origin) for tile_id in sorted(tiles))
-        after = Manifest(self.serial + 1, placed, origin)
+        placed, adjusted_joins = placed_tiles(tiles, self._joins_of(tiles, joins), origin)
+        after = Manifest(self.serial + 1, placed, origin, {}, adjusted_joins)
         retired = dict.fromkeys(self.files, now) | dict(self.retired)
         return replace(after, retired={name: when for name, when in sorted(retired.items()) if name not in after.files})
+
+    def _joins_of(self, tiles: Mapping[str, Tile], further: Sequence[Join]) -> list[Join]:
+        """Joins between these tiles; of two between the same ones the last."""
+        same = {name for name, tile in tiles.items() if name in self.by_id and self.by_id[name].map.sha256 == tile.map.sha256}
+        known = {join.pair: join for join in self.joins if same.issuperset(join.pair)}
+        known |= {join.pair: join for join in further if tiles.keys() >= set(join.pair)}
+        return [join for join in known.values() if tiles[join.first].world != tiles[join.second].world]
 
     def to_bytes(self) -> bytes:
         """As `atlas.json` holds it."""
@@ -142,6 +181,7 @@ class Manifest:
             "origin": None if origin is None else {"lat": origin.lat, "lon": origin.lon, "h": origin.h},
             "tiles": [tile.to_json() for tile in self.tiles],
             "retired": dict(self.retired),
+            **({"joins": [join.to_json() for join in self.joins]} if self.joins else {}),
         }
         return (json.dumps(data, indent=1) + "\n").encode("utf-8")
 
@@ -157,17 +197,8 @@ class Manifest:
 
 def check_tile_id(tile_id: str) -> None:
     """Raises AtlasError where no tile can be called so."""
-    if not _ID.fullmatch(tile_id):
+    if not ID.fullmatch(tile_id):
         raise AtlasError(f"no tile can be called {tile_id[:80]!r}: at most 100 letters, digits, `_`, `-` and `.`, a letter or digit first")
-
-
-def _in_atlas_world(tile: Tile, origin: GeoPoint | None) -> Tile:
-    """A georeferenced tile with its pose in the atlas's world, which is east-north-up at `origin`."""
-    known = tile.georeference
-    if known is None or origin is None:
-        return tile
-    atlas_from_ecef = origin.ecef_from_enu().inverse()
-    return replace(tile, atlas_from_world=atlas_from_ecef @ known.origin.ecef_from_enu() @ known.enu_from_world)
 
 
 def _manifest_of(data: Any) -> Manifest:
@@ -175,16 +206,29 @@ def _manifest_of(data: Any) -> Manifest:
         raise ValueError(f"'format' is not {FORMAT!r}")
     if data.get("version") != FORMAT_VERSION:
         raise ValueError(f"version {str(data.get('version'))[:20]} of the format; this topoloc reads version {FORMAT_VERSION}")
-    rows = _of(list, data["tiles"], "tiles")
-    tiles = [_tile_of(_of(dict, row, "a tile")) for row in rows[: MAX_TILES + 1]]
+    rows = of(list, data["tiles"], "tiles")
+    tiles = [_tile_of(of(dict, row, "a tile")) for row in rows[: MAX_TILES + 1]]
     if len(tiles) > MAX_TILES or len({tile.tile_id for tile in tiles}) < len(tiles):
         raise ValueError("too many tiles, or two of one id")
-    origin, retired = data["origin"], _of(dict, data["retired"], "retired")
+    origin, retired = data["origin"], of(dict, data["retired"], "retired")
     for name in retired:
-        _matching(_FILE, name, "a retired file")
-    place = None if origin is None else GeoPoint(*(_number(origin[name], name) for name in ("lat", "lon", "h")))
+        matching(_FILE, name, "a retired file")
+    place = None if origin is None else GeoPoint(*(number(origin[name], name) for name in ("lat", "lon", "h")))
     ordered = tuple(sorted(tiles, key=lambda tile: tile.tile_id))
-    return Manifest(_count(data["serial"], "serial"), ordered, place, {name: _number(when, "retired") for name, when in retired.items()})
+    joins = [Join.from_json(of(dict, row, "a join")) for row in of(list, data.get("joins", []), "joins")]
+    _check_joins(joins, {tile.tile_id for tile in tiles})
+    given_up = {name: number(when, "retired") for name, when in retired.items()}
+    return Manifest(count(data["serial"], "serial"), ordered, place, given_up, tuple(joins))
+
+
+def _check_joins(joins: Sequence[Join], known: set[str]) -> None:
+    for join in joins:
+        if not known.issuperset(join.pair):
+            raise ValueError(f"a join of {join.first} and {join.second}, which are not both tiles")
+        if join.first >= join.second:
+            raise ValueError(f"a join of {join.first} and {join.second}, which are not two in their order")
+    if len({join.pair for join in joins}) < len(joins):
+        raise ValueError("two joins of the same tiles")
 
 
 def _tile_of(row: dict[str, Any]) -> Tile:
@@ -192,57 +236,35 @@ def _tile_of(row: dict[str, Any]) -> Tile:
     if box.shape != (2, 3) or not np.isfinite(box).all():
         raise ValueError("box_world is no two points")
     geo_box, georeference, pose, recipe = row["geo_box"], row["georeference"], row["atlas_from_world"], row.get("recipe")
-    focal = _number(row["focal_px"], "focal_px")
+    joint = row.get("joint")
+    focal = number(row["focal_px"], "focal_px")
     if focal <= 0.0:
         raise ValueError("focal_px is not above 0")
-    vocabularies = _of(dict, row["places"]["vocabularies"], "vocabularies")
-    corners = None if geo_box is None else [_number(value, "geo_box") for value in _of(list, geo_box, "geo_box")]
+    vocabularies = of(dict, row["places"]["vocabularies"], "vocabularies")
+    corners = None if geo_box is None else [number(value, "geo_box") for value in of(list, geo_box, "geo_box")]
     if corners is not None and len(corners) != 4:
         raise ValueError("geo_box is no four degrees")
     return Tile(
-        tile_id=_matching(_ID, row["id"], "id"),
+        tile_id=matching(ID, row["id"], "id"),
         map=_file_of(row["map"]),
         places=_file_of(row["places"]),
-        vocabularies={kind: _of(str, version, "vocabularies") for kind, version in vocabularies.items()},
-        map_id=_matching(_MAP_ID, row["map_id"], "map_id"),
-        map_version=_count(row["map_version"], "map_version"),
-        kinds=tuple(_of(str, kind, "kinds") for kind in _of(list, row["kinds"], "kinds")),
-        num_nodes=_count(row["num_nodes"], "num_nodes"),
-        sessions=tuple(_of(str, name, "sessions") for name in _of(list, row["sessions"], "sessions")),
+        vocabularies={kind: of(str, version, "vocabularies") for kind, version in vocabularies.items()},
+        map_id=matching(_MAP_ID, row["map_id"], "map_id"),
+        map_version=count(row["map_version"], "map_version"),
+        kinds=tuple(of(str, kind, "kinds") for kind in of(list, row["kinds"], "kinds")),
+        num_nodes=count(row["num_nodes"], "num_nodes"),
+        sessions=tuple(of(str, name, "sessions") for name in of(list, row["sessions"], "sessions")),
         focal_px=focal,
         box_world=box,
-        world=_matching(_ID, row["world"], "world"),
+        world=matching(ID, row["world"], "world"),
         georeference=None if georeference is None else Georeference.from_json(georeference),
         geo_box=None if corners is None else (corners[0], corners[1], corners[2], corners[3]),
         atlas_from_world=None if pose is None else Rigid3.from_matrix(np.array(pose, np.float64)),
-        recipe=None if recipe is None else _matching(_SHA256, recipe, "recipe"),
+        recipe=None if recipe is None else matching(_SHA256, recipe, "recipe"),
+        joint=None if joint is None else JointPose.from_json(of(dict, joint, "joint")),
     )
 
 
 def _file_of(row: Any) -> StoredFile:
-    name, sha256 = _matching(_FILE, row["file"], "file"), _matching(_SHA256, row["sha256"], "sha256")
-    return StoredFile(name, sha256, _count(row["bytes"], "bytes"))
-
-
-def _of(kind: type[T], value: Any, what: str) -> T:
-    if not isinstance(value, kind):
-        raise ValueError(f"{what} is no {kind.__name__}")
-    return value
-
-
-def _matching(pattern: re.Pattern[str], value: Any, what: str) -> str:
-    if not isinstance(value, str) or not pattern.fullmatch(value):
-        raise ValueError(f"{what} cannot be {str(value)[:80]!r}")
-    return value
-
-
-def _count(value: Any, what: str) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**53:
-        raise ValueError(f"{what} is no count")
-    return value
-
-
-def _number(value: Any, what: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ValueError(f"{what} is no finite number")
-    return float(value)
+    name, sha256 = matching(_FILE, row["file"], "file"), matching(_SHA256, row["sha256"], "sha256")
+    return StoredFile(name, sha256, count(row["bytes"], "bytes"))

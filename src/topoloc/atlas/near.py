@@ -112,14 +112,13 @@ def _near_pose(manifest: Manifest, near: NearPose, may_be: Bool[np.ndarray, " t"
     apart = np.linalg.norm(np.clip(centre, boxes[:, 0], boxes[:, 1]) - centre, axis=1)
     in_reach = np.flatnonzero(may_be & of_world & (apart <= near.radius_m))
     reached: dict[str, Rigid3 | None] = {manifest.tiles[number].tile_id: near.world_from_cam for number in in_reach}
-    known = [manifest.tiles[number].atlas_from_world for number in np.flatnonzero(of_world)]
-    atlas_from_world = next((pose for pose in known if pose is not None), None)
-    if atlas_from_world is None:
-        return reached
-    for number in np.flatnonzero(may_be & ~of_world):
+    one = manifest.tiles[int(np.flatnonzero(of_world)[0])]
+    is_known = np.array([tile.atlas_from_world is not None or tile.joint is not None for tile in manifest.tiles], bool)
+    for number in np.flatnonzero(may_be & ~of_world & is_known):
         tile = manifest.tiles[number]
-        if tile.atlas_from_world is not None:
-            pose = tile.atlas_from_world.inverse() @ atlas_from_world @ near.world_from_cam
+        world_from_one = tile.from_world_of(one)
+        if world_from_one is not None:
+            pose = world_from_one @ near.world_from_cam
             nearest = np.clip(pose.translation, tile.box_world[0], tile.box_world[1])
             if np.linalg.norm(nearest - pose.translation) <= near.radius_m:
                 reached[tile.tile_id] = pose

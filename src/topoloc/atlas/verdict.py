@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from topoloc.atlas.joins import sigmas_at
 from topoloc.atlas.manifest import Tile
 from topoloc.localization.belief import MIN_LEAD
 from topoloc.localization.evidence import log_odds_of
@@ -21,6 +22,7 @@ from topoloc.localization.fitted_weights import FittedWeights, RivalWeights, wei
 from topoloc.localization.result import Alternative, Localization, NotLocalized, R
 
 _SAME_METRES, _SAME_DEG = 1.0, 5.0
+_SIGMAS = 3.0  # of a join, which add to these; at most as much again
 _MIN_ALTERNATIVE = 0.01
 
 
@@ -92,10 +94,13 @@ def _refusal(heard: Sequence[Heard]) -> NotLocalized:
 
 def _of_tile(result: R, tile: Tile) -> R:
     """With the name of the tile, and the pose in the atlas's world where that is known."""
-    pose = None
+    pose, joint_pose, joint = None, None, None if tile.joint is None else tile.joint.joint
     if isinstance(result, Localization) and tile.atlas_from_world is not None:
         pose = tile.atlas_from_world @ result.world_from_cam
-    return replace(result, provenance=replace(result.provenance, tile=tile.tile_id, atlas_from_cam=pose))
+    if isinstance(result, Localization) and tile.joint is not None:
+        joint_pose = tile.joint.joint_from_world @ result.world_from_cam
+    of_atlas = {"tile": tile.tile_id, "atlas_from_cam": pose, "joint_world": joint, "joint_from_cam": joint_pose}
+    return replace(result, provenance=replace(result.provenance, **of_atlas))
 
 
 def _lead(a: Localization, b: Localization) -> float:
@@ -134,11 +139,20 @@ def _is_from_walls(result: Localization) -> bool:
 
 
 def _is_same(tile: Tile, pose: Localization, other: Tile, other_pose: Localization) -> bool:
-    """Do poses of two tiles say the same, as far as the atlas knows how these lie to each other?"""
-    a, b = pose.world_from_cam, other_pose.world_from_cam
-    if tile.world != other.world:
-        if tile.atlas_from_world is None or other.atlas_from_world is None:
-            return False
-        a, b = tile.atlas_from_world @ a, other.atlas_from_world @ b
-    apart = a.inverse() @ b
-    return float(np.linalg.norm(apart.translation)) < _SAME_METRES and math.degrees(apart.angle()) < _SAME_DEG
+    """Do poses of two tiles say the same, as far as the atlas knows how these lie to each other? Of tiles that are joined this is known
+    within the joins' sigmas."""
+    world_from_other = tile.from_world_of(other)
+    if world_from_other is None:
+        return False
+    apart = pose.world_from_cam.inverse() @ world_from_other @ other_pose.world_from_cam
+    metres, radians = _join_sigmas(tile, pose, other)
+    near = float(np.linalg.norm(apart.translation)) < _SAME_METRES + min(_SIGMAS * metres, _SAME_METRES)
+    return near and math.degrees(apart.angle()) < _SAME_DEG + min(_SIGMAS * math.degrees(radians), _SAME_DEG)
+
+
+def _join_sigmas(tile: Tile, pose: Localization, other: Tile) -> tuple[float, float]:
+    """How certain the way from one tile to another is at this pose of the first: metres and radians; 0 where it is no matter of joins."""
+    here, there = tile.joint, other.joint
+    if tile.world == other.world or here is None or there is None or here.joint != there.joint:
+        return 0.0, 0.0
+    return sigmas_at((here.joint_from_world @ pose.world_from_cam).translation, here.covariance + there.covariance)

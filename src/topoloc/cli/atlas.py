@@ -1,14 +1,17 @@
-"""topoloc atlas create | add | remove | info ATLAS [MAP ...]."""
+"""topoloc atlas create | add | remove | join | info ATLAS [MAP|TILE ...]."""
 
 from __future__ import annotations
 
+import math
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import tyro
 
 from topoloc.cli.output import File, Flag, UsageError, print_facts, write_json
+from topoloc.cli.settings_file import Settings, read_settings
 
 Names = Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="MAP|TILE ...", help_behavior_hint="")]
 
@@ -17,12 +20,14 @@ Names = Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="
 class Command:
     """What `topoloc atlas` takes."""
 
-    action: Annotated[tyro.conf.Positional[Literal["create", "add", "remove", "info"]], tyro.conf.arg(metavar="ACTION")]
-    """`create`: a new atlas of maps. `add`: more maps. `remove`: tiles by their ids. `info`: what it holds."""
+    action: Annotated[tyro.conf.Positional[Literal["create", "add", "remove", "join", "info"]], tyro.conf.arg(metavar="ACTION")]
+    """`create`: a new atlas of maps. `add`: more maps. `remove`: tiles by their ids. `join`: tiles that overlap get one world, as far as
+    what they see is beyond doubt the same. `info`: what it holds."""
     atlas: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ATLAS")]
     """The atlas: a folder; or, with the extra `cluster`, a prefix of an object store, such as s3://bucket/campus."""
     names: Names = ()
-    """Of `create` and `add`: map files, which are copied. Of `remove`: ids of tiles."""
+    """Of `create` and `add`: map files, which are copied. Of `remove`: ids of tiles. Of `join`: ids of tiles that others are
+    compared with (none: all with each other)."""
     id: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the file's name without .topo)")] = None
     """Of `create` and `add`, for one map: what the tile is called."""
     world: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: each its own)")] = None
@@ -30,14 +35,18 @@ class Command:
     recordings whose poses are in one world)."""
     replace: Flag = False
     """Of `add`: a tile of the same id is replaced by the new map."""
+    join: Flag = False
+    """Of `create` and `add`: then the new tiles are joined with those that they overlap with."""
     check: Flag = False
     """Of `info`: also compare every file with its checksum; exit status 1 where one is missing or another."""
     json: File = None
     """Write what the atlas holds afterwards as JSON to this file (- for standard output)."""
+    config: File = None
+    """Settings of `join`: a TOML file, as `topoloc config atlas` prints it."""
 
     def run(self) -> int:
         self._check_usage()
-        found = []
+        found, tried = [], None
         if self.action == "info":
             from topoloc.atlas.atlas import Atlas, tile_problem
 
@@ -46,8 +55,13 @@ class Command:
             if self.check:
                 found = [f"tile {tile.tile_id}: {problem}" for tile in manifest.tiles if (problem := tile_problem(atlas, tile))]
         else:
-            manifest = self._written()
+            settings = read_settings(self.config)
+            manifest = None if self.action == "join" else self._written()
+            if manifest is None or self.join:
+                ids = [tile.tile_id for tile in self._new()] if self.join else self.names
+                manifest, tried = joined_neighbours(self.atlas, ids, settings, is_told=self.json != "-")
         facts = describe(self.atlas, manifest) | ({"check": found or "ok"} if self.check else {})
+        facts |= {} if tried is None else {"tried": tried}
         if self.json != "-":
             print_atlas(facts)
         write_json(self.json, facts)
@@ -56,12 +70,17 @@ class Command:
         return 1 if found else 0
 
     def _written(self) -> Any:
-        from topoloc.atlas.editing import add_tiles, create_atlas, new_tiles, remove_tiles
+        from topoloc.atlas.editing import add_tiles, create_atlas, remove_tiles
 
         if self.action == "remove":
             return remove_tiles(self.atlas, self.names)
-        new = new_tiles(self.names, self.id, self.world)
+        new = self._new()
         return create_atlas(self.atlas, new) if self.action == "create" else add_tiles(self.atlas, new, self.replace)
+
+    def _new(self) -> Any:
+        from topoloc.atlas.editing import new_tiles
+
+        return new_tiles(self.names, self.id, self.world)
 
     def _check_usage(self) -> None:
         if self.action == "info" and self.names:
@@ -74,8 +93,39 @@ class Command:
             raise UsageError("--world is of maps that are added")
         if self.replace and self.action != "add":
             raise UsageError("--replace belongs to add")
+        if self.join and self.action not in ("create", "add"):
+            raise UsageError("--join belongs to create and add; `topoloc atlas join` joins what is there")
+        if self.config is not None and self.action != "join" and not self.join:
+            raise UsageError("--config sets how tiles are joined")
         if self.check and self.action != "info":
             raise UsageError("--check belongs to info")
+
+
+def joined_neighbours(
+    where: str, tile_ids: Sequence[str], settings: Settings, is_told: bool, pairs: Sequence[tuple[str, str]] | None = None
+) -> tuple[Any, list[dict[str, Any]]]:
+    """The atlas's manifest once these tiles are joined with those that they overlap with, or just these `pairs`, and what was found of
+    each pair; a line each."""
+    from topoloc.lifelong.neighbours import Tried, join_tiles
+    from topoloc.lifelong.tile_joins import Found, TileJoinConfig
+
+    rows = list[dict[str, Any]]()
+
+    def tell(one: Tried) -> None:
+        found = one.found
+        row: dict[str, Any] = {"first": one.first, "second": one.second, "joined": isinstance(found, Found)}
+        if isinstance(found, Found):
+            row |= {"num_agreeing": found.num_agreeing, "same_pictures": found.is_by_shared}
+            row |= {"num_near": found.num_near, "num_recognised": found.num_recognised, "agreeing": round(found.agreeing, 3)}
+            asked = f"{found.num_agreeing} nodes agree, {found.num_recognised} of {found.num_near} that must be recognised are"
+            said = f"joined, by {found.num_agreeing} pictures that are part of both" if found.is_by_shared else f"joined, {asked}"
+        else:
+            row |= {"reason": (said := found.reason)}
+        rows.append(row)
+        if is_told:
+            print(f"{one.first} and {one.second}: {said}", file=sys.stderr)
+
+    return join_tiles(where, tile_ids, settings.of(TileJoinConfig), tell, pairs).manifest, rows
 
 
 def describe(where: str, manifest: Any) -> dict[str, Any]:
@@ -89,8 +139,27 @@ def describe(where: str, manifest: Any) -> dict[str, Any]:
         "num_nodes": sum(tile.num_nodes for tile in manifest.tiles),
         "bytes": sum(tile.map.num_bytes + tile.places.num_bytes for tile in manifest.tiles),
         "origin": None if origin is None else {"lat": origin.lat, "lon": origin.lon, "h": origin.h},
+        "worlds": worlds_of(manifest),
+        "joins": [_join_facts(join, manifest) for join in manifest.joins],
         "tiles": tiles,
     }
+
+
+def worlds_of(manifest: Any) -> dict[str, list[str]]:
+    """The ids of the tiles of each world, those that joins make one together."""
+    worlds: dict[str, list[str]] = {}
+    for tile in manifest.tiles:
+        worlds.setdefault(tile.in_joint_world.joint, []).append(tile.tile_id)
+    return worlds
+
+
+def _join_facts(join: Any, manifest: Any) -> dict[str, Any]:
+    """What the manifest says of it, and one sigma of where the second tile's middle lies in the first's world."""
+    from topoloc.atlas.joins import sigmas_at
+
+    middle = manifest.by_id[join.second].box_world.mean(axis=0)
+    metres, radians = sigmas_at(join.first_from_second.apply(middle), join.covariance)
+    return join.to_json() | {"sigma_m": metres, "sigma_deg": math.degrees(radians)}
 
 
 def print_atlas(facts: dict[str, Any]) -> None:
@@ -101,9 +170,18 @@ def print_atlas(facts: dict[str, Any]) -> None:
             ("atlas", f"{facts['path']}, serial {facts['serial']}"),
             ("tiles", f"{facts['num_tiles']}, {facts['num_nodes']} nodes, {facts['bytes'] / 1e6:.2f} MB"),
             *(("", f"{tile['id']:<{width}}  {_tile_line(tile)}") for tile in facts["tiles"]),
+            *(("world", f"{name}: {', '.join(ids)}") for name, ids in facts["worlds"].items() if len(ids) > 1),
+            *(("join", _join_line(join)) for join in facts["joins"]),
             *([("check", "ok" if facts["check"] == "ok" else f"{len(facts['check'])} tiles are damaged")] if "check" in facts else []),
         ]
     )
+
+
+def _join_line(join: dict[str, Any]) -> str:
+    said = f"{join['first']} and {join['second']}: {join['num_agreeing']} pictures agree"
+    if join["residual"] is None:
+        return f"{said}, but other joins contradict them; not used"
+    return f"{said}, {100 * join['sigma_m']:.1f} cm, {join['sigma_deg']:.2f} deg"
 
 
 def _tile_line(tile: dict[str, Any]) -> str:

@@ -5,18 +5,23 @@ from __future__ import annotations
 import os
 import sys
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from topoloc.cli.features_option import BUILD_FEATURES, kinds_to_build
 from topoloc.cli.output import CameraOption, File, Flag, Format, Topics, UsageError, check_outputs, progress_bar, write_json
 from topoloc.cli.recording_maps import MapMaking, PosesAsked
+from topoloc.cli.recording_pieces import Pieces, Split, pieces_of
 from topoloc.cli.settings_file import Settings, read_settings, with_option
 from topoloc.map.build import BuildConfig
 from topoloc.map.description import describe_map
 from topoloc.slam.slam import SlamConfig
+
+if TYPE_CHECKING:
+    from topoloc.cluster.tiles import Outcome, TileJob
 
 
 @dataclass(frozen=True)
@@ -71,14 +76,19 @@ class Command:
     """With --ray, the world that the poses of all recordings are in."""
     replace: Flag = False
     """With --ray, a tile of the same id that was made of something else, or otherwise, is replaced."""
+    split: Annotated[str | None, tyro.conf.arg(metavar="FRAMES[,SHARED]", help_behavior_hint="(default: each whole)")] = None
+    """With --ray, longer recordings are mapped in pieces of so many frames, of one world, that share SHARED frames (a tenth)."""
+    join: Flag = False
+    """With --ray, tiles that overlap are joined, as by `topoloc atlas join`."""
     json: File = None
     """Write what `topoloc info` says of the new map, or what became of each recording, to this file (- for standard output)."""
     config: File = None
     """All other settings: a TOML file, as `topoloc config build` prints it."""
 
     def run(self) -> int:
-        if self.ray is None and (self.world is not None or self.replace):
-            raise UsageError("--world and --replace belong to --ray")
+        if self.ray is None and (self.world is not None or self.replace or self.join or self.split is not None):
+            raise UsageError("--world, --replace, --join and --split belong to --ray")
+        split = Split.of(self.split)
         recordings, target = self._split_paths()
         read = [path for path in (*self.trajectory, self.config) if path not in ("truth", "slam", None)]
         check_outputs([str(target) if self.ray is None else None, self.json], inputs=read)
@@ -86,7 +96,7 @@ class Command:
             raise UsageError(f"--scale must be a positive number, or IMAGE_A,IMAGE_B=3.2m, not {self.scale[0][:80]}")
         settings = read_settings(self.config)
         making = self._making(recordings, settings)
-        return self._make_map(making, Path(target)) if self.ray is None else self._make_tiles(making, target, settings)
+        return self._make_map(making, Path(target)) if self.ray is None else self._make_tiles(making, target, settings, split)
 
     def _making(self, recordings: list[str], settings: Settings) -> MapMaking:
         config = with_option(settings.of(BuildConfig), "nodes.d_thresh", self.d_thresh, "--d-thresh")
@@ -113,17 +123,16 @@ class Command:
         write_json(self.json, info)
         return 0
 
-    def _make_tiles(self, making: MapMaking, atlas: str, settings: Settings) -> int:
+    def _make_tiles(self, making: MapMaking, atlas: str, settings: Settings, split: Split | None) -> int:
         """Each recording a tile, on the cluster; status 1 where one could not be mapped."""
         from topoloc.cli.recordings_table import finished_line, recordings_table
         from topoloc.cluster.building import AtlasBuild, build_on_ray
         from topoloc.cluster.config import ClusterConfig
-        from topoloc.cluster.tiles import TileJob, tile_ids
 
         assert self.ray is not None
-        ids = tile_ids(making.recordings)
-        jobs = [TileJob(one.recordings[0], name, self.world or name, one) for name, one in zip(ids, making.one_each(), strict=True)]
-        with recordings_table(making.recordings) as (show, is_live):
+        rows = self._jobs(making, split)
+        jobs = [job for row in rows for job in row]
+        with recordings_table([job.recording for job in jobs]) as (show, is_live):
             build = AtlasBuild(jobs, atlas, self.replace, settings.of(ClusterConfig))
             outcomes = build_on_ray(build, self.ray, show, is_live)
         for outcome in outcomes:
@@ -134,8 +143,35 @@ class Command:
         counts = {state: sum(outcome.state == state for outcome in outcomes) for state in ("built", "there", "failed")}
         if self.json != "-":
             print(f"{atlas}: {counts['built']} recordings mapped, {counts['there']} there already, {counts['failed']} failed")
-        write_json(self.json, {"atlas": atlas, **counts, "recordings": [outcome.to_json() for outcome in outcomes]})
+        tried = self._joined(rows, outcomes, atlas, settings)
+        facts = {"atlas": atlas, **counts, "recordings": [outcome.to_json() for outcome in outcomes]}
+        write_json(self.json, facts | ({} if tried is None else {"tried": tried}))
         return 1 if counts["failed"] else 0
+
+    def _jobs(self, making: MapMaking, split: Split | None) -> list[list[TileJob]]:
+        """What is to be made of each recording."""
+        from topoloc.cluster.tiles import TileJob, tile_ids
+
+        wholes = zip(tile_ids(making.recordings), making.one_each(), strict=True)
+        pieces = [Pieces([one]) if split is None else pieces_of(one, name, split) for name, one in wholes]
+        ids = iter(tile_ids([piece.recordings[0] for one in pieces for piece in one.makings]))
+        return [
+            [TileJob(piece.recordings[0], name := next(ids), self.world or one.world or name, piece) for piece in one.makings]
+            for one in pieces
+        ]
+
+    def _joined(self, rows: list[list[TileJob]], outcomes: list[Outcome], atlas: str, settings: Settings) -> list[dict[str, Any]] | None:
+        """Pieces of one recording joined with the next one, where it is no matter of course; with --join all tiles. What was tried."""
+        from topoloc.cli.atlas import joined_neighbours
+
+        there = {outcome.recording: outcome.tile_id for outcome in outcomes if outcome.state != "failed"}
+        pairs = [(a, b) for row in rows for a, b in pairwise(row) if a.world != b.world and {a.recording, b.recording} <= there.keys()]
+        if not there or not (self.join or pairs):
+            return None
+        told = self.json != "-"
+        if self.join:
+            return joined_neighbours(atlas, list(there.values()), settings, told)[1]
+        return joined_neighbours(atlas, [], settings, told, [(there[a.recording], there[b.recording]) for a, b in pairs])[1]
 
     def _split_paths(self) -> tuple[list[str], str]:
         """The recordings, and the map file or atlas to write: never a recording or a file that is none, as where it was forgotten."""

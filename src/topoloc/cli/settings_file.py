@@ -31,6 +31,7 @@ TABLES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "slam": ("topoloc.slam.slam", "SlamConfig", ("slam", "build", "update")),
     "update": ("topoloc.lifelong.update", "UpdateConfig", ("update", "merge")),
     "against_itself": ("topoloc.lifelong.weak_parts", "WeakPartsConfig", ("evaluate",)),
+    "join": ("topoloc.lifelong.tile_joins", "TileJoinConfig", ("atlas", "build")),
     "prune": ("topoloc.lifelong.prune", "PruneConfig", ("prune",)),
     "serve": ("topoloc.service.config", "ServiceConfig", ("serve",)),
     "cluster": ("topoloc.cluster.config", "ClusterConfig", ("build",)),

@@ -36,6 +36,36 @@ class ConsensusConfig:
     """Of more estimates than this, so many, drawn with a fixed seed, are tried as hypotheses."""
 
 
+@dataclass(frozen=True)
+class DriftConfig:
+    """How wrong the way may be along which an estimate is carried."""
+
+    drift: Annotated[float, AtLeast(0)] = 0.02
+    """Share of the way by which its end may be off (one sigma) ..."""
+    drift_deg: Annotated[float, AtLeast(0)] = 0.3
+    """... and degrees a metre."""
+
+    def covariance(self, motion: Rigid3) -> Float[np.ndarray, "6 6"]:
+        """Of a motion, m and rad."""
+        way = float(np.linalg.norm(motion.translation))
+        return diagonal_covariance(self.drift * way, self.drift_deg * way)
+
+
+def diagonal_covariance(metres: float, degrees: float) -> Float[np.ndarray, "6 6"]:
+    """Of these standard deviations along and about each axis, m and rad."""
+    return np.diag(np.square([metres] * 3 + [np.deg2rad(degrees)] * 3))
+
+
+def carried(
+    c_from_a: Rigid3, a_from_b: Rigid3, covariance: Float[np.ndarray, "6 6"], b_from_d: Rigid3, config: DriftConfig
+) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
+    """An estimate of a_from_b, said at other places: c_from_d, and the covariance of its left perturbation. The longer the ways between,
+    the less certain."""
+    to_c, to_d = c_from_a.adjoint(), (c_from_a @ a_from_b).adjoint()
+    at_c = to_c @ covariance @ to_c.T + config.covariance(c_from_a)
+    return c_from_a @ a_from_b @ b_from_d, at_c + to_d @ config.covariance(b_from_d) @ to_d.T
+
+
 @dataclass(frozen=True, eq=False)
 class TransformConsensus:
     """What the estimates where `agrees` is True say together.

@@ -14,6 +14,7 @@ from typing import Any
 from topoloc.bounds import check_bounds
 from topoloc.errors import MapError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
+from topoloc.lifelong.asked_nodes import ask_nodes
 from topoloc.lifelong.coarse_models import PlaceView, taught_places
 from topoloc.lifelong.earlier_recall import earlier_recall
 from topoloc.lifelong.grown_sides import grown_sides
@@ -22,8 +23,6 @@ from topoloc.lifelong.session_poses import Progress, SessionPoses, held_by
 from topoloc.lifelong.update import UpdateConfig, is_well_held
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.building import with_map_facts
-from topoloc.localization.query import Picture
-from topoloc.localization.result import Localization
 from topoloc.map.nodes import NodePoses, node_distances
 from topoloc.map.sums import LandmarkSums
 from topoloc.map.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
@@ -79,13 +78,8 @@ def _held(
     first: TopoMetricMap, second: TopoMetricMap, config: UpdateConfig, localizer_config: LocalizerConfig | None, progress: Progress
 ) -> SessionPoses:
     """The second map's nodes, by their rows, in the world of the first."""
-    localizer = Localizer(first, localizer_config)
-    answers: dict[int, Localization | None] = {}
-    for row in range(len(second.summaries)):
-        features = {kind: second.nodes_of(kind)[row].features for kind in first.kinds}
-        result = localizer.ask(Picture.of_features(features, second.nodes[row].camera))[0]
-        answers[row] = result if isinstance(result, Localization) else None
-        progress("comparing the maps", row + 1, len(second.summaries))
+    rows = range(len(second.summaries))
+    answers = ask_nodes(Localizer(first, localizer_config), second, rows, lambda done: progress("comparing the maps", done, len(rows)))
     own = {row: summary.world_from_cam for row, summary in enumerate(second.summaries)}
     d_thresh = first.config.nodes.d_thresh
     assert d_thresh is not None, "a map's own configuration is resolved"

@@ -16,7 +16,8 @@ from topoloc.localization import checked_json as checked
 class Provenance:
     """What a result comes from: the map by its id, in which version (the number of its last edit), by which kind of `features`; when the
     picture was taken (nanoseconds), and with which camera. What is not known is None, or empty. `tile` is what the map is called in the
-    atlas that was asked, `atlas_from_cam` the camera's pose in the atlas's world; None where no atlas was asked, or that is not known."""
+    atlas that was asked, `atlas_from_cam` the camera's pose in the atlas's world; None where no atlas was asked, or that is not known.
+    `joint_world` is the name of the world that the tile shares with those joined with it, `joint_from_cam` the pose in that one."""
 
     map_id: str = ""
     map_version: int = 0
@@ -25,18 +26,25 @@ class Provenance:
     camera: Camera | None = None
     tile: str | None = None
     atlas_from_cam: Rigid3 | None = None
+    joint_world: str | None = None
+    joint_from_cam: Rigid3 | None = None
 
     def to_json(self) -> dict[str, Any]:
         camera = None if self.camera is None else self.camera.to_json()
         of_atlas: dict[str, Any] = {} if self.tile is None else {"tile": self.tile}
         if self.atlas_from_cam is not None:
             of_atlas["atlas_from_cam"] = checked.pose_json(self.atlas_from_cam)
+        if self.joint_world is not None:
+            of_atlas["joint_world"] = self.joint_world
+        if self.joint_from_cam is not None:
+            of_atlas["joint_from_cam"] = checked.pose_json(self.joint_from_cam)
         return of_atlas | {"map": self.map_id, "version": self.map_version, "t_ns": self.t_ns, "camera": camera, "features": self.features}
 
     @staticmethod
     def from_json(data: Mapping[str, Any]) -> Provenance:
         """Of a result's JSON; results of before there was any have none. Raises ResultError."""
         t_ns, camera, tile, pose = (data.get(key) for key in ("t_ns", "camera", "tile", "atlas_from_cam"))
+        joint, joint_pose = data.get("joint_world"), data.get("joint_from_cam")
         if camera is not None and not isinstance(camera, dict):
             raise ResultError("no result: 'camera' is no object")
         try:
@@ -48,6 +56,8 @@ class Provenance:
                 None if camera is None else Camera.from_json(camera),
                 None if tile is None else checked.text(tile, "tile"),
                 None if pose is None else checked.rigid(pose, "atlas_from_cam"),
+                None if joint is None else checked.text(joint, "joint_world"),
+                None if joint_pose is None else checked.rigid(joint_pose, "joint_from_cam"),
             )
         except CalibrationError as error:
             raise ResultError(f"no result: {error}") from None

@@ -99,7 +99,8 @@ def _replied(service: Service, body: bytes, only: str | None) -> tuple[GeoPoseRe
                 georeferences[name] = topomap.georeference
     near = asked.near(service.config.geolocation_m)
     for localizer in localizers:
-        known = {tile.tile_id: tile.georeference for tile in localizer.atlas.manifest.tiles if tile.georeference is not None}
+        manifest = localizer.atlas.manifest
+        known = {tile.tile_id: place for tile in manifest.tiles if (place := manifest.georeference_of(tile)) is not None}
         if known:
             camera = _camera_of(reading, picture, image, None)
             result = localizer.near(near, placed_only=True).localize(image, camera, max_ms=service.answerer.max_ms)

@@ -19,7 +19,14 @@ from jaxtyping import Float, Int
 
 from topoloc.bounds import Above, AtLeast, Between
 from topoloc.geometry.rigid import Rigid3, covariance_of_inverse
-from topoloc.geometry.transform_consensus import ConsensusConfig, TransformConsensus, find_consensus
+from topoloc.geometry.transform_consensus import (
+    ConsensusConfig,
+    DriftConfig,
+    TransformConsensus,
+    carried,
+    diagonal_covariance,
+    find_consensus,
+)
 from topoloc.slam.keyframes import KeyFrame, PlaceView
 from topoloc.slam.loop_closure import Link, LoopConfig, is_within_reach, rank_places
 from topoloc.slam.place_matching import PlaceMatchingConfig, match_places, num_repeated
@@ -186,19 +193,18 @@ def _estimates(
     links: Sequence[Link], keyframes: Sequence[KeyFrame], ends: _Ends, config: JoinConfig
 ) -> tuple[list[Rigid3], Float[np.ndarray, "n 6 6"]]:
     """first_from_second as each link says, and the covariances; the further along the sub-maps it is, the less exactly."""
-    estimates, covariances = [], []
+    estimates, covariances, along = [], [], DriftConfig(config.drift, config.drift_deg)
     for link in links:
         a, b = _in_order(link, keyframes)
         first_from_a = ends.first.cam_from_world @ keyframes[a].cam_from_world.inverse()
         b_from_second = keyframes[b].cam_from_world @ ends.second.cam_from_world.inverse()
         a_from_b = link.match.target_from_source
-        covariance = config.covariance_scale * link.match.covariance + _diagonal(config.sigma, config.sigma_deg)
+        covariance = config.covariance_scale * link.match.covariance + diagonal_covariance(config.sigma, config.sigma_deg)
         if link.source == a:
             a_from_b, covariance = a_from_b.inverse(), covariance_of_inverse(a_from_b, covariance)
-        to_first, to_second = first_from_a.adjoint(), (first_from_a @ a_from_b).adjoint()
-        covariance = to_first @ covariance @ to_first.T + _drift(first_from_a, config)
-        covariances.append(covariance + to_second @ _drift(b_from_second, config) @ to_second.T)
-        estimates.append(first_from_a @ a_from_b @ b_from_second)
+        estimate, carried_covariance = carried(first_from_a, a_from_b, covariance, b_from_second, along)
+        estimates.append(estimate)
+        covariances.append(carried_covariance)
     return estimates, np.stack(covariances)
 
 
@@ -268,12 +274,3 @@ def _alike(source: KeyFrame, target: KeyFrame, target_from_source: Rigid3, confi
     is_from_side = np.sum(points * rays, axis=1) > np.cos(np.deg2rad(config.alike_deg)) * lengths * others
     is_as_far = (lengths < config.alike_ratio * others) & (others < config.alike_ratio * lengths)
     return valid[is_inside & is_from_side & is_as_far]
-
-
-def _drift(motion: Rigid3, config: JoinConfig) -> Float[np.ndarray, "6 6"]:
-    way = float(np.linalg.norm(motion.translation))
-    return _diagonal(config.drift * way, config.drift_deg * way)
-
-
-def _diagonal(metres: float, degrees: float) -> Float[np.ndarray, "6 6"]:
-    return np.diag(np.square([metres] * 3 + [np.deg2rad(degrees)] * 3))

@@ -1,0 +1,145 @@
+"""The tiles of an atlas that overlap are joined: read from `join_tiles`.
+
+Only tiles whose places look alike are compared, by the atlas's index over the places of all; each pair as `tile_joins.py` says. What is
+found is committed at once, so that whoever is called again goes on. The manifest adjusts all joins together (`atlas/joint_worlds.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from topoloc.atlas.atlas import Atlas
+from topoloc.atlas.editing import add_joins
+from topoloc.atlas.joins import Join
+from topoloc.atlas.joint_worlds import MAX_APART_M
+from topoloc.atlas.manifest import Manifest, Tile
+from topoloc.atlas.open_maps import Maps
+from topoloc.bounds import check_bounds
+from topoloc.errors import AtlasError, MapError
+from topoloc.lifelong.tile_joins import Found, NotJoined, OpenTile, TileJoinConfig, joined
+from topoloc.localization.localizer import Localizer
+
+_NUM_LOOKED_UP = 32
+_BEST = 3
+_MAX_BYTES = 512_000_000
+
+Tell = Callable[["Tried"], None]
+
+
+@dataclass(frozen=True)
+class Tried:
+    """Two tiles, and what was found of them."""
+
+    first: str
+    second: str
+    found: Found | NotJoined
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbours:
+    """The atlas as it is afterwards, and what was tried."""
+
+    manifest: Manifest
+    tried: list[Tried]
+
+
+def join_tiles(
+    where: str,
+    tile_ids: Sequence[str] = (),
+    config: TileJoinConfig | None = None,
+    tell: Tell | None = None,
+    pairs: Sequence[tuple[str, str]] | None = None,
+) -> Neighbours:
+    """Tiles that overlap joined, those of them that no join connects directly yet.
+
+    Args:
+        tile_ids: only pairs with one of these; none: all.
+        tell: is told of each pair that was compared.
+        pairs: just these are compared, by the ids of the tiles; None: those that look alike.
+
+    Raises:
+        ConfigError: a setting is out of its bounds.
+        AtlasError: no atlas is there, it has no such tile, or it cannot be written.
+        FeatureKindError, MissingExtraError, WeightsError: maps' features cannot be compared here.
+    """
+    config = config or TileJoinConfig()
+    check_bounds(config)
+    atlas = Atlas.open(where)
+    wanted = {atlas.tile(tile_id).tile_id for tile_id in tile_ids} or set(atlas.manifest.by_id)
+    maps, manifest, tried = Maps([], Localizer, _MAX_BYTES), atlas.manifest, list[Tried]()
+    try:
+        for first, second in likely_pairs(atlas, wanted, config) if pairs is None else _open_pairs(atlas, pairs):
+            try:
+                found = _compared(atlas, maps, first, second, config)
+            except (MapError, AtlasError) as error:
+                found = NotJoined(str(error))
+            tried.append(Tried(first.tile_id, second.tile_id, found))
+            if tell is not None:
+                tell(tried[-1])
+            if isinstance(found, Found):
+                join = Join(first.tile_id, second.tile_id, found.first_from_second, found.covariance, found.num_agreeing)
+                manifest = add_joins(where, [join], {first.tile_id: first, second.tile_id: second})
+    finally:
+        maps.close()
+    return Neighbours(manifest, tried)
+
+
+def _compared(atlas: Atlas, maps: Maps, first: Tile, second: Tile, config: TileJoinConfig) -> Found | NotJoined:
+    places = [atlas.places_of(tile) for tile in (first, second)]
+    with (
+        maps.lent(first.tile_id, atlas.map_path(first)) as one,
+        maps.lent(second.tile_id, atlas.map_path(second)) as other,
+    ):
+        return joined(OpenTile(one.localizer, places[0]), OpenTile(other.localizer, places[1]), config)
+
+
+def _open_pairs(atlas: Atlas, pairs: Sequence[tuple[str, str]]) -> list[tuple[Tile, Tile]]:
+    """Those of the pairs, in the order of their ids, that are not joined yet."""
+    ordered = [(min(pair), max(pair)) for pair in pairs]
+    known = {join.pair for join in atlas.manifest.joins}
+    return [(atlas.tile(first), atlas.tile(second)) for first, second in ordered if (first, second) not in known]
+
+
+def likely_pairs(atlas: Atlas, wanted: Collection[str], config: TileJoinConfig) -> list[tuple[Tile, Tile]]:
+    """Pairs of tiles in the order of their ids that may overlap, the most alike first: of worlds of their own, not joined yet, not known to
+    lie far apart; their most similar places look alike."""
+    manifest, index = atlas.manifest, atlas.index
+    scores = dict[tuple[str, str], float]()
+    known = {join.pair for join in manifest.joins}
+    for tile in manifest.tiles:
+        if tile.tile_id not in wanted or tile.tile_id in atlas.problems:
+            continue
+        among = [other.tile_id for other in manifest.tiles if _may_overlap(tile, other)]
+        for other_id, score in _alike(atlas, tile, among, config) if among and index.kinds else ():
+            pair = (min(tile.tile_id, other_id), max(tile.tile_id, other_id))
+            if pair not in known and score >= config.min_likeness:
+                scores[pair] = max(score, scores.get(pair, -1.0))
+    best = sorted(scores, key=lambda pair: (-scores[pair], pair))[: config.max_pairs]
+    return [(manifest.by_id[first], manifest.by_id[second]) for first, second in best]
+
+
+def _alike(atlas: Atlas, tile: Tile, among: Sequence[str], config: TileJoinConfig) -> Iterator[tuple[str, float]]:
+    """The tiles that look most like a tile, with how much: the median of the most similar places."""
+    places, found = atlas.places_of(tile), dict[str, list[float]]()
+    kind = next((kind for kind in tile.kinds if kind in places), next(iter(places)))
+    rows = np.unique(np.linspace(0, len(places[kind]) - 1, min(len(places[kind]), _NUM_LOOKED_UP)).round().astype(int))
+    for row in rows:
+        for other_id, likeness in atlas.index.rank({kind: places[kind][row]}, config.num_neighbours, among):
+            found.setdefault(other_id, []).append(likeness)
+    scores = {other_id: float(np.median(sorted(values)[-_BEST:])) for other_id, values in found.items()}
+    yield from sorted(scores.items(), key=lambda pair: -pair[1])[: config.num_neighbours]
+
+
+def _may_overlap(tile: Tile, other: Tile) -> bool:
+    """Are these of two worlds that are not known to lie far from each other?"""
+    if tile.world == other.world:
+        return False
+    world_from_other = tile.from_world_of(other)
+    if world_from_other is None:
+        return True
+    reaches = [float(np.linalg.norm(np.diff(one.box_world, axis=0))) / 2.0 for one in (tile, other)]
+    centres = [one.box_world.mean(axis=0) for one in (tile, other)]
+    return float(np.linalg.norm(world_from_other.apply(centres[1]) - centres[0])) <= sum(reaches) + MAX_APART_M
