@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
-from jaxtyping import install_import_hook
 
 import topoloc
 import topoloc_paper
 import topoloc_training
 import topoloc_worlds
+from checked_shapes import check
 
 
 def _modules_with_checked_shapes() -> list[str]:
@@ -24,7 +24,7 @@ def _modules_with_checked_shapes() -> list[str]:
     return [m.name for m in modules if not m.ispkg and not m.name.endswith(("_kernels", ".ros_messages"))]
 
 
-_hook = install_import_hook(_modules_with_checked_shapes(), "beartype.beartype")
+check(_modules_with_checked_shapes())
 
 settings.register_profile("busy machine", deadline=None)
 settings.load_profile("busy machine")

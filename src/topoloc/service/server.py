@@ -22,7 +22,7 @@ from topoloc.service.logs import log_json
 
 _MAX_CONNECTIONS = 1000
 _KEEP_ALIVE_S = 75
-"""A connection is kept for longer than clients and load balancers keep theirs (5 to 60 s): else a request now and then meets one that is being closed."""
+"""Longer than clients and load balancers keep a connection (5 to 60 s): else a request now and then meets one that is being closed."""
 
 
 @dataclass(frozen=True)
