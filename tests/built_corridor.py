@@ -11,6 +11,7 @@ from functools import cache
 
 import numpy as np
 
+from made_once import once_a_run
 from tiny_world import BASELINE, LEVEL_FROM_CAM, Panel, render, right_pose, smooth_texture
 from topoloc.features.kinds import learned_kind
 from topoloc.geometry.camera import Camera
@@ -96,13 +97,13 @@ class WalkAhead:
         return StereoFrame(self.names[index], self.t_ns[index], left, self.camera, right=right, rig=rig, world_from_cam=pose)
 
 
-@cache
+@once_a_run
 def built_corridor() -> TopoMetricMap:
     """The map of the walk ahead, with side nodes, of SURF alone."""
     return build_map(WalkAhead(0), BuildConfig(other_kinds=()))
 
 
-@cache
+@once_a_run
 def corridor_of_two_kinds() -> TopoMetricMap:
     """The same, of SURF and the learned features at hand, which describe the side nodes. Raises MissingExtraError without ONNX Runtime."""
     return build_map(WalkAhead(0), BuildConfig(other_kinds=(learned_kind(),)))
