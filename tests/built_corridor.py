@@ -11,6 +11,7 @@ from functools import cache
 
 import numpy as np
 
+from made_once import once_a_run
 from tiny_world import BASELINE, LEVEL_FROM_CAM, Panel, render, right_pose, smooth_texture
 from topoloc.features.kinds import learned_kind
 from topoloc.geometry.camera import Camera
@@ -54,6 +55,17 @@ def back(y: float, x: float = 0.0, yaw: float = 0.0) -> Rigid3:
     return ahead(y, x, np.pi + yaw)
 
 
+def _walking(number: int) -> Rigid3:
+    return ahead(STEP * number, x=0.04 * np.sin(number), yaw=0.02 * np.cos(number))
+
+
+@cache
+def _seen_from(seed: int, number: int, side: int, camera: Camera) -> np.ndarray:
+    """What the left (0) or right (1) camera of a pair of the walk sees; a map is built from several passes over the recording."""
+    pose = _walking(number)
+    return render(corridor(seed), right_pose(pose) if side else pose, camera, noise_seed=2 * number + side)[0]
+
+
 @dataclass(frozen=True, eq=False)
 class WalkAhead:
     """A recording of stereo pairs from the corridor's one end towards the other."""
@@ -73,28 +85,25 @@ class WalkAhead:
 
     @property
     def poses(self) -> list[Rigid3 | None]:
-        return [ahead(STEP * number, x=0.04 * np.sin(number), yaw=0.02 * np.cos(number)) for number in range(self.num_pairs)]
+        return [_walking(number) for number in range(self.num_pairs)]
 
     def __len__(self) -> int:
         return self.num_pairs
 
     def __getitem__(self, index: int) -> StereoFrame:
-        pose = self.poses[index]
-        assert pose is not None
-        left, right = (
-            render(corridor(self.seed), p, self.camera, noise_seed=2 * index + k)[0] for k, p in enumerate((pose, right_pose(pose)))
-        )
+        pose = _walking(index)
+        left, right = (_seen_from(self.seed, index, side, self.camera).copy() for side in (0, 1))
         rig = StereoRig.rectified(self.camera, BASELINE)
         return StereoFrame(self.names[index], self.t_ns[index], left, self.camera, right=right, rig=rig, world_from_cam=pose)
 
 
-@cache
+@once_a_run
 def built_corridor() -> TopoMetricMap:
     """The map of the walk ahead, with side nodes, of SURF alone."""
     return build_map(WalkAhead(0), BuildConfig(other_kinds=()))
 
 
-@cache
+@once_a_run
 def corridor_of_two_kinds() -> TopoMetricMap:
     """The same, of SURF and the learned features at hand, which describe the side nodes. Raises MissingExtraError without ONNX Runtime."""
     return build_map(WalkAhead(0), BuildConfig(other_kinds=(learned_kind(),)))

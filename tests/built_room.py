@@ -9,7 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tiny_world import CAMERA, path_pose, render, room, tum_line
+from made_once import once_a_run
+from tiny_world import CAMERA, path_pose, render, room, tum_line, write_stereo_recording
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.map_facts.building import build_map
 from topoloc.map.build import BuildConfig
@@ -17,13 +18,19 @@ from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.open import open_sequence
 
 
-@cache
+@once_a_run
+def recorded_room(folder: Path) -> Path:
+    """The recording `tiny_recording`."""
+    return write_stereo_recording(folder)
+
+
+@once_a_run
 def built_room(recording: Path) -> TopoMetricMap:
     """The map of the recording `tiny_recording`, of SURF alone."""
     return build_map(open_sequence(recording), BuildConfig(other_kinds=()))
 
 
-@cache
+@once_a_run
 def room_of_two_kinds(recording: Path) -> TopoMetricMap:
     """A map of every other pair, of SURF and SIFT."""
     return build_map(open_sequence(f"{recording}@0::2"), BuildConfig(other_kinds=("sift",)))

@@ -9,12 +9,13 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
-from jaxtyping import install_import_hook
 
 import topoloc
 import topoloc_paper
 import topoloc_training
 import topoloc_worlds
+from checked_shapes import check
+from made_once import share_in
 
 
 def _modules_with_checked_shapes() -> list[str]:
@@ -24,7 +25,7 @@ def _modules_with_checked_shapes() -> list[str]:
     return [m.name for m in modules if not m.ispkg and not m.name.endswith(("_kernels", ".ros_messages"))]
 
 
-_hook = install_import_hook(_modules_with_checked_shapes(), "beartype.beartype")
+check(_modules_with_checked_shapes())
 
 settings.register_profile("busy machine", deadline=None)
 settings.load_profile("busy machine")
@@ -48,20 +49,30 @@ def no_networks_but_the_tests_own(tmp_path_factory: pytest.TempPathFactory) -> I
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def of_all_workers(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder for what all processes of this test run read."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "of-all-workers"
+    folder.mkdir(exist_ok=True)
+    share_in(folder)
+    return folder
+
+
 @pytest.fixture(scope="session")
-def tiny_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def tiny_recording(of_all_workers: Path) -> Path:
     """A small rendered room as a stereo recording (KITTI-like, 14 pairs of 320x240) with exact truth.tum and a camera.json.
 
     Not to be written to: all tests share it. `tiny_world` renders more of the same place, or others.
     """
-    from tiny_world import write_stereo_recording  # after the hook above
+    from built_room import recorded_room  # after the hook above
 
-    return write_stereo_recording(tmp_path_factory.mktemp("tiny") / "room")
+    return recorded_room(of_all_workers / "tiny" / "room")
 
 
 @pytest.fixture(scope="session")
 def room_map(tiny_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The map of `tiny_recording`; not to be written to."""
+    """The map of `tiny_recording`, of SURF alone; not to be written to."""
     from built_room import built_room
 
     path = tmp_path_factory.mktemp("map") / "room.topo"

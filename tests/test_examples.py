@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import contextlib
+import io
 import json
 import re
 import runpy
@@ -14,8 +16,10 @@ import cv2
 import numpy as np
 import pytest
 
+import topoloc
 from topoloc.demo.recordings import SHIPPED
 from topoloc.map.topomap import TopoMetricMap
+from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.trajectory import read_trajectory
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -24,26 +28,36 @@ MAX_LINES = 60
 Run = Callable[..., str]
 
 
+def _run_in(folder: Path, patch: pytest.MonkeyPatch, name: str, *args: object) -> None:
+    patch.chdir(folder)
+    patch.setenv("MPLBACKEND", "Agg")
+    patch.setattr(sys, "argv", [f"examples/{name}.py", *map(str, args)])
+    runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
+
+
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
     """Runs an example in an empty folder as the command line does; returns what it printed."""
 
     def run_example(name: str, *args: object) -> str:
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setenv("MPLBACKEND", "Agg")
-        monkeypatch.setattr(sys, "argv", [f"examples/{name}.py", *map(str, args)])
-        runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
+        _run_in(tmp_path, monkeypatch, name, *args)
         return capsys.readouterr().out
 
     return run_example
 
 
 @pytest.fixture(scope="module")
-def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A map of the built-in lab, made by the first example of all."""
-    path = tmp_path_factory.mktemp("example") / "lab.topo"
-    runpy.run_path(str(EXAMPLES / "map_and_localize.py"))["main"](str(SHIPPED / "map_lap1"), str(SHIPPED / "day@0"), path)
-    return path
+def mapped(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A map of the built-in lab and what the first example of all, which made it, printed."""
+    folder, printed = tmp_path_factory.mktemp("example"), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
+        _run_in(folder, patch, "map_and_localize", "--ask", SHIPPED / "day@0::8")
+    return folder / "lab.topo", printed.getvalue()
+
+
+@pytest.fixture
+def lab(mapped: tuple[Path, str]) -> Path:
+    return mapped[0]
 
 
 def _centimetres(text: str, before: str) -> list[float]:
@@ -57,12 +71,12 @@ def test_an_example_is_short_says_how_it_is_run_and_is_tested_here(path: Path):
     assert docstring
     assert f"    python examples/{path.name}" in docstring
     assert len(text.splitlines()) <= MAX_LINES
-    assert f'run("{path.stem}"' in Path(__file__).read_text(encoding="utf-8")
+    assert re.search(rf'run(_in)?\((folder, patch, )?"{path.stem}"', Path(__file__).read_text(encoding="utf-8"))
 
 
-def test_map_and_localize(run: Run, tmp_path: Path):
-    printed = run("map_and_localize", "--ask", SHIPPED / "day@0::8")
-    assert len(TopoMetricMap.load(tmp_path / "lab.topo").nodes) > 20
+def test_map_and_localize(mapped: tuple[Path, str]):
+    path, printed = mapped
+    assert len(TopoMetricMap.load(path).nodes) > 20
     assert "not localized" not in printed
     errors = _centimetres(printed, "off by")
     assert len(errors) == 4
@@ -88,8 +102,12 @@ def test_localize_folder(run: Run, lab: Path, tmp_path: Path):
     assert len(read_trajectory(tmp_path / "answers" / "poses.tum")) == 2
 
 
-def test_own_camera(run: Run):
+def test_own_camera(run: Run, lab: Path, monkeypatch: pytest.MonkeyPatch):
+    """The map that it makes is that of the first example."""
+    recordings: list[StereoSequence] = []
+    monkeypatch.setattr(topoloc, "build_map", lambda recording: recordings.append(recording) or TopoMetricMap.load(lab))
     with_lens, as_pinhole = run("own_camera").splitlines()
+    assert [recording.name for recording in recordings] == ["map_lap1"]
     assert "8 of 8 localized" in with_lens
     (error,), (error_as_pinhole,) = (_centimetres(line, "median error") for line in (with_lens, as_pinhole))
     assert error < 1.5

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -71,20 +72,28 @@ def path_pose(index: float) -> Rigid3:
     return Rigid3(sway @ LEVEL_FROM_CAM, np.array([0.13 * index, 0.05 * np.sin(index), 0.02 * np.cos(index)]))
 
 
-def render(panels: list[Panel], world_from_cam: Rigid3, camera: Camera = CAMERA, noise_seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """The grey picture (uint8, with a grey level of noise) and its exact depth (float64, metres, NaN where nothing is)."""
+@cache
+def _rays(camera: Camera) -> np.ndarray:
+    """The directions of the pixels in the camera's frame, row by row of the picture: 3 x N, the third is 1."""
     columns, rows = np.meshgrid(np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64))
     normalized = camera.normalized_from_img(np.column_stack([columns.ravel(), rows.ravel()]))
-    rays = np.column_stack([normalized, np.ones(len(normalized))]) @ world_from_cam.rotation.T
-    depth = np.full(len(rays), np.inf)
-    grey = np.full(len(rays), 127.5, np.float32)
+    return np.vstack([normalized.T, np.ones(len(normalized))])
+
+
+def render(panels: list[Panel], world_from_cam: Rigid3, camera: Camera = CAMERA, noise_seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """The grey picture (uint8, with a grey level of noise) and its exact depth (float64, metres, NaN where nothing is)."""
+    rays = _rays(camera)
+    depth = np.full(rays.shape[1], np.inf)
+    grey = np.full(rays.shape[1], 127.5, np.float32)
     for panel in panels:
-        normal = np.cross(panel.right, panel.down)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            z = normal @ (panel.centre - world_from_cam.translation) / (rays @ normal)
-        on_panel = world_from_cam.translation + np.where((z > 0) & np.isfinite(z), z, 0.0)[:, None] * rays - panel.centre
-        across, along = on_panel @ panel.right, on_panel @ panel.down
-        seen = (z > 0) & (z < depth) & (np.abs(across) < panel.half[0]) & (np.abs(along) < panel.half[1])
+        axes_world = np.stack([np.cross(panel.right, panel.down), panel.right, panel.down])
+        towards, to_right, to_down = (axes_world @ world_from_cam.rotation) @ rays  # what a metre of depth adds along each axis
+        begin = axes_world @ (world_from_cam.translation - panel.centre)
+        with np.errstate(divide="ignore"):
+            z = -begin[0] / towards
+        z[~((z > 0) & (z < depth))] = 0.0
+        across, along = begin[1] + z * to_right, begin[2] + z * to_down
+        seen = (z > 0) & (np.abs(across) < panel.half[0]) & (np.abs(along) < panel.half[1])
         if not seen.any():
             continue
         texel_x, texel_y = (

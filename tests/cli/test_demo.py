@@ -78,6 +78,7 @@ def test_without_matplotlib_all_but_the_report_is_done(
     assert {path.name for path in tmp_path.iterdir()} == {"lab.topo", "results.jsonl", "day.tum", "night.tum"}
 
 
+@pytest.mark.slow  # the tests of quickstart and examples map and ask the same recordings
 @pytest.mark.skipif(bool(missing_recordings(SHIPPED)), reason="the demo's recordings are not in this checkout")
 def test_the_recordings_brought_along_keep_the_promise(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert main(["demo", "--out", str(tmp_path / "out"), "--json", "-"]) == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, is_dataclass
@@ -146,6 +147,7 @@ _VALUES = st.recursive(
 )
 
 
+@functools.cache
 def _trees(name: str) -> st.SearchStrategy[Any]:
     keys = st.sampled_from(_keys(config_class(name)())) | st.text(max_size=8)
     return st.recursive(_VALUES, lambda inner: st.dictionaries(keys, inner, max_size=4), max_leaves=12)

@@ -19,7 +19,7 @@ from topoloc.map.landmarks import LandmarkConfig
 from topoloc.map.nodes import NodeConfig, NodePoses, node_distances
 from topoloc.map.topomap import Edge, TopoMetricMap, TopoNode
 
-SOME = NodeConfig(d_thresh=0.35, lambda_rot=1.0)
+ALONE = BuildConfig(nodes=NodeConfig(d_thresh=0.35, lambda_rot=1.0), other_kinds=())
 
 
 @pytest.fixture
@@ -56,7 +56,8 @@ def test_a_map_whose_parts_lie_on_disk_while_it_is_made_is_the_same(
 
 
 def test_points_are_right_and_refined_better_than_measured(tiny_recording: Path, tiny_map: TopoMetricMap):
-    unrefined = build_map(topoloc.open_sequence(f"{tiny_recording}@0::2"), BuildConfig(landmarks=LandmarkConfig(nodes_per_image=0)))
+    measured = replace(tiny_map.config, landmarks=LandmarkConfig(nodes_per_image=0))
+    unrefined = build_map(topoloc.open_sequence(f"{tiny_recording}@0::2"), measured)
     errors, errors_before = (np.concatenate([depth_errors(node) for node in m.nodes]) for m in (tiny_map, unrefined))
     assert abs(np.nanmedian(errors)) < 0.01
     assert np.nanmedian(np.abs(errors)) < 0.02
@@ -76,21 +77,21 @@ def test_a_node_holds_what_the_paper_says(tiny_map: TopoMetricMap):
 
 
 def test_limits_on_points_are_kept(tiny_recording: Path):
-    few = build_map(topoloc.open_sequence(f"{tiny_recording}@0:4"), BuildConfig(nodes=SOME, max_node_points=50, template_side_px=60))
+    few = build_map(topoloc.open_sequence(f"{tiny_recording}@0:4"), replace(ALONE, max_node_points=50, template_side_px=60))
     assert {summary.num_points for summary in few.summaries} == {50}
     assert cv2.imdecode(np.frombuffer(few.nodes[0].template_jpeg, np.uint8), cv2.IMREAD_GRAYSCALE).shape == (60, 80)
 
 
 def test_depth_pictures_make_a_map_too(tmp_path: Path):
     folder = tiny_world.write_depth_recording(tmp_path / "rgbd", indices=[0.0, 2.0, 4.0])
-    topomap = build_map(topoloc.open_sequence(folder), BuildConfig(nodes=SOME))
+    topomap = build_map(topoloc.open_sequence(folder), ALONE)
     errors = np.concatenate([depth_errors(node) for node in topomap.nodes])
     assert np.nanmedian(np.abs(errors)) < 0.005
 
 
 def test_two_recordings_make_one_map_without_an_edge_between_them(tiny_recording: Path):
     parts = [topoloc.open_sequence(f"{tiny_recording}@{part}") for part in ("0:4", "9:13")]
-    topomap = build_map(parts, BuildConfig(nodes=SOME))
+    topomap = build_map(parts, ALONE)
     last = topomap.place_images[3].node_id
     first = topomap.place_images[4].node_id
     assert first != last
@@ -114,7 +115,7 @@ def test_two_builds_of_a_real_recording_give_the_same_bytes(shared: Path, tmp_pa
 
 def test_progress_is_told(tiny_recording: Path):
     told: list[tuple[str, int, int]] = []
-    build_map(topoloc.open_sequence(f"{tiny_recording}@0:3"), BuildConfig(nodes=SOME), lambda *step: told.append(step))
+    build_map(topoloc.open_sequence(f"{tiny_recording}@0:3"), ALONE, lambda *step: told.append(step))
     assert [step for step in told if step[0] == "images"] == [("images", k, 3) for k in (1, 2, 3)]
     assert [step[1] for step in told if step[0] == "nodes"][-1] == [step[2] for step in told if step[0] == "nodes"][-1]
 
@@ -136,14 +137,14 @@ class CountedReads:
 
 def test_each_picture_is_read_once(tiny_recording: Path):
     recording = CountedReads(topoloc.open_sequence(f"{tiny_recording}@0:5"))
-    build_map(recording, BuildConfig(nodes=SOME))
+    build_map(recording, ALONE)
     assert recording.reads == [1] * 5
 
 
 def test_an_unreadable_picture_is_named(own_recording: Path):
     (own_recording / "image_0" / "000003.png").write_bytes(b"\x89PNG")
     with pytest.raises(UnreadableImageError, match=r"000003\.png"):
-        build_map(topoloc.open_sequence(own_recording), BuildConfig(nodes=SOME))
+        build_map(topoloc.open_sequence(own_recording), ALONE)
 
 
 def test_nan_in_a_trajectory_is_refused(own_recording: Path):
@@ -166,11 +167,11 @@ def test_recordings_without_poses_or_depth_are_refused(own_recording: Path):
 def test_blank_pictures_become_no_node(own_recording: Path):
     for side in ("image_0", "image_1"):
         cv2.imwrite(str(own_recording / side / "000000.png"), np.full((240, 320), 90, np.uint8))
-    topomap = build_map(topoloc.open_sequence(f"{own_recording}@0:6"), BuildConfig(nodes=SOME))
+    topomap = build_map(topoloc.open_sequence(f"{own_recording}@0:6"), ALONE)
     assert "image_0/000000.png" not in [summary.name for summary in topomap.summaries]
     assert len(topomap.place_images) == 6
     with pytest.raises(EmptyMapError):
-        build_map(topoloc.open_sequence(f"{own_recording}@0:1"), BuildConfig(nodes=SOME))
+        build_map(topoloc.open_sequence(f"{own_recording}@0:1"), ALONE)
     with pytest.raises(EmptyMapError):
         build_map(topoloc.open_sequence(f"{own_recording}@0:1"))
 
@@ -179,5 +180,5 @@ def test_a_pose_that_jumps_makes_a_node_of_its_own(tiny_recording: Path):
     sequence = topoloc.open_sequence(f"{tiny_recording}@0:3")
     poses = list(sequence.poses)
     poses[1] = Rigid3(np.eye(3), np.array([500.0, 0.0, 0.0]))
-    topomap = build_map(replace(sequence, poses=poses), BuildConfig(nodes=SOME))
+    topomap = build_map(replace(sequence, poses=poses), ALONE)
     assert [image.node_id for image in topomap.place_images][1] == 1

@@ -15,7 +15,7 @@ from built_corridor import WIDE, WalkAhead, seen_ahead
 from topoloc.localization.map_facts.building import build_map
 
 OPENING = Path(__file__).with_name("opening.py")
-NUM_MUTATIONS = 150
+NUM_MUTATIONS = 100
 
 
 @pytest.fixture(scope="module")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -27,21 +28,37 @@ ASKING, PEERS = {"asking surf-vlad", "asking cnn-nn"}, set(_CODE)
 
 
 @pytest.fixture
-def code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of the program that may be changed."""
     for package, root in ROOTS.items():
         shutil.copytree(
             root / package, tmp_path / package, ignore=lambda folder, names: [n for n in names if Path(n).suffix not in (".py", "")]
         )
         monkeypatch.setitem(ROOTS, package, tmp_path)
+    for reading in _READ:
+        monkeypatch.setattr(stage_code, reading, None)  # as it was, afterwards
     _forget()
-    yield tmp_path
-    _forget()
+    return tmp_path
+
+
+_READ = {"_imports": stage_code._imports.__wrapped__, "_meaning": stage_code._meaning.__wrapped__}
+
+
+@functools.cache
+def _of_content(reading: str, module: str, content: bytes) -> object:
+    """What is read of a module, once for all tests that leave it as it is."""
+    return _READ[reading](module)
 
 
 def _forget() -> None:
-    stage_code._imports.cache_clear()
-    stage_code._meaning.cache_clear()
+    """Each file is read again; but the trees of those that are as before."""
+    for reading in _READ:
+
+        @functools.cache
+        def read(module: str, reading: str = reading) -> object:
+            return _of_content(reading, module, _file(module).read_bytes())
+
+        setattr(stage_code, reading, read)
 
 
 def _done_again(change: Callable[[], object]) -> set[str]:

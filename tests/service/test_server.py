@@ -7,6 +7,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -56,20 +57,22 @@ def test_only_those_with_the_token_are_answered(maps: Path, view: Path, tmp_path
 
 def test_requests_in_progress_are_finished_when_it_is_told_to_end(maps: Path, queries: Path, camera: str):
     """Sixteen wait when the signal comes; each gets its answer, and the process ends with status 0."""
-    data = (queries / "view02.png").read_bytes()
-    statuses = list[int]()
-    with running(maps / "room.topo", "--workers", 1, "--max-queue", 100) as service, service.client() as client:
-        client.post("/v1/maps/room/localize", files={"image": data}, data={"camera": camera})
+    asked = {"files": {"image": (queries / "view02.png").read_bytes()}, "data": {"camera": camera}}
+    statuses, together, until = list[int](), threading.Barrier(16), time.monotonic() + 60.0
+    with running(maps / "room.topo", "--workers", 1, "--max-queue", 100) as service, service.client() as client, ExitStack() as stack:
+        client.post("/v1/maps/room/localize", **asked)
+        clients = [stack.enter_context(service.client()) for _ in range(16)]
 
-        def ask() -> None:
-            with service.client() as one:
-                statuses.append(one.post("/v1/maps/room/localize", files={"image": data}, data={"camera": camera}).status_code)
+        def ask(one: httpx.Client) -> None:
+            one.get("/healthz")  # making a connection takes longer than an answer
+            together.wait()
+            statuses.append(one.post("/v1/maps/room/localize", **asked).status_code)
 
-        threads = [threading.Thread(target=ask) for _ in range(16)]
+        threads = [threading.Thread(target=ask, args=(one,)) for one in clients]
         for thread in threads:
             thread.start()
         while client.get("/healthz").json()["jobs"] < 8:
-            time.sleep(0.005)
+            assert time.monotonic() < until, "never do eight wait at once"
         assert service.end() == 0
         for thread in threads:
             thread.join()

@@ -120,7 +120,8 @@ def test_truth_agrees_with_the_rendered_geometry(recorded: Path):
 def test_depth_tells_where_a_point_is_in_the_right_picture(tmp_path: Path):
     camera = Camera.pinhole(160, 100, 95.0, 95.0, 79.5, 49.5)
     quiet = SensorConfig(full_well=1e9, read_noise=0.0)
-    config = replace(CONFIG, camera=camera, sensor=quiet, render=RenderConfig(), route=replace(CONFIG.route, num_frames=1))
+    fine = replace(RenderConfig(), bake=CONFIG.render.bake)  # of the light that other tests have traced
+    config = replace(CONFIG, camera=camera, sensor=quiet, render=fine, route=replace(CONFIG.route, num_frames=1))
     record(BOX_WORLD, DAY, tmp_path / "box", replace(config, grey=True))
     frame = open_sequence(tmp_path / "box")[0]
     depth = cv2.imread(str(tmp_path / "box" / "depth_0" / "000000.png"), cv2.IMREAD_UNCHANGED) / 5000.0

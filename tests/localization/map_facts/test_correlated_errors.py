@@ -58,15 +58,8 @@ def measurings(monkeypatch: pytest.MonkeyPatch) -> list[TopoMetricMap]:
     return measured
 
 
-@pytest.fixture
-def saved(tiny_recording: Path, tmp_path: Path) -> Path:
-    path = tmp_path / "room.topo"
-    topoloc.build_map(topoloc.open_sequence(tiny_recording), topoloc.BuildConfig(other_kinds=())).save(path)
-    return path
-
-
-def test_a_map_knows_what_was_measured_when_it_was_built(saved: Path, measurings: list[TopoMetricMap]):
-    loaded = TopoMetricMap.load(saved)
+def test_a_map_knows_what_was_measured_when_it_was_built(room_map: Path, measurings: list[TopoMetricMap]):
+    loaded = TopoMetricMap.load(room_map)
     known = Localizer(loaded).correlated_errors
     assert not measurings
     unknown = replace(loaded, shared_errors=None)
@@ -83,22 +76,22 @@ def test_a_map_knows_what_was_measured_when_it_was_built(saved: Path, measurings
     ],
     ids=["correlated errors", "guided", "pose"],
 )
-def test_with_other_settings_it_is_measured_anew(config: LocalizerConfig, saved: Path, measurings: list[TopoMetricMap]):
-    loaded = TopoMetricMap.load(saved)
+def test_with_other_settings_it_is_measured_anew(config: LocalizerConfig, room_map: Path, measurings: list[TopoMetricMap]):
+    loaded = TopoMetricMap.load(room_map)
     rho = Localizer(loaded, config).correlated_errors
     assert measurings == [loaded]
     assert rho == Localizer(replace(loaded, shared_errors=None), config).correlated_errors
 
 
-def test_settings_that_it_does_not_depend_on_may_change(saved: Path, measurings: list[TopoMetricMap]):
-    loaded = TopoMetricMap.load(saved)
+def test_settings_that_it_does_not_depend_on_may_change(room_map: Path, measurings: list[TopoMetricMap]):
+    loaded = TopoMetricMap.load(room_map)
     assert loaded.shared_errors is not None
     assert Localizer(loaded, LocalizerConfig(num_candidates=2)).correlated_errors == loaded.shared_errors.rho
     assert not measurings
 
 
-def test_of_other_nodes_it_is_measured_anew(saved: Path, measurings: list[TopoMetricMap]):
-    moved = _disturbed(TopoMetricMap.load(saved), 0.02, 0.005)
+def test_of_other_nodes_it_is_measured_anew(room_map: Path, measurings: list[TopoMetricMap]):
+    moved = _disturbed(TopoMetricMap.load(room_map), 0.02, 0.005)
     assert moved.shared_errors is not None
     assert Localizer(moved).correlated_errors > moved.shared_errors.rho
     assert measurings == [moved]
@@ -115,8 +108,8 @@ def test_without_correlated_errors_the_covariance_stays_as_it_is():
     assert inflation(100, 0.1) == pytest.approx(11.0)
 
 
-def test_the_first_query_computes_nothing_of_the_map(saved: Path, tiny_recording: Path, monkeypatch: pytest.MonkeyPatch):
-    localizer, frame = Localizer(TopoMetricMap.load(saved)), topoloc.open_sequence(tiny_recording)[1]
+def test_the_first_query_computes_nothing_of_the_map(room_map: Path, tiny_recording: Path, monkeypatch: pytest.MonkeyPatch):
+    localizer, frame = Localizer(TopoMetricMap.load(room_map)), topoloc.open_sequence(tiny_recording)[1]
     assert localizer.map.focal == frame.camera.fx
 
     def never(*args: object) -> None:
@@ -127,4 +120,4 @@ def test_the_first_query_computes_nothing_of_the_map(saved: Path, tiny_recording
     assert localizer.localize(frame.image, frame.camera).localized
     localizer.map.moves(0)
     with pytest.raises(AssertionError, match="a digest of the nodes"):
-        Localizer(TopoMetricMap.load(saved))
+        Localizer(TopoMetricMap.load(room_map))
