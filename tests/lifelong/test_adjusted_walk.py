@@ -47,12 +47,12 @@ def _answers() -> dict[int, Localization]:
 
 def test_the_whole_says_how_long_the_rest_is(stretch: Stretch):
     held = _too_long(1.15)
-    adjusted = adjusted_walk(stretch, held, _answers(), SessionPosesConfig().adjustment)
+    adjusted = adjusted_walk(stretch, held, _answers(), 8.0, SessionPosesConfig().adjustment)
     assert _off(held) > 0.08
     assert _off(adjusted) < 0.03
 
 
 def test_frames_without_a_pose_stay_without(stretch: Stretch):
     held: list[Rigid3 | None] = [None, *_too_long(1.02)[1:15]]
-    adjusted = adjusted_walk(stretch, held, _answers(), SessionPosesConfig().adjustment)
+    adjusted = adjusted_walk(stretch, held, _answers(), 8.0, SessionPosesConfig().adjustment)
     assert [pose is None for pose in adjusted] == [True] + [False] * 14

@@ -24,6 +24,7 @@ def adjusted_walk(
     stretch: Stretch,
     held: Sequence[Rigid3 | None],
     anchors: Mapping[int, Localization],
+    points_widened: float,
     config: BundleConfig,
 ) -> list[Rigid3 | None]:
     """world_from_cam of the frames, better than `held`, which has them in the map's world and metres; None stays None.
@@ -32,11 +33,14 @@ def adjusted_walk(
 
     Args:
         anchors: the map's answers that are believed, by frame.
+        points_widened: how many times as large the sigmas of followed points are as odometry took them for.
     """
     keyframes = _in_the_map(stretch, held)
     moved = set(map(id, keyframes))
     frames = {f.frame_idx: f for f in stretch.frames if id(f.keyframe) in moved and _is_known(held, f.frame_idx)}
     relative = {index: _seen_from(frame, held) for index, frame in frames.items()}
+    for keyframe in keyframes:
+        keyframe.observations.weights /= points_widened
     said = [_anchor(relative[index], frame, anchors[index]) for index, frame in frames.items() if index in anchors]
     adjust_bundle(keyframes, [], stretch.landmarks, config, said)
     adjusted = list(held)

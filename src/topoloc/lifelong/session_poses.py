@@ -62,8 +62,11 @@ class SessionPosesConfig:
     """Where the map and a single camera's motion say places that are further apart than so many D_thresh, beside three of the map's sigmas
     (widened), a frame has no pose."""
     graph: PoseGraphConfig = field(default_factory=PoseGraphConfig)
-    adjustment: BundleConfig = field(default_factory=lambda: BundleConfig(max_steps=30, min_decrease=1e-5, cauchy_scale=1.0))
+    adjustment: BundleConfig = field(default_factory=lambda: BundleConfig(max_steps=30, min_decrease=1e-5, cauchy_scale=0.5))
     """Of a single camera's walk as a whole."""
+    points_widened: Annotated[float, Above(0)] = 8.0
+    """In it, points that were followed are trusted as if their sigmas were so many times as large: one that slides does so in all of its
+    key frames."""
     odometry: SingleCameraConfig = field(default_factory=SingleCameraConfig)
     scale: ScaleConfig = field(default_factory=ScaleConfig)
 

@@ -61,7 +61,8 @@ def poses_by_map(
         own = stretch.own_from_cams()
         held, agreeing = held_stretch(sequence.name, own, seen, of_map.nodes.d_thresh, config)
         if held is not None:
-            adjusted = adjusted_walk(stretch, held, {index: seen[index] for index in agreeing}, config.adjustment)
+            anchors = {index: seen[index] for index in agreeing}
+            adjusted = adjusted_walk(stretch, held, anchors, config.points_widened, config.adjustment)
             held, agreeing = _undisputed(adjusted, seen, agreeing, of_map.nodes.d_thresh, config)
         for index in own:
             if index not in agreeing:
