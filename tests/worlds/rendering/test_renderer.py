@@ -62,6 +62,13 @@ def test_the_sky_goes_round_from_east_to_north(column, forward):
     assert np.isnan(seen.depth).all()
 
 
+def test_an_empty_scene_is_rendered_while_another_one_is_alive():
+    other = Renderer(Scene((slanted_wall(),), grey_sky()), DRAFT)
+    other.render(CAMERA, looking_north(), 0)
+    seen = Renderer(Scene((), grey_sky(0.7)), DRAFT).render(CAMERA, looking_north(), 0).radiance
+    np.testing.assert_allclose(seen, 0.7, rtol=1e-3)
+
+
 def test_the_zenith_is_the_first_row():
     radiance = np.concatenate([np.full((8, 32, 3), 3.0), np.full((8, 32, 3), 0.5)]).astype(np.float32)
     seen = Renderer(Scene((), Sky(radiance)), DRAFT).render(CAMERA, looking_north(), 0).radiance[:, :, 0]

@@ -68,7 +68,7 @@ def find_first_hits(
     else:
         origins = mi.Point3f(np.ascontiguousarray(start.T))
         dr.make_opaque(origins)  # a value that the code would contain costs a compilation for every picture
-        found = _recorded(follow)(scene, origins, mi.Vector3f(np.ascontiguousarray(rays.T)))
+        found = _recorded_in(scene, follow)(scene, origins, mi.Vector3f(np.ascontiguousarray(rays.T)))
         dr.eval(*found)  # all in one kernel
         columns = [_array(part, len(rays)) for part in found]
     return _first_hits(columns, rays, haze_range)
@@ -88,12 +88,17 @@ def open_towards(scene: Any, points: Float64[np.ndarray, "n 3"], direction_world
 
     starts = mi.Point3f(np.ascontiguousarray(points.T, np.float32))
     ray = mi.Ray3f(starts, mi.Vector3f(*direction_world.tolist()))
-    return np.array(_recorded(let_through)(scene, ray), np.float32)
+    return np.array(_recorded_in(scene, let_through)(scene, ray), np.float32)
 
 
 def forget_recordings() -> None:
     """To be called before a scene is loaded: it may come to lie where another one was, and be taken for that by its recording."""
     _recorded.cache_clear()
+
+
+def _recorded_in(scene: Any, function: Callable[..., Any]) -> Callable[..., Any]:
+    """Recorded, but for an empty scene: there Dr.Jit misses the surfaces of any other scene that is still alive, and refuses."""
+    return _recorded(function) if len(scene.shapes()) else function
 
 
 @cache
