@@ -75,3 +75,15 @@ def test_where_the_map_and_the_motion_contradict_each_other_nothing_is_said():
     assert min(agreeing) >= 4
     assert poses[:4] == [None] * 4
     assert all(pose is not None for pose in poses[6:])
+
+
+def test_two_ways_that_the_map_answers_are_none():
+    """The greater part of the answers is of a place that looks alike from the other end."""
+    turned = Rigid3(np.diag([-1.0, -1.0, 1.0]), np.array([9.0, -3.0, 0.0]))
+    answers = _answers([*range(0, 30, 2), *range(40, 60, 2)], [])
+    for k in range(0, 30, 2):
+        wrong = WORLD_FROM_OWN @ turned @ TRUTH[k]
+        answers[k] = Localization(wrong, answers[k].covariance, 0.99, 0, [], 100, 80)
+    poses, agreeing = held_stretch("walk", _motion(0.0), answers, 0.6, SessionPosesConfig())
+    assert poses is None
+    assert agreeing == []

@@ -58,6 +58,8 @@ class SessionPosesConfig:
     """Sigma of its rotation, radians a metre of the way and a radian of the turn, beside half a milliradian."""
     widened: Annotated[float, Above(0)] = 3.0
     """The map's answers are trusted as if their sigmas were so many times as large: neighbours share errors of the map."""
+    rival_share: Annotated[float, Between(0, 1)] = 0.3
+    """Of a single camera, answers that agree about one way are believed if fewer than this share of them agree about another one."""
     contradiction: Annotated[float, Above(0)] = 0.1
     """Where the map and a single camera's motion say places that are further apart than so many D_thresh, beside three of the map's sigmas
     (widened), a frame has no pose."""

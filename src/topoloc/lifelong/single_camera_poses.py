@@ -71,6 +71,10 @@ def poses_by_map(
             if held is not None:
                 poses[index] = held[index] if index < len(held) else None
     known = [(index, pose) for index, pose in enumerate(poses) if pose is not None]
+    if not known:
+        raise TrajectoryError(
+            f"{sequence.name}: what the map answers to its pictures does not agree with their motion; the map stays as it is"
+        )
     asked = [known[k][0] for k in place_nodes([pose for _, pose in known], of_map.nodes)]
     answers = {index: seen.get(index) for index in asked}
     carried = [index for index, _ in known if index not in seen]
@@ -89,15 +93,25 @@ def held_stretch(
         metric = in_metres(own, {index: of_it[index] for index in agreeing}, config.scale) if len(agreeing) >= config.min_agreeing else {}
         within = {index: answer for index, answer in of_it.items() if index in metric}
         if len(within) < config.min_agreeing:
-            return None, agreeing
+            return None, _unrivalled(own, of_it, agreeing, d_thresh, config)
         try:
             held = held_by(name, metric, within, d_thresh, config)
         except TrajectoryError:
-            return None, agreeing
+            return None, _unrivalled(own, of_it, agreeing, d_thresh, config)
         agreeing = held.agreeing
-    if held is None:
-        return None, agreeing
+    if held is None or not _unrivalled(own, of_it, agreeing, d_thresh, config):
+        return None, []
     return _undisputed(held.world_from_cams, of_it, agreeing, d_thresh, config)
+
+
+def _unrivalled(
+    own: Mapping[int, Rigid3], of_it: Mapping[int, Localization], agreeing: list[int], d_thresh: float, config: SessionPosesConfig
+) -> list[int]:
+    """The agreeing answers, or none of them where others agree with one another about another way: a place that looks like itself from the
+    other end is answered wrongly for as long as it is in view."""
+    rest = {index: answer for index, answer in of_it.items() if index not in agreeing}
+    rivals = largest_agreement(own, rest, config.slack * d_thresh, config.slack_deg, config.scale)
+    return [] if len(rivals) >= max(config.min_agreeing, config.rival_share * len(agreeing)) else agreeing
 
 
 def _undisputed(
