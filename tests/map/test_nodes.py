@@ -56,9 +56,10 @@ def test_every_frame_is_near_a_node_and_no_two_nodes_are_near(steps: list[tuple[
     poses = [moved(x, yaw) for x, yaw in steps]
     frame_idx = place_nodes(poses, NodeConfig(d_thresh, lambda_rot))
     nodes = NodePoses.of([poses[i] for i in frame_idx])
-    assert all(node_distances(pose, nodes, lambda_rot).min() <= d_thresh for pose in poses)
+    rounding = 1.0 + 1e-12  # a step of 1e-124 from where a node just is none is seen in one order of the sums and not in the other
+    assert all(node_distances(pose, nodes, lambda_rot).min() <= d_thresh * rounding for pose in poses)
     between = np.array([node_distances(poses[i], nodes, lambda_rot) for i in frame_idx])
-    assert (between[~np.eye(len(frame_idx), dtype=bool)] > d_thresh).all()
+    assert (between[~np.eye(len(frame_idx), dtype=bool)] > d_thresh / rounding).all()
 
 
 @given(
