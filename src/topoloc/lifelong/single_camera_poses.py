@@ -116,13 +116,15 @@ def _unrivalled(
 
 def _undisputed(
     poses: Sequence[Rigid3 | None], seen: Mapping[int, Localization], agreeing: Sequence[int], d_thresh: float, config: SessionPosesConfig
-) -> tuple[list[Rigid3 | None], list[int]]:
-    """The poses and the agreeing answers without those of which the map and the motion say different things, and either may be right."""
+) -> tuple[list[Rigid3 | None] | None, list[int]]:
+    """The poses and the agreeing answers without those of which the map and the motion say different things, and either may be right; no
+    poses where too few answers are left to hold them."""
     of_it = {index: answer for index, answer in seen.items() if index < len(poses) and poses[index] is not None}
     apart = {index for index, answer in of_it.items() if _contradicts(answer, poses[index], d_thresh, config)}
     disputed = _disputed(list(of_it), apart)
     left = [None if index in disputed else pose for index, pose in enumerate(poses)]
-    return left, [index for index in agreeing if index not in apart]
+    holding = [index for index in agreeing if index not in apart]
+    return (left, holding) if len(holding) >= config.min_agreeing else (None, [])
 
 
 def _contradicts(answer: Localization, pose: Rigid3 | None, d_thresh: float, config: SessionPosesConfig) -> bool:
