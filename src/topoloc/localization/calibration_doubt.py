@@ -75,8 +75,8 @@ def doubt_of_calibration(search: Search, fit: PoseFit) -> tuple[SeenCamera | Non
 
 
 def _settled(search: Search, fit: PoseFit, found: PictureCalibration) -> tuple[PoseFit, PictureCalibration]:
-    """The points sought again around what is found, until nothing changes."""
-    for _ in range(_ROUNDS):
+    """The points sought again around what is found, until nothing changes; not at all where the settings seek none around poses."""
+    for _ in range(_ROUNDS if search.config.guided.num_nodes else 0):
         around = _around(search, fit, found)
         again = _measured(search, around)
         if again is None:  # it leads nowhere: what was seen at first has to do
