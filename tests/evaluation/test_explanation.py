@@ -1,6 +1,7 @@
 """What is said of an answer, or of none."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -8,8 +9,10 @@ import numpy as np
 import pytest
 
 from built_room import unseen_views, write_pictures
+from tiny_world import CAMERA
 from topoloc.cli import main
 from topoloc.evaluation.explanation import explain
+from topoloc.localization.fitted_weights import weights_of
 from topoloc.localization.localizer import Localizer
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.open import open_sequence
@@ -29,6 +32,16 @@ def test_an_answer_is_among_what_was_tried(localizer: Localizer, queries: Path):
     assert best is not None
     assert best.verdict == "the answer"
     assert explanation.num_features["surf"] == len(best.fit.features)
+
+
+def test_first_poses_that_lead_nowhere_new_are_told_so(localizer: Localizer):
+    """Where no evidence is enough, all that looks alike is asked, and leads to the same pose."""
+    weights = weights_of("surf")
+    weights = replace(weights, evidence=replace(weights.evidence, clear_log_odds=1e9))
+    never_clear = Localizer(localizer.topomap, weights=weights)
+    verdicts = [pose.verdict for picture, _ in unseen_views() for pose in explain(never_clear, picture, CAMERA).poses]
+    assert "the same as one that was found already" in verdicts
+    assert verdicts.count("the answer") == len(unseen_views())
 
 
 def test_a_dark_blank_picture_is_called_so(localizer: Localizer, queries: Path):

@@ -13,13 +13,15 @@ from doubled_room import ELSEWHERE, twice
 from tiny_world import CAMERA
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization import propose
+from topoloc.localization import localizer as localizer_module
+from topoloc.localization import propose, refine
+from topoloc.localization.belief import Belief, Hypothesis
 from topoloc.localization.config import LocalizerConfig, LookAlikesConfig, ViewpointsConfig
 from topoloc.localization.fitted_weights import weights_of
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import PoseFit
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.localization.search import Trace
+from topoloc.localization.search import Proposal, Search, Trace
 from topoloc.map.topomap import TopoMetricMap
 
 LIGHTS = (0.055, 0.05, 0.045)
@@ -201,3 +203,26 @@ def test_a_prior_that_is_wrong_makes_no_place_of_an_image_from_elsewhere(room: T
     localizer, (_, somewhere) = Localizer(room), unseen_views()[2]
     for picture, _ in unseen_views(seed=1, step=4.0):
         assert isinstance(localizer.localize(picture, CAMERA, prior=somewhere), NotLocalized)
+
+
+# what was found already
+
+
+def test_a_pose_that_was_found_already_is_not_followed_up_again(room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch):
+    followed = list[tuple[Search, Proposal]]()
+
+    def hypothesis_of(search: Search, proposal: Proposal) -> Hypothesis | None:
+        followed.append((search, proposal))
+        return refine.hypothesis_of(search, proposal)
+
+    monkeypatch.setattr(localizer_module, "hypothesis_of", hypothesis_of)
+    for picture, _ in unseen_views():
+        followed.clear()
+        assert isinstance(Localizer(room).localize(picture, CAMERA), Localization)
+        search, proposal = followed[0]
+        assert refine.is_found_already(search, proposal)
+        pose = proposal.fit.pose
+        assert pose is not None
+        beside = replace(pose, cam_from_world=Rigid3(np.eye(3), np.array([0.3, 0.0, 0.0])) @ pose.cam_from_world)
+        assert not refine.is_found_already(search, replace(proposal, fit=replace(proposal.fit, pose=beside)))
+        assert not refine.is_found_already(replace(search, belief=Belief()), proposal)

@@ -93,6 +93,8 @@ def _tried_pose(tried: Tried, result: Localization | NotLocalized) -> TriedPose:
         return TriedPose(tried, fit, probability, _verdict(tried.hypothesis.world_from_cam, probability, result))
     if fit.pose is None:
         return TriedPose(tried, fit, None, f"no pose: the {len(fit.matches)} matches agree on none")
+    if tried.refined is None and tried.source != "walls":
+        return TriedPose(tried, fit, None, "the same as one that was found already")
     return TriedPose(tried, fit, None, "hopeless: far too little of what must be in view was found")
 
 

@@ -26,18 +26,13 @@ from topoloc.localization.walls.propose_walls import WallProposal, refine_wall, 
 
 _MOST_SAID, _FEW_MATCHES = 3.0, 30.0  # odds, in logarithms, that one kind adds to another's; matches with which it is heard by half
 _NUM_COMPARED = 512  # of the points in view that are compared with dense descriptors
+_ALIKE = 0.75  # of the points of a believed pose, within reach of the guided step around another one
 _HOPELESS = -3.0  # odds, in logarithms, that nothing can mend
 
 
 def hypothesis_of(search: Search, proposal: Proposal) -> Hypothesis | None:
-    """The proposal followed up; None where too little was found for any evidence."""
-    if isinstance(proposal, WallProposal):
-        with search.query.clock.stage("walls"):
-            final = refine_wall(proposal)
-            hypothesis = weigh_wall(proposal, final) if final is not None else None
-    else:
-        final = refine(search, proposal) if proposal.repeats is None else proposal.fit
-        hypothesis = weigh(search, proposal, final)
+    """The proposal followed up; None where too little was found for any evidence, or nothing new can be."""
+    final, hypothesis = (None, None) if is_found_already(search, proposal) else _followed_up(search, proposal)
     if search.first is None:
         search.first = proposal.fit if final is None or final.pose is None else final
     if search.trace is not None:
@@ -45,6 +40,32 @@ def hypothesis_of(search: Search, proposal: Proposal) -> Hypothesis | None:
         kind = search.query.feature_config.kind
         search.trace.tried.append(Tried(proposal.source, proposal.fit, final, hypothesis, milliseconds, kind))
     return hypothesis
+
+
+def _followed_up(search: Search, proposal: Proposal) -> tuple[PoseFit | None, Hypothesis | None]:
+    if isinstance(proposal, WallProposal):
+        with search.query.clock.stage("walls"):
+            final = refine_wall(proposal)
+            return final, weigh_wall(proposal, final) if final is not None else None
+    final = refine(search, proposal) if proposal.repeats is None else proposal.fit
+    return final, weigh(search, proposal, final)
+
+
+def is_found_already(search: Search, proposal: Proposal) -> bool:
+    """Does the first pose show the points of a believed one in nearly the same pixels? Then the same would be found around it."""
+    fit, config = proposal.fit, search.config
+    if fit.pose is None or proposal.repeats is not None or isinstance(proposal, WallProposal):
+        return False
+    radius_px = config.guided.radius_px * max(max(fit.camera.width, fit.camera.height) / 640.0, 0.5)
+    for known in search.belief.hypotheses:
+        if known.is_from_walls or known.probability < config.evidence.min_probability or known.fit.pose is None:
+            continue
+        seen = known.fit.seen_points(1.0)
+        with np.errstate(invalid="ignore"):
+            apart = np.linalg.norm(fit.camera.img_from_cam(fit.pose.cam_from_world.apply(seen.points_world)) - seen.points_img, axis=1)
+        if np.count_nonzero(apart < radius_px) >= _ALIKE * len(apart):
+            return True
+    return False
 
 
 def refine(search: Search, proposal: Proposal) -> PoseFit:
@@ -106,17 +127,20 @@ def _evidence(search: Search, proposal: Proposal, final: PoseFit, covariance: Fl
         return replace(counted, num_by_chance=repeats.num_by_chance, num_matches=unguided[0], num_inliers=unguided[1])
     assert final.pose is not None
     by_chance = count_by_chance(final.features, final.local_map, final.pose.cam_from_world, final.camera, search.config.guided)
-    counted = replace(counted, num_by_chance=by_chance)
+    counted, may_be_hopeless = replace(counted, num_by_chance=by_chance), True
     if not proposal.is_guided:
         evidence = _with_unguided(search, counted, proposal.fit, final)
-        if log_odds_of(evidence, search.weights) > search.weights.evidence.clear_log_odds:
+        log_odds = log_odds_of(evidence, search.weights)
+        if log_odds > search.weights.evidence.clear_log_odds:
             return evidence
+        may_be_hopeless = log_odds < 2.0 * _HOPELESS
     at_best = replace(counted, num_matches=final.num_inliers, num_inliers=final.num_inliers)
     if log_odds_of(at_best, search.weights) < _HOPELESS:  # whatever the unguided matches say
         return None
-    of_strongest = _with_unguided(search, counted, _unguided(search, final, search.config.num_first_features), final)
-    if log_odds_of(of_strongest, search.weights) < 2.0 * _HOPELESS:  # whatever those of the other features say
-        return None
+    if may_be_hopeless:
+        of_strongest = _with_unguided(search, counted, _unguided(search, final, search.config.num_first_features), final)
+        if log_odds_of(of_strongest, search.weights) < 2.0 * _HOPELESS:  # whatever those of the other features say
+            return None
     return _with_unguided(search, counted, _unguided(search, final), final)
 
 

@@ -19,8 +19,9 @@ from topoloc.places.coarse import NodeScore
 class Tried:
     """A first pose and what became of it.
 
-    `refined` is the pose found around the first one (None: the first was not followed up), `hypothesis` that with its evidence (None:
-    too little was found for any), `milliseconds` the time since the query began, `features` the kind that was asked.
+    `refined` is the pose found around the first one (None: the first was not followed up, as where that pose was found already),
+    `hypothesis` that with its evidence (None: too little was found for any), `milliseconds` the time since the query began, `features`
+    the kind that was asked.
     """
 
     source: str
