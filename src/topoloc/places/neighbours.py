@@ -20,8 +20,8 @@ MAX_EXACT_VECTORS = 8_000
 MANY_IMAGES = 2_000
 # Of an inverted file: cells that a query looks into, images that its cells are learnt from, of each.
 NUM_PROBES, IMAGES_PER_CELL = 24, 48
-# The axes of this many images are those of all; beyond it only the time grows.
-MAX_LEARNING_IMAGES = 2000
+# The axes of this many images are those of all; beyond it only memory and time grow (200 MB and 7 s with 2,000).
+MAX_LEARNING_IMAGES = 1_000
 
 
 class PlaceIndex:
@@ -110,14 +110,16 @@ def learn_whitening(raw: Float32[np.ndarray, "n d"] | Sequence[Float32[np.ndarra
     The variances are softened by the mean one, since the trailing components of few images are noise, which plain
     whitening would blow up.
     """
-    raw = np.stack([raw[k] for k in np.unique(np.linspace(0, len(raw) - 1, MAX_LEARNING_IMAGES).astype(int)).tolist()])
-    mean = raw.mean(axis=0)
-    centred = raw - mean
-    by_image = len(raw) < raw.shape[1]  # whichever is smaller: the products of images, or those of dimensions
-    eigenvalues, vectors = np.linalg.eigh(centred @ centred.T if by_image else centred.T @ centred)
+    rows = np.unique(np.linspace(0, len(raw) - 1, MAX_LEARNING_IMAGES).astype(int)).tolist()
+    centred = np.stack([raw[k] for k in rows])
+    mean = centred.mean(axis=0)
+    centred -= mean
+    by_image = len(centred) < centred.shape[1]  # whichever is smaller: the products of images, or those of dimensions
+    products = centred @ centred.T if by_image else centred.T @ centred
+    eigenvalues, vectors = np.linalg.eigh(products)
     order = np.argsort(-eigenvalues, kind="stable")[:dimension]
     # Vectors are of unit length: below a millionth of that is rounding.
-    keep = order[eigenvalues[order] > 1e-6 * max(float(eigenvalues.max()), len(raw) * 1e-6)]
+    keep = order[eigenvalues[order] > 1e-6 * max(float(eigenvalues.max()), len(centred) * 1e-6)]
     if len(keep) == 0:  # one image, or all alike
         direction = mean / max(float(np.linalg.norm(mean)), 1e-6)
         return Whitening(np.zeros_like(mean), direction[None].astype(np.float32))
