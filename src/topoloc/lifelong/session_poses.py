@@ -20,6 +20,7 @@ from topoloc.errors import TrajectoryError
 from topoloc.geometry.rigid import Rigid3, covariance_of_inverse
 from topoloc.lifelong.scale_of_motion import ScaleConfig
 from topoloc.lifelong.session_calibration import check_by_other_focal_lengths, check_calibration
+from topoloc.lifelong.straightened_walk import BendConfig
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.map.config import MapConfig
@@ -63,12 +64,17 @@ class SessionPosesConfig:
     contradiction: Annotated[float, Above(0)] = 0.1
     """Where the map and a single camera's motion say places that are further apart than so many D_thresh, beside three of the map's sigmas
     (widened), a frame has no pose."""
+    max_sigma: Annotated[float, Above(0)] = 0.1
+    """A frame that no motion holds has the pose that the map answers where that is known to within so many D_thresh (a sigma of its
+    position)."""
     graph: PoseGraphConfig = field(default_factory=PoseGraphConfig)
     adjustment: BundleConfig = field(default_factory=lambda: BundleConfig(max_steps=30, min_decrease=1e-5, cauchy_scale=0.5))
     """Of a single camera's walk as a whole."""
     points_widened: Annotated[float, Above(0)] = 8.0
     """In it, points that were followed are trusted as if their sigmas were so many times as large: one that slides does so in all of its
     key frames."""
+    bend: BendConfig = field(default_factory=BendConfig)
+    """How a single camera's walk is drawn to the map's answers."""
     odometry: SingleCameraConfig = field(default_factory=SingleCameraConfig)
     scale: ScaleConfig = field(default_factory=ScaleConfig)
 

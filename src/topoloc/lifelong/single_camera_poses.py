@@ -18,6 +18,7 @@ from topoloc.lifelong.adjusted_walk import adjusted_walk
 from topoloc.lifelong.scale_of_motion import in_metres, largest_agreement
 from topoloc.lifelong.session_calibration import check_by_other_focal_lengths, check_calibration
 from topoloc.lifelong.session_poses import Progress, SessionPoses, SessionPosesConfig, held_by
+from topoloc.lifelong.straightened_walk import straightened
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.map.config import MapConfig
 from topoloc.map.nodes import place_nodes
@@ -55,30 +56,39 @@ def poses_by_map(
     if len(by_map) < config.min_agreeing:
         check_by_other_focal_lengths(sequence, range(len(sequence)), tracker.localizer)
         raise TrajectoryError(f"{sequence.name}: the map recognises {len(by_map)} of its {len(sequence)} pictures: too few to join")
-    assert of_map.nodes.d_thresh is not None, "a map's own configuration is resolved"
-    poses: list[Rigid3 | None] = [by_map.get(index) for index in range(len(sequence))]
+    d_thresh = of_map.nodes.d_thresh
+    assert d_thresh is not None, "a map's own configuration is resolved"
+    clear = {index for index, answer in seen.items() if answer.position_sigma_m <= config.max_sigma * d_thresh}
+    poses: list[Rigid3 | None] = [by_map[index] if index in clear else None for index in range(len(sequence))]
     for stretch in odometry.stretches:
         own = stretch.own_from_cams()
-        held, agreeing = held_stretch(sequence.name, own, seen, of_map.nodes.d_thresh, config)
+        held, agreeing = held_stretch(sequence.name, own, seen, d_thresh, config)
         if held is not None:
             anchors = {index: seen[index] for index in agreeing}
             adjusted = adjusted_walk(stretch, held, anchors, config.points_widened, config.adjustment)
-            held, agreeing = _undisputed(adjusted, seen, agreeing, of_map.nodes.d_thresh, config)
+            straight = straightened(adjusted, anchors, d_thresh, config.bend)
+            held, agreeing = _undisputed(straight, seen, agreeing, d_thresh, config)
         for index in own:
-            if index not in agreeing:
-                seen.pop(index, None)
-            poses[index] = by_map.get(index) if index in agreeing else None
-            if held is not None:
-                poses[index] = held[index] if index < len(held) else None
+            answer = seen[index] if index in agreeing else seen.pop(index, None)
+            if held is None:
+                poses[index] = by_map[index] if index in agreeing and index in clear else None
+            else:
+                poses[index] = _not_denied(held[index] if index < len(held) else None, answer, d_thresh, config)
     known = [(index, pose) for index, pose in enumerate(poses) if pose is not None]
     if not known:
-        raise TrajectoryError(
-            f"{sequence.name}: what the map answers to its pictures does not agree with their motion; the map stays as it is"
-        )
+        raise TrajectoryError(f"{sequence.name}: {_why_not(seen)}; the map stays as it is")
     asked = [known[k][0] for k in place_nodes([pose for _, pose in known], of_map.nodes)]
     answers = {index: seen.get(index) for index in asked}
     carried = [index for index, _ in known if index not in seen]
     return SessionPoses(poses, answers, [index for index in asked if index in seen], carried)
+
+
+def _why_not(seen: Mapping[int, Localization]) -> str:
+    """Why no frame has a pose, of the answers that agree with the motion."""
+    if not seen:
+        return "what the map answers to its pictures does not agree with their motion"
+    known_to = float(np.median([answer.position_sigma_m for answer in seen.values()]))
+    return f"the map knows where its pictures were taken to {known_to:.2f} m only, which is too little to tell how long its way is"
 
 
 def held_stretch(
@@ -125,6 +135,15 @@ def _undisputed(
     left = [None if index in disputed else pose for index, pose in enumerate(poses)]
     holding = [index for index in agreeing if index not in apart]
     return (left, holding) if len(holding) >= config.min_agreeing else (None, [])
+
+
+def _not_denied(pose: Rigid3 | None, answer: Localization | None, d_thresh: float, config: SessionPosesConfig) -> Rigid3 | None:
+    """The pose, unless the map says another one: a node there would contradict those that say so."""
+    if pose is None or answer is None:
+        return pose
+    apart = answer.world_from_cam.inverse() @ pose
+    is_near = np.linalg.norm(apart.translation) <= config.slack * d_thresh and np.degrees(apart.angle()) <= config.slack_deg
+    return pose if is_near else None
 
 
 def _contradicts(answer: Localization, pose: Rigid3 | None, d_thresh: float, config: SessionPosesConfig) -> bool:

@@ -51,8 +51,9 @@ class UpdateConfig:
     poses: SessionPosesConfig = field(default_factory=SessionPosesConfig)
     min_inliers: Annotated[int, Between(1, 10_000)] = 60
     """A picture that the map localizes with at least so many inliers ..."""
-    max_sigma: Annotated[float, Above(0)] = 0.1
-    """... and to within so many D_thresh (a sigma of its position) needs no node."""
+    max_sigma: Annotated[float, Above(0)] = 0.3
+    """... and to within so many D_thresh (a sigma of its position, without what the map's points are wrong by together, which nodes that
+    the map itself holds in place would share) needs no node."""
     earlier_asked: Annotated[int, Between(0, 10_000)] = 24
     """Nodes of earlier sessions, at most, that the map is asked before and after, for its history to tell what the edit cost; 0: none."""
 
@@ -210,7 +211,7 @@ def is_well_held(answer: Localization | None, d_thresh: float, config: UpdateCon
     """Whether the map needs no node where this answer was given."""
     if answer is None or answer.num_inliers < config.min_inliers:
         return False
-    of_inverse = covariance_of_inverse(answer.world_from_cam, answer.covariance)
+    of_inverse = answer.noise_share * covariance_of_inverse(answer.world_from_cam, answer.covariance)
     at_camera = position_covariance(answer.world_from_cam.inverse(), of_inverse)
     return float(np.sqrt(np.linalg.eigvalsh(at_camera)[-1])) <= config.max_sigma * d_thresh
 
