@@ -11,6 +11,7 @@ TopolocError
 │   ├── EmptyMapError         no node could be built, or the map holds none
 │   ├── UnknownMapError       no map of this name where maps are asked for by name
 │   └── AtlasError            an atlas that cannot be opened, read or written, or two tiles of one id
+│       └── StoreError            an object store that does not answer, or not in time
 ├── WeightsError          weights of a network that are missing, damaged or of another network
 ├── TrainingError         a training that cannot begin or go on: nothing to learn from, a loss that is not finite
 ├── ConfigError           a setting that is unknown, of the wrong type or out of its bounds; names the key
@@ -66,6 +67,10 @@ class UnknownMapError(MapError):
 
 class AtlasError(MapError):
     """An atlas that cannot be opened, read or written, or a tile that it cannot take."""
+
+
+class StoreError(AtlasError):
+    """An object store that does not answer, or whose files cannot be kept here: nothing is said of what they hold, and later it may go."""
 
 
 class WeightsError(TopolocError):
