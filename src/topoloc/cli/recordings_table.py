@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from topoloc.cluster.building import Running
+from topoloc.cluster.tasks import Running
 from topoloc.cluster.tiles import Outcome
 
 _STATES = {"built": "built", "there": "there already", "failed": "failed"}
@@ -29,6 +29,15 @@ def finished_line(outcome: Outcome) -> str:
     size = f"{outcome.num_nodes} nodes, {outcome.num_bytes / 1e6:.2f} MB"
     took = "there already" if outcome.state == "there" else f"{outcome.seconds:.1f} s on {outcome.host}"
     return f"{outcome.recording}: tile {outcome.tile_id}, {size}, {took}"
+
+
+def tell_notes(outcomes: Sequence[Outcome], was_live: bool) -> None:
+    """What is to be known of recordings beside; below a table (`was_live`) also what failed once more, where it can be copied."""
+    for outcome in outcomes:
+        for note in outcome.notes:
+            print(f"{outcome.recording}: {note}", file=sys.stderr)
+        if was_live and outcome.reason is not None:
+            print(finished_line(outcome), file=sys.stderr)
 
 
 @contextmanager

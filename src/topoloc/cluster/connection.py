@@ -29,6 +29,7 @@ except ImportError:  # Windows
 LOCAL, AUTO = "local", "auto"
 _PATIENCE_S = 5.0
 _FOLDER = "topoloc-ray-"
+_CONNECTED: list[str] = []
 _TOKEN_SETTINGS = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 
 
@@ -44,13 +45,17 @@ def ray_module() -> Any:
 @contextmanager
 def connected(address: str) -> Iterator[Any]:
     """Ray, connected to the cluster at `address` (HOST:PORT; `auto`: the one that runs on this machine, or that RAY_ADDRESS names; `local`:
-    one of this machine's processors, which ends with the block). Tasks that still run when the block ends are ended.
+    one of this machine's processors, which ends with the block). Tasks that still run when the block ends are ended. Inside of a block of
+    the same address it is that one's connection.
 
     Raises:
         MissingExtraError: Ray is not installed.
         ClusterError: nothing answers there, it is no Ray, or one of another version.
     """
     ray = ray_module()
+    if address in _CONNECTED:
+        yield ray
+        return
     _check_address(address)
     with contextlib.ExitStack() as at_end:
         options: dict[str, Any] = {"address": address}
@@ -69,6 +74,8 @@ def connected(address: str) -> Iterator[Any]:
         if threading.current_thread() is threading.main_thread():  # Ray's own handler prints where it was
             signal.signal(signal.SIGTERM, _interrupt)
             at_end.callback(signal.signal, signal.SIGTERM, before or signal.SIG_DFL)
+        _CONNECTED.append(address)
+        at_end.callback(_CONNECTED.remove, address)
         yield ray
 
 
