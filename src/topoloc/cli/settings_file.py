@@ -34,7 +34,7 @@ TABLES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "join": ("topoloc.lifelong.tile_joins", "TileJoinConfig", ("atlas", "build")),
     "prune": ("topoloc.lifelong.prune", "PruneConfig", ("prune",)),
     "serve": ("topoloc.service.config", "ServiceConfig", ("serve",)),
-    "cluster": ("topoloc.cluster.config", "ClusterConfig", ("build",)),
+    "cluster": ("topoloc.cluster.config", "ClusterConfig", ("build", "evaluate")),
     "replicas": ("topoloc.cluster.config", "ReplicasConfig", ("serve",)),
 }
 _WIDTH = 110
