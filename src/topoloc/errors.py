@@ -6,6 +6,7 @@ TopolocError
 │   ├── CalibrationError      no calibration, or one that is not usable
 │   └── UnreadableImageError  an image that is missing, empty, truncated or too large
 ├── TrajectoryError       a trajectory file with NaN, bad rotations, or times that match no frame
+│   └── SessionKnownError     a recording that is in the map already
 ├── MapError              a map that cannot be opened, read or written
 │   ├── MapVersionError       written by a later topoloc, schema unknown here
 │   ├── EmptyMapError         no node could be built, or the map holds none
@@ -47,6 +48,10 @@ class UnreadableImageError(RecordingError):
 
 class TrajectoryError(TopolocError):
     """A trajectory that is malformed or fits no frame of the recording."""
+
+
+class SessionKnownError(TrajectoryError):
+    """A recording that is to join a map and is in it already."""
 
 
 class MapError(TopolocError):

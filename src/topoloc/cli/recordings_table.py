@@ -1,4 +1,4 @@
-"""The recordings of a build on a cluster: one table on a terminal, one line each elsewhere."""
+"""Recordings that become tiles, or join them: one table on a terminal, one line each elsewhere."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from topoloc.cluster.tasks import Running
 from topoloc.cluster.tiles import Outcome
 
-_STATES = {"built": "built", "there": "there already", "failed": "failed"}
+_STATES = {"built": "built", "recognised": "waits", "updated": "updated", "there": "there already", "failed": "failed"}
 
 
 def state_text(state: Outcome | Running | None) -> str:
@@ -42,7 +42,7 @@ def tell_notes(outcomes: Sequence[Outcome], was_live: bool) -> None:
 
 @contextmanager
 def recordings_table(recordings: Sequence[str]) -> Iterator[tuple[Callable[[int, Outcome | Running], None], bool]]:
-    """A callable (recording's number, its state) that shows it; and whether it wants to know of those that are being mapped, too."""
+    """A callable (recording's number, its state) that shows it; and whether it wants to know of those that are being worked on, too."""
     if not sys.stderr.isatty():
         yield lambda number, state: print(finished_line(state), file=sys.stderr) if isinstance(state, Outcome) else None, False
         return

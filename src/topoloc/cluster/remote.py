@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from topoloc.cluster.tasks import Job
 
 _BETWEEN_S = 0.3
+Progress = Callable[[str, int, int], None]
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -64,19 +65,26 @@ def run_task(packed: bytes, terms: Terms, board: Any, number: int) -> bytes:
     return pickle.dumps(work.job.run(_reporter(board, number)))
 
 
-def _reporter(board: Any, number: int) -> Callable[[str, int, int], None]:
+def _reporter(board: Any, number: int) -> Progress:
     """Writes on the board now and then; whether anybody reads it does not matter here."""
+    if board is None:
+        return lambda stage, done, total: None
+    return now_and_then(lambda *line: board.write.remote(number, line))
+
+
+def now_and_then(report: Progress) -> Progress:
+    """Tells of each stage when it begins and when it ends, and in between a few times a second."""
     last = [("", 0.0)]
 
-    def report(stage: str, done: int, total: int) -> None:
+    def tell(stage: str, done: int, total: int) -> None:
         before, when = last[0]
         now = time.monotonic()
-        if board is None or (stage == before and now - when < _BETWEEN_S and done < total):
+        if stage == before and now - when < _BETWEEN_S and done < total:
             return
         last[0] = (stage, now)
-        board.write.remote(number, (stage, done, total))
+        report(stage, done, total)
 
-    return report
+    return tell
 
 
 class Board:

@@ -17,9 +17,8 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from topoloc.cluster.config import ClusterConfig
 from topoloc.cluster.connection import connected
-from topoloc.cluster.remote import Terms, Work, progress_board, run_task
+from topoloc.cluster.remote import Progress, Terms, Work, now_and_then, progress_board, run_task
 from topoloc.errors import TopolocError
-from topoloc.map.build import Progress
 
 _LOOK_S = 0.5
 T = TypeVar("T")
@@ -94,6 +93,26 @@ def run_on_ray(
             if board is not None:
                 _look(ray, board, outcomes, show)
         return [outcomes[number] for number in range(len(jobs))]
+
+
+def run_here(jobs: Sequence[Job[T]], show: Show[T] | None = None, is_live: bool = False) -> list[T]:
+    """As `run_on_ray`, in this process, one after the other."""
+
+    def told(number: int) -> Progress:
+        if show is None or not is_live:
+            return lambda stage, done, total: None
+        return now_and_then(lambda *line: show(number, Running(*line)))
+
+    outcomes = list[T]()
+    for number, job in enumerate(jobs):
+        try:
+            outcome = job.run(told(number))
+        except TopolocError as error:
+            outcome = job.failed(" ".join(str(error).split()))
+        outcomes.append(outcome)
+        if show is not None:
+            show(number, outcome)
+    return outcomes
 
 
 def _queues(num_jobs: int, lines: Sequence[str] | None) -> list[deque[int]]:
