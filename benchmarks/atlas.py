@@ -126,7 +126,7 @@ def main() -> None:
     warm_up()
     atlas = Atlas.open(args.atlas)
     set_node_memory(args.memory_mb * 500_000)
-    localizer = AtlasLocalizer(atlas, Maps([Path(args.atlas)], Localizer, args.memory_mb * 500_000))
+    localizer = AtlasLocalizer(atlas, Maps([args.atlas], Localizer, args.memory_mb * 500_000))
     rows: dict[str, list[dict[str, Any]]] = {}
     for pair in args.recordings:
         tile_id, path = pair.split("=", 1)

@@ -6,11 +6,13 @@ TopolocError
 │   ├── CalibrationError      no calibration, or one that is not usable
 │   └── UnreadableImageError  an image that is missing, empty, truncated or too large
 ├── TrajectoryError       a trajectory file with NaN, bad rotations, or times that match no frame
+│   └── SessionKnownError     a recording that is in the map already
 ├── MapError              a map that cannot be opened, read or written
 │   ├── MapVersionError       written by a later topoloc, schema unknown here
 │   ├── EmptyMapError         no node could be built, or the map holds none
 │   ├── UnknownMapError       no map of this name where maps are asked for by name
 │   └── AtlasError            an atlas that cannot be opened, read or written, or two tiles of one id
+│       └── StoreError            an object store that does not answer, or not in time
 ├── WeightsError          weights of a network that are missing, damaged or of another network
 ├── TrainingError         a training that cannot begin or go on: nothing to learn from, a loss that is not finite
 ├── ConfigError           a setting that is unknown, of the wrong type or out of its bounds; names the key
@@ -48,6 +50,10 @@ class TrajectoryError(TopolocError):
     """A trajectory that is malformed or fits no frame of the recording."""
 
 
+class SessionKnownError(TrajectoryError):
+    """A recording that is to join a map and is in it already."""
+
+
 class MapError(TopolocError):
     """A map file that cannot be opened, read or written."""
 
@@ -66,6 +72,10 @@ class UnknownMapError(MapError):
 
 class AtlasError(MapError):
     """An atlas that cannot be opened, read or written, or a tile that it cannot take."""
+
+
+class StoreError(AtlasError):
+    """An object store that does not answer, or whose files cannot be kept here: nothing is said of what they hold, and later it may go."""
 
 
 class WeightsError(TopolocError):

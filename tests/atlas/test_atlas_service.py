@@ -25,7 +25,7 @@ from topoloc.service.config import ServiceConfig
 
 @pytest.fixture
 def client(own_atlas: Path) -> Iterator[TestClient]:
-    application = make_application(Maps([own_atlas], Localizer, 100_000_000), ServiceConfig(workers=1), Access())
+    application = make_application(Maps([str(own_atlas)], Localizer, 100_000_000), ServiceConfig(workers=1), Access())
     with TestClient(application, base_url="http://127.0.0.1") as client:
         yield client
 

@@ -159,7 +159,7 @@ def test_ctrl_c_in_mid_evaluation(room_map: Path, queries: Path, tmp_path: Path,
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("topoloc.cli.evaluate.answer_queries", interrupted)
+    monkeypatch.setattr("topoloc.cli.recording_queries.answer_queries", interrupted)
     files = ["--json", tmp_path / "a.json", "--report", tmp_path / "a.html"]
     assert "interrupted" in complaint("evaluate", room_map, queries, *files)
 

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from topoloc.cli.recordings_table import recordings_table, state_text
-from topoloc.cluster.building import Running
+from topoloc.cluster.tasks import Running
 from topoloc.cluster.tiles import Outcome
 
 BUILT = Outcome("walks/hall", "hall", "built", num_nodes=12, num_bytes=2_500_000, seconds=31.26, host="one")

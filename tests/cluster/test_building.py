@@ -21,8 +21,9 @@ from logging_maker import LoggingMaker
 from topoloc.atlas.atlas import Atlas, tile_problem
 from topoloc.cli import main
 from topoloc.cli.recording_maps import MapMaking, PosesAsked
-from topoloc.cluster.building import AtlasBuild, Running, build_on_ray
+from topoloc.cluster.building import AtlasBuild, build_on_ray
 from topoloc.cluster.config import ClusterConfig
+from topoloc.cluster.tasks import Running
 from topoloc.cluster.tiles import Outcome, TileJob
 from topoloc.map.build import BuildConfig
 from topoloc.slam.slam import SlamConfig

@@ -12,8 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from topoloc.cluster.connection import _own_folder, _own_token, _quiet, connected
+from topoloc.cluster.connection import _own_token, _quiet, connected
 from topoloc.errors import ClusterError, MissingExtraError
+from topoloc.sequences.atomic import scratch_folder
 
 Complaint = Callable[..., str]
 needs_ray = pytest.mark.usefixtures("ray")
@@ -62,9 +63,9 @@ def test_without_ray_the_extra_is_named(tiny_recording: Path, tmp_path: Path, co
 def test_folders_of_killed_clusters_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     (tmp_path / "topoloc-ray-left" / "session").mkdir(parents=True)
-    with _own_folder() as one:
+    with scratch_folder("topoloc-ray-") as one:
         assert list(tmp_path.iterdir()) == [one]
-        with _own_folder() as two:
+        with scratch_folder("topoloc-ray-") as two:
             assert sorted(tmp_path.iterdir()) == sorted([one, two])
         assert list(tmp_path.iterdir()) == [one]
     assert list(tmp_path.iterdir()) == []

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from topoloc.cluster.building import TileTask
 from topoloc.cluster.remote import Board, Terms, Work, _reporter, run_task
 from topoloc.cluster.tiles import Outcome, TileJob
 from topoloc.errors import ClusterError, RecordingError
@@ -44,10 +45,9 @@ def _asked(work: Work) -> str:
 
 @pytest.mark.usefixtures("undone")
 def test_paths_days_and_threads_are_the_drivers(tmp_path: Path):
-    job = TileJob("walk", "walk", "walk", Witness())
-    atlas = str(tmp_path / "campus")
-    assert _asked(Work(job, atlas, False, str(tmp_path), "86400")) == f"{tmp_path} 86400 3"
-    assert _asked(Work(job, atlas, False, str(tmp_path / "not here"), None)) == "/ None 3"
+    task = TileTask(TileJob("walk", "walk", "walk", Witness()), str(tmp_path / "campus"), False)
+    assert _asked(Work(task, str(tmp_path), "86400")) == f"{tmp_path} 86400 3"
+    assert _asked(Work(task, str(tmp_path / "not here"), None)) == "/ None 3"
 
 
 def test_another_version_of_topoloc():

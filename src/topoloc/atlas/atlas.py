@@ -29,6 +29,11 @@ def is_atlas(where: str) -> bool:
     return "://" in where or os.path.isfile(Path(where) / MANIFEST)
 
 
+def whole_address(where: str) -> str:
+    """Of an atlas, as it is found from any folder."""
+    return where if "://" in where else os.path.abspath(where)
+
+
 @dataclass(frozen=True, eq=False)
 class Atlas:
     """An atlas as its manifest said when it was read; later writes are not seen. Tiles keep their files while anybody may ask them."""

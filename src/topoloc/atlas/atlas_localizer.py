@@ -22,7 +22,7 @@ from topoloc.atlas.near import Near, tiles_in_reach
 from topoloc.atlas.open_maps import Maps
 from topoloc.atlas.verdict import Heard, joint_result
 from topoloc.bounds import check_bounds
-from topoloc.errors import AtlasError, MapError, MissingExtraError, WeightsError
+from topoloc.errors import AtlasError, MapError, MissingExtraError, StoreError, WeightsError
 from topoloc.features.kinds import KINDS, FeatureConfig, check_available
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
@@ -138,6 +138,7 @@ class AtlasLocalizer:
         Raises:
             QueryError: the image is no picture of 8 bits, or the camera is of another image size.
             AtlasError: there is no such tile, a prior comes without one, or no tile can be read.
+            StoreError: the object store does not answer that holds a tile which must be asked.
         """
         start, limit = time.perf_counter(), max_ms if max_ms is not None else self.config.max_ms
         deadline = float("inf") if limit is None else start + limit / 1e3
@@ -238,10 +239,12 @@ class AtlasLocalizer:
             return
         tile = self.atlas.tile(tile_id)
         try:
-            with self._maps.lent(tile_id, self.atlas.map_path(tile)) as opened:
+            with self._maps.lent(tile_id, self._maps.tile_path(self.atlas, tile)) as opened:
                 localizer: Localizer = opened.localizer if is_full else opened.localizer.at_first_glance
                 known = prior if prior is not None or self._reached is None else self._reached.get(tile_id)
                 result, named = localizer.ask(hearing.picture, known, hearing.left_ms)
+        except StoreError:  # what the tile would have said nobody knows
+            raise
         except MapError as error:
             self.problems[tile_id] = str(error)
             hearing.heard.pop(tile_id, None)

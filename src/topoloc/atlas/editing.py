@@ -94,10 +94,34 @@ def add_tiles(where: str, new: Sequence[NewTile], replaces: bool = False, grace_
         _check_free(manifest, new, replaces)
         return manifest.with_tiles(manifest.by_id | added, now)
 
-    after, names = _changed(store, with_added, grace_s, creates), store.ages()
-    for one, tile in zip(new, added.values(), strict=True):
-        if not {tile.map.name, tile.places.name} <= set(names):  # an old file of the same contents, swept just before it was named again
-            tile_of(one, store)
+    after = _changed(store, with_added, grace_s, creates)
+    _keep_files(store, new, list(added.values()))
+    return after
+
+
+def replace_tile(where: str, new: NewTile, before: Tile, grace_s: float = GRACE_S) -> Manifest | None:
+    """The manifest with a tile whose map was changed since it was `before`, but not its world: its joins stay, as they are by now. None
+    where the tile is gone or its map is another one by now; nothing is changed then.
+
+    Raises:
+        AtlasError: no atlas is there, or it cannot be written.
+        MapError: the map is missing, damaged or empty.
+    """
+    store = store_at(where)
+    tile = tile_of(new, store)
+
+    def with_replaced(manifest: Manifest, now: float) -> Manifest:
+        there = manifest.by_id.get(before.tile_id)
+        if there is None or (there.map.sha256, there.world) != (before.map.sha256, before.world):
+            raise _OtherTileError
+        joins = [join for join in manifest.joins if before.tile_id in join.pair]
+        return manifest.with_tiles(manifest.by_id | {tile.tile_id: tile}, now, joins)
+
+    try:
+        after = _changed(store, with_replaced, grace_s)
+    except _OtherTileError:
+        return None
+    _keep_files(store, [new], [tile])
     return after
 
 
@@ -146,6 +170,18 @@ def tile_of(new: NewTile, store: Store) -> Tile:
 
 def _put(store: Store, new: Sequence[NewTile]) -> list[Tile]:
     return [tile_of(one, store) for one in new]
+
+
+def _keep_files(store: Store, new: Sequence[NewTile], tiles: Sequence[Tile]) -> None:
+    """Put those again that were swept just before they were named: old files of the same contents."""
+    names = set(store.ages())
+    for one, tile in zip(new, tiles, strict=True):
+        if not {tile.map.name, tile.places.name} <= names:
+            tile_of(one, store)
+
+
+class _OtherTileError(Exception):
+    """Another writer was faster."""
 
 
 _UNKNOWN = StoredFile("", "", 0)

@@ -24,7 +24,7 @@ from topoloc.atlas.index import AtlasIndex
 from topoloc.atlas.manifest import Tile
 from topoloc.atlas.place_shard import PlaceShard, ShardTile
 from topoloc.atlas.place_vectors import PlaceVectors
-from topoloc.errors import AtlasError
+from topoloc.errors import AtlasError, StoreError
 from topoloc.features.network_files import cache_folder
 from topoloc.places.shared_vocabulary import shared_vocabulary
 
@@ -76,6 +76,9 @@ def open_index(tiles: Sequence[Tile], read: ReadPlaces, folder: Path) -> OpenedI
 
     Args:
         read: the place vectors of a tile; raises AtlasError where they cannot be had.
+
+    Raises:
+        StoreError: what `read` raised.
     """
     work = _Opening(tiles, folder)
     kept = {kind: work.kept(kind) for kind in work.versions}
@@ -149,6 +152,8 @@ class _Opening:
                 continue
             try:
                 vectors = read(tile)
+            except StoreError:  # says nothing of the tile, and the next one would be waited for as long
+                raise
             except AtlasError as error:
                 self.problems[tile.tile_id] = str(error)
                 continue

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
@@ -18,7 +18,7 @@ from typing import Any
 
 from topoloc.atlas.manifest import TILES
 from topoloc.atlas.store import sha256_of
-from topoloc.errors import AtlasError, MissingExtraError
+from topoloc.errors import AtlasError, MissingExtraError, StoreError
 from topoloc.features.network_files import cache_folder
 from topoloc.sequences.atomic import replaced_file
 
@@ -54,6 +54,11 @@ class ObjectStore:
         with self._told():
             return self._newest()[1]
 
+    def version(self) -> Hashable | None:
+        with self._told():
+            names = self._manifests()
+        return names[-1] if names else None
+
     def commit(self, before: bytes | None, after: bytes) -> bool:
         with self._told():
             names, newest = self._newest()
@@ -84,14 +89,25 @@ class ObjectStore:
             self._files.put_file(str(path), f"{self._root}/{name}")
 
     def local(self, name: str, sha256: str) -> Path:
-        path = cache_folder() / "tiles" / f"{sha256}{Path(name).suffix}"
-        if path.is_file():
-            os.utime(path)
-            return path
-        with self._told(), _made(path) as temporary:
-            self._files.get_file(f"{self._root}/{name}", str(temporary))
+        kept = self.kept(name, sha256)
+        if kept is not None:
+            return kept
+        path = _kept_at(name, sha256)
+        with _made(path) as temporary, self._told():
+            try:
+                self._files.get_file(f"{self._root}/{name}", str(temporary))
+            except FileNotFoundError:
+                raise AtlasError(f"{self.where}/{name} is missing") from None
             if sha256_of(temporary) != sha256:
                 raise AtlasError(f"{self.where}/{name} is not the file that was added: its checksum is another")
+        return path
+
+    def kept(self, name: str, sha256: str) -> Path | None:
+        path = _kept_at(name, sha256)
+        try:
+            os.utime(path, ns=(time.time_ns(), path.stat().st_mtime_ns))  # when it was used last; it is the same file all along
+        except OSError:
+            return path if path.is_file() else None
         return path
 
     def ages(self) -> dict[str, float]:
@@ -136,14 +152,22 @@ class ObjectStore:
             raise
         except Exception as error:
             text = " ".join(str(error).split())[:200] or type(error).__name__
-            raise AtlasError(f"{self.where} does not answer, or not as a store: {text}") from error
+            raise StoreError(f"{self.where} does not answer, or not as a store: {text}") from error
+
+
+def _kept_at(name: str, sha256: str) -> Path:
+    return cache_folder() / "tiles" / f"{sha256}{Path(name).suffix}"
 
 
 @contextmanager
 def _made(path: Path) -> Iterator[Path]:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replaced_file(path) as temporary:
-        yield temporary
+    """A file to be, in the cache folder. Raises StoreError where it cannot be written."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replaced_file(path) as temporary:
+            yield temporary
+    except OSError as error:
+        raise StoreError(f"cannot keep {path}: {error.strerror or error}") from error
 
 
 def _is_s3(fsspec: Any, where: str) -> bool:

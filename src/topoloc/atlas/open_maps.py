@@ -1,6 +1,7 @@
 """Maps by their names: opened when they are asked for, closed when there are too many, replaced when their file is.
 
-A map's name is that of its file without `.topo`; of an atlas's tile, its id. A file is looked at before each request: another one in its
+A map's name is that of its file without `.topo`; of an atlas's tile, its id. Tiles of object stores are files of this machine when they
+are opened; how they come here is said by who makes the `Maps`. A file is looked at before each request: another one in its
 place is opened, and the one before is let go of when the last request that uses it is answered. What is kept of nodes has a budget of its
 own (`map/memory.py`); here a map counts by the bytes of its file, which no open map exceeds apart from its nodes.
 """
@@ -16,13 +17,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from topoloc.atlas.atlas import Atlas, is_atlas
-from topoloc.atlas.store import MANIFEST
+from topoloc.atlas.manifest import Tile
+from topoloc.atlas.watched_atlas import WatchedAtlas
 from topoloc.errors import MapError, UnknownMapError
 from topoloc.localization.localizer import Localizer
 from topoloc.map.topomap import TopoMetricMap
 
 SUFFIX = ".topo"
 OpenLocalizer = Callable[[TopoMetricMap], Localizer]
+TilePath = Callable[[Atlas, Tile], Path]
+"""The map file of a tile, on this machine; raises AtlasError, or whatever tells that it is not here yet."""
 
 
 @dataclass(eq=False)
@@ -49,58 +53,60 @@ class _Place:
     opened: OpenedMap | None = None
 
 
+@dataclass(frozen=True)
+class _Found:
+    """A map by the name of its file; of a tile, with its atlas."""
+
+    where: str
+    tile: tuple[Atlas, Tile] | None = field(default=None, compare=False)
+
+
 class Maps:
-    """The maps of these files, folders and atlases.
+    """The maps of these files, folders and atlases, which may lie in object stores.
 
     Args:
         max_bytes: open maps are closed, those used longest ago first, while they have more bytes than this. One in use is never closed.
+        tile_path: how tiles become files of this machine; by itself they are fetched while their caller waits.
 
     Raises:
         MapError: a path is missing, an atlas is damaged, or two files have one name.
+        StoreError: the store of an atlas does not answer.
     """
 
-    def __init__(self, sources: Sequence[Path], open_localizer: OpenLocalizer, max_bytes: int) -> None:
-        self._sources, self._open_localizer, self._max_bytes = list(sources), open_localizer, max_bytes
+    def __init__(self, sources: Sequence[str], open_localizer: OpenLocalizer, max_bytes: int, tile_path: TilePath = Atlas.map_path) -> None:
+        self._open_localizer, self._max_bytes, self.tile_path = open_localizer, max_bytes, tile_path
         self._lock = threading.Lock()
         self._places: OrderedDict[str, _Place] = OrderedDict()  # the one used last is the last
-        self._atlas_paths = dict[Path, tuple[tuple[int, ...], dict[str, Path]]]()
-        for source in self._sources:
-            if not os.path.exists(source):
+        for source in sources:
+            if "://" not in source and not os.path.exists(source):
                 raise MapError(f"{source}: no such map")
-        self.paths()
+        self.atlases = [WatchedAtlas(source) for source in dict.fromkeys(sources) if is_atlas(source)]
+        self._files = [Path(source) for source in sources if not is_atlas(source)]
+        self.names()
 
-    def paths(self) -> dict[str, Path]:
-        """The files by their names, as they are there now.
+    def names(self) -> list[str]:
+        """Of all maps, as they are there now; no object store is asked.
 
         Raises:
             MapError: two files have one name.
         """
-        found: dict[str, Path] = {}
-        for source in self._sources:
-            for name, path in self._paths_in(source).items():
-                if found.setdefault(name, path) != path:
-                    raise MapError(f"two maps are called {name}: {found[name]} and {path}")
+        return list(self._found())
+
+    def _found(self) -> dict[str, _Found]:
+        found: dict[str, _Found] = {}
+        for name, one in self._all():
+            if found.setdefault(name, one) != one:
+                raise MapError(f"two maps are called {name}: {found[name].where} and {one.where}")
         return found
 
-    @property
-    def atlases(self) -> list[Path]:
-        """Those of the sources that are atlases."""
-        return [source for source in self._sources if is_atlas(str(source))]
-
-    def _paths_in(self, source: Path) -> dict[str, Path]:
-        if is_atlas(str(source)):
-            return self._tiles_of(source)
-        paths = sorted(source.glob(f"*{SUFFIX}")) if source.is_dir() else [source]
-        return {path.name.removesuffix(SUFFIX): path for path in paths}
-
-    def _tiles_of(self, source: Path) -> dict[str, Path]:
-        """The tiles of an atlas, as its manifest names them now."""
-        stamp = _stamp_of(source / MANIFEST)
-        known = self._atlas_paths.get(source)
-        if known is None or known[0] != stamp:
-            tiles = Atlas.open(str(source)).manifest.tiles
-            self._atlas_paths[source] = known = stamp, {tile.tile_id: source / tile.map.name for tile in tiles}
-        return known[1]
+    def _all(self) -> Iterator[tuple[str, _Found]]:
+        for source in self._files:
+            for path in sorted(source.glob(f"*{SUFFIX}")) if source.is_dir() else [source]:
+                yield path.name.removesuffix(SUFFIX), _Found(str(path))
+        for watched in self.atlases:
+            atlas = watched.now()
+            for tile in atlas.manifest.tiles:
+                yield tile.tile_id, _Found(f"{atlas.store.where}/{tile.map.name}", (atlas, tile))
 
     @property
     def num_bytes(self) -> int:
@@ -161,10 +167,10 @@ class Maps:
             self._retire(one)
 
     def _path_of(self, name: str) -> Path:
-        path = self.paths().get(name)
-        if path is None:
+        found = self._found().get(name)
+        if found is None:
             raise UnknownMapError(f"there is no map {name[:80]!r} here; GET /v1/maps names those that are")
-        return path
+        return Path(found.where) if found.tile is None else self.tile_path(*found.tile)
 
     def _opened(self, path: Path) -> Localizer:
         topomap = TopoMetricMap.load(path)

@@ -10,7 +10,7 @@ import hashlib
 import os
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -39,6 +39,10 @@ class Store(Protocol):
         """As it is now; None where there is none. Raises AtlasError."""
         ...
 
+    def version(self) -> Hashable | None:
+        """What is another one after each write of the manifest, and cheaper to ask for; None where there is none. Raises AtlasError."""
+        ...
+
     def commit(self, before: bytes | None, after: bytes) -> bool:
         """Replace the manifest, if it is still `before`; else nothing is changed and False returned. Raises AtlasError."""
         ...
@@ -48,7 +52,11 @@ class Store(Protocol):
         ...
 
     def local(self, name: str, sha256: str) -> Path:
-        """A file of this machine with these contents. Raises AtlasError where it is missing."""
+        """A file of this machine with these contents. Raises AtlasError where it is missing or another, StoreError where nobody answers."""
+        ...
+
+    def kept(self, name: str, sha256: str) -> Path | None:
+        """As `local`, if nothing need be fetched for it; else None. Raises AtlasError where it is missing."""
         ...
 
     def ages(self) -> dict[str, float]:
@@ -73,6 +81,12 @@ class FolderStore:
             return None
         except (OSError, ValueError) as error:
             raise AtlasError(f"cannot read {self.folder / MANIFEST}: {getattr(error, 'strerror', error)}") from None
+
+    def version(self) -> Hashable | None:
+        with suppress(OSError):
+            status = (self.folder / MANIFEST).stat()
+            return status.st_mtime_ns, status.st_size, status.st_ino
+        return None
 
     def commit(self, before: bytes | None, after: bytes) -> bool:
         with self._lock():
@@ -103,6 +117,9 @@ class FolderStore:
         if not path.is_file():
             raise AtlasError(f"{path} is missing")
         return path
+
+    def kept(self, name: str, sha256: str) -> Path | None:
+        return self.local(name, sha256)
 
     def ages(self) -> dict[str, float]:
         now, ages = time.time(), dict[str, float]()

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from topoloc.cli.output import File, Flag, UsageError, print_facts, write_json
-from topoloc.cli.settings_file import Settings, read_settings
+from topoloc.cli.joined_neighbours import joined_neighbours
+from topoloc.cli.output import File, Flag, RayOption, UsageError, print_facts, write_json
+from topoloc.cli.settings_file import read_settings
 
 Names = Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="MAP|TILE ...", help_behavior_hint="")]
 
@@ -37,6 +37,8 @@ class Command:
     """Of `add`: a tile of the same id is replaced by the new map."""
     join: Flag = False
     """Of `create` and `add`: then the new tiles are joined with those that they overlap with."""
+    ray: RayOption = None
+    """Of `join` and `--join`: a Ray cluster on which each pair of tiles is compared, as in `topoloc build`."""
     check: Flag = False
     """Of `info`: also compare every file with its checksum; exit status 1 where one is missing or another."""
     json: File = None
@@ -46,7 +48,7 @@ class Command:
 
     def run(self) -> int:
         self._check_usage()
-        found, tried = [], None
+        found, joined = [], None
         if self.action == "info":
             from topoloc.atlas.atlas import Atlas, tile_problem
 
@@ -59,9 +61,10 @@ class Command:
             manifest = None if self.action == "join" else self._written()
             if manifest is None or self.join:
                 ids = [tile.tile_id for tile in self._new()] if self.join else self.names
-                manifest, tried = joined_neighbours(self.atlas, ids, settings, is_told=self.json != "-")
+                joined = joined_neighbours(self.atlas, ids, settings, self.json != "-", ray=self.ray)
+                manifest, found = joined.manifest, joined.not_compared
         facts = describe(self.atlas, manifest) | ({"check": found or "ok"} if self.check else {})
-        facts |= {} if tried is None else {"tried": tried}
+        facts |= {} if joined is None else {"tried": joined.rows}
         if self.json != "-":
             print_atlas(facts)
         write_json(self.json, facts)
@@ -97,35 +100,10 @@ class Command:
             raise UsageError("--join belongs to create and add; `topoloc atlas join` joins what is there")
         if self.config is not None and self.action != "join" and not self.join:
             raise UsageError("--config sets how tiles are joined")
+        if self.ray is not None and self.action != "join" and not self.join:
+            raise UsageError("--ray is of tiles that are joined")
         if self.check and self.action != "info":
             raise UsageError("--check belongs to info")
-
-
-def joined_neighbours(
-    where: str, tile_ids: Sequence[str], settings: Settings, is_told: bool, pairs: Sequence[tuple[str, str]] | None = None
-) -> tuple[Any, list[dict[str, Any]]]:
-    """The atlas's manifest once these tiles are joined with those that they overlap with, or just these `pairs`, and what was found of
-    each pair; a line each."""
-    from topoloc.lifelong.neighbours import Tried, join_tiles
-    from topoloc.lifelong.tile_joins import Found, TileJoinConfig
-
-    rows = list[dict[str, Any]]()
-
-    def tell(one: Tried) -> None:
-        found = one.found
-        row: dict[str, Any] = {"first": one.first, "second": one.second, "joined": isinstance(found, Found)}
-        if isinstance(found, Found):
-            row |= {"num_agreeing": found.num_agreeing, "same_pictures": found.is_by_shared}
-            row |= {"num_near": found.num_near, "num_recognised": found.num_recognised, "agreeing": round(found.agreeing, 3)}
-            asked = f"{found.num_agreeing} nodes agree, {found.num_recognised} of {found.num_near} that must be recognised are"
-            said = f"joined, by {found.num_agreeing} pictures that are part of both" if found.is_by_shared else f"joined, {asked}"
-        else:
-            row |= {"reason": (said := found.reason)}
-        rows.append(row)
-        if is_told:
-            print(f"{one.first} and {one.second}: {said}", file=sys.stderr)
-
-    return join_tiles(where, tile_ids, settings.of(TileJoinConfig), tell, pairs).manifest, rows
 
 
 def describe(where: str, manifest: Any) -> dict[str, Any]:

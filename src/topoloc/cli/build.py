@@ -7,12 +7,13 @@ import sys
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from topoloc.cli.features_option import BUILD_FEATURES, kinds_to_build
-from topoloc.cli.output import CameraOption, File, Flag, Format, Topics, UsageError, check_outputs, progress_bar, write_json
+from topoloc.cli.joined_neighbours import JoinedNeighbours, joined_neighbours
+from topoloc.cli.output import CameraOption, File, Flag, Format, RayOption, Topics, UsageError, check_outputs, progress_bar, write_json
 from topoloc.cli.recording_maps import MapMaking, PosesAsked
 from topoloc.cli.recording_pieces import Pieces, Split, pieces_of
 from topoloc.cli.settings_file import Settings, read_settings, with_option
@@ -69,7 +70,7 @@ class Command:
     features: BUILD_FEATURES = None
     """Local features of the map, and of every query to it. `learned`: of the first network that `topoloc weights list` finds;
     `both`: of SURF, too."""
-    ray: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT|auto|local", help_behavior_hint="(default: none)")] = None
+    ray: RayOption = None
     """A Ray cluster on which each recording is mapped, each by itself: `auto` is the one that runs on this machine, `local` one of this
     machine's processors alone. Called again after it was interrupted, it goes on where it was."""
     world: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: each its own)")] = None
@@ -125,28 +126,29 @@ class Command:
 
     def _make_tiles(self, making: MapMaking, atlas: str, settings: Settings, split: Split | None) -> int:
         """Each recording a tile, on the cluster; status 1 where one could not be mapped."""
-        from topoloc.cli.recordings_table import finished_line, recordings_table
+        from topoloc.cli.recordings_table import recordings_table, tell_notes
         from topoloc.cluster.building import AtlasBuild, build_on_ray
         from topoloc.cluster.config import ClusterConfig
+        from topoloc.cluster.connection import connected
 
         assert self.ray is not None
         rows = self._jobs(making, split)
         jobs = [job for row in rows for job in row]
-        with recordings_table([job.recording for job in jobs]) as (show, is_live):
-            build = AtlasBuild(jobs, atlas, self.replace, settings.of(ClusterConfig))
-            outcomes = build_on_ray(build, self.ray, show, is_live)
-        for outcome in outcomes:
-            for note in outcome.notes:
-                print(f"{outcome.recording}: {note}", file=sys.stderr)
-            if is_live and outcome.reason is not None:  # below the table once more, where it can be copied
-                print(finished_line(outcome), file=sys.stderr)
-        counts = {state: sum(outcome.state == state for outcome in outcomes) for state in ("built", "there", "failed")}
-        if self.json != "-":
-            print(f"{atlas}: {counts['built']} recordings mapped, {counts['there']} there already, {counts['failed']} failed")
-        tried = self._joined(rows, outcomes, atlas, settings)
+        with connected(self.ray):
+            with recordings_table([job.recording for job in jobs]) as (show, is_live):
+                build = AtlasBuild(jobs, atlas, self.replace, settings.of(ClusterConfig))
+                outcomes = build_on_ray(build, self.ray, show, is_live)
+            tell_notes(outcomes, is_live)
+            counts = {state: sum(outcome.state == state for outcome in outcomes) for state in ("built", "there", "failed")}
+            if self.json != "-":
+                print(f"{atlas}: {counts['built']} recordings mapped, {counts['there']} there already, {counts['failed']} failed")
+            joined = self._joined(rows, outcomes, atlas, settings)
         facts = {"atlas": atlas, **counts, "recordings": [outcome.to_json() for outcome in outcomes]}
-        write_json(self.json, facts | ({} if tried is None else {"tried": tried}))
-        return 1 if counts["failed"] else 0
+        write_json(self.json, facts | ({} if joined is None else {"tried": joined.rows}))
+        not_compared = [] if joined is None else joined.not_compared
+        for problem in not_compared:
+            print(f"error: {problem}", file=sys.stderr)
+        return 1 if counts["failed"] or not_compared else 0
 
     def _jobs(self, making: MapMaking, split: Split | None) -> list[list[TileJob]]:
         """What is to be made of each recording."""
@@ -160,18 +162,14 @@ class Command:
             for one in pieces
         ]
 
-    def _joined(self, rows: list[list[TileJob]], outcomes: list[Outcome], atlas: str, settings: Settings) -> list[dict[str, Any]] | None:
-        """Pieces of one recording joined with the next one, where it is no matter of course; with --join all tiles. What was tried."""
-        from topoloc.cli.atlas import joined_neighbours
-
+    def _joined(self, rows: list[list[TileJob]], outcomes: list[Outcome], atlas: str, settings: Settings) -> JoinedNeighbours | None:
+        """Pieces of one recording joined with the next one, where it is no matter of course; with --join all tiles."""
         there = {outcome.recording: outcome.tile_id for outcome in outcomes if outcome.state != "failed"}
         pairs = [(a, b) for row in rows for a, b in pairwise(row) if a.world != b.world and {a.recording, b.recording} <= there.keys()]
         if not there or not (self.join or pairs):
             return None
-        told = self.json != "-"
-        if self.join:
-            return joined_neighbours(atlas, list(there.values()), settings, told)[1]
-        return joined_neighbours(atlas, [], settings, told, [(there[a.recording], there[b.recording]) for a, b in pairs])[1]
+        named = None if self.join else [(there[a.recording], there[b.recording]) for a, b in pairs]
+        return joined_neighbours(atlas, list(there.values()), settings, self.json != "-", named, self.ray)
 
     def _split_paths(self) -> tuple[list[str], str]:
         """The recordings, and the map file or atlas to write: never a recording or a file that is none, as where it was forgotten."""

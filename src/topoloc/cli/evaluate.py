@@ -24,26 +24,24 @@ from topoloc.cli.output import (
     Topics,
     UsageError,
     check_outputs,
-    open_recording,
     print_facts,
     print_recordings,
     progress_bar,
     report_writer,
     write_json,
 )
+from topoloc.cli.recording_queries import Queries, QueryRecording, SentMap, answers_on_ray
 from topoloc.cli.settings_file import Settings, read_settings, with_option
+from topoloc.cluster.config import ClusterConfig
 from topoloc.errors import TrajectoryError
-from topoloc.evaluation.experiments import answer_elsewhere, answer_queries
 from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION, Answer, by_recording, length_text, summarize
 from topoloc.evaluation.world_fit import WorldFit, fit_worlds
-from topoloc.geometry.pose_conventions import PoseReading
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.calibration_doubt import verdicts_of
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.map.description import describe_map
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.json_file import read_json
-from topoloc.sequences.trajectory import as_read
 
 
 @dataclass(frozen=True)
@@ -84,6 +82,9 @@ class Command:
     """Write the evaluation as JSON to this file (- for standard output)."""
     report: File = None
     """Write a page with the table, the map from above, the error curves and the worst queries to this file (report.html)."""
+    ray: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT|auto|local", help_behavior_hint="(default: none)")] = None
+    """A Ray cluster whose machines answer the pictures, with the same figures: `auto` is the one that runs on this machine, `local` one of
+    this machine's processors alone."""
     config: File = None
     """All other settings: a TOML file, as `topoloc config evaluate` prints it."""
 
@@ -105,16 +106,13 @@ class Command:
         topomap = judged.topomap
         info = describe_map(topomap, topomap.file.path if topomap.file else Path(self.map))
         map_from_truth = _read_rigid(Path(self.map_from_truth)) if self.map_from_truth else None
-        reading = PoseReading.of(self.poses)
-        sequences = [as_read(open_recording(path, self.format, self.camera, self.topics), reading) for path in self.sequences]
-        others = [open_recording(path, self.format, self.camera, self.topics) for path in self.elsewhere]
-        labels = _labels([*self.sequences, *self.elsewhere], [*sequences, *others])
-        answers: list[Answer] = []
+        asked = self._opened(map_from_truth)
         with progress_bar() as progress:
-            for sequence, label in zip(sequences, labels, strict=False):
-                answers += answer_queries(judged, sequence, map_from_truth, progress, label)
-            for sequence, label in zip(others, labels[len(sequences) :], strict=True):
-                answers += answer_elsewhere(judged, sequence, progress, label)
+            if self.ray is None:
+                answers = [answer for queries in asked for answer in queries.answers(judged, progress)]
+            else:
+                sent = SentMap.of(judged, config, self.features)
+                answers = answers_on_ray(sent, asked, self.ray, settings.of(ClusterConfig), progress)
         of_worlds = [] if isinstance(judged, JudgedTile) else by_recording(answers).values()
         fits = [fit for of_one in of_worlds if (fit := fit_worlds(of_one)) is not None]
         calibrations = _calibrations(answers)
@@ -131,9 +129,18 @@ class Command:
         self._write_fit(fits)
         return 0
 
+    def _opened(self, map_from_truth: Rigid3 | None) -> list[Queries]:
+        """The recordings, those with truth first."""
+        paths, count = [*self.sequences, *self.elsewhere], len(self.sequences)
+        how = (self.format, self.camera, self.topics, self.poses)
+        recordings = [QueryRecording(path, *how, is_elsewhere=number >= count) for number, path in enumerate(paths)]
+        sequences = [recording.open() for recording in recordings]
+        labels = _labels(paths, sequences)
+        return [Queries(*one, map_from_truth) for one in zip(recordings, sequences, labels, strict=True)]
+
     def _refuse_beside_itself(self) -> None:
         """Hold that nothing is given that is of recordings."""
-        names = ("elsewhere", "tile", "map_from_truth", "fit_map_from_truth", "format", "camera", "poses", "topics")
+        names = ("elsewhere", "tile", "map_from_truth", "fit_map_from_truth", "format", "camera", "poses", "topics", "ray")
         given = ["recordings"] * bool(self.sequences) + [f"--{name.replace('_', '-')}" for name in names if getattr(self, name)]
         if given:
             raise UsageError(f"--against-itself asks the map alone, without {', '.join(given)}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 
 from topoloc.atlas.atlas import Atlas, is_atlas
 from topoloc.atlas.atlas_localizer import AtlasLocalizer
@@ -15,7 +16,7 @@ from topoloc.localization.query_camera import CameraOfSize, named_camera
 from topoloc.map.memory import set_node_memory
 from topoloc.map.topomap import TopoMetricMap
 
-__all__ = ["camera_for", "is_atlas", "localizer_at", "open_atlas"]
+__all__ = ["atlas_localizer", "camera_for", "is_atlas", "localizer_at", "open_atlas"]
 
 MEMORY_MB = 512
 
@@ -23,10 +24,17 @@ MEMORY_MB = 512
 def open_atlas(where: str, config: LocalizerConfig, features: str | None, asked: AtlasConfig) -> AtlasLocalizer:
     """An atlas to be asked, with half of the memory for its tiles' nodes and half for the rest of those that are open. What is wrong with
     single tiles is said on standard error. Raises AtlasError."""
-    atlas, budget = Atlas.open(where), MEMORY_MB * 500_000
+    return atlas_localizer(Atlas.open(where), config, features, asked, lambda text: print(f"warning: {text}", file=sys.stderr))
+
+
+def atlas_localizer(
+    atlas: Atlas, config: LocalizerConfig, features: str | None, asked: AtlasConfig, warn: Callable[[str], None]
+) -> AtlasLocalizer:
+    """As `open_atlas`, of one that is read; `warn` is told what is wrong with single tiles. Raises AtlasError."""
+    budget = MEMORY_MB * 500_000
     set_node_memory(budget)
     maps = Maps([], lambda topomap: localizer_of(topomap, config, features), budget)
-    return AtlasLocalizer(atlas, maps, asked, lambda text: print(f"warning: {text}", file=sys.stderr))
+    return AtlasLocalizer(atlas, maps, asked, warn)
 
 
 def localizer_at(where: str, config: LocalizerConfig, features: str | None, asked: AtlasConfig) -> Localizer | AtlasLocalizer:

@@ -9,8 +9,8 @@ from typing import Annotated
 import tyro
 
 from topoloc.cli.output import File, UsageError, check_outputs, progress_bar, write_json
+from topoloc.cli.session_joining import describe_untaught
 from topoloc.cli.settings_file import read_settings
-from topoloc.cli.update import describe_untaught
 from topoloc.lifelong.merge import merge_maps
 from topoloc.lifelong.update import UpdateConfig
 from topoloc.localization.localizer import LocalizerConfig

@@ -30,6 +30,8 @@ Format = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint=
 CameraOption = Annotated[str | None, tyro.conf.arg(metavar="FILE|fx,fy,cx,cy", help_behavior_hint="(default: that of the recording)")]
 # Which topic of a bag is what.
 Topics = Annotated[str | None, tyro.conf.arg(metavar="ROLE=TOPIC,...", help_behavior_hint="(default: guessed)")]
+# A Ray cluster.
+RayOption = Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT|auto|local", help_behavior_hint="(default: none)")]
 _COLUMNS = ("recording", "localized", "median error", "in 5 cm, 5 deg", "in 25 cm, 2 deg", "false accepts", "ms")
 
 

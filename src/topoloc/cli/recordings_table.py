@@ -1,4 +1,4 @@
-"""The recordings of a build on a cluster: one table on a terminal, one line each elsewhere."""
+"""Recordings that become tiles, or join them: one table on a terminal, one line each elsewhere."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from topoloc.cluster.building import Running
+from topoloc.cluster.tasks import Running
 from topoloc.cluster.tiles import Outcome
 
-_STATES = {"built": "built", "there": "there already", "failed": "failed"}
+_STATES = {"built": "built", "recognised": "waits", "updated": "updated", "there": "there already", "failed": "failed"}
 
 
 def state_text(state: Outcome | Running | None) -> str:
@@ -31,9 +31,18 @@ def finished_line(outcome: Outcome) -> str:
     return f"{outcome.recording}: tile {outcome.tile_id}, {size}, {took}"
 
 
+def tell_notes(outcomes: Sequence[Outcome], was_live: bool) -> None:
+    """What is to be known of recordings beside; below a table (`was_live`) also what failed once more, where it can be copied."""
+    for outcome in outcomes:
+        for note in outcome.notes:
+            print(f"{outcome.recording}: {note}", file=sys.stderr)
+        if was_live and outcome.reason is not None:
+            print(finished_line(outcome), file=sys.stderr)
+
+
 @contextmanager
 def recordings_table(recordings: Sequence[str]) -> Iterator[tuple[Callable[[int, Outcome | Running], None], bool]]:
-    """A callable (recording's number, its state) that shows it; and whether it wants to know of those that are being mapped, too."""
+    """A callable (recording's number, its state) that shows it; and whether it wants to know of those that are being worked on, too."""
     if not sys.stderr.isatty():
         yield lambda number, state: print(finished_line(state), file=sys.stderr) if isinstance(state, Outcome) else None, False
         return

@@ -29,7 +29,7 @@ class Command:
     maps: Annotated[
         tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="MAP|FOLDER|ATLAS ...", help_behavior_hint="(required)")
     ] = ()
-    """Map files, folders of them, and atlases. A map goes by the name of its file without .topo, a tile of an atlas by its id."""
+    """Map files, folders, and atlases (s3://bucket/campus, too). A map goes by the name of its file without .topo, a tile by its id."""
     host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
     """Where to listen. Elsewhere than on this machine only with a token, and with TLS or a proxy that speaks it."""
     port: Annotated[int, tyro.conf.arg(metavar="N")] = 8571

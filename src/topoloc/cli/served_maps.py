@@ -8,6 +8,7 @@ from pathlib import Path
 
 from topoloc.atlas.config import AtlasConfig
 from topoloc.atlas.open_maps import Maps
+from topoloc.atlas.tile_fetches import TileFetches
 from topoloc.cli.features_option import localizer_of
 from topoloc.compiled import set_num_threads
 from topoloc.errors import TopolocError
@@ -49,7 +50,8 @@ class ServedMaps:
             set_num_threads(1)
         budget = self.service.memory_mb * 500_000
         set_node_memory(budget)
-        return Maps([Path(path) for path in self.paths], lambda topomap: localizer_of(topomap, self.localizer, self.features), budget)
+        fetches = TileFetches(self.service.fetch_s)
+        return Maps(self.paths, lambda topomap: localizer_of(topomap, self.localizer, self.features), budget, fetches.path)
 
 
 def read_token(path: str | None) -> str | None:

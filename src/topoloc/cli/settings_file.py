@@ -26,15 +26,16 @@ _ASKING = ("localize", "evaluate", "explain", "serve", "follow")
 TABLES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "build": ("topoloc.map.build", "BuildConfig", ("build",)),
     "localize": ("topoloc.localization.localizer", "LocalizerConfig", (*_ASKING, "update", "merge")),
-    "atlas": ("topoloc.atlas.config", "AtlasConfig", ("localize", "evaluate", "explain", "serve")),
+    "atlas": ("topoloc.atlas.config", "AtlasConfig", ("localize", "evaluate", "explain", "serve", "update")),
     "track": ("topoloc.tracking.tracker", "TrackerConfig", ("localize", "serve", "follow")),
     "slam": ("topoloc.slam.slam", "SlamConfig", ("slam", "build", "update")),
     "update": ("topoloc.lifelong.update", "UpdateConfig", ("update", "merge")),
+    "tile_choice": ("topoloc.lifelong.tile_choice", "TileChoiceConfig", ("update",)),
     "against_itself": ("topoloc.lifelong.weak_parts", "WeakPartsConfig", ("evaluate",)),
     "join": ("topoloc.lifelong.tile_joins", "TileJoinConfig", ("atlas", "build")),
     "prune": ("topoloc.lifelong.prune", "PruneConfig", ("prune",)),
     "serve": ("topoloc.service.config", "ServiceConfig", ("serve",)),
-    "cluster": ("topoloc.cluster.config", "ClusterConfig", ("build",)),
+    "cluster": ("topoloc.cluster.config", "ClusterConfig", ("build", "atlas", "update", "evaluate")),
     "replicas": ("topoloc.cluster.config", "ReplicasConfig", ("serve",)),
 }
 _WIDTH = 110

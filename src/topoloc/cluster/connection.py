@@ -8,27 +8,21 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
-import shutil
 import signal
 import socket
 import sys
-import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 from topoloc.errors import ClusterError, MissingExtraError
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
+from topoloc.sequences.atomic import scratch_folder
 
 LOCAL, AUTO = "local", "auto"
 _PATIENCE_S = 5.0
-_FOLDER = "topoloc-ray-"
+_FOLDER = "topoloc-ray-"  # short, for sockets lie in it
+_CONNECTED: list[str] = []
 _TOKEN_SETTINGS = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 
 
@@ -44,20 +38,24 @@ def ray_module() -> Any:
 @contextmanager
 def connected(address: str) -> Iterator[Any]:
     """Ray, connected to the cluster at `address` (HOST:PORT; `auto`: the one that runs on this machine, or that RAY_ADDRESS names; `local`:
-    one of this machine's processors, which ends with the block). Tasks that still run when the block ends are ended.
+    one of this machine's processors, which ends with the block). Tasks that still run when the block ends are ended. Inside of a block of
+    the same address it is that one's connection.
 
     Raises:
         MissingExtraError: Ray is not installed.
         ClusterError: nothing answers there, it is no Ray, or one of another version.
     """
     ray = ray_module()
+    if address in _CONNECTED:
+        yield ray
+        return
     _check_address(address)
     with contextlib.ExitStack() as at_end:
         options: dict[str, Any] = {"address": address}
         if address == LOCAL:
             os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
             at_end.enter_context(_own_token())
-            options |= {"include_dashboard": False, "_temp_dir": str(at_end.enter_context(_own_folder()))}
+            options |= {"include_dashboard": False, "_temp_dir": str(at_end.enter_context(scratch_folder(_FOLDER)))}
         before = signal.getsignal(signal.SIGTERM)
         try:
             with _quiet():
@@ -69,6 +67,8 @@ def connected(address: str) -> Iterator[Any]:
         if threading.current_thread() is threading.main_thread():  # Ray's own handler prints where it was
             signal.signal(signal.SIGTERM, _interrupt)
             at_end.callback(signal.signal, signal.SIGTERM, before or signal.SIG_DFL)
+        _CONNECTED.append(address)
+        at_end.callback(_CONNECTED.remove, address)
         yield ray
 
 
@@ -135,29 +135,3 @@ def _own_token() -> Iterator[None]:
     finally:  # the mode was set by Ray meanwhile
         for name in _TOKEN_SETTINGS:
             os.environ.pop(name, None)
-
-
-@contextmanager
-def _own_folder() -> Iterator[Path]:
-    """For the files of a cluster of our own: its name is short, for sockets lie in it. Those whose owners were killed go, too."""
-    for left in Path(tempfile.gettempdir()).glob(f"{_FOLDER}*"):
-        with contextlib.suppress(OSError), _locked(left):
-            shutil.rmtree(left, ignore_errors=True)
-    folder = Path(tempfile.mkdtemp(prefix=_FOLDER))
-    with _locked(folder):
-        try:
-            yield folder
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """The folder is its holder's until the process ends, however it does. Raises OSError where it is another's."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        if fcntl is not None:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
-    finally:
-        os.close(descriptor)

@@ -1,4 +1,4 @@
-"""What runs on the cluster's machines: a task a recording, and a board on which the tasks write how far they are.
+"""What runs on the cluster's machines: a task a job, and a board on which the tasks write how far they are.
 
 This module loads nothing heavy by itself, so that the threads of the numeric libraries are said before any of them is loaded.
 """
@@ -17,19 +17,18 @@ from typing import TYPE_CHECKING, Any
 from topoloc.errors import ClusterError
 
 if TYPE_CHECKING:
-    from topoloc.cluster.tiles import TileJob
+    from topoloc.cluster.tasks import Job
 
 _BETWEEN_S = 0.3
+Progress = Callable[[str, int, int], None]
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True)
 class Work:
-    """A recording that becomes a tile. `folder` is the driver's, where relative paths begin; `epoch` its SOURCE_DATE_EPOCH."""
+    """A job. `folder` is the driver's, where relative paths begin; `epoch` its SOURCE_DATE_EPOCH."""
 
-    job: TileJob
-    atlas: str
-    replaces: bool
+    job: Job[Any]
     folder: str
     epoch: str | None
 
@@ -43,10 +42,11 @@ class Terms:
 
 
 def run_task(packed: bytes, terms: Terms, board: Any, number: int) -> bytes:
-    """A pickled `Work` is done; returns the `Outcome`, pickled. `number` is that of the recording on the board.
+    """A pickled `Work` is done; returns the job's outcome, pickled. `number` is that of the job on the board.
 
     Raises:
         ClusterError: this machine has another version of topoloc.
+        TopolocError: as of the job.
     """
     if terms.version != version("topoloc"):
         raise ClusterError(f"{platform.node()} has topoloc {version('topoloc')}, and {terms.version} asks it")
@@ -59,40 +59,46 @@ def run_task(packed: bytes, terms: Terms, board: Any, number: int) -> bytes:
     os.environ.pop("SOURCE_DATE_EPOCH", None)
     if work.epoch is not None:
         os.environ["SOURCE_DATE_EPOCH"] = work.epoch
-    from topoloc.cluster.tiles import build_tile
     from topoloc.compiled import set_num_threads
 
     set_num_threads(terms.num_threads)
-    return pickle.dumps(build_tile(work.job, work.atlas, work.replaces, _reporter(board, number)))
+    return pickle.dumps(work.job.run(_reporter(board, number)))
 
 
-def _reporter(board: Any, number: int) -> Callable[[str, int, int], None]:
+def _reporter(board: Any, number: int) -> Progress:
     """Writes on the board now and then; whether anybody reads it does not matter here."""
+    if board is None:
+        return lambda stage, done, total: None
+    return now_and_then(lambda *line: board.write.remote(number, line))
+
+
+def now_and_then(report: Progress) -> Progress:
+    """Tells of each stage when it begins and when it ends, and in between a few times a second."""
     last = [("", 0.0)]
 
-    def report(stage: str, done: int, total: int) -> None:
+    def tell(stage: str, done: int, total: int) -> None:
         before, when = last[0]
         now = time.monotonic()
-        if board is None or (stage == before and now - when < _BETWEEN_S and done < total):
+        if stage == before and now - when < _BETWEEN_S and done < total:
             return
         last[0] = (stage, now)
-        board.write.remote(number, (stage, done, total))
+        report(stage, done, total)
 
-    return report
+    return tell
 
 
 class Board:
-    """How far each recording is, for the eyes of the driver; an actor."""
+    """How far each job is, for the eyes of the driver; an actor."""
 
     def __init__(self) -> None:
         self._lines: dict[int, tuple[str, int, int]] = {}
 
     def write(self, number: int, line: tuple[str, int, int]) -> None:
-        """Of a recording: stage, steps done, steps in all."""
+        """Of a job: stage, steps done, steps in all."""
         self._lines[number] = line
 
     def read(self) -> dict[int, tuple[str, int, int]]:
-        """All lines, by the numbers of the recordings."""
+        """All lines, by the numbers of the jobs."""
         return self._lines
 
 

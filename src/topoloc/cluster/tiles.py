@@ -13,7 +13,7 @@ import re
 import tempfile
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -29,7 +29,7 @@ from topoloc.map.topomap import TopoMetricMap
 from topoloc.map.writing import write_map
 from topoloc.sequences.atomic import scratch_file
 
-State = Literal["built", "there", "failed"]
+State = Literal["built", "recognised", "updated", "there", "failed"]
 
 
 @runtime_checkable
@@ -69,7 +69,8 @@ class TileJob:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a recording: `reason` says why it failed, `notes` are lines that are to be known beside.
+    """What became of a recording: `reason` says why it failed, `notes` are lines that are to be known beside, `changes` what its session
+    changed of a tile that was there.
 
     `seconds` are those on the clock, `cpu_seconds` those of all its threads on a processor; `host` is the machine that did it.
     """
@@ -84,9 +85,11 @@ class Outcome:
     seconds: float = 0.0
     cpu_seconds: float = 0.0
     host: str = ""
+    changes: dict[str, Any] | None = None
 
     def to_json(self) -> dict[str, Any]:
-        return asdict(self) | {"notes": list(self.notes), "seconds": round(self.seconds, 3), "cpu_seconds": round(self.cpu_seconds, 3)}
+        data = asdict(self) | {"notes": list(self.notes), "seconds": round(self.seconds, 3), "cpu_seconds": round(self.cpu_seconds, 3)}
+        return data if self.changes is not None else {name: value for name, value in data.items() if name != "changes"}
 
 
 def build_tile(job: TileJob, atlas: str, replaces: bool, progress: Progress) -> Outcome:
@@ -95,11 +98,16 @@ def build_tile(job: TileJob, atlas: str, replaces: bool, progress: Progress) -> 
     Args:
         replaces: a tile of the same id that was made otherwise is replaced, else it is a failure.
     """
+    return outcome_of(job.recording, job.tile_id, lambda: _built(job, atlas, replaces, progress))
+
+
+def outcome_of(recording: str, tile_id: str, work: Callable[[], tuple[State, Tile]]) -> Outcome:
+    """What becomes of a recording by this work, which says it, with the tile as it is then; or why nothing does."""
     started, cpu_started, said = time.monotonic(), time.process_time(), io.StringIO()
     state, reason, tile = "failed", None, None
     with contextlib.redirect_stderr(said):
         try:
-            state, tile = _built(job, atlas, replaces, progress)
+            state, tile = work()
         except TopolocError as error:
             reason = " ".join(str(error).split())
         except MemoryError:
@@ -107,7 +115,7 @@ def build_tile(job: TileJob, atlas: str, replaces: bool, progress: Progress) -> 
         except Exception as error:  # a bug: the others go on, and all of it is told
             traceback.print_exc()
             reason = " ".join(f"{type(error).__name__}: {error}".split())[:500]
-    done = Outcome(job.recording, job.tile_id, state, reason, tuple(said.getvalue().splitlines()), host=platform.node())
+    done = Outcome(recording, tile_id, state, reason, tuple(said.getvalue().splitlines()), host=platform.node())
     if tile is not None:
         done = replace(done, tile_id=tile.tile_id, num_nodes=tile.num_nodes, num_bytes=tile.map.num_bytes)
     return replace(done, seconds=time.monotonic() - started, cpu_seconds=time.process_time() - cpu_started)

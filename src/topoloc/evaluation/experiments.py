@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -32,12 +32,14 @@ def answer_queries(
     map_from_truth: Rigid3 | None = None,
     progress: Callable[[str, int, int], None] | None = None,
     label: str | None = None,
+    frames: Sequence[int] | None = None,
 ) -> list[Answer]:
     """Localize every frame whose pose is known; only the left (or colour) picture is shown to the localizer.
 
     Args:
         map_from_truth: the recording's world given in the map's, where the two differ.
         label: what the answers call the recording, by default its name.
+        frames: these alone, in this order; their poses are known.
 
     Raises:
         TrajectoryError: the recording holds no truth.
@@ -45,9 +47,7 @@ def answer_queries(
     """
     nodes = NodePoses.of([summary.world_from_cam for summary in localizer.topomap.summaries])
     lambda_rot = localizer.topomap.config.lambda_rot
-    frames = [i for i, pose in enumerate(sequence.poses) if pose is not None]
-    if not frames:
-        raise TrajectoryError(f"{sequence.name}: no frame has a known pose to judge against")
+    frames = frames_with_truth(sequence) if frames is None else frames
     label = label or sequence.name
     answers = []
     for done, i in enumerate(frames):
@@ -58,7 +58,7 @@ def answer_queries(
         nearest = localizer.topomap.summaries[int(np.argmin(distances))].node_id
         near = neighbours_of(localizer.topomap, distances)
         result = _localize(localizer, frame)
-        answer = Answer(frame.name, result, world_from_cam, nearest, label, _image_reader(sequence, i), frame.camera, near)
+        answer = Answer(frame.name, result, world_from_cam, nearest, label, image_reader(sequence, i), frame.camera, near)
         answers.append(_in_answered_world(localizer, answer))
         if progress:
             progress(label, done + 1, len(frames))
@@ -70,21 +70,38 @@ def answer_elsewhere(
     sequence: StereoSequence,
     progress: Callable[[str, int, int], None] | None = None,
     label: str | None = None,
+    frames: Sequence[int] | None = None,
 ) -> list[Answer]:
     """Show the localizer images that were not taken in the map: every pose that it gives is false.
+
+    Args:
+        frames: these alone, in this order.
 
     Raises:
         CalibrationError: the recording holds no camera.
     """
-    label = label or sequence.name
+    label, frames = label or sequence.name, range(len(sequence)) if frames is None else frames
     answers = []
-    for i, name in enumerate(sequence.names):
+    for done, i in enumerate(frames):
         frame = sequence[i]
         result = _localize(localizer, frame)
-        answers.append(Answer(name, result, None, None, label, _image_reader(sequence, i), frame.camera))
+        answers.append(Answer(sequence.names[i], result, None, None, label, image_reader(sequence, i), frame.camera))
         if progress:
-            progress(f"{label} (elsewhere)", i + 1, len(sequence))
+            progress(f"{label} (elsewhere)", done + 1, len(frames))
     return answers
+
+
+def frames_with_truth(sequence: StereoSequence) -> list[int]:
+    """The frames whose pose is known. Raises TrajectoryError where there is none."""
+    frames = [i for i, pose in enumerate(sequence.poses) if pose is not None]
+    if not frames:
+        raise TrajectoryError(f"{sequence.name}: no frame has a known pose to judge against")
+    return frames
+
+
+def image_reader(sequence: StereoSequence, index: int) -> Callable[[], Image]:
+    """Reads the picture of a frame once more."""
+    return lambda: sequence[index].image
 
 
 def neighbours_of(topomap: TopoMetricMap, distances: Float[np.ndarray, " nodes"]) -> frozenset[int]:
@@ -110,7 +127,3 @@ def _localize(localizer: Asked, frame: StereoFrame) -> Localization | NotLocaliz
     if frame.camera is None:
         raise CalibrationError(f"{frame.name}: no calibration; put a camera.json into the recording's folder")
     return localizer.localize(frame.image, frame.camera, t_ns=frame.t_ns)
-
-
-def _image_reader(sequence: StereoSequence, index: int) -> Callable[[], Image]:
-    return lambda: sequence[index].image

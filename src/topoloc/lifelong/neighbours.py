@@ -21,12 +21,18 @@ from topoloc.bounds import check_bounds
 from topoloc.errors import AtlasError, MapError
 from topoloc.lifelong.tile_joins import Found, NotJoined, OpenTile, TileJoinConfig, joined
 from topoloc.localization.localizer import Localizer
+from topoloc.map.build import Progress
 
 _NUM_LOOKED_UP = 32
 _BEST = 3
 _MAX_BYTES = 512_000_000
 
 Tell = Callable[["Tried"], None]
+
+
+@dataclass(frozen=True)
+class NotCompared(NotJoined):
+    """Why nothing is known of two tiles: whoever compared them ended in the middle."""
 
 
 @dataclass(frozen=True)
@@ -65,26 +71,71 @@ def join_tiles(
         AtlasError: no atlas is there, it has no such tile, or it cannot be written.
         FeatureKindError, MissingExtraError, WeightsError: maps' features cannot be compared here.
     """
-    config = config or TileJoinConfig()
-    check_bounds(config)
-    atlas = Atlas.open(where)
-    wanted = {atlas.tile(tile_id).tile_id for tile_id in tile_ids} or set(atlas.manifest.by_id)
-    maps, manifest, tried = Maps([], Localizer, _MAX_BYTES), atlas.manifest, list[Tried]()
+    config, atlas = config or TileJoinConfig(), Atlas.open(where)
+    maps, tried = Maps([], Localizer, _MAX_BYTES), list[Tried]()
     try:
-        for first, second in likely_pairs(atlas, wanted, config) if pairs is None else _open_pairs(atlas, pairs):
-            try:
-                found = _compared(atlas, maps, first, second, config)
-            except (MapError, AtlasError) as error:
-                found = NotJoined(str(error))
-            tried.append(Tried(first.tile_id, second.tile_id, found))
+        for first, second in _pairs(atlas, tile_ids, config, pairs):
+            tried.append(_joined(atlas, maps, (first, second), config))
             if tell is not None:
                 tell(tried[-1])
-            if isinstance(found, Found):
-                join = Join(first.tile_id, second.tile_id, found.first_from_second, found.covariance, found.num_agreeing)
-                manifest = add_joins(where, [join], {first.tile_id: first, second.tile_id: second})
     finally:
         maps.close()
-    return Neighbours(manifest, tried)
+    return Neighbours(Atlas.open(where).manifest, tried)
+
+
+def pairs_to_join(
+    where: str, tile_ids: Sequence[str] = (), config: TileJoinConfig | None = None, pairs: Sequence[tuple[str, str]] | None = None
+) -> list[tuple[str, str]]:
+    """The ids of the tiles that `join_tiles` compares, in its order. Raises ConfigError, AtlasError as that does."""
+    found = _pairs(Atlas.open(where), tile_ids, config or TileJoinConfig(), pairs)
+    return [(first.tile_id, second.tile_id) for first, second in found]
+
+
+@dataclass(frozen=True)
+class PairJob:
+    """Two tiles of the atlas at `where`, which are compared, and joined if they overlap, by whoever runs it: a job of a cluster."""
+
+    where: str
+    first: str
+    second: str
+    config: TileJoinConfig
+
+    @property
+    def name(self) -> str:
+        return f"join {self.first} {self.second}"
+
+    def run(self, progress: Progress) -> Tried:
+        """Raises as `join_tiles`; AtlasError also where a tile is gone."""
+        maps = Maps([], Localizer, _MAX_BYTES)
+        try:
+            atlas = Atlas.open(self.where)
+            return _joined(atlas, maps, (atlas.tile(self.first), atlas.tile(self.second)), self.config)
+        finally:
+            maps.close()
+
+    def failed(self, reason: str) -> Tried:
+        return Tried(self.first, self.second, NotCompared(reason))
+
+
+def _pairs(
+    atlas: Atlas, tile_ids: Sequence[str], config: TileJoinConfig, pairs: Sequence[tuple[str, str]] | None
+) -> list[tuple[Tile, Tile]]:
+    check_bounds(config)
+    wanted = {atlas.tile(tile_id).tile_id for tile_id in tile_ids} or set(atlas.manifest.by_id)
+    return likely_pairs(atlas, wanted, config) if pairs is None else _open_pairs(atlas, pairs)
+
+
+def _joined(atlas: Atlas, maps: Maps, pair: tuple[Tile, Tile], config: TileJoinConfig) -> Tried:
+    """What is found of a pair; it stands in the manifest then."""
+    first, second = pair
+    try:
+        found = _compared(atlas, maps, first, second, config)
+    except (MapError, AtlasError) as error:
+        found = NotJoined(str(error))
+    if isinstance(found, Found):
+        join = Join(first.tile_id, second.tile_id, found.first_from_second, found.covariance, found.num_agreeing)
+        add_joins(atlas.store.where, [join], {first.tile_id: first, second.tile_id: second})
+    return Tried(first.tile_id, second.tile_id, found)
 
 
 def _compared(atlas: Atlas, maps: Maps, first: Tile, second: Tile, config: TileJoinConfig) -> Found | NotJoined:

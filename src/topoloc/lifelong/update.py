@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Int
 
 from topoloc.bounds import Above, Between, check_bounds
-from topoloc.errors import TrajectoryError
+from topoloc.errors import SessionKnownError
 from topoloc.geometry.rigid import covariance_of_inverse, position_covariance
 from topoloc.lifelong.coarse_models import PlaceView, taught_places
 from topoloc.lifelong.earlier_recall import earlier_recall
@@ -96,13 +96,14 @@ def update_map(
 
     Raises:
         ConfigError: a setting is out of its bounds.
-        TrajectoryError: it is in the map already; the map recognises too little of it, or not as its poses say.
+        SessionKnownError: it is in the map already.
+        TrajectoryError: the map recognises too little of it, or not as its poses say.
         FeatureKindError, MissingExtraError, WeightsError: the map's features cannot be found here.
         RecordingError, CalibrationError, UnreadableImageError: from reading the recording.
     """
     config, progress = config or UpdateConfig(), progress or (lambda stage, done, total: None)
     check_bounds(config)
-    _refuse_known(topomap, sequence)
+    refuse_known(topomap, sequence)
     localizer = Localizer(topomap, localizer_config)
     if poses_from == "map":
         held = poses_by_map(sequence, Tracker(localizer), topomap.config, config.poses, progress)
@@ -135,8 +136,9 @@ def _counts(held: SessionPoses, joined: _Joined, kind: str) -> dict[str, Any]:
     }
 
 
-def _refuse_known(topomap: TopoMetricMap, sequence: StereoSequence) -> None:
-    """A session that is in the map already is not doubled. Names and clocks may be those of another day: pictures, or paths, decide."""
+def refuse_known(topomap: TopoMetricMap, sequence: StereoSequence) -> None:
+    """A session that is in the map already is not doubled. Names and clocks may be those of another day: pictures, or paths, decide.
+    Raises SessionKnownError."""
     if len(sequence) == 0:
         return
     times, path = (min(sequence.t_ns), max(sequence.t_ns)), path_of(sequence)
@@ -148,7 +150,7 @@ def _refuse_known(topomap: TopoMetricMap, sequence: StereoSequence) -> None:
         is_there = path is not None and path == session.recording
         is_same_file = is_there and (session.start_ns, session.end_ns) == times
         if is_same_file or _shows_the_same(topomap, session.session_id, sequence, is_there):
-            raise TrajectoryError(f"{sequence.name}: it is in the map already, as session {session.session_id}; the map stays as it is")
+            raise SessionKnownError(f"{sequence.name}: it is in the map already, as session {session.session_id}; the map stays as it is")
 
 
 def _shows_the_same(topomap: TopoMetricMap, session_id: int, sequence: StereoSequence, is_there: bool) -> bool:

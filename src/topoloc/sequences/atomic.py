@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import secrets
 import shutil
+import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from hashlib import blake2b
@@ -75,6 +76,20 @@ def scratch_file(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             temporary.unlink()
+        os.close(lock)
+
+
+@contextmanager
+def scratch_folder(prefix: str) -> Iterator[Path]:
+    """A new folder among this machine's temporary files, its name beginning so, that is removed afterwards; those of owners that were
+    killed go, too. Raises OSError where none can be made."""
+    for left in Path(tempfile.gettempdir()).glob(f"{prefix}*"):
+        _remove_unowned(left)
+    folder, lock = _own_folder(prefix)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
         os.close(lock)
 
 
@@ -171,13 +186,32 @@ def _own_file(path: Path) -> tuple[Path, int]:
             temporary.unlink()
 
 
+def _own_folder(prefix: str) -> tuple[Path, int]:
+    """A new folder, and its descriptor, which holds its lock."""
+    while True:
+        folder = Path(tempfile.mkdtemp(prefix=prefix))
+        try:
+            descriptor = os.open(folder, os.O_RDONLY)
+        except FileNotFoundError:  # another one took it for a leftover
+            continue
+        if _lock(descriptor) is not False and os.fstat(descriptor).st_nlink > 0:
+            return folder, descriptor
+        os.close(descriptor)
+
+
 def _remove_unowned(temporary: Path) -> None:
+    """A file, or a folder with all that is in it, unless a writer holds its lock."""
+    is_folder = temporary.is_dir()
     try:
-        descriptor = os.open(temporary, os.O_RDWR)
+        descriptor = os.open(temporary, os.O_RDONLY if is_folder else os.O_RDWR)
     except OSError:  # removed by another writer, or not ours to remove
         return
     try:
-        if _lock(descriptor):
+        if not _lock(descriptor):
+            return
+        if is_folder:
+            shutil.rmtree(temporary, ignore_errors=True)
+        else:
             with suppress(OSError):
                 temporary.unlink()
     finally:

@@ -45,7 +45,7 @@ class Answerer:
         is shared by those that are still to be asked."""
         localizers, end = self.atlases.localizers(), time.perf_counter() + self._limit_ms(asked) / 1e3
         tiles = {tile_id for localizer in localizers for tile_id in localizer.atlas.manifest.by_id}
-        names = [name for name in self.maps.paths() if name not in tiles]
+        names = [name for name in self.maps.names() if name not in tiles]
         answers, num_left = dict[str, Localization | NotLocalized](), len(names) + len(localizers)
         for one in [*names, *localizers]:
             left_ms = max(1.0, 1e3 * (end - time.perf_counter()) / num_left)

@@ -48,7 +48,7 @@ def make_application(
 ) -> App:
     """The application; its maps are closed when it ends. `asked` says how the tiles of its atlases are asked."""
     metrics = Metrics()
-    atlases = ServedAtlases(maps.atlases, maps, asked or AtlasConfig())
+    atlases = ServedAtlases(maps, asked or AtlasConfig())
     answerer = Answerer(maps, config.max_pixels, 1e3 * config.answer_s, atlases)
     streams = Streams(maps, answerer, tracking or TrackerConfig(), config.max_sessions, config.session_idle_s)
     service = Service(maps, answerer, Workers(config.num_workers, config.max_queue), config, metrics, streams)
@@ -56,7 +56,8 @@ def make_application(
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        log("ready", maps=list(maps.paths()), workers=config.num_workers)
+        log("ready", maps=maps.names(), workers=config.num_workers)
+        atlases.watch()
         house = asyncio.create_task(keep_house(streams))
         yield
         house.cancel()

@@ -27,6 +27,8 @@ class ServiceConfig:
     """Seconds in which a request must be there whole, and in which a client must take its answer."""
     answer_s: Annotated[float, Above(0)] = 30.0
     """Seconds in which a request is answered, waiting included; then it is told that it took too long."""
+    fetch_s: Annotated[float, Above(0)] = 10.0
+    """Seconds that a request waits for a tile to come from an object store; it goes on coming, for those who ask later."""
     geolocation_m: Annotated[float, Above(0)] = 100.0
     """Where a request of the GeoPose Protocol says where the device is, tiles of atlases are not asked that lie further from there than
     so many metres and three times the accuracy that the device claims."""

@@ -87,10 +87,8 @@ def _replied(service: Service, body: bytes, only: str | None) -> tuple[GeoPoseRe
     image = decoded_picture(picture, service.answerer.max_pixels) if isinstance(picture, PictureBytes) else picture
     localizers = [] if only is not None else service.answerer.atlases.localizers()
     tiles = {tile_id for localizer in localizers for tile_id in localizer.atlas.manifest.by_id}
-    localizers = [] if only is not None else service.answerer.atlases.localizers()
-    tiles = {tile_id for localizer in localizers for tile_id in localizer.atlas.manifest.by_id}
     results, georeferences = dict[str, Localization | NotLocalized](), dict[str, Georeference]()
-    for name in [only] if only is not None else [name for name in service.maps.paths() if name not in tiles]:
+    for name in [only] if only is not None else [name for name in service.maps.names() if name not in tiles]:
         with service.maps.lent(name) as opened:
             topomap = opened.localizer.topomap
             if topomap.georeference is not None:

@@ -46,7 +46,7 @@ async def capabilities(request: Request) -> dict[str, Any]:
         "name": "topoloc",
         "version": topoloc.__version__,
         "services": ["localization", "geopose", "streams"],
-        "maps": list(service.maps.paths()),
+        "maps": service.maps.names(),
         "camera_models": list(MODELS),
         "geopose_protocol": ["1.0", "2.0"],
         "limits": {"megabytes": config.max_upload_mb, "megapixels": config.max_megapixels, "sessions": config.max_sessions},
@@ -56,7 +56,7 @@ async def capabilities(request: Request) -> dict[str, Any]:
 @router.get("/v1/maps", responses=errors(401, 503))
 async def maps(request: Request) -> dict[str, list[str]]:
     """The names of all maps."""
-    return {"maps": list(service_of(request).maps.paths())}
+    return {"maps": service_of(request).maps.names()}
 
 
 @router.get("/v1/maps/{map}", responses=errors(401, 404, 422, 429, 503))

@@ -66,9 +66,11 @@ def serve_on_ray(maker: AppMaker, address: str, front: Front, replicas: Replicas
         was_there = bool(serve.status().proxies)
         options = {"host": front.host, "port": front.port, "ssl_certfile": front.tls_cert, "ssl_keyfile": front.tls_key}
         try:
-            if not was_there:
-                serve.start(proxy_location="EveryNode", http_options={key: value for key, value in options.items() if value is not None})
             try:
+                if not was_there:
+                    serve.start(
+                        proxy_location="EveryNode", http_options={key: value for key, value in options.items() if value is not None}
+                    )
                 serve.run(_deployment(serve, front, replicas).bind(maker), name=NAME, route_prefix="/")
             except Exception as error:  # of many classes; what a replica raised is a text in the deployment's state
                 raise ClusterError(f"no replica of the service began: {_reason(serve, error)}") from error

@@ -6,6 +6,7 @@ from topoloc.errors import (
     EmptyMapError,
     MapError,
     MissingExtraError,
+    StoreError,
     TopolocError,
     UnknownMapError,
     UnreadableImageError,
@@ -35,6 +36,8 @@ def refusal_of(error: Exception) -> Refusal:
         return error
     if isinstance(error, UnknownMapError):
         return Refusal(404, str(error))
+    if isinstance(error, StoreError):
+        return Refusal(503, str(error), retry_after_s=5)
     if isinstance(error, _OURS):
         return Refusal(503, str(error), retry_after_s=30)
     if isinstance(error, UnreadableImageError):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TypeVar
@@ -11,6 +12,7 @@ from typing import TypeVar
 from starlette.requests import HTTPConnection
 
 from topoloc.atlas.open_maps import Maps
+from topoloc.atlas.tile_fetches import Fetch, TileAwaited
 from topoloc.errors import TopolocError
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.service.answers import Answerer
@@ -35,16 +37,33 @@ class Service:
     metrics: Metrics
     streams: Streams
     scenes: dict[str, tuple[tuple[int, ...], bytes]] = field(default_factory=dict)
+    num_awaiting: int = 0
 
     async def work(self, request: HTTPConnection, job: Callable[[], R]) -> R:
-        """What a worker makes of the job. Raises Refusal, whatever it raised."""
+        """What a worker makes of the job, which may be done again from its beginning: where it needs a tile that is not here, the worker is
+        free for others until that has come. Raises Refusal, whatever it raised."""
+        start = time.monotonic()
         try:
-            return await self.workers.run(job, self.config.answer_s)
+            while True:
+                try:
+                    return await self.workers.run(job, self.config.answer_s, time.monotonic() - start)
+                except TileAwaited as awaited:
+                    await self._ended(awaited.fetch)
         except Exception as error:
             refusal = refusal_of(error)
             if not isinstance(error, TopolocError | Refusal):
                 log("failure", logging.ERROR, error, request_id=request.scope["request_id"])
             raise refusal from error
+
+    async def _ended(self, fetch: Fetch) -> None:
+        """When the tile is here, will not come, or has been waited for long enough. Raises Refusal where too many wait already."""
+        if self.num_awaiting >= self.workers.number + self.workers.max_queue:
+            raise Refusal(429, f"{self.num_awaiting} requests wait already for tiles that are being fetched", retry_after_s=5)
+        self.num_awaiting += 1
+        try:
+            await asyncio.wait([asyncio.wrap_future(fetch.ended)], timeout=max(0.0, fetch.until - time.monotonic()))
+        finally:
+            self.num_awaiting -= 1
 
     def count(self, request: HTTPConnection, name: str, result: Localization | NotLocalized) -> None:
         """The outcome, for the metrics and the log."""
@@ -56,6 +75,7 @@ class Service:
 
     async def close(self) -> None:
         """What has begun is finished; then the maps are closed."""
+        self.answerer.atlases.close()
         await asyncio.to_thread(self.workers.close)
         self.streams.close()
         self.maps.close()

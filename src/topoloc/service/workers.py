@@ -26,8 +26,8 @@ class Workers:
         """Jobs that are done or wait."""
         return self._num_jobs
 
-    async def run(self, job: Callable[[], R], timeout_s: float) -> R:
-        """What the job returns or raises.
+    async def run(self, job: Callable[[], R], timeout_s: float, spent_s: float = 0.0) -> R:
+        """What the job returns or raises; of the seconds until it takes too long some may be spent.
 
         Raises:
             Refusal: too many wait already; or it took too long, in which case a job that had begun is finished for nobody.
@@ -40,7 +40,7 @@ class Workers:
         future: Future[R] = self._pool.submit(self._timed, job)
         future.add_done_callback(lambda _: loop.call_soon_threadsafe(self._done))
         try:
-            return await asyncio.wait_for(asyncio.wrap_future(future), timeout_s)
+            return await asyncio.wait_for(asyncio.wrap_future(future), timeout_s - spent_s)
         except TimeoutError:
             raise Refusal(503, f"no answer within {timeout_s:g} s", retry_after_s=5) from None
 

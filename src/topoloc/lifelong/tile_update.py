@@ -1,0 +1,51 @@
+"""A tile's map is edited as any map file is, and put back where nobody was faster."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+from topoloc.atlas.atlas import Atlas
+from topoloc.atlas.editing import NewTile, replace_tile
+from topoloc.atlas.manifest import Tile
+from topoloc.atlas.store import sha256_of
+from topoloc.errors import AtlasError
+from topoloc.sequences.atomic import scratch_folder
+
+_MAX_TRIES = 5
+T = TypeVar("T")
+
+
+def edited_tile(where: str, tile_id: str, edit: Callable[[Path], T]) -> tuple[Tile, T]:
+    """The tile with its map edited, in the same world and with the same joins, and what the edit says.
+
+    Args:
+        edit: edits the map file at a path, a copy, as `map/edit.py` does; what it leaves beside it is dropped. It is called again where
+            another writer replaced the tile meanwhile.
+
+    Raises:
+        AtlasError: there is no such atlas or tile, it cannot be read or written, or others replaced it again and again.
+        TopolocError: as of `edit`; the atlas is as it was.
+    """
+    for _ in range(_MAX_TRIES):
+        atlas = Atlas.open(where)
+        before = atlas.tile(tile_id)
+        with scratch_folder("topoloc-tile-") as folder:
+            path = folder / f"{tile_id}.topo"
+            _copy(atlas, before, path)
+            done = edit(path)
+            after = replace_tile(where, NewTile(tile_id, path, before.world, before.recipe), before)
+        if after is not None:
+            return after.by_id[tile_id], done
+    raise AtlasError(f"{where}: tile {tile_id} was replaced by others {_MAX_TRIES} times meanwhile; it stays as they left it")
+
+
+def _copy(atlas: Atlas, tile: Tile, path: Path) -> None:
+    try:
+        shutil.copyfile(atlas.map_path(tile), path)
+    except OSError as error:
+        raise AtlasError(f"cannot copy the map of tile {tile.tile_id}: {error.strerror}") from None
+    if sha256_of(path) != tile.map.sha256:
+        raise AtlasError(f"{tile.map.name} of {atlas.store.where} is not the file that was added: its checksum is another")
