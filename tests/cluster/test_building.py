@@ -101,7 +101,7 @@ def _lines(log: Path) -> list[list[str]]:
     return [line.split() for line in log.read_text().splitlines()] if log.exists() else []
 
 
-def _wait_for(condition: Callable[[], Any], seconds: float = 30.0) -> Any:
+def _wait_for(condition: Callable[[], Any], seconds: float = 180.0) -> Any:
     until = time.monotonic() + seconds
     while time.monotonic() < until:
         if found := condition():

@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from topoloc.cluster.config import ClusterConfig
@@ -98,21 +99,25 @@ def run_on_ray(
 def run_here(jobs: Sequence[Job[T]], show: Show[T] | None = None, is_live: bool = False) -> list[T]:
     """As `run_on_ray`, in this process, one after the other."""
 
-    def told(number: int) -> Progress:
-        if show is None or not is_live:
-            return lambda stage, done, total: None
-        return now_and_then(lambda *line: show(number, Running(*line)))
-
+    show = show or (lambda number, state: None)
     outcomes = list[T]()
     for number, job in enumerate(jobs):
+        tell = partial(_tell_running, show, number) if is_live else _tell_nobody
         try:
-            outcome = job.run(told(number))
+            outcome = job.run(now_and_then(tell))
         except TopolocError as error:
             outcome = job.failed(" ".join(str(error).split()))
         outcomes.append(outcome)
-        if show is not None:
-            show(number, outcome)
+        show(number, outcome)
     return outcomes
+
+
+def _tell_running(show: Show[Any], number: int, stage: str, done: int, total: int) -> None:
+    show(number, Running(stage, done, total))
+
+
+def _tell_nobody(stage: str, done: int, total: int) -> None:
+    pass
 
 
 def _queues(num_jobs: int, lines: Sequence[str] | None) -> list[deque[int]]:
