@@ -91,9 +91,9 @@ def test_recordings_join_their_tiles_as_on_one_machine(
 ):
     """Two of one tile one after the other, one of another tile beside them, one of elsewhere; and again."""
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
-    rows = {"noon": (1, 0.3, 5.3), "late": (3, 0.3, 7.3), "night": (1, 0.4, 5.4), "nowhere": (5, 0.0, 5.0)}
+    rows = {"noon": (1, 0.3, 8.3), "late": (3, 0.3, 7.3), "night": (1, 0.4, 8.4), "nowhere": (5, 0.0, 5.0)}
     recordings = [
-        write_stereo_recording(tmp_path / name, seed, [start + (stop - start) * k / 11 for k in range(12)])
+        write_stereo_recording(tmp_path / name, seed, [start + (stop - start) * k / 15 for k in range(16)])
         for name, (seed, start, stop) in rows.items()
     ]
     alone, shared = (Path(shutil.copytree(pieces, tmp_path / name)) for name in ("alone", "shared"))
