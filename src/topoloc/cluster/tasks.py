@@ -6,12 +6,13 @@ begun again: a worker by Ray, the driver by its user, so that a job should find 
 
 from __future__ import annotations
 
+import io
 import os
 import pickle
 import sys
 from collections import deque
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol, TypeVar, runtime_checkable
@@ -76,7 +77,7 @@ def run_on_ray(
         MissingExtraError, ClusterError: as of `connected`.
     """
     config, show = config or ClusterConfig(), show or (lambda number, state: None)
-    with connected(address) as ray:
+    with redirect_stdout(io.StringIO()), connected(address) as ray:  # Ray prints there of workers that died, which are begun again
         _warn_of_few_processors(ray, config.cpus_per_recording)
         board = progress_board(ray) if is_live else None
         queues = _queues(len(jobs), lines)
