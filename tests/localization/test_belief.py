@@ -270,3 +270,15 @@ def test_what_is_asked_of_an_answer_can_be_set():
     for log_odds, is_answer in ((2.0, False), (4.0, True)):
         result, _ = answer(believed([made_hypothesis(log_odds)], strict))
         assert isinstance(result, Localization) is is_answer
+
+
+# when nothing else is asked
+
+
+def test_it_is_settled_where_it_is_clear_and_no_other_place_comes_near():
+    clear = made_hypothesis(8.0)
+    assert believed([clear]).is_settled
+    assert believed([clear, made_hypothesis(-5.0, x=9.0, even_share=0.01)]).is_settled
+    assert not believed([clear, made_hypothesis(7.0, x=9.0)]).is_settled
+    assert not believed([made_hypothesis(2.0)]).is_settled
+    assert not believed([]).is_settled

@@ -81,6 +81,18 @@ def test_a_clear_picture_is_never_asked_for_the_second_kind(topomap: TopoMetricM
     assert (len(asked["surf"]), len(asked["sift"])) == (len(unseen_views()), 0)
 
 
+def test_where_another_place_is_nearly_as_likely_the_second_kind_is_asked(
+    topomap: TopoMetricMap, changed: Callable[..., list[int]], monkeypatch: pytest.MonkeyPatch
+):
+    """However clear the best one is: a twin of the place may be what the first kind is sure of."""
+    asked = changed("sift", lambda features: features)
+    monkeypatch.setattr(Search, "is_settled", property(lambda search: False))
+    result = Localizer(topomap).localize(PICTURE, CAMERA)
+    assert _is_right(result)
+    assert len(asked) == 1
+    assert result.provenance.features == "sift"
+
+
 def test_what_the_first_kind_leaves_open_the_second_answers(topomap: TopoMetricMap, changed: Callable[..., list[int]]):
     changed("surf", _useless)
     asked = changed("sift", lambda features: features)

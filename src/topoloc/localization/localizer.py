@@ -168,7 +168,7 @@ class Localizer:
         result, named = None, list[Answered]()
         for search in searches:
             _follow_up(search, propose(search, prior))
-            is_last = search.is_stopped or search.is_clear or search.following is None or prior is not None
+            is_last = search.is_stopped or search.is_settled or search.following is None or prior is not None
             result, named = final_answer(search) if is_last else answer(search)
             if search.is_stopped or (is_last and isinstance(result, Localization)):
                 return result, named

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from topoloc.localization.belief import Belief, Hypothesis
+from topoloc.localization.belief import Belief, Hypothesis, lead
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.evidence import Evidence
 from topoloc.localization.fitted_weights import FittedWeights
@@ -101,3 +101,12 @@ class Search:
         """Is there so much for one hypothesis that only parts of the map that look nearly the same are asked still?"""
         best = self.best
         return best is not None and best.log_odds > self.weights.evidence.clear_log_odds
+
+    @property
+    def is_settled(self) -> bool:
+        """Is it clear, and every other hypothesis as far behind as nowhere is? A twin of the place that this kind of features believes may
+        be told from it by another one."""
+        if not self.is_clear:
+            return False
+        best, *others = self.belief.ranked(self.weights.rivals)
+        return all(lead(best, other, self.weights.rivals) > self.weights.evidence.clear_log_odds for other in others)
