@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.rigid import Rigid3, covariance_of_inverse
+from topoloc.lifelong.scale_of_motion import ways_of
 from topoloc.localization.result import Localization
 from topoloc.slam.bundle import Anchor, BundleConfig, adjust_bundle
 from topoloc.slam.keyframes import FramePose, KeyFrame
@@ -86,13 +87,8 @@ def _in_the_map(stretch: Stretch, held: Sequence[Rigid3 | None]) -> list[KeyFram
 
 def _units(before: Sequence[Rigid3], after: Sequence[Rigid3]) -> Float[np.ndarray, " k"]:
     """What a unit of the motion is in metres at each key frame, by the way to the ones around it."""
-    ways = [_way([pose.inverse().translation for pose in poses]) for poses in (before, after)]
+    ways = [ways_of(np.array([pose.inverse().translation for pose in poses]).reshape(-1, 3)) for poses in (before, after)]
     first = np.maximum(np.arange(len(before)) - _NEIGHBOURS, 0)
     last = np.minimum(np.arange(len(before)) + _NEIGHBOURS, len(before) - 1)
     own, metres = (way[last] - way[first] for way in ways)
     return metres / np.maximum(own, 1e-12)
-
-
-def _way(positions: Sequence[Float[np.ndarray, "3"]]) -> Float[np.ndarray, " k"]:
-    steps = np.linalg.norm(np.diff(np.array(positions).reshape(-1, 3), axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])

@@ -84,7 +84,7 @@ def in_metres(own: Mapping[int, Rigid3], localized: Mapping[int, Localization], 
     """The motion with its steps in metres, as answers that agree say; only where these tell its unit. Its world stays the first frame's."""
     answers = _answers(own, localized)
     positions = np.array([pose.translation for pose in own.values()])
-    ways = _ways(positions)
+    ways = ways_of(positions)
     pairs = _pairs(answers, config)
     if len(pairs) == 0:
         return {}
@@ -132,7 +132,7 @@ def _pairs(answers: _Answers, config: ScaleConfig) -> Int[np.ndarray, "p 2"]:
 def _answers(own: Mapping[int, Rigid3], localized: Mapping[int, Localization]) -> _Answers:
     row_of = {index: row for row, index in enumerate(own)}
     rows = np.array([row_of[index] for index in localized], np.int64)
-    ways = _ways(np.array([pose.translation for pose in own.values()]))
+    ways = ways_of(np.array([pose.translation for pose in own.values()]))
     poses, found = [own[index] for index in localized], list(localized.values())
     return _Answers(
         rows,
@@ -145,8 +145,8 @@ def _answers(own: Mapping[int, Rigid3], localized: Mapping[int, Localization]) -
     )
 
 
-def _ways(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """How far it is along the motion to each of its frames."""
+def ways_of(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    """How far it is along a motion to each of its positions."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
 
 

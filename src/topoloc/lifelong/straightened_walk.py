@@ -19,6 +19,7 @@ from jaxtyping import Float
 
 from topoloc.bounds import Above
 from topoloc.geometry.rigid import Rigid3, exp_so3, log_so3
+from topoloc.lifelong.scale_of_motion import ways_of
 from topoloc.localization.result import Localization
 
 _ROUNDS, _SIGMAS = 4, 3.0
@@ -65,7 +66,7 @@ def straightened(
     answered = [index for index, answer in answers.items() if index in poses and _may_be_bent(poses[index], answer)]
     if not answered:
         return list(world_from_cams)
-    ways = dict(zip(poses, _ways([pose.translation for pose in poses.values()]), strict=True))
+    ways = dict(zip(poses, ways_of(np.array([pose.translation for pose in poses.values()])), strict=True))
     at = np.array([ways[index] for index in answered])
     bends = _bends([poses[index] for index in answered], [answers[index] for index in answered], at, d_thresh, config)
     moved = {index: _moved(pose, *bends.at(ways[index], config.reach * d_thresh)) for index, pose in poses.items()}
@@ -110,8 +111,3 @@ def _common(
         apart = np.linalg.norm(rows[None] - common[:, None], axis=2) / stray
         robust = weights / (1.0 + apart**2)
     return common
-
-
-def _ways(positions: Sequence[Float[np.ndarray, "3"]]) -> Float[np.ndarray, " n"]:
-    """How far it is along the walk to each of its poses."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(np.array(positions), axis=0), axis=1))])
