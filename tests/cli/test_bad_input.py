@@ -98,7 +98,9 @@ def test_a_missing_recording(room_map: Path, tmp_path: Path, complaint: Complain
 
 def test_a_folder_that_is_no_recording(tmp_path: Path, complaint: Complaint):
     (tmp_path / "letters").mkdir()
-    assert "letters: no known recording" in complaint("build", tmp_path / "letters", tmp_path / "room.topo")
+    assert "letters: no known recording: the folder is empty" in complaint("build", tmp_path / "letters", tmp_path / "room.topo")
+    (tmp_path / "letters/one.txt").write_text("Dear reader,")
+    assert "letters: no known recording. Looked for euroc" in complaint("build", tmp_path / "letters", tmp_path / "room.topo")
     assert "there are euroc, tum" in complaint("build", tmp_path / "letters", tmp_path / "room.topo", "--format", "betamax")
 
 

@@ -77,7 +77,7 @@ class FolderStore:
     def manifest(self) -> bytes | None:
         try:
             return (self.folder / MANIFEST).read_bytes()
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             return None
         except (OSError, ValueError) as error:
             raise AtlasError(f"cannot read {self.folder / MANIFEST}: {getattr(error, 'strerror', error)}") from None

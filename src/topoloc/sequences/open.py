@@ -121,5 +121,7 @@ def _recognise(path: Path) -> str:
     for name, candidate in FORMATS.items():
         if candidate.recognises(path):
             return name
+    if path.is_dir() and not any(path.iterdir()):
+        raise UnknownFormatError(f"{path}: no known recording: the folder is empty")
     looked_for = "; ".join(f"{name}: {candidate.looks_for}" for name, candidate in FORMATS.items())
     raise UnknownFormatError(f"{path}: no known recording. Looked for {looked_for}")
