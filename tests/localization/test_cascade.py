@@ -93,6 +93,19 @@ def test_where_another_place_is_nearly_as_likely_the_second_kind_is_asked(
     assert result.provenance.features == "sift"
 
 
+@pytest.mark.parametrize("says", [2.0, -20.0], ids=["yes", "no"])
+def test_around_an_expected_pose_the_second_kind_is_heard_on_what_the_first_is_not_sure_of(
+    topomap: TopoMetricMap, changed: Callable[..., list[int]], monkeypatch: pytest.MonkeyPatch, says: float
+):
+    """A twin of the place is no less likely where a stream that was placed wrongly expects it."""
+    changed("sift", _useless)
+    monkeypatch.setattr("topoloc.localization.localizer.say_on", lambda search, hypothesis: says)
+    assert _is_right(Localizer(topomap).localize(PICTURE, CAMERA, TRUTH)), "it is settled: nobody else is heard"
+    monkeypatch.setattr(Search, "is_settled", property(lambda search: False))
+    result = Localizer(topomap).localize(PICTURE, CAMERA, TRUTH)
+    assert _is_right(result) == result.localized == (says > 0.0)
+
+
 def test_what_the_first_kind_leaves_open_the_second_answers(topomap: TopoMetricMap, changed: Callable[..., list[int]]):
     changed("surf", _useless)
     asked = changed("sift", lambda features: features)

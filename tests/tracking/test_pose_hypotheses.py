@@ -55,6 +55,27 @@ def test_nothing_is_predicted_before_the_first_pose_nor_long_after_the_last():
     assert not hypotheses.continues
 
 
+@pytest.mark.parametrize(("share_new", "is_decided"), [(1.0, True), (0.05, False)])
+def test_a_pose_that_is_not_sure_is_believed_once_another_picture_says_so(share_new: float, is_decided: bool):
+    hypotheses = PoseHypotheses(HypothesesConfig())
+    hypotheses.weigh(0, one_of(at(0.0), sum_=0.8))
+    assert not hypotheses.is_decided
+    hypotheses.predict(STEP_NS)
+    hypotheses.weigh(STEP_NS, one_of(at(0.1), sum_=0.8), share_new=share_new)
+    assert hypotheses.is_decided == is_decided
+
+
+def test_pictures_without_a_pose_count_against_what_little_speaks_for():
+    doubtful, established = PoseHypotheses(HypothesesConfig()), walked_a_second()
+    doubtful.weigh(0, one_of(at(0.0), sum_=0.95))
+    assert doubtful.is_decided
+    for hypotheses in (doubtful, established):
+        for _ in range(3):
+            hypotheses.weigh(SECOND, [])
+    assert not doubtful.is_decided
+    assert established.is_decided
+
+
 def test_odometry_carries_further():
     hypotheses = PoseHypotheses(HypothesesConfig())
     seen(hypotheses, 0, at(5.0), odom_from_cam=at(100.0))

@@ -168,11 +168,14 @@ class Localizer:
         result, named = None, list[Answered]()
         for search in searches:
             _follow_up(search, propose(search, prior))
-            is_last = search.is_stopped or search.is_settled or search.following is None or prior is not None
+            is_last = search.is_stopped or search.is_settled or search.following is None
             result, named = final_answer(search) if is_last else answer(search)
             if search.is_stopped or (is_last and isinstance(result, Localization)):
                 return result, named
+            if prior is not None and named and not is_last and (heard := self._second_look(search, searches[-1]))[1]:
+                return heard
         if len(searches) > 1 and not named and prior is None:
+            _follow_up(searches[0], propose_more(searches[0]))
             of_first = self._second_look(searches[0], searches[-1])
             if of_first[1]:
                 return of_first
@@ -180,8 +183,7 @@ class Localizer:
         return result, named
 
     def _second_look(self, first: Search, last: Search) -> Verdict:
-        """What the first kind of features finds by all that it has, where the others found nothing; they are heard on it."""
-        _follow_up(first, propose_more(first))
+        """What the first kind of features believes; the last one is heard on it."""
         weights = first.weights.rivals
         believed = [one for one in first.belief.hypotheses if one.probability >= self.config.evidence.min_probability]
         seconded = Belief()

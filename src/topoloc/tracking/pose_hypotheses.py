@@ -42,7 +42,11 @@ class HypothesesConfig:
     miss_ambiguous: Annotated[float, Between(1e-6, 0.5)] = 0.1
     """... and that the true pose is not among alternatives, at least."""
     renewal: Annotated[float, Above(0)] = 1.0
-    """Motion (way in depths of the points, plus radians) after which what alternatives say is new (but for 1/e)."""
+    """Motion (way in depths of the points, plus radians) after which what alternatives say is new (but for 1/e) ..."""
+    renewal_alone: Annotated[float, Above(0)] = 0.1
+    """... and what a single pose says that is less sure than a localization can be."""
+    refused: Annotated[float, Between(0.01, 1)] = 0.6
+    """Share of its weight that a hypothesis keeps, beside "elsewhere", with a picture that gets no pose: it should have had one there."""
     elsewhere: Annotated[float, Between(1e-9, 0.5)] = 0.0005
     """Probability that the camera is at none of the hypotheses, at least: it was carried, or all of them are wrong."""
     max_number: Annotated[int, Between(1, 1000)] = 24
@@ -162,13 +166,14 @@ class PoseHypotheses:
     def weigh(self, t_ns: int, candidates: Sequence[Candidate], odom_from_cam: Rigid3 | None = None, share_new: float = 1.0) -> None:
         """What the picture's answer makes of the hypotheses, if this share of what it says is new.
 
-        The candidates exclude each other; where there are none, nothing is learnt.
+        The candidates exclude each other; where there are none, a place that is not in the map is a little likelier.
         """
         if not candidates:
+            self._keep([replace(one, weight=self.config.refused * one.weight) for one in self._alive], self._elsewhere)
             return
         before, miss = self.best, self.config.miss if len(candidates) == 1 else self.config.miss_ambiguous
         none = max(miss, 1.0 - sum(one.probability for one in candidates))
-        new = self._agreed(candidates[0], odom_from_cam) if len(candidates) == 1 else []
+        new = self._agreed(candidates[0], odom_from_cam, share_new) if len(candidates) == 1 else []
         for one in self._alive:
             if new and self.follows(one.now, candidates[0].world_from_cam, candidates[0].covariance):
                 continue  # it is that one
@@ -195,13 +200,14 @@ class PoseHypotheses:
         self._alive[0] = replace(self._alive[0], state=state, now=state, odom_from_cam=odom_from_cam)
         self._compare()
 
-    def _agreed(self, candidate: Candidate, odom_from_cam: Rigid3 | None) -> list[_Hypothesis]:
+    def _agreed(self, candidate: Candidate, odom_from_cam: Rigid3 | None, share_new: float) -> list[_Hypothesis]:
         """The hypotheses that a sure pose follows from, as one: there they all are. The motion is that of the likeliest of them."""
         pose, covariance = candidate.world_from_cam, candidate.covariance
         weight, likeliest = 0.0, (-math.inf, None)
         for one in self._alive:
             if (taking := self._taking(one, 0, candidate, odom_from_cam)) is not None:
-                weight += one.weight * candidate.probability * math.exp(-0.5 * self._slack_surprise(one.now, pose, covariance))
+                surprised = math.exp(-0.5 * self._slack_surprise(one.now, pose, covariance))
+                weight += one.weight * (candidate.probability * surprised) ** share_new
                 spread = float(np.linalg.slogdet(one.now.pose_covariance + covariance)[1])
                 density = math.log(one.weight) - 0.5 * (surprise(one.now, pose, covariance) + spread)
                 likeliest = max(likeliest, (density, taking), key=lambda pair: pair[0])

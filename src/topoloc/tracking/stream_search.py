@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.evidence import precision_of
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import SeenPoints
 from topoloc.localization.result import Localization, NotLocalized
@@ -21,13 +22,15 @@ from topoloc.tracking.tracker_state import StreamPicture
 class Expected:
     """About where the picture was taken, and what that is wrong by beside what the filter knows of (covariance, left, of cam_from_world).
 
-    Who asks around there alone finds only what is there; `is_enough` where nothing else is likely.
+    Who asks around there alone finds only what is there; `is_enough` where nothing else is likely. `by_walls`: nodes around do not look
+    this way, so that they know nothing of the picture.
     """
 
     world_from_cam: Rigid3
     doubt: Float[np.ndarray, "6 6"]
-    is_followed: bool
     is_enough: bool
+    is_followed: bool = False
+    by_walls: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +57,8 @@ class StreamSearch:
         if expected is not None and expected.is_enough:
             refusal, found = self._ask(picture, expected.world_from_cam)
             if refusal is not None and expected.is_followed:
+                if not expected.by_walls:
+                    self._hypotheses.weigh(picture.t_ns, [])
                 return refusal
         if len(found) != 1 or not self._follows(found[0], doubt):
             refusal, found = self._everywhere(picture)
@@ -64,20 +69,22 @@ class StreamSearch:
         return refusal or refused(found[0].result)
 
     def _share_new(self, found: list[Found]) -> float:
-        """How much of what an ambiguous picture says is new since the one before."""
-        best, before = self._hypotheses.best, self._asked_at
-        if len(found) > 1 and best is not None:
-            self._asked_at = best.world_from_cam
-            if before is not None and self._hypotheses.continues:
-                moved = before.inverse() @ best.world_from_cam
-                depth = float(np.median([one.errors.depth for one in found]))
-                way = float(np.linalg.norm(moved.translation)) / depth + moved.angle()
-                return 1.0 - math.exp(-way / self._hypotheses.config.renewal)
-        return 1.0
+        """How much of what a picture says that is not sure is new since the one before that was not."""
+        best, before, config = self._hypotheses.best, self._asked_at, self._hypotheses.config
+        if not found or best is None or found[0].probability >= 1.0 - config.miss:
+            return 1.0
+        self._asked_at = best.world_from_cam
+        if before is None or not self._hypotheses.continues:
+            return 1.0
+        moved = before.inverse() @ best.world_from_cam
+        depth = float(np.median([one.errors.depth for one in found]))
+        way = float(np.linalg.norm(moved.translation)) / depth + moved.angle()
+        return 1.0 - math.exp(-way / (config.renewal if len(found) > 1 else config.renewal_alone))
 
     def _everywhere(self, picture: StreamPicture) -> tuple[NotLocalized | None, list[Found]]:
         """As `_ask` in all of the map. Where that does not settle it, also around each hypothesis that the answer leaves out: of many
-        poses that look alike a search finds some. What it left out is as likely as the others are in the mean.
+        poses that look alike a search finds some. What it left out is at most as likely as the others are in the
+        mean.
         """
         refusal, found = self._ask(picture, None)
         if refusal is None:
@@ -89,7 +96,7 @@ class StreamSearch:
                 missed += [one for one in around if not _is_among(one.result.world_from_cam, [*found, *missed])]
         whole = len(found) + len(missed)
         found = [replace(one, probability=one.probability * len(found) / whole) for one in found]
-        return refusal, found + [replace(one, probability=1.0 / whole) for one in missed]
+        return refusal, found + [replace(one, probability=one.probability / whole) for one in missed]
 
     def _follows(self, found: Found, doubt: Float[np.ndarray, "6 6"]) -> bool:
         best = self._hypotheses.best
@@ -100,12 +107,16 @@ class StreamSearch:
         result, named = self._localizer.localize_near(picture.image, picture.camera, near)
         if isinstance(result, NotLocalized):
             return result, [self._found(one, seen, one.probability) for one, seen in named]
-        # its probability is also that of being precise, which says nothing of other places
-        return None, [self._found(one, seen, 1.0 - self._hypotheses.config.miss) for one, seen in named]
+        return None, [self._found(one, seen, min(_of_place(one), 1.0 - self._hypotheses.config.miss)) for one, seen in named]
 
     def _found(self, result: Localization, seen: SeenPoints, probability: float) -> Found:
         depth = float(np.median(result.world_from_cam.inverse().apply(seen.points_world)[:, 2]))
         return Found(result, seen, errors_of(result, depth, self._floor_share), probability)
+
+
+def _of_place(found: Localization) -> float:
+    """The probability of the place: that of the answer is also that of being precise, which says nothing of other places."""
+    return found.probability if found.evidence is None else min(found.probability / precision_of(found.evidence), 1.0)
 
 
 def _is_among(world_from_cam: Rigid3, found: list[Found]) -> bool:

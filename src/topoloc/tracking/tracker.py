@@ -220,11 +220,11 @@ class Tracker:
             return None
         if followed is None:
             is_known = doubt_of(predicted, reference.errors.depth) <= self.config.max_doubt
-            return Expected(predicted.world_from_cam, np.zeros((6, 6)), is_followed=False, is_enough=is_known and is_alone)
-        motion, scale = followed.cam_from_ref.adjoint(), self.config.hypotheses.prediction_scale
-        doubt = motion @ reference.errors.whole @ motion.T + scale**2 * self._followed_covariance(followed)
+            return Expected(predicted.world_from_cam, np.zeros((6, 6)), is_known and is_alone)
+        motion, scale = followed.cam_from_ref.adjoint(), self.config.hypotheses.prediction_scale**2
+        doubt = motion @ reference.errors.whole @ motion.T + scale * self._followed_covariance(followed)
         near = (followed.cam_from_ref @ reference.cam_from_world).inverse()
-        return Expected(near, doubt, is_followed=True, is_enough=is_alone)
+        return Expected(near, doubt, is_alone, is_followed=True, by_walls=reference.is_by_walls)
 
     def _believe(
         self, picture: StreamPicture, found: Found, predicted: MotionState | None, followed: Followed | None, seconds: float
@@ -279,7 +279,7 @@ class Tracker:
         result = Localization(
             world_from_cam=world_from_cam,
             covariance=covariance,
-            probability=found.probability,
+            probability=min(found.probability, self._hypotheses.alternatives()[0].probability),
             node_id=found.node_id,
             candidates=[],
             num_matches=followed.num_found,
