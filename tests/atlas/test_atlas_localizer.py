@@ -19,6 +19,7 @@ from topoloc.errors import AtlasError
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization import query
+from topoloc.localization.asking import Asking
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized, result_from_json
 from topoloc.map.topomap import TopoMetricMap
@@ -93,6 +94,24 @@ def test_two_tiles_that_know_the_place_as_well_are_both_named(own_atlas: Path, r
     assert [one.probability for one in result.alternatives] == pytest.approx([0.5, 0.5], abs=0.05)
     assert {one["tile"] for one in result.to_json("view")["alternatives"]} == {"room", "twin"}
     assert result_from_json(result.to_json("view")).alternatives[0].tile in ("room", "twin")  # pyright: ignore
+
+
+def test_a_look_alike_that_cannot_come_near_is_left_at_that(atlas: Path, monkeypatch: pytest.MonkeyPatch):
+    """Neither does it cost a glance, nor is it named."""
+    asked = list[str]()
+    glance = Asking.at_a_glance
+    monkeypatch.setattr(Asking, "at_a_glance", lambda self: asked.append(self.features) or glance(self))
+    wide = AtlasConfig(settled_gap=2.0, hopeless_gap=2.0, alike_gap=2.0, num_glanced=1)
+    result = _localizer(atlas, wide).localize(unseen_views()[0][0], CAMERA)
+    assert isinstance(result, Localization)
+    assert asked == ["surf"], "the tile that answers, not the other one"
+
+
+def test_a_twin_that_is_asked_last_is_heard(own_atlas: Path, room_map: Path):
+    add_tiles(str(own_atlas), new_tiles([str(room_map)], "twin"))
+    result = _localizer(own_atlas, AtlasConfig(settled_gap=2.0, num_glanced=1)).localize(unseen_views()[0][0], CAMERA)
+    assert isinstance(result, NotLocalized)
+    assert result.reason == "ambiguous"
 
 
 def test_two_tiles_of_one_world_agree(own_atlas: Path, room_map: Path):

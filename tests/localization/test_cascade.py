@@ -99,7 +99,7 @@ def test_around_an_expected_pose_the_second_kind_is_heard_on_what_the_first_is_n
 ):
     """A twin of the place is no less likely where a stream that was placed wrongly expects it."""
     changed("sift", _useless)
-    monkeypatch.setattr("topoloc.localization.localizer.say_on", lambda search, hypothesis: says)
+    monkeypatch.setattr("topoloc.localization.asking.say_on", lambda search, hypothesis: says)
     assert _is_right(Localizer(topomap).localize(PICTURE, CAMERA, TRUTH)), "it is settled: nobody else is heard"
     monkeypatch.setattr(Search, "is_settled", property(lambda search: False))
     result = Localizer(topomap).localize(PICTURE, CAMERA, TRUTH)

@@ -13,8 +13,7 @@ from doubled_room import ELSEWHERE, twice
 from tiny_world import CAMERA
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization import localizer as localizer_module
-from topoloc.localization import propose, refine
+from topoloc.localization import asking, propose, refine
 from topoloc.localization.belief import Belief, Hypothesis
 from topoloc.localization.config import LocalizerConfig, LookAlikesConfig, ViewpointsConfig
 from topoloc.localization.fitted_weights import weights_of
@@ -215,7 +214,7 @@ def test_a_pose_that_was_found_already_is_not_followed_up_again(room: TopoMetric
         followed.append((search, proposal))
         return refine.hypothesis_of(search, proposal)
 
-    monkeypatch.setattr(localizer_module, "hypothesis_of", hypothesis_of)
+    monkeypatch.setattr(asking, "hypothesis_of", hypothesis_of)
     for picture, _ in unseen_views():
         followed.clear()
         assert isinstance(Localizer(room).localize(picture, CAMERA), Localization)

@@ -1,10 +1,11 @@
 """Localizing a single image in an atlas: which tiles, in which order, until when.
 
-The picture's features are extracted once, whatever number of tiles asks for them. The index ranks the tiles (`index.py`), by the cheapest
-kind of features and, where that leaves it open, by the next. A tile that leads by far is asked at once by all means
-(`localization/localizer.py`); else the likeliest are asked at a glance, by retrieval alone, until a pose is clear, and the most promising
-ones by all means until one answers. Last, tiles that look as much like the picture as the one that answered must not vouch for a pose as
-well (`verdict.py`): aliasing grows with the number of places.
+The picture's features are extracted once, whatever number of tiles asks for them. The index ranks the tiles (`index.py`) by the cheapest
+kind of features. A tile that leads by far is asked at once by all means (`localization/localizer.py`); else the likeliest are asked at a
+glance, by retrieval alone, until a pose is clear. Where none is, the next kind of features ranks them, and more are asked at a glance; the
+most promising ones by all means until one answers. Last, tiles that look as much like the picture as the one that answered must not vouch
+for a pose as well (`verdict.py`): aliasing grows with the number of places. They are asked as look-alikes within a map are: one that agrees
+with far fewer of the picture's strongest features is left at that.
 """
 
 from __future__ import annotations
@@ -12,12 +13,14 @@ from __future__ import annotations
 import copy
 import time
 import warnings
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from functools import cached_property
+from typing import Literal
 
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.config import AtlasConfig
+from topoloc.atlas.hearing import Hearing, Ranking
 from topoloc.atlas.near import Near, tiles_in_reach
 from topoloc.atlas.open_maps import Maps
 from topoloc.atlas.verdict import Heard, joint_result
@@ -27,53 +30,14 @@ from topoloc.features.kinds import KINDS, FeatureConfig, check_available
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
-from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.localizer import LocalizerConfig
 from topoloc.localization.query import Picture, Query, StageClock, reduced_image, unknown_camera
 from topoloc.localization.result import Alternative, Localization, NotLocalized, at_time
 from topoloc.places.coarse import Image
 from topoloc.places.shared_vocabulary import shared_vocabulary
 
-Ranking = list[tuple[str, float]]
-"""Tiles with the likeness of their best place, the likeliest first."""
-
-
-@dataclass(eq=False)
-class _Hearing:
-    """One picture: what the tiles have said so far, until when others may be asked."""
-
-    picture: Picture
-    ranking: Ranking
-    deadline: float
-    heard: dict[str, Heard] = field(default_factory=dict)
-
-    @property
-    def is_late(self) -> bool:
-        return time.perf_counter() > self.deadline
-
-    @property
-    def left_ms(self) -> float | None:
-        """Milliseconds that are left; None where there is no limit."""
-        return None if self.deadline == float("inf") else max(1.0, 1e3 * (self.deadline - time.perf_counter()))
-
-    @property
-    def is_settled(self) -> bool:
-        """Is a pose so well founded that the tile itself asked no further?"""
-        return any(one.is_clear for one in self.heard.values())
-
-    @property
-    def answers(self) -> list[Heard]:
-        """The tiles that vouch for a pose when they are asked by all means."""
-        return [one for one in self.heard.values() if one.is_full and isinstance(one.result, Localization)]
-
-    def was_asked(self, tile_id: str) -> bool:
-        """By all means?"""
-        return tile_id in self.heard and self.heard[tile_id].is_full
-
-    def promise(self, ranked: tuple[str, float]) -> tuple[float, float]:
-        """Which of several tiles is asked first: the one with the likeliest pose at a glance, then the one that looks most like the
-        picture."""
-        known = self.heard.get(ranked[0])
-        return max((one.probability for one in known.named), default=0.0) if known else 0.0, ranked[1]
+Way = Literal["by all means", "at a glance", "as a rival"]
+"""How a tile is asked; as a rival of an answer, at a glance, and only where it may be one."""
 
 
 class AtlasLocalizer:
@@ -147,17 +111,15 @@ class AtlasLocalizer:
             raise AtlasError("a prior is a pose in one tile's world: name the tile")
         if tile_id is None and self._reached is not None and not self._reached:
             return self.completed(NotLocalized("not_in_map", detail=self._nowhere), t_ns)
-        clock = StageClock()
-        hearing = _Hearing(picture, [] if tile_id is not None else self.rank(picture, clock), deadline)
-        ranked = clock.times_ms()
+        hearing, clock = Hearing(picture, deadline), StageClock()
         if tile_id is None:
-            self._hear(hearing)
+            self._hear(hearing, clock)
         else:
             self._ask(hearing, self.atlas.tile(tile_id).tile_id, 1.0, prior=prior)
         if not hearing.heard:
             raise AtlasError(f"no tile of the atlas {self.atlas.store.where} can be asked: {next(iter(self.problems.values()), 'no time')}")
         result = self._on_earth(joint_result(list(hearing.heard.values())))
-        result = replace(result, times_ms=_all_times(hearing, ranked) | {"total": 1e3 * (time.perf_counter() - start)})
+        result = replace(result, times_ms=_all_times(hearing, clock) | {"total": 1e3 * (time.perf_counter() - start)})
         return result if t_ns is None else at_time(result, t_ns)
 
     def _on_earth(self, result: Localization | NotLocalized) -> Localization | NotLocalized:
@@ -178,36 +140,45 @@ class AtlasLocalizer:
         """What is said of a picture that could not be asked, with its time (nanoseconds)."""
         return result if t_ns is None else at_time(result, t_ns)
 
-    def rank(self, picture: Picture, clock: StageClock | None = None) -> Ranking:
+    def rank(self, picture: Picture) -> Ranking:
         """The tiles that look most like the picture; behind them those whose places cannot be ranked."""
+        *_, ranking = self._rankings(picture, StageClock())
+        return ranking
+
+    def _rankings(self, picture: Picture, clock: StageClock) -> Iterator[Ranking]:
+        """As `rank`, by the cheapest kind of features; then by the next as well, until a tile leads."""
         sizes = LocalizerConfig()  # those that tiles reduce a picture by, so that they find its features extracted
         image, lens = reduced_image(picture.image, picture.camera, self._focal, sizes.max_finer, sizes.max_side_px)
-        index, vectors, ranking = self.atlas.index, {}, Ranking()
+        unranked = [(tile_id, 0.0) for tile_id in self.atlas.problems if self._reached is None or tile_id in self._reached]
+        vectors, ranking = {}, Ranking()
         for kind in self._ranked_by:
             vocabulary = shared_vocabulary(kind)
             assert vocabulary is not None
-            query = Query(image, lens, 1.0, FeatureConfig(kind=kind), clock or StageClock(), shared=picture.features)
-            vectors[kind] = vocabulary.vector(query.features, lens.width, lens.height)
-            ranking = index.rank(vectors, self.config.num_ranked, self._reached)
+            features = Query(image, lens, 1.0, FeatureConfig(kind=kind), clock, shared=picture.features).features
+            with clock.stage("tiles"):
+                vectors[kind] = vocabulary.vector(features, lens.width, lens.height)
+                ranking = self.atlas.index.rank(vectors, self.config.num_ranked, self._reached)
+            yield ranking + unranked
             if _gap(ranking) >= self.config.settled_gap:
-                break
-        return ranking + [(tile_id, 0.0) for tile_id in self.atlas.problems if self._reached is None or tile_id in self._reached]
+                return
+        if not vectors:
+            yield unranked
 
     @cached_property
     def _ranked_by(self) -> list[str]:
         """The kinds of features that tiles can be ranked by and that can be had here, the cheapest first."""
         return [kind for kind in KINDS if kind in self.atlas.index.kinds and _is_available(kind)]
 
-    def _hear(self, hearing: _Hearing) -> None:
+    def _hear(self, hearing: Hearing, clock: StageClock) -> None:
         """Ask tiles until one answers; then those that look as much like the picture."""
-        config, ranking = self.config, self._left(hearing.ranking)
-        hopeful = [one for one in ranking if one[1] >= ranking[0][1] - config.hopeless_gap or one[0] in self.atlas.problems]
-        if _gap(ranking) < config.settled_gap:
-            for tile_id, likeness in hopeful[: config.num_glanced]:
-                self._ask(hearing, tile_id, likeness, is_full=False)
-                if hearing.is_settled or hearing.is_late:
-                    break
-        for _ in range(config.num_asked):
+        for number, ranking in enumerate(self._rankings(hearing.picture, clock), start=1):
+            hearing.ranking = ranking
+            if _gap(self._left(ranking)) < self.config.settled_gap:
+                self._glance(hearing, self.config.num_glanced if number >= len(self._ranked_by) else self.config.num_glanced_first)
+            if hearing.is_settled or hearing.is_late:
+                break
+        hopeful = self._hopeful(hearing)
+        for _ in range(self.config.num_asked):
             left = [one for one in self._left(hopeful) if not hearing.was_asked(one[0])]
             if not left or hearing.answers or (hearing.heard and hearing.is_late):
                 break
@@ -216,23 +187,37 @@ class AtlasLocalizer:
             self._ask(hearing, *left[0])
         self._hear_look_alikes(hearing)
 
+    def _hopeful(self, hearing: Hearing) -> Ranking:
+        """Tiles that look not far less like the picture than the best one."""
+        ranking = self._left(hearing.ranking)
+        return [one for one in ranking if one[1] >= ranking[0][1] - self.config.hopeless_gap or one[0] in self.atlas.problems]
+
+    def _glance(self, hearing: Hearing, num_tiles: int) -> None:
+        """Ask the likeliest tiles at a glance, until a pose is clear."""
+        for tile_id, likeness in self._hopeful(hearing)[:num_tiles]:
+            if hearing.is_settled or hearing.is_late:
+                return
+            if tile_id not in hearing.heard:
+                self._ask(hearing, tile_id, likeness, "at a glance")
+
     def _left(self, ranking: Ranking) -> Ranking:
         """Without tiles that cannot be read."""
         return [one for one in ranking if one[0] not in self.problems]
 
-    def _hear_look_alikes(self, hearing: _Hearing) -> None:
-        """Tiles that look about as much like the picture as the one that answered, at a glance."""
+    def _hear_look_alikes(self, hearing: Hearing) -> None:
+        """Tiles that look about as much like the picture as the one that answered, at a glance, where the cheapest test leaves open that
+        they rival it."""
         if not hearing.answers:
             return
         least = min(answer.likeness for answer in hearing.answers) - self.config.alike_gap
         alike = [(tile_id, likeness) for tile_id, likeness in hearing.ranking if likeness >= least and tile_id not in hearing.heard]
         for tile_id, likeness in alike[: self.config.num_alike]:
             if not hearing.is_late:
-                self._ask(hearing, tile_id, likeness, is_full=False)
+                self._ask(hearing, tile_id, likeness, "as a rival")
         for one in [one for one in hearing.heard.values() if one.is_clear and not one.is_full]:  # it may be the answer itself
             self._ask(hearing, one.tile.tile_id, one.likeness)
 
-    def _ask(self, hearing: _Hearing, tile_id: str, likeness: float, is_full: bool = True, prior: Rigid3 | None = None) -> None:
+    def _ask(self, hearing: Hearing, tile_id: str, likeness: float, way: Way = "by all means", prior: Rigid3 | None = None) -> None:
         """Put the picture to a tile; where that cannot be read, the others answer."""
         if tile_id in self.problems:
             hearing.heard.pop(tile_id, None)
@@ -240,9 +225,14 @@ class AtlasLocalizer:
         tile = self.atlas.tile(tile_id)
         try:
             with self._maps.lent(tile_id, self._maps.tile_path(self.atlas, tile)) as opened:
-                localizer: Localizer = opened.localizer if is_full else opened.localizer.at_first_glance
                 known = prior if prior is not None or self._reached is None else self._reached.get(tile_id)
-                result, named = localizer.ask(hearing.picture, known, hearing.left_ms)
+                before, asking = hearing.begun.get(tile_id, (None, None))
+                if asking is None or before is not opened:
+                    asking = opened.localizer.asking(hearing.picture, known, hearing.left_ms)
+                hearing.begun[tile_id] = opened, asking
+                if way == "as a rival" and not hearing.may_be_rival(asking):
+                    return
+                result, named = asking.by_all_means() if way == "by all means" else asking.at_a_glance()
         except StoreError:  # what the tile would have said nobody knows
             raise
         except MapError as error:
@@ -250,7 +240,7 @@ class AtlasLocalizer:
             hearing.heard.pop(tile_id, None)
             self._warn(f"tile {tile_id} is not asked: {error}")
             return
-        hearing.heard[tile_id] = Heard(tile, result, tuple(one for one, _ in named), is_full, likeness)
+        hearing.heard[tile_id] = Heard(tile, result, tuple(one for one, _ in named), way == "by all means", likeness)
 
 
 def _gap(ranking: Ranking) -> float:
@@ -266,11 +256,10 @@ def _is_available(kind: str) -> bool:
     return True
 
 
-def _all_times(hearing: _Hearing, ranked: dict[str, float]) -> dict[str, float]:
+def _all_times(hearing: Hearing, clock: StageClock) -> dict[str, float]:
     """Milliseconds of each stage, of all tiles together; `tiles` is that of ranking them, without the features."""
-    features = {stage: ms for stage, ms in ranked.items() if stage != "total"}
-    total = {**features, "tiles": ranked["total"] - sum(features.values())}
-    for one in hearing.heard.values():
-        for stage, ms in one.result.times_ms.items():
+    total = clock.times_ms()
+    for _, asking in hearing.begun.values():
+        for stage, ms in asking.times_ms.items():
             total[stage] = total.get(stage, 0.0) + ms
     return total

@@ -17,10 +17,12 @@ class AtlasConfig:
     settled_gap: Annotated[float, Between(0, 2)] = 0.15
     """A tile whose best place is so much more like the picture than any other tile's is asked by all means at once; and where no tile
     leads so by one kind of features, the next kind ranks them."""
+    num_glanced_first: Annotated[int, Between(0, 100_000)] = 2
+    """Before the next kind of features ranks them, so many are asked by retrieval alone, at most, until a pose is clear."""
     hopeless_gap: Annotated[float, Between(0, 2)] = 0.25
     """Tiles whose best place is so much less like the picture than the best tile's are not asked."""
     num_glanced: Annotated[int, Between(1, 100_000)] = 8
-    """Where no tile leads, so many are asked by retrieval alone, at most, until a pose is clear."""
+    """Where no tile leads, so many are asked by retrieval alone, at most, until a pose is clear; those asked before count."""
     num_asked: Annotated[int, Between(1, 10_000)] = 3
     """Tiles that are asked by all means, at most, until one answers."""
     alike_gap: Annotated[float, Between(0, 2)] = 0.1

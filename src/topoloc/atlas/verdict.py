@@ -17,8 +17,8 @@ import numpy as np
 from topoloc.atlas.joins import sigmas_at
 from topoloc.atlas.manifest import Tile
 from topoloc.localization.belief import MIN_LEAD
-from topoloc.localization.evidence import log_odds_of
-from topoloc.localization.fitted_weights import FittedWeights, RivalWeights, weights_of
+from topoloc.localization.evidence import Evidence, log_odds_of, strength_of
+from topoloc.localization.fitted_weights import FittedWeights, weights_of
 from topoloc.localization.result import Alternative, Localization, NotLocalized, R
 
 _SAME_METRES, _SAME_DEG = 1.0, 5.0
@@ -57,6 +57,15 @@ def joint_result(heard: Sequence[Heard]) -> Localization | NotLocalized:
         others = (1.0 / best.result.probability) - 1.0 + sum(math.exp(-by) for by in leads)
         return _of_tile(replace(best.result, probability=1.0 / (1.0 + others)), best.tile)
     return _ambiguity(best, rivals, leads)
+
+
+def is_far_behind(evidence: Evidence, features: str, answer: Localization) -> bool:
+    """Would a pose of another tile with this evidence be too improbable beside the answer to be named as an alternative?"""
+    weights = weights_of(features)
+    log_odds = log_odds_of(evidence, weights)
+    is_alike = features == answer.provenance.features and not _is_from_walls(answer)
+    by = _strength(answer) - strength_of(evidence, log_odds, weights.rivals) if is_alike else _log_odds(answer) - log_odds
+    return by > -math.log(_MIN_ALTERNATIVE)
 
 
 def _rivals_of(one: Heard, vouching: Sequence[tuple[Tile, Localization]]) -> list[tuple[Tile, Localization]]:
@@ -112,11 +121,9 @@ def _lead(a: Localization, b: Localization) -> float:
 
 def _strength(result: Localization) -> float:
     """As of `belief.lead`."""
-    weights, evidence = _rivals(result), result.evidence
-    if evidence is None or _is_from_walls(result):
+    if result.evidence is None or _is_from_walls(result):
         return _log_odds(result)
-    even, doubt = math.log(evidence.even_share + 0.002), math.log(max(evidence.doubt, 0.01))
-    return weights.odds * _log_odds(result) + weights.even_share * even + weights.doubt * doubt
+    return strength_of(result.evidence, _log_odds(result), _weights(result).rivals)
 
 
 def _log_odds(result: Localization) -> float:
@@ -128,10 +135,6 @@ def _log_odds(result: Localization) -> float:
 
 def _weights(result: Localization) -> FittedWeights:
     return weights_of(result.provenance.features)
-
-
-def _rivals(result: Localization) -> RivalWeights:
-    return _weights(result).rivals
 
 
 def _is_from_walls(result: Localization) -> bool:

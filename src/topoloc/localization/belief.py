@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.evidence import Evidence, EvidenceConfig, precision_of
+from topoloc.localization.evidence import Evidence, EvidenceConfig, precision_of, strength_of
 from topoloc.localization.fitted_weights import RivalWeights
 from topoloc.localization.pose_fit import PoseFit
 
@@ -68,17 +68,11 @@ def lead(a: Hypothesis, b: Hypothesis, weights: RivalWeights) -> float:
 
 def _leads(hypotheses: tuple[Hypothesis, ...], weights: RivalWeights) -> Float[np.ndarray, "n n"]:
     """By how much each is likelier than each: by their strengths, or their odds where one of the two comes from walls."""
-    strength = np.array([_strength(one, weights) for one in hypotheses])
+    strength = np.array([strength_of(one.evidence, one.log_odds, weights) for one in hypotheses])
     log_odds = np.array([one.log_odds for one in hypotheses])
     from_walls = np.array([one.is_from_walls for one in hypotheses])
     by_odds = from_walls[:, None] | from_walls
     return np.where(by_odds, log_odds[:, None] - log_odds, strength[:, None] - strength)
-
-
-def _strength(hypothesis: Hypothesis, weights: RivalWeights) -> float:
-    evidence = hypothesis.evidence
-    odds, even = weights.odds * hypothesis.log_odds, weights.even_share * math.log(evidence.even_share + 0.002)
-    return odds + even + weights.doubt * math.log(max(evidence.doubt, 0.01))
 
 
 def is_same_pose(a: PoseFit, b: PoseFit, config: EvidenceConfig) -> bool:

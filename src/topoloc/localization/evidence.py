@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from topoloc.bounds import Above, AtLeast, Between
-from topoloc.localization.fitted_weights import EvidenceWeights, FittedWeights
+from topoloc.localization.fitted_weights import EvidenceWeights, FittedWeights, RivalWeights
 
 COLUMNS, ROWS = 8, 6
 """The cells of a picture whose number with an inlier in it measures the inliers' spread."""
@@ -132,6 +132,12 @@ def log_odds_of(evidence: Evidence, weights: FittedWeights) -> float:
 def node_log_odds(evidence: Evidence, weights: EvidenceWeights) -> float:
     """The same of a pose that the map's nodes let expect, not its walls."""
     return sum(weight * x for weight, x in zip(weights.in_order, score_features(evidence), strict=True)) + weights.bias
+
+
+def strength_of(evidence: Evidence, log_odds: float, rivals: RivalWeights) -> float:
+    """By how much more of this a pose that the nodes let expect leads another one, in logarithms of odds."""
+    even, doubt = math.log(evidence.even_share + 0.002), math.log(max(evidence.doubt, 0.01))
+    return rivals.odds * log_odds + rivals.even_share * even + rivals.doubt * doubt
 
 
 def wall_score_features(evidence: Evidence) -> tuple[float, ...]:

@@ -2,11 +2,11 @@
 
 The coarse localizer names the nodes that the image may belong to; the image is patch-normalised and its features are
 matched with those of the nodes; PnP on the matches gives the camera's global pose. Unlike the paper's blind first choice, this is one
-loop of hypotheses: first poses are proposed (`propose.py`), the cheapest and likeliest first; each is refined in the same way, its evidence
-counted (`refine.py`), and it joins what is believed (`belief.py`), until that is settled. A pose is reported only where the evidence for it
-is strong and nothing else in the map explains the image as well. One candidate, no guided step, no look-alikes, viewpoints and walls
-(`num_candidates=1`, `guided.num_nodes=0`, `look_alikes.max_groups=0`, `viewpoints.num_nodes=0`, `walls.num_ranked=0`) give the paper's own
-behaviour.
+loop of hypotheses (`asking.py`): first poses are proposed (`propose.py`), the cheapest and likeliest first; each is refined in the same
+way, its evidence counted (`refine.py`), and it joins what is believed (`belief.py`), until that is settled. A pose is reported only where
+the evidence for it is strong and nothing else in the map explains the image as well. One candidate, no guided step, no look-alikes,
+viewpoints and walls (`num_candidates=1`, `guided.num_nodes=0`, `look_alikes.max_groups=0`, `viewpoints.num_nodes=0`, `walls.num_ranked=0`)
+give the paper's own behaviour.
 """
 
 from __future__ import annotations
@@ -15,24 +15,21 @@ import copy
 import time
 from collections.abc import Iterable
 from dataclasses import replace
-from functools import cached_property
 from typing import TypeVar
 
 from topoloc.bounds import check_bounds
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
-from topoloc.localization.answer import Answered, Verdict, answer, final_answer
+from topoloc.localization.answer import Verdict
 from topoloc.localization.asked_kind import AskedKind, kinds_to_ask
-from topoloc.localization.belief import Belief
+from topoloc.localization.asking import Asking
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.fitted_weights import FittedWeights
-from topoloc.localization.propose import propose, propose_more
 from topoloc.localization.provenance import Provenance
 from topoloc.localization.query import Picture, Query, reduced_image, unknown_camera
-from topoloc.localization.refine import hypothesis_of, say_on
 from topoloc.localization.result import Localization, NotLocalized, at_time
-from topoloc.localization.search import Proposal, Search, Trace
+from topoloc.localization.search import Search, Trace
 from topoloc.map.contents import map_id_of
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.coarse import CoarseLocalizer, Image
@@ -40,7 +37,6 @@ from topoloc.places.coarse import CoarseLocalizer, Image
 __all__ = ["Localizer", "LocalizerConfig"]
 
 R = TypeVar("R", bound=Localization | NotLocalized)
-_LEAST_SECOND = 1.4  # log odds of a pose that only the features asked first found: twins of the true place come to 1.2
 
 
 class Localizer:
@@ -116,27 +112,16 @@ class Localizer:
 
     def ask(self, picture: Picture, prior: Rigid3 | None = None, max_ms: float | None = None, trace: Trace | None = None) -> Verdict:
         """As `localize_near`, of a picture whose features other maps may have asked for before."""
-        searches = self._searches(self._query(picture, max_ms), trace)
-        result, named = self._answered(searches, prior)
-        for search in searches:  # they know each other: a ring, which would keep the picture in memory until the collector comes by
-            search.before = search.following = None
-        camera = picture.camera
-        return self.completed(result, camera), [(self.completed(one, camera), seen) for one, seen in named]
+        return self.asking(picture, prior, max_ms, trace).by_all_means()
 
-    @cached_property
-    def at_first_glance(self) -> Localizer:
-        """The same map asked by its first kind of features and by retrieval alone: the cheapest question that a clear picture answers."""
-        other, first = copy.copy(self), self._kinds[0]
-        c = first.config
-        brief = replace(
-            c,
-            look_alikes=replace(c.look_alikes, max_groups=0),
-            viewpoints=replace(c.viewpoints, num_nodes=0),
-            walls=replace(c.walls, num_ranked=0),
-            max_repetitions=0,
-        )
-        other._kinds, other.config = [replace(first, config=brief)], brief
-        return other
+    def asking(self, picture: Picture, prior: Rigid3 | None = None, max_ms: float | None = None, trace: Trace | None = None) -> Asking:
+        """The same question, to be put at a glance first."""
+        searches, camera = self._searches(self._query(picture, max_ms), trace), picture.camera
+
+        def completed(verdict: Verdict) -> Verdict:
+            return self.completed(verdict[0], camera), [(self.completed(one, camera), seen) for one, seen in verdict[1]]
+
+        return Asking(searches, prior, completed)
 
     def without(self, node_ids: Iterable[int]) -> Localizer:
         """The same map as if nobody had stood at these nodes: a picture that was taken there is then asked of the rest of the map.
@@ -146,7 +131,6 @@ class Localizer:
         rows, other = [self.topomap.row_of(node_id) for node_id in node_ids], copy.copy(self)
         other._kinds = [replace(kind, map=kind.map.without(rows)) for kind in self._kinds]
         other.map = other._kinds[0].map
-        other.__dict__.pop("at_first_glance", None)
         return other
 
     def completed(self, result: R, camera: Camera | RoughCamera | None = None, t_ns: int | None = None) -> R:
@@ -164,43 +148,14 @@ class Localizer:
             return replace(result, provenance=provenance, alternatives=alternatives)
         return replace(result, provenance=provenance, geopose=georeference.geopose(result.world_from_cam) if georeference else None)
 
-    def _answered(self, searches: list[Search], prior: Rigid3 | None) -> Verdict:
-        result, named = None, list[Answered]()
-        for search in searches:
-            _follow_up(search, propose(search, prior))
-            is_last = search.is_stopped or search.is_settled or search.following is None
-            result, named = final_answer(search) if is_last else answer(search)
-            if search.is_stopped or (is_last and isinstance(result, Localization)):
-                return result, named
-            if prior is not None and named and not is_last and (heard := self._second_look(search, searches[-1]))[1]:
-                return heard
-        if len(searches) > 1 and not named and prior is None:
-            _follow_up(searches[0], propose_more(searches[0]))
-            of_first = self._second_look(searches[0], searches[-1])
-            if of_first[1]:
-                return of_first
-        assert result is not None
-        return result, named
-
-    def _second_look(self, first: Search, last: Search) -> Verdict:
-        """What the first kind of features believes; the last one is heard on it."""
-        weights = first.weights.rivals
-        believed = [one for one in first.belief.hypotheses if one.probability >= self.config.evidence.min_probability]
-        seconded = Belief()
-        for one in believed:
-            log_odds = one.log_odds if one.is_from_walls else one.log_odds + say_on(last, one)
-            if one.is_from_walls or log_odds >= _LEAST_SECOND:
-                seconded = seconded.given(replace(one, log_odds=log_odds), self.config.evidence, weights)
-        return final_answer(replace(first, belief=seconded))
-
     def _searches(self, query: Query, trace: Trace | None) -> list[Search]:
-        """One by each kind of features, which know each other."""
+        """One by each kind of features, which know those before them."""
         searches = list[Search]()
         for kind in self._kinds:
             of_kind = replace(query, feature_config=kind.map.feature_config)
             search = Search(of_kind, kind.map, kind.config, kind.weights, kind.correlated_errors, trace)
             if searches:
-                search.before, searches[-1].following = searches[-1], search
+                search.before, searches[-1].is_last = searches[-1], False
             searches.append(search)
         return searches
 
@@ -215,14 +170,3 @@ class Localizer:
         reduced, lens = reduced_image(image, camera, self.map.focal, self.config.max_finer, self.config.max_side_px)
         deadline = float("inf") if limit is None else start + limit / 1e3
         return Query(reduced, lens, image.shape[1] / lens.width, self.map.feature_config, deadline=deadline, shared=picture.features)
-
-
-def _follow_up(search: Search, proposals: Iterable[Proposal]) -> None:
-    """All that is proposed, until time is up."""
-    for proposal in proposals:
-        hypothesis = hypothesis_of(search, proposal)
-        if hypothesis is not None:
-            search.belief = search.belief.given(hypothesis, search.config.evidence, search.weights.rivals)
-        if search.query.is_late:
-            search.is_stopped = True
-            return

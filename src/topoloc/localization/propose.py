@@ -46,15 +46,11 @@ def propose(search: Search, prior: Rigid3 | None) -> Iterator[Proposal]:
         rows = [candidate.node_id for candidate in _near(search, prior)]
         yield _pooled(search, "prior", rows, float(search.config.num_chance_inliers))
         return
-    features = search.query.features
-    with search.query.clock.stage("coarse"):
-        num_ranked = max(search.config.num_candidates, search.config.look_alikes.num_ranked)
-        search.ranked = search.map.coarse.rank(search.query.image, features, num_ranked)
-    rows = [candidate.node_id for candidate in search.candidates]
+    rows = _ranked(search)
     retrieved = _pooled(search, "retrieval", rows, float(search.config.num_chance_inliers))
     search.retrieved = retrieved.fit
     yield retrieved
-    if search.following is None or search.is_clear:
+    if search.is_last or search.is_clear:
         yield from _of_other_features(search)
         yield from propose_more(search)
 
@@ -70,6 +66,21 @@ def propose_more(search: Search) -> Iterator[Proposal]:
     yield from propose_walls(search)
 
 
+def propose_briefly(search: Search, least: float) -> Proposal | None:
+    """What retrieval by the strongest features alone leads to; None where fewer than `least` of them agree."""
+    brief = _matched(search, "retrieval", _ranked(search), least, search.config.num_first_features)
+    return brief if brief.fit.num_inliers >= least else None
+
+
+def _ranked(search: Search) -> list[int]:
+    """The rows of the nodes that the coarse localizer names, of which the best are asked together."""
+    features = search.query.features
+    with search.query.clock.stage("coarse"):
+        num_ranked = max(search.config.num_candidates, search.config.look_alikes.num_ranked)
+        search.ranked = search.map.coarse.rank(search.query.image, features, num_ranked)
+    return [candidate.node_id for candidate in search.candidates]
+
+
 def _near(search: Search, world_from_cam: Rigid3) -> list[NodeScore]:
     """As many nodes as the coarse step would name; nearer ones (Eq. 1) score higher."""
     distances = search.map.distances(world_from_cam)
@@ -81,20 +92,20 @@ def _near(search: Search, world_from_cam: Rigid3) -> list[NodeScore]:
 def _pooled(search: Search, source: Source, rows: list[int], least: float) -> Proposal:
     """These nodes' points together. The strongest features are nearly always enough, or agree in fewer than `least`; else all are tried."""
     config = search.config
-    proposal = _matched(search, source, rows, config.num_first_features)
+    proposal = _matched(search, source, rows, least, config.num_first_features)
     is_open = least <= proposal.fit.num_inliers < config.num_clear_inliers
     if is_open and len(search.query.features) > config.num_first_features:
-        proposal = _matched(search, source, rows)
+        proposal = _matched(search, source, rows, least)
     return proposal
 
 
-def _matched(search: Search, source: Source, rows: list[int], max_features: int | None = None) -> Proposal:
-    """Matches with the points of these nodes, and robust PnP."""
+def _matched(search: Search, source: Source, rows: list[int], least: float, max_features: int | None = None) -> Proposal:
+    """Matches with the points of these nodes, and robust PnP, where as many as `least` may agree on a pose."""
     query, local_map = search.query, search.map.local_map(rows)
     with query.clock.stage("matching"):
         descriptors = query.features.descriptors[:max_features]
         matches = match_pooled(descriptors, local_map.descriptors, local_map.points_world, local_map.radii, search.config.matching)
-    if len(matches) < search.config.min_matches:
+    if len(matches) < max(search.config.min_matches, least):
         return Proposal(source, PoseFit(query.features, query.lens, query.camera, local_map, matches, None), is_guided=False)
     with query.clock.stage("pnp"):
         return Proposal(source, fit_pose(query.features, query.lens, local_map, matches, search.config.pose), is_guided=False)
@@ -118,14 +129,14 @@ def _look_alikes(search: Search) -> Iterator[Proposal]:
         near = node_distances(leader, nodes, search.map.lambda_rot) <= reach
         group, left = [row for row in left if near[row]], [row for row in left if not near[row]]
         if set(group) != asked:
-            num_groups, least = num_groups + 1, _least_inliers(search)
+            num_groups, least = num_groups + 1, least_inliers(search)
             proposal = _pooled(search, "look-alikes", group[: search.config.num_candidates], least)
             if proposal.fit.num_inliers >= least:
                 yield proposal
 
 
-def _least_inliers(search: Search) -> float:
-    """With how many of the strongest features a part of the map must agree: more than by chance, not far fewer than what is believed."""
+def least_inliers(search: Search) -> float:
+    """With how many of the strongest features another place must agree: more than by chance, not far fewer than what is believed."""
     best, config, least = search.best, search.config, float(search.config.num_chance_inliers)
     if best is None or best.fit.pose is None or best.probability < config.evidence.min_probability:
         return least

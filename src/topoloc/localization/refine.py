@@ -108,6 +108,16 @@ def weigh(search: Search, proposal: Proposal, final: PoseFit) -> Hypothesis | No
     return Hypothesis(proposal.source, final, evidence, covariance, 1.0 / inflated, log_odds)
 
 
+def best_case(search: Search, proposal: Proposal) -> Evidence | None:
+    """The evidence for the proposal followed up if all that no pose guided agreed with it; None where too little is found for any."""
+    final = refine(search, proposal)
+    if final.pose is None or final.num_inliers < search.config.evidence.min_found:
+        return None
+    with search.query.clock.stage("evidence"):
+        counted = _counted(search, final, inflation(final.num_inliers, search.rho) * final.pose.covariance)
+        return _at_best(replace(counted, num_by_chance=_by_chance(search, final)), final)
+
+
 def say_on(search: Search, hypothesis: Hypothesis) -> float:
     """What these features say on a pose of others, in logarithms of odds: little where few of them match anything, as in the dark."""
     final = _around(search, hypothesis.fit)
@@ -126,16 +136,14 @@ def _evidence(search: Search, proposal: Proposal, final: PoseFit, covariance: Fl
         unguided = (repeats.num_matches, repeats.num_inliers)
         return replace(counted, num_by_chance=repeats.num_by_chance, num_matches=unguided[0], num_inliers=unguided[1])
     assert final.pose is not None
-    by_chance = count_by_chance(final.features, final.local_map, final.pose.cam_from_world, final.camera, search.config.guided)
-    counted, may_be_hopeless = replace(counted, num_by_chance=by_chance), True
+    counted, may_be_hopeless = replace(counted, num_by_chance=_by_chance(search, final)), True
     if not proposal.is_guided:
         evidence = _with_unguided(search, counted, proposal.fit, final)
         log_odds = log_odds_of(evidence, search.weights)
         if log_odds > search.weights.evidence.clear_log_odds:
             return evidence
         may_be_hopeless = log_odds < 2.0 * _HOPELESS
-    at_best = replace(counted, num_matches=final.num_inliers, num_inliers=final.num_inliers)
-    if log_odds_of(at_best, search.weights) < _HOPELESS:  # whatever the unguided matches say
+    if log_odds_of(_at_best(counted, final), search.weights) < _HOPELESS:  # whatever the unguided matches say
         return None
     if may_be_hopeless:
         of_strongest = _with_unguided(search, counted, _unguided(search, final, search.config.num_first_features), final)
@@ -173,6 +181,16 @@ def _even_share(
         visible_img = visible_img[asked]
         found_img = visible_img[dense.agrees(visible_img, final.local_map.descriptors[visible[asked]])]
     return even_share_of(found_img, visible_img, camera.width, camera.height)
+
+
+def _by_chance(search: Search, final: PoseFit) -> int:
+    assert final.pose is not None
+    return count_by_chance(final.features, final.local_map, final.pose.cam_from_world, final.camera, search.config.guided)
+
+
+def _at_best(counted: Evidence, final: PoseFit) -> Evidence:
+    """As if all unguided matches agreed with the pose."""
+    return replace(counted, num_matches=final.num_inliers, num_inliers=final.num_inliers)
 
 
 def _with_unguided(search: Search, evidence: Evidence, unguided: PoseFit, final: PoseFit) -> Evidence:

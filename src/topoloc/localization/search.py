@@ -68,8 +68,8 @@ class Search:
     trace: Trace | None = None
     before: Search | None = None
     """The search by the kind of features that was asked before, and left it open."""
-    following: Search | None = None
-    """That by the kind which is asked where this one leaves it open."""
+    is_last: bool = True
+    """No other kind is asked where this one leaves it open."""
     belief: Belief = field(default_factory=Belief)
     ranked: list[NodeScore] = field(default_factory=list)
     retrieved: PoseFit | None = None
