@@ -20,10 +20,10 @@ class StreamedPose:
 
     `state` says what stands behind it: "localized", the picture was matched with the map; "tracked", points of the map were
     followed into it from the picture before; "predicted", neither, and `smoothed` is what the motion so far lets expect (by the
-    paper's rule: a copy of the pose before); "ambiguous", the pictures so far leave open which of several poses it is, and
-    `result.alternatives` names them; "lost", no pose at all. In the first two states alone `result` is a `Localization`, the raw pose, and
-    else it says why there is none. `smoothed` is world_from_cam as the whole stream up to this picture shows it;
-    `smoothed_covariance` (6, 6) is of its left perturbation, order (translation, rotation), metres and radians.
+    paper's rule: a copy of the pose before); "ambiguous", the pictures so far leave open which of several poses it is, or say too
+    little for one, and `result.alternatives` names them; "lost", no pose at all. In the first two states alone `result` is a
+    `Localization`, the raw pose, and else it says why there is none. `smoothed` is world_from_cam as the whole stream up to this
+    picture shows it; `smoothed_covariance` (6, 6) is of its left perturbation, order (translation, rotation), metres and radians.
     `is_repeated`: the same picture as the one before, whose answer this is.
     """
 

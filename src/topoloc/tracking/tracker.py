@@ -37,7 +37,7 @@ from topoloc.tracking.pose_hypotheses import HypothesesConfig, PoseHypotheses
 from topoloc.tracking.pose_window import PoseWindow, PoseWindowConfig
 from topoloc.tracking.stream_result import StreamedPose
 from topoloc.tracking.stream_search import Expected, Found, StreamSearch, refused
-from topoloc.tracking.tracker_state import Reference, StreamPicture, doubt_of, reduced, smoothed_covariance
+from topoloc.tracking.tracker_state import Reference, StreamPicture, doubt_of, followed_covariance, reduced, smoothed_covariance
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,8 @@ class Tracker:
         """The answer where one hypothesis leads; else that it may be any of them."""
         if self._hypotheses.is_decided:
             return answer
-        detail, alternatives = "the pictures so far leave open which of these", self._hypotheses.alternatives()
+        alternatives = self._hypotheses.alternatives()
+        detail = "the pictures so far leave open which of these" if len(alternatives) > 1 else "too little speaks for this pose so far"
         result = NotLocalized("ambiguous", [], 0, 0, answer.result.times_ms, detail, alternatives, answer.result.provenance)
         return StreamedPose(answer.t_ns, "ambiguous", result)
 
@@ -222,7 +223,7 @@ class Tracker:
             is_known = doubt_of(predicted, reference.errors.depth) <= self.config.max_doubt
             return Expected(predicted.world_from_cam, np.zeros((6, 6)), is_known and is_alone)
         motion, scale = followed.cam_from_ref.adjoint(), self.config.hypotheses.prediction_scale**2
-        doubt = motion @ reference.errors.whole @ motion.T + scale * self._followed_covariance(followed)
+        doubt = motion @ reference.errors.whole @ motion.T + scale * followed_covariance(followed, self.config.followed_share)
         near = (followed.cam_from_ref @ reference.cam_from_world).inverse()
         return Expected(near, doubt, is_alone, is_followed=True, by_walls=reference.is_by_walls)
 
@@ -265,7 +266,7 @@ class Tracker:
         """cam_from_before, from the picture localized last, with the covariance of its left perturbation."""
         assert self._reference is not None
         if followed is not None:
-            return followed.cam_from_ref, self._followed_covariance(followed)
+            return followed.cam_from_ref, followed_covariance(followed, self.config.followed_share)
         return predicted.world_from_cam.inverse() @ self._reference.smoothed.inverse(), predicted.pose_covariance
 
     def _tracked(self, picture: StreamPicture, followed: Followed, clock: StageClock) -> StreamedPose:
@@ -295,9 +296,3 @@ class Tracker:
         if predicted is None:
             return StreamedPose(t_ns, "lost", result)
         return StreamedPose(t_ns, "predicted", result, predicted.world_from_cam, smoothed_covariance(self._reference, predicted))
-
-    def _followed_covariance(self, followed: Followed) -> Float[np.ndarray, "6 6"]:
-        """Of a followed motion: what the points say, and what wrong depths make of it, in proportion to the motion."""
-        way, turn = float(np.linalg.norm(followed.cam_from_ref.translation)), followed.cam_from_ref.angle()
-        share = np.diag(np.repeat([way**2, turn**2], 3)) * self.config.followed_share**2
-        return followed.covariance + share

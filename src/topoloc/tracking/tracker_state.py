@@ -12,7 +12,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization
 from topoloc.places.coarse import Image
-from topoloc.tracking.following import PointFollower
+from topoloc.tracking.following import Followed, PointFollower
 from topoloc.tracking.motion import MotionState
 from topoloc.tracking.pose_errors import PoseErrors
 
@@ -56,6 +56,12 @@ def doubt_of(predicted: MotionState, depth: float) -> float:
     """Three sigma (radians) of the direction in which points at this depth (metres) are seen."""
     sigmas = np.sqrt(np.diag(predicted.pose_covariance))
     return 3.0 * float(np.hypot(sigmas[:3].max() / depth, sigmas[3:].max()))
+
+
+def followed_covariance(followed: Followed, share: float) -> Float[np.ndarray, "6 6"]:
+    """Of a followed motion: what the points say, and what wrong depths make of it, this share of the motion."""
+    way, turn = float(np.linalg.norm(followed.cam_from_ref.translation)), followed.cam_from_ref.angle()
+    return followed.covariance + np.diag(np.repeat([way**2, turn**2], 3)) * share**2
 
 
 def smoothed_covariance(reference: Reference | None, since: MotionState | None = None) -> Float[np.ndarray, "6 6"]:
