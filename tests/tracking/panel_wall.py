@@ -29,11 +29,11 @@ def at(x: float) -> Rigid3:
 
 class PanelWall(Localizer):
     """`xs` are where the next picture may have been taken, the likeliest first; who looks near a pose finds one within
-    half a panel."""
+    half a panel. `probability` is that of a single one."""
 
     def __init__(self) -> None:
         self.xs: list[float] = []
-        self.num_asked = 0
+        self.num_asked, self.probability = 0, 0.99
         self.topomap, self.map_id = TopoMetricMap([], [], [], [], {}), ""
 
     def localize_near(
@@ -46,7 +46,7 @@ class PanelWall(Localizer):
         if not xs:
             return NotLocalized("not_in_map"), []
         if len(xs) == 1:
-            named = _answered(xs[0], 0.99)
+            named = _answered(xs[0], self.probability)
             return named[0], [named]
         shares = [0.9 * (len(xs) - number) / sum(range(len(xs) + 1)) for number in range(len(xs))]
         alternatives = tuple(Alternative(at(x), p, int(x)) for x, p in zip(xs, shares, strict=True))

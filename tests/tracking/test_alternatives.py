@@ -84,6 +84,27 @@ def test_a_stream_that_began_one_panel_off_is_overruled():
         assert is_right(answer, walk)
 
 
+def test_a_pose_that_its_picture_is_not_sure_of_waits_for_the_next():
+    walk = Walk()
+    walk.wall.probability = 0.8
+    first = walk.see(0.0)
+    assert first.state == "ambiguous"
+    assert isinstance(first.result, NotLocalized)
+    assert first.result.detail == "too little speaks for this pose so far"
+    assert [round(one.probability, 2) for one in first.result.alternatives] == [0.8]
+    second = walk.see(0.0)
+    assert second.state == "localized"
+    assert is_right(second, walk)
+
+
+@pytest.mark.parametrize(("num_seen", "state"), [(1, "ambiguous"), (4, "predicted")])
+def test_pictures_without_a_pose_count_against_what_little_speaks_for(num_seen: int, state: str):
+    walk = Walk()
+    walk.wall.probability = 0.93
+    assert [walk.see(0.0).state for _ in range(num_seen)] == ["localized"] * num_seen
+    assert walk.see().state == state
+
+
 def test_a_camera_that_was_carried_elsewhere_is_found():
     walk = Walk()
     for _ in range(4):

@@ -63,7 +63,7 @@ def is_far_behind(evidence: Evidence, features: str, answer: Localization) -> bo
     """Would a pose of another tile with this evidence be too improbable beside the answer to be named as an alternative?"""
     weights = weights_of(features)
     log_odds = log_odds_of(evidence, weights)
-    is_alike = features == answer.provenance.features and not _is_from_walls(answer)
+    is_alike = features == answer.provenance.features and not answer.is_from_walls
     by = _strength(answer) - strength_of(evidence, log_odds, weights.rivals) if is_alike else _log_odds(answer) - log_odds
     return by > -math.log(_MIN_ALTERNATIVE)
 
@@ -115,13 +115,13 @@ def _of_tile(result: R, tile: Tile) -> R:
 def _lead(a: Localization, b: Localization) -> float:
     """By how much one pose is likelier than another of another tile, in logarithms of odds: by their strengths, which tell twins apart,
     where features of one kind speak for both, else by the odds of each."""
-    is_alike = a.provenance.features == b.provenance.features and not (_is_from_walls(a) or _is_from_walls(b))
+    is_alike = a.provenance.features == b.provenance.features and not (a.is_from_walls or b.is_from_walls)
     return _strength(a) - _strength(b) if is_alike else _log_odds(a) - _log_odds(b)
 
 
 def _strength(result: Localization) -> float:
     """As of `belief.lead`."""
-    if result.evidence is None or _is_from_walls(result):
+    if result.evidence is None or result.is_from_walls:
         return _log_odds(result)
     return strength_of(result.evidence, _log_odds(result), _weights(result).rivals)
 
@@ -135,10 +135,6 @@ def _log_odds(result: Localization) -> float:
 
 def _weights(result: Localization) -> FittedWeights:
     return weights_of(result.provenance.features)
-
-
-def _is_from_walls(result: Localization) -> bool:
-    return result.evidence is not None and result.evidence.num_distinct is not None
 
 
 def _is_same(tile: Tile, pose: Localization, other: Tile, other_pose: Localization) -> bool:

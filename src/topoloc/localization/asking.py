@@ -73,8 +73,9 @@ class Asking:
             verdict = final_answer(search) if is_last else answer(search)
             if search.is_stopped or (is_last and isinstance(verdict[0], Localization)):
                 return verdict
-            if number == 0 and self.prior is not None and verdict[1] and not is_last and (heard := self._seconded())[1]:
-                return heard
+            is_open = number == 0 and self.prior is not None and not is_last
+            if is_open and verdict[1] and (seconded := self._seconded())[1]:
+                return seconded
         assert verdict is not None
         if len(self.searches) > 1 and not verdict[1] and self.prior is None:
             _follow_up(self.searches[0], propose_more(self.searches[0]))

@@ -58,7 +58,7 @@ class Hypothesis:
 
     @property
     def is_from_walls(self) -> bool:
-        return self.evidence.num_distinct is not None
+        return self.evidence.is_from_walls
 
 
 def lead(a: Hypothesis, b: Hypothesis, weights: RivalWeights) -> float:

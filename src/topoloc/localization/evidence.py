@@ -52,6 +52,11 @@ class Evidence:
     even_share: float
     num_distinct: int | None = None
 
+    @property
+    def is_from_walls(self) -> bool:
+        """Is the pose one that the walls along the way let expect, not the map's nodes?"""
+        return self.num_distinct is not None
+
 
 @dataclass(frozen=True)
 class EvidenceConfig:
@@ -123,7 +128,7 @@ def score_features(evidence: Evidence) -> tuple[float, ...]:
 
 def log_odds_of(evidence: Evidence, weights: FittedWeights) -> float:
     """Logarithm of the odds that the pose is right."""
-    if evidence.num_distinct is not None:
+    if evidence.is_from_walls:
         features, walls = wall_score_features(evidence), weights.walls
         return sum(weight * x for weight, x in zip(walls.in_order, features, strict=True)) + walls.bias
     return node_log_odds(evidence, weights.evidence)
@@ -161,7 +166,7 @@ def precision_of(evidence: Evidence) -> float:
 
     A wall alone may leave a pose imprecise though the place is beyond doubt.
     """
-    return 1.0 if evidence.num_distinct is None else precision_at(evidence.doubt)
+    return precision_at(evidence.doubt) if evidence.is_from_walls else 1.0
 
 
 def precision_at(doubt: float) -> float:

@@ -63,6 +63,11 @@ class Localization:
         return True
 
     @property
+    def is_from_walls(self) -> bool:
+        """Was the place recognised by the walls along the way, of which the nodes around show another side?"""
+        return self.evidence is not None and self.evidence.is_from_walls
+
+    @property
     def position_sigma_m(self) -> float:
         """Root mean square of the distance from the true position that `camera_covariance` lets expect, metres."""
         return float(np.sqrt(np.trace(self.camera_covariance[:3, :3])))

@@ -22,15 +22,15 @@ from topoloc.tracking.tracker_state import StreamPicture
 class Expected:
     """About where the picture was taken, and what that is wrong by beside what the filter knows of (covariance, left, of cam_from_world).
 
-    Who asks around there alone finds only what is there; `is_enough` where nothing else is likely. `by_walls`: nodes around do not look
-    this way, so that they know nothing of the picture.
+    Who asks around there alone finds only what is there; `is_enough` where nothing else is likely. `is_from_walls`: nodes around do not
+    look this way, so that they know nothing of the picture.
     """
 
     world_from_cam: Rigid3
     doubt: Float[np.ndarray, "6 6"]
     is_enough: bool
     is_followed: bool = False
-    by_walls: bool = False
+    is_from_walls: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class StreamSearch:
         if expected is not None and expected.is_enough:
             refusal, found = self._ask(picture, expected.world_from_cam)
             if refusal is not None and expected.is_followed:
-                if not expected.by_walls:
+                if not expected.is_from_walls:
                     self._hypotheses.weigh(picture.t_ns, [])
                 return refusal
         if len(found) != 1 or not self._follows(found[0], doubt):
@@ -83,8 +83,8 @@ class StreamSearch:
 
     def _everywhere(self, picture: StreamPicture) -> tuple[NotLocalized | None, list[Found]]:
         """As `_ask` in all of the map. Where that does not settle it, also around each hypothesis that the answer leaves out: of many
-        poses that look alike a search finds some. What it left out is at most as likely as the others are in the
-        mean.
+        poses that look alike a search finds some. What it left out is at most as likely as the others are in
+        the mean.
         """
         refusal, found = self._ask(picture, None)
         if refusal is None:

@@ -225,7 +225,7 @@ class Tracker:
         motion, scale = followed.cam_from_ref.adjoint(), self.config.hypotheses.prediction_scale**2
         doubt = motion @ reference.errors.whole @ motion.T + scale * followed_covariance(followed, self.config.followed_share)
         near = (followed.cam_from_ref @ reference.cam_from_world).inverse()
-        return Expected(near, doubt, is_alone, is_followed=True, by_walls=reference.is_by_walls)
+        return Expected(near, doubt, is_alone, is_followed=True, is_from_walls=reference.found.is_from_walls)
 
     def _believe(
         self, picture: StreamPicture, found: Found, predicted: MotionState | None, followed: Followed | None, seconds: float

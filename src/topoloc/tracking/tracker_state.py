@@ -46,11 +46,6 @@ class Reference:
     offset: Rigid3
     follower: PointFollower
 
-    @property
-    def is_by_walls(self) -> bool:
-        """Was it recognised by the walls along the way, of which nodes show another side?"""
-        return self.found.evidence is not None and self.found.evidence.num_distinct is not None
-
 
 def doubt_of(predicted: MotionState, depth: float) -> float:
     """Three sigma (radians) of the direction in which points at this depth (metres) are seen."""
