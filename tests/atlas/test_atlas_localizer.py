@@ -84,6 +84,19 @@ def test_features_are_extracted_once_for_all_tiles(atlas: Path, monkeypatch: pyt
     assert kinds == ["surf"]
 
 
+@pytest.mark.parametrize(("least_likeness", "num_asked"), [(-1.0, 2), (2.0, 1)])
+def test_where_no_tile_looks_like_the_picture_only_the_likeliest_is_asked_by_all_means(
+    atlas: Path, monkeypatch: pytest.MonkeyPatch, least_likeness: float, num_asked: int
+):
+    asked = list[str]()
+    by_all_means = Asking.by_all_means
+    monkeypatch.setattr(Asking, "by_all_means", lambda self: asked.append(self.features) or by_all_means(self))
+    config = AtlasConfig(settled_gap=2.0, hopeless_gap=2.0, least_likeness=least_likeness)
+    result = _localizer(atlas, config).localize(unseen_views(seed=2)[0][0], CAMERA)
+    assert isinstance(result, NotLocalized)
+    assert len(asked) == num_asked
+
+
 def test_two_tiles_that_know_the_place_as_well_are_both_named(own_atlas: Path, room_map: Path):
     """The same room in two buildings of one plan: nothing tells them apart."""
     add_tiles(str(own_atlas), new_tiles([str(room_map)], "twin"))

@@ -178,8 +178,10 @@ class AtlasLocalizer:
             if hearing.is_settled or hearing.is_late:
                 break
         hopeful = self._hopeful(hearing)
-        for _ in range(self.config.num_asked):
+        for number in range(self.config.num_asked):
             left = [one for one in self._left(hopeful) if not hearing.was_asked(one[0])]
+            if number:
+                left = [one for one in left if self._is_promising(hearing, one)]
             if not left or hearing.answers or (hearing.heard and hearing.is_late):
                 break
             self._ask(hearing, *max(left, key=hearing.promise))
@@ -191,6 +193,10 @@ class AtlasLocalizer:
         """Tiles that look not far less like the picture than the best one."""
         ranking = self._left(hearing.ranking)
         return [one for one in ranking if one[1] >= ranking[0][1] - self.config.hopeless_gap or one[0] in self.atlas.problems]
+
+    def _is_promising(self, hearing: Hearing, ranked: tuple[str, float]) -> bool:
+        """Does a glance name a pose there, or does it look more like the picture than any place does? One that is not ranked may."""
+        return hearing.promise(ranked) >= (0.0, self.config.least_likeness) or ranked[0] in self.atlas.problems
 
     def _glance(self, hearing: Hearing, num_tiles: int) -> None:
         """Ask the likeliest tiles at a glance, until a pose is clear."""

@@ -25,6 +25,9 @@ class AtlasConfig:
     """Where no tile leads, so many are asked by retrieval alone, at most, until a pose is clear; those asked before count."""
     num_asked: Annotated[int, Between(1, 10_000)] = 3
     """Tiles that are asked by all means, at most, until one answers."""
+    least_likeness: Annotated[float, Between(-1, 2)] = 0.33
+    """Any place looks so much like a picture. After the first one, tiles whose best place is less like it are asked by all means only where
+    a glance names a pose."""
     alike_gap: Annotated[float, Between(0, 2)] = 0.1
     """Tiles whose best place is less like the picture than that of the tile that answered by no more than this must not vouch for a pose
     as well."""

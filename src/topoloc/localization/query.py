@@ -8,7 +8,7 @@ picture is reduced until its pixels see as much as the map's did; a coarser one 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -50,13 +50,17 @@ class SharedFeatures:
     """The features of one picture by its size and their settings, extracted once, whichever of several maps asks for them first."""
 
     def __init__(self) -> None:
-        self._kept: dict[tuple[int, int, FeatureConfig], Features] = {}
+        self._kept: dict[tuple[int, int, FeatureConfig, Hashable], Features] = {}
 
     def of(self, query: Query) -> Features:
         """Of the picture as it was reduced for a query."""
-        key = (query.image.shape[1], query.image.shape[0], query.feature_config)
+        return self.once(query, None, query.extracted)
+
+    def once(self, query: Query, view: Hashable, extract: Callable[[], Features]) -> Features:
+        """Those of a view of that picture, such as the one to its side."""
+        key = (query.image.shape[1], query.image.shape[0], query.feature_config, view)
         if key not in self._kept:
-            self._kept[key] = query.extracted()
+            self._kept[key] = extract()
         return self._kept[key]
 
 
@@ -64,6 +68,7 @@ class StoredFeatures(SharedFeatures):
     """Those of a picture of which nothing else is left, by their kinds, such as a node of another map; pixels of `width` columns."""
 
     def __init__(self, known: Mapping[str, Features], width: int) -> None:
+        super().__init__()
         self._known, self._width = known, width
 
     def of(self, query: Query) -> Features:

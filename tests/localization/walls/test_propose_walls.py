@@ -23,10 +23,11 @@ from topoloc.localization.config import WallsConfig
 from topoloc.localization.fitted_weights import weights_of
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.open_map import OpenMap
-from topoloc.localization.query import Query
+from topoloc.localization.query import Picture, Query
 from topoloc.localization.refine import hypothesis_of
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Search
+from topoloc.localization.walls import propose_walls as propose_walls_module
 from topoloc.localization.walls.propose_walls import propose_walls
 from topoloc.map.topomap import SideNodes, TopoMetricMap
 
@@ -98,6 +99,21 @@ def test_the_points_seen_are_handed_on(localizer: Localizer):
     assert len(seen.points_img) == result.num_inliers
     offsets = np.linalg.norm(WIDE.img_from_cam(truth.inverse().apply(seen.points_world)) - seen.points_img, axis=1)
     assert np.median(offsets) < 3.0
+
+
+def test_the_walls_are_looked_at_once_for_all_maps(localizer: Localizer, monkeypatch: pytest.MonkeyPatch):
+    extracted = list[tuple[int, ...]]()
+    extract = propose_walls_module.extract_normalized
+    monkeypatch.setattr(
+        propose_walls_module, "extract_normalized", lambda grey, config: extracted.append(grey.shape) or extract(grey, config)
+    )
+    image, _ = seen_on_the_way_back()[2]
+    picture = Picture(image, WIDE)
+    first, second = (localizer.ask(picture)[0] for _ in range(2))
+    assert isinstance(first, Localization)
+    assert isinstance(second, Localization)
+    assert np.array_equal(first.world_from_cam.matrix(), second.world_from_cam.matrix())
+    assert len(extracted) == 2  # to the left and to the right
 
 
 def test_another_camera_with_distortion_is_localized_on_the_way_back(localizer: Localizer):

@@ -12,12 +12,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
+from jaxtyping import UInt8
 
 from topoloc.features.extraction import extract_normalized, normalize_image
+from topoloc.features.features import Features
 from topoloc.features.matching import match_pooled
-from topoloc.features.side_views import side_views
+from topoloc.features.side_views import SideView, side_views
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
@@ -28,6 +31,7 @@ from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.map_facts.correlated_errors import inflation
 from topoloc.localization.pose_fit import PoseFit
+from topoloc.localization.query import Query
 from topoloc.localization.search import Proposal, Search
 from topoloc.localization.walls.wall_index import WallIndex
 from topoloc.localization.walls.wall_matching import SeenSide, SideMatches, count_sides, estimate_pose, match_sides, nearest_sides
@@ -59,7 +63,7 @@ class SeenWalls:
         assert isinstance(query.lens, Camera)
         for view in side_views(query.lens, index.view_config):
             picture = view.picture(query.grey)
-            features = view.within(extract_normalized(normalize_image(picture, query.feature_config), query.feature_config))
+            features = query.shared.once(query, (view.name, index.view_config), partial(_features_of, query, view, picture))
             seen.append(SeenSide(view, features, view.in_picture(features, query.lens)))
             ranked.append([node.node_id for node in index.coarse.rank(picture, features, search.config.walls.num_ranked)])
         return SeenWalls(search, index, seen, ranked)
@@ -67,6 +71,11 @@ class SeenWalls:
     @property
     def camera(self) -> Camera:
         return self.search.query.camera
+
+
+def _features_of(query: Query, view: SideView, picture: UInt8[np.ndarray, "a b"]) -> Features:
+    """Those of what a view shows."""
+    return view.within(extract_normalized(normalize_image(picture, query.feature_config), query.feature_config))
 
 
 def propose_walls(search: Search) -> Iterator[Proposal]:
@@ -107,11 +116,11 @@ def _best(found: list[WallProposal]) -> list[WallProposal]:
 
 
 def _compared(walls: SeenWalls, view: int, row: int) -> WallProposal | None:
-    """A view compared with one side node."""
+    """A view's strongest features compared with one side node: those of another place agree less often than all would."""
     config, side = walls.search.config.walls, walls.seen[view]
     node, local_map = walls.index.local_map(row)
     points = (local_map.descriptors, local_map.points_world, local_map.radii)
-    matches = match_pooled(side.features.descriptors, *points, config.matching)
+    matches = match_pooled(side.features.descriptors[: walls.search.config.num_first_features], *points, config.matching)
     agreeing = agreeing_pose(side.features, side.view.camera, node, matches)
     if agreeing is None or agreeing[0] < config.min_agreeing:
         return None
