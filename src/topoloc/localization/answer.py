@@ -88,7 +88,9 @@ def _least_lead(search: Search, best: Hypothesis, other: Hypothesis) -> float:
 
 
 def _is_unclear_beside(search: Search, best: Hypothesis, other: Hypothesis) -> bool:
-    """Is the best hypothesis not clear, and the other one elsewhere?"""
+    """Is the best hypothesis not clear, and the other one elsewhere? Evidence of walls is held against all other walls already."""
+    if best.is_from_walls:
+        return False
     apart, config = best.world_from_cam.inverse() @ other.world_from_cam, search.config.evidence
     is_elsewhere = np.linalg.norm(apart.translation) > 2.0 * config.max_translation or apart.angle() > math.radians(_ELSEWHERE_DEG)
     return bool(is_elsewhere) and best.log_odds <= search.weights.evidence.clear_log_odds
