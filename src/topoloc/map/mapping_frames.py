@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain, groupby
 from typing import TypeVar
 
 import cv2
@@ -120,10 +121,11 @@ class PointLocator:
         self._images: OrderedDict[int, MappingImage] = OrderedDict()
 
     def for_each(self, work: Callable[[tuple[MappingFrame, StereoFrame]], R], frames: Sequence[MappingFrame]) -> Iterator[R]:
-        """What work(frame, as read) gives, in their order; several frames at a time, unless one needs other frames to be read for it."""
-        read = ((frame, frame.read()) for frame in frames)
-        needs_others = any(_is_single(of_session[0].read()) for of_session in self._sessions.values())
-        return map(work, read) if needs_others else in_order(work, read)
+        """What work(frame, as read) gives, in their order; several frames at a time, but for single pictures, for which others are read."""
+        for _, of_session in groupby(frames, lambda frame: frame.session_id):
+            read = ((frame, frame.read()) for frame in of_session)
+            first = next(read)
+            yield from (map if _is_single(first[1]) else in_order)(work, chain([first], read))
 
     def image(self, frame: MappingFrame, view: FrameView) -> MappingImage:
         """The frame described, from memory where that is possible."""

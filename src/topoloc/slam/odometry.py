@@ -44,9 +44,10 @@ class Odometry:
         self._bias = DisparityBias()
         self._places = Shelf[PlaceView]()
 
-    def process(self, frame_idx: int, frame: StereoFrame) -> list[FramePose]:
-        """Where this frame is, and those before it whose place is known only now; nothing where that is not known."""
-        measured = self._measured(frame)
+    def process(self, frame_idx: int, frame: StereoFrame, measured: MeasuredView) -> list[FramePose]:
+        """Where this frame is, and those before it whose place is known only now; nothing where that is not known. `measured` is
+        `measured_view(frame)`."""
+        self._expect_bias(measured)
         pose = self._follow(frame_idx, frame, measured)
         return [pose] if pose is not None else self._lost(frame_idx, frame, measured)
 
@@ -54,11 +55,9 @@ class Odometry:
         """The recording is at its end: the frames that were sought in vain until then."""
         return self._begin_again() if len(self._missed) > 1 else []
 
-    def _measured(self, frame: StereoFrame) -> MeasuredView:
-        measured = measured_view(frame)
+    def _expect_bias(self, measured: MeasuredView) -> None:
         if measured.right is not None:
             self._bias.information = 1.0 / self._config.sigma_bias_px**2
-        return measured
 
     def _follow(self, frame_idx: int, frame: StereoFrame, measured: MeasuredView) -> FramePose | None:
         """Where the frame is, by its step from the last one."""
@@ -215,7 +214,7 @@ class Odometry:
         num_keyframes, num_landmarks, num_lost = len(self._keyframes), self._landmarks.num, self._num_lost
         poses: list[FramePose] = []
         for frame_idx, frame in missed:
-            measured = self._measured(frame)
+            measured = measured_view(frame)
             pose = self._follow(frame_idx, frame, measured) if poses else None
             if pose is None:  # what came before it leads nowhere
                 poses, self._reference = [], None
