@@ -9,10 +9,12 @@ steps and the motion does not tell which.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 
 import numpy as np
 
+from topoloc.compiled import be_one_of_several
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.frame import StereoFrame
 from topoloc.shelf import Shelf
@@ -43,6 +45,8 @@ class Odometry:
         self._repeats: list[Rigid3] = []  # of the last frame before the camera was lost
         self._bias = DisparityBias()
         self._places = Shelf[PlaceView]()
+        self._looking = ThreadPoolExecutor(1, initializer=be_one_of_several)
+        self._looked_at: KeyFrame | None = None
 
     def process(self, frame_idx: int, frame: StereoFrame, measured: MeasuredView) -> list[FramePose]:
         """Where this frame is, and those before it whose place is known only now; nothing where that is not known. `measured` is
@@ -53,7 +57,9 @@ class Odometry:
 
     def finish(self) -> list[FramePose]:
         """The recording is at its end: the frames that were sought in vain until then."""
-        return self._begin_again() if len(self._missed) > 1 else []
+        poses = self._begin_again() if len(self._missed) > 1 else []
+        self._looking.shutdown()
+        return poses
 
     def _expect_bias(self, measured: MeasuredView) -> None:
         if measured.right is not None:
@@ -151,7 +157,7 @@ class Odometry:
         self._follow_from(keyframe, measured)
         self._checks.look_at_keyframe(keyframe, self._landmarks, measured)
         if self._is_new_place(keyframe):
-            keyframe.place = place_view(measured.view, self._config.places)
+            self._look(keyframe, measured)
 
     def _observations(self, ids: np.ndarray, values: np.ndarray, sigmas: np.ndarray) -> Observations:
         weights = np.full((len(ids), 3), 1.0 / self._config.sigma_px)
@@ -186,6 +192,13 @@ class Odometry:
         depth = keyframe.cam_from_world.apply(self._landmarks.positions[seen.landmark_ids[seen.active]])[:, 2]
         far = np.linalg.norm(motion.translation) > self._config.place_distance * np.median(depth)
         return bool(far or motion.angle() > np.deg2rad(self._config.place_angle_deg))
+
+    def _look(self, keyframe: KeyFrame, measured: MeasuredView) -> None:
+        """How a key frame looks is found while the next frames are followed; of one at a time, so that few pictures are held."""
+        if self._looked_at is not None:
+            assert self._looked_at.place is not None  # waits
+        keyframe.coming_place = self._looking.submit(place_view, measured.view, self._config.places)
+        self._looked_at = keyframe
 
     def _last_places(self, num: int) -> list[KeyFrame]:
         """The last key frames of this sub-map whose looks are known, newest first."""
