@@ -54,7 +54,7 @@ def is_kept(compiled: Any) -> bool:
 
 
 def set_num_threads(number: int) -> None:
-    """At most so many threads work on one query, one frame or one mapping image.
+    """At most so many threads work on one query or one frame; while a map is made, each on a mapping image or a node of its own.
 
     Unless it is said these are 2, and 1 for the networks of learned coarse localizers. The answers do not depend on it, but for the last
     digits of such a network's scores. Holds for topoloc in this process and for the libraries that it calls: OpenCV, FAISS, and PyTorch

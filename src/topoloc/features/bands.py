@@ -39,7 +39,7 @@ def in_order(work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
     """What work(item) gives, in the order of the items, of which as many threads as `set_num_threads` said take one each at a time.
 
     A whole item a thread: nothing waits for the other half of a picture, and what Python does for one item hides behind the kernels of
-    another. At most as many results wait to be taken as items are worked on; an exception is raised in its item's place.
+    another. At most one result more than there are threads waits to be taken, so that memory stays what it is; an exception is raised in its item's place.
     """
     number = compiled.num_threads()
     if number == 1:
@@ -50,7 +50,7 @@ def in_order(work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
         try:
             for item in items:
                 coming.append(pool.submit(work, item))
-                if len(coming) > 2 * number:
+                if len(coming) > number:
                     yield coming.popleft().result()
             while coming:
                 yield coming.popleft().result()
