@@ -39,7 +39,8 @@ def in_order(work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
     """What work(item) gives, in the order of the items, of which as many threads as `set_num_threads` said take one each at a time.
 
     A whole item a thread: nothing waits for the other half of a picture, and what Python does for one item hides behind the kernels of
-    another. At most one result more than there are threads waits to be taken, so that memory stays what it is; an exception is raised in its item's place.
+    another. At most one result more than there are threads waits to be taken, so that memory stays what it is; an exception is raised in
+    its item's place. The items themselves are made by the calling thread.
     """
     number = compiled.num_threads()
     if number == 1:
