@@ -11,6 +11,7 @@ import contextlib
 import hashlib
 import os
 import sys
+import threading
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -25,6 +26,7 @@ _USUAL_THREADS = 2
 KERNELS: list[Any] = []
 """All that were declared by now."""
 _chosen: list[int] = []
+_own = threading.local()
 _told: list[str] = []
 
 
@@ -52,7 +54,7 @@ def is_kept(compiled: Any) -> bool:
 
 
 def set_num_threads(number: int) -> None:
-    """At most so many threads work on one query, one frame or one mapping image.
+    """At most so many threads work on one query or one frame; while a map is made, each on a mapping image or a node of its own.
 
     Unless it is said these are 2, and 1 for the networks of learned coarse localizers. The answers do not depend on it, but for the last
     digits of such a network's scores. Holds for topoloc in this process and for the libraries that it calls: OpenCV, FAISS, and PyTorch
@@ -75,8 +77,13 @@ def set_num_threads(number: int) -> None:
 
 
 def num_threads(usual: int = _USUAL_THREADS) -> int:
-    """As `set_num_threads` said, `usual` where it was not called."""
-    return _chosen[0] if _chosen else usual
+    """As `set_num_threads` said, `usual` where it was not called; 1 in a thread that is one of several already."""
+    return 1 if hasattr(_own, "is_one_of_several") else _chosen[0] if _chosen else usual
+
+
+def be_one_of_several() -> None:
+    """From now on this thread of Python starts no others: they are all at work on items of their own (`features/bands.py`)."""
+    _own.is_one_of_several = True
 
 
 class _KeptCode(NullCache):

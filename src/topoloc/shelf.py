@@ -9,7 +9,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import fields, is_dataclass
+from dataclasses import is_dataclass
 from typing import Any, TypeVar, overload
 
 import numpy as np
@@ -153,5 +153,5 @@ def bytes_of(value: Any, apart: Container[int] = ()) -> int:
     if isinstance(value, list | tuple):
         return sum(bytes_of(item, apart) for item in value)
     if is_dataclass(value) and not isinstance(value, type):
-        return sum(bytes_of(getattr(value, item.name), apart) for item in fields(value))
+        return sum(bytes_of(getattr(value, name), apart) for name in value.__dataclass_fields__)
     return 0

@@ -1,14 +1,16 @@
-"""Work shared out to threads: every row once, errors raised, and a forked child has threads of its own."""
+"""Work shared out to threads: every row and item once and in order, errors raised, and a forked child has threads of its own."""
 
 from __future__ import annotations
 
 import os
 import sys
+import threading
 
 import numpy as np
 import pytest
 
-from topoloc.features.bands import run_in_bands
+from topoloc import compiled
+from topoloc.features.bands import in_order, run_in_bands
 
 
 @pytest.mark.parametrize(("num_rows", "num_threads"), [(1, 4), (7, 1), (7, 3), (480, 2)])
@@ -40,3 +42,31 @@ def test_a_forked_child_can_work_too():
         run_in_bands(lambda first, last: None, 10, 2)
         os._exit(7)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+
+
+def test_items_come_in_order_a_few_at_a_time_each_by_one_thread():
+    taken, at_once, both = list[int](), list[int](), threading.Barrier(2)
+
+    def items():
+        for item in range(10):
+            taken.append(item)
+            yield item
+
+    def work(item: int) -> tuple[int, int, list[int]]:
+        if item < 2:
+            both.wait(timeout=60)  # the first two are worked on at the same time
+        return item, compiled.num_threads(), list(in_order(abs, [-item]))
+
+    for item, num_threads, nested in in_order(work, items()):
+        assert (num_threads, nested) == (1, [item])
+        at_once.append(len(taken) - item)
+    assert taken == list(range(10))
+    assert max(at_once) <= compiled.num_threads() + 1
+    assert compiled.num_threads() == 2
+
+
+def test_an_error_is_raised_in_its_items_place():
+    quotients = in_order(lambda item: 1.0 / item, [2, 1, 0, 4])
+    assert [next(quotients), next(quotients)] == [0.5, 1.0]
+    with pytest.raises(ZeroDivisionError):
+        next(quotients)

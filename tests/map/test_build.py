@@ -107,6 +107,13 @@ def test_two_builds_give_the_same_bytes(tiny_recording: Path, tmp_path: Path):
     assert (tmp_path / "one.topo").read_bytes() == (tmp_path / "two.topo").read_bytes()
 
 
+def test_the_number_of_threads_changes_no_byte(tiny_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    for number in (1, 3):
+        monkeypatch.setattr("topoloc.compiled._chosen", [number])
+        topoloc.build_map(topoloc.open_sequence(f"{tiny_recording}@0::2")).save(tmp_path / f"{number}.topo")
+    assert (tmp_path / "1.topo").read_bytes() == (tmp_path / "3.topo").read_bytes()
+
+
 def test_two_builds_of_a_real_recording_give_the_same_bytes(shared: Path, tmp_path: Path):
     for name in ("one", "two"):
         build_map(topoloc.open_sequence(f"{shared}/data/zed_lab/session1@0:24:8")).save(tmp_path / name)

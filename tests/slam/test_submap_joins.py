@@ -14,6 +14,7 @@ from topoloc.geometry.alignment import absolute_trajectory_errors
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.sequences.frame import StereoFrame, StereoSequence
 from topoloc.sequences.frame_view import frame_view
+from topoloc.slam.disparity import measured_view
 from topoloc.slam.input_checks import InputCheckConfig, InputChecks
 from topoloc.slam.keyframes import FramePose, KeyFrame, Landmarks, PlaceView
 from topoloc.slam.loop_closure import LoopConfig, find_links
@@ -49,7 +50,7 @@ def tracked(*recordings: FrameList) -> tuple[list[KeyFrame], list[FramePose]]:
     for number, recording in enumerate(recordings):
         odometry = Odometry(number, keyframes, landmarks, InputChecks(recording.name, InputCheckConfig()), OdometryConfig())
         for i, frame in enumerate(recording.frames):
-            poses += odometry.process(i, frame)
+            poses += odometry.process(i, frame, measured_view(frame))
         poses += odometry.finish()
     return keyframes, poses
 

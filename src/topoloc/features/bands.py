@@ -1,13 +1,18 @@
-"""Rows (of an image, of a table of products) shared out to threads: kernels that release the GIL fill one band each."""
+"""Work shared out to threads, whose kernels release the GIL: rows (of an image, of a table of products), one band each, or whole items."""
 
 from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
 
 from topoloc import compiled
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 @functools.cache
@@ -28,3 +33,28 @@ def run_in_bands(run: Callable[[int, int], object], num_rows: int, num_threads: 
     run(0, borders[1])
     for other in others:
         other.result()
+
+
+def in_order(work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+    """What work(item) gives, in the order of the items, of which as many threads as `set_num_threads` said take one each at a time.
+
+    A whole item a thread: nothing waits for the other half of a picture, and what Python does for one item hides behind the kernels of
+    another. At most one result more than there are threads waits to be taken, so that memory stays what it is; an exception is raised in
+    its item's place. The items themselves are made by the calling thread.
+    """
+    number = compiled.num_threads()
+    if number == 1:
+        yield from map(work, items)
+        return
+    with ThreadPoolExecutor(number, initializer=compiled.be_one_of_several) as pool:
+        coming: deque[Future[R]] = deque()
+        try:
+            for item in items:
+                coming.append(pool.submit(work, item))
+                if len(coming) > number:
+                    yield coming.popleft().result()
+            while coming:
+                yield coming.popleft().result()
+        finally:
+            for future in coming:
+                future.cancel()

@@ -179,7 +179,7 @@ def _joined(
     with_sides = new_walls(topomap, [frame.world_from_cam for frame in wanted])
     drafts = list[NodeDraft]()
     for done, frame in enumerate(wanted):
-        draft = draft_node(frame, locator, done in with_sides, of_map)
+        draft = draft_node(frame, frame.view(), locator, done in with_sides, of_map)
         if len(draft.points[topomap.kind].features) >= of_map.min_node_points:
             drafts.append(draft)
         progress("new nodes", done + 1, len(wanted))
@@ -223,7 +223,7 @@ def _observe_new(
 ) -> None:
     for k in nearest[: topomap.config.landmarks.nodes_per_image]:
         if frame not in drafts[k].sources:
-            observe(drafts[k], image, frame.session_id, topomap.config)
+            drafts[k].add(observe(drafts[k], image, frame.session_id, topomap.config))
 
 
 def _see_again(topomap: TopoMetricMap, image: MappingImage, session_id: int, nearest: Int[np.ndarray, " n"], joined: _Joined) -> None:

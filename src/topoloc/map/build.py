@@ -6,22 +6,23 @@ with their 3-D positions. All mapping images, labelled with their node, teach th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 
 from topoloc.bounds import check_bounds
 from topoloc.errors import EmptyMapError
+from topoloc.features.bands import in_order
 from topoloc.features.kinds import find_kind
 from topoloc.geometry.camera import Camera
 from topoloc.map.config import MapConfig
-from topoloc.map.drafts import Drafts, draft_node, finish_node, observe
+from topoloc.map.drafts import Drafts, NodeDraft, draft_node, finish_node, observe
 from topoloc.map.entries import Edge, PlaceImage, TopoNode
-from topoloc.map.mapping_frames import MappingFrame, PointLocator, mapping_image, posed_frames
+from topoloc.map.landmarks import Observations
+from topoloc.map.mapping_frames import MappingFrame, MappingImage, PointLocator, mapping_image, posed_frames, view_of
 from topoloc.map.nodes import NearestNodes, NodeConfig, NodePoses, place_nodes
 from topoloc.map.schema import SCHEMA_VERSION
 from topoloc.map.sessions import Edit, Light, Session, mean_light, path_of, poses_source_of, today
@@ -29,8 +30,7 @@ from topoloc.map.side_nodes import gather_sides, nodes_with_sides
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.coarse import CoarseModel
 from topoloc.places.vlad import SurfVlad, learn_words_of, placed, vlad
-from topoloc.sequences.frame import StereoSequence
-from topoloc.sequences.frame_view import FrameView
+from topoloc.sequences.frame import StereoFrame, StereoSequence
 from topoloc.shelf import Shelf
 
 BuildConfig = MapConfig
@@ -104,13 +104,14 @@ def _resolve_node_config(frames: list[MappingFrame], locator: PointLocator, conf
     """D_thresh from the scene, where the user named none."""
     if config.nodes.d_thresh is not None:
         return config.nodes.resolved(0.0)
-    samples = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, 7).astype(int))]
-    depths = []
-    for frame in samples:
-        view, first = frame.view(), replace(config, other_kinds=())
+    samples, first = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, 7).astype(int))], replace(config, other_kinds=())
+
+    def depths(read: tuple[MappingFrame, StereoFrame]) -> Float[np.ndarray, " n"]:
+        frame, view = read[0], view_of(read[1])
         located = locator.locate(frame, view, mapping_image(frame, view, first))[0][config.features.kind]
-        depths.append(located.points_cam[located.valid, 2])
-    all_depths = np.concatenate(depths)
+        return located.points_cam[located.valid, 2]
+
+    all_depths = np.concatenate(list(locator.for_each(depths, samples)))
     if len(all_depths) == 0:
         raise EmptyMapError(f"{frames[0].sequence.name}: no feature with a 3-D position in {len(samples)} pictures tried")
     return config.nodes.resolved(float(np.median(all_depths)))
@@ -120,15 +121,19 @@ def _draft_nodes(
     frames: list[MappingFrame], locator: PointLocator, node_config: NodeConfig, config: BuildConfig, progress: Progress
 ) -> Drafts:
     """The trajectory discretised by Eq. 1; a picture with too few points (dark, blurred, blank) becomes no node."""
-    frame_idx = place_nodes([frame.world_from_cam for frame in frames], node_config)
+    chosen = [frames[i] for i in place_nodes([frame.world_from_cam for frame in frames], node_config)]
     kind = find_kind(config.features.kind)
-    with_sides = nodes_with_sides([frames[i].world_from_cam for i in frame_idx], node_config, config.sides)
+    rows = nodes_with_sides([frame.world_from_cam for frame in chosen], node_config, config.sides)
+    with_sides = {chosen[row] for row in rows}
     drafts = Drafts(Shelf(by_reference=frames))
-    for done, i in enumerate(frame_idx):
-        draft = draft_node(frames[i], locator, done in with_sides, config)
+
+    def draft_of(read: tuple[MappingFrame, StereoFrame]) -> NodeDraft:
+        return draft_node(read[0], view_of(read[1]), locator, read[0] in with_sides, config)
+
+    for done, draft in enumerate(locator.for_each(draft_of, chosen)):
         if len(draft.points[kind.name].features) >= config.min_node_points:
             drafts.append(draft)
-        progress("nodes", done + 1, len(frame_idx))
+        progress("nodes", done + 1, len(chosen))
     if not drafts.rows:
         raise EmptyMapError(f"{frames[0].sequence.name}: no picture has {config.min_node_points} features with a 3-D position")
     return drafts
@@ -144,19 +149,18 @@ def _visit_all_images(
     nodes = NearestNodes(NodePoses.of(drafts.world_from_nodes), node_config.lambda_rot)
     images: list[PlaceImage] = []
     lights, vlads, cells = [], {kind: Shelf[np.ndarray]() for kind in config.kinds}, {kind: [] for kind in config.kinds}
-    for done, (frame, view) in enumerate(_read_ahead(frames, drafts)):
-        image = drafts.image(frame) if view is None else mapping_image(frame, view, config)
-        nearest = nodes.rows(image.world_from_cam, max(1, config.landmarks.nodes_per_image)).tolist()
-        for row in nearest[: config.landmarks.nodes_per_image]:
+    read = ((frame, None if frame in drafts.rows else frame.read()) for frame in frames)
+    visits = in_order(lambda one: _visit(*one, drafts, nodes, words, config), read)
+    for done, (frame, visit) in enumerate(zip(frames, visits, strict=True)):
+        for row, observed in visit.observed.items():
             draft = drafts.shelf[row]
-            if frame not in draft.sources:
-                observe(draft, image, frame.session_id, config)
-                drafts.shelf[row] = draft
+            draft.add(observed)
+            drafts.shelf[row] = draft
+        image = visit.image
         for kind, features in image.features.items():
-            described = placed(features, image.camera.width, image.camera.height, config.vlad_of(kind))
-            vlads[kind].append(vlad(described, words[kind]))
+            vlads[kind].append(visit.vlads[kind])
             cells[kind].append(features.cells)
-        of_image = (nearest[0], image.world_from_cam, image.place_jpeg, frame.session_id, done + 1)
+        of_image = (visit.nearest, image.world_from_cam, image.place_jpeg, frame.session_id, done + 1)
         images.append(PlaceImage(frame.sequence.name, frame.name, *of_image))
         lights.append(image.light)
         progress("images", done + 1, len(frames))
@@ -166,19 +170,31 @@ def _visit_all_images(
     return images, lights, [model if kind == first else replace(model, name=f"{model.name}@{kind}") for kind, model in models.items()]
 
 
-def _read_ahead(frames: list[MappingFrame], drafts: Drafts) -> Iterator[tuple[MappingFrame, FrameView | None]]:
-    """The frames, each read while the one before is worked on; None of those that are nodes: they are known already."""
-    with ThreadPoolExecutor(max_workers=1) as reader:
+@dataclass(frozen=True, eq=False)
+class _Visit:
+    """What a mapping image gives: its nearest node's row, what it sees of the nodes around, by their rows, and its VLADs by kind."""
 
-        def begin(frame: MappingFrame) -> Future[FrameView | None]:
-            return reader.submit(lambda: None if frame in drafts.rows else frame.view(with_depth=False))
+    image: MappingImage
+    nearest: int
+    observed: dict[int, dict[str, Observations]]
+    vlads: dict[str, Float32[np.ndarray, " v"]]
 
-        coming = begin(frames[0])
-        for frame, after in zip(frames, [*frames[1:], None], strict=True):
-            view = coming.result()
-            if after is not None:
-                coming = begin(after)
-            yield frame, view
+
+def _visit(
+    frame: MappingFrame,
+    read: StereoFrame | None,
+    drafts: Drafts,
+    nodes: NearestNodes,
+    words: dict[str, Float32[np.ndarray, "k d"]],
+    config: BuildConfig,
+) -> _Visit:
+    """`read` is None for a frame that is a node: what it shows is known already. Changes nothing, so that several may run at a time."""
+    image = drafts.image(frame) if read is None else mapping_image(frame, view_of(read, with_depth=False), config)
+    nearest = nodes.rows(image.world_from_cam, max(1, config.landmarks.nodes_per_image)).tolist()
+    around = {row: drafts.shelf[row] for row in nearest[: config.landmarks.nodes_per_image]}
+    observed = {row: observe(draft, image, frame.session_id, config) for row, draft in around.items() if frame not in draft.sources}
+    placed_of = {kind: placed(of, image.camera.width, image.camera.height, config.vlad_of(kind)) for kind, of in image.features.items()}
+    return _Visit(image, nearest[0], observed, {kind: vlad(described, words[kind]) for kind, described in placed_of.items()})
 
 
 def _words(drafts: Drafts, kind: str, config: BuildConfig) -> Float32[np.ndarray, "k d"]:
@@ -188,10 +204,15 @@ def _words(drafts: Drafts, kind: str, config: BuildConfig) -> Float32[np.ndarray
 def _finished(drafts: Drafts, config: BuildConfig) -> tuple[dict[str, Sequence[TopoNode]], Sequence[TopoNode]]:
     """The nodes by their kinds of features, and all side nodes; each draft is looked at once."""
     of_kind, sides = {kind: Shelf[TopoNode]() for kind in config.kinds}, Shelf[TopoNode]()
-    for node_id, draft in enumerate(drafts.shelf):
-        for kind, nodes in of_kind.items():
-            nodes.append(finish_node(node_id, draft, kind, config))
-        for side in draft.sides:
+
+    def finished(node_id: int) -> tuple[list[TopoNode], list[TopoNode]]:
+        draft = drafts.shelf[node_id]
+        return [finish_node(node_id, draft, kind, config) for kind in config.kinds], draft.sides
+
+    for node_id, (nodes, of_node) in enumerate(in_order(finished, range(len(drafts.shelf)))):
+        for kind, node in zip(config.kinds, nodes, strict=True):
+            of_kind[kind].append(node)
+        for side in of_node:
             sides.append(replace(side, summary=replace(side.summary, of_node=node_id)))
     return dict(of_kind), sides
 

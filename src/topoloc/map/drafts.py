@@ -16,6 +16,7 @@ from topoloc.map.landmarks import Observations, observe_points, refine_points, s
 from topoloc.map.mapping_frames import MappingFrame, MappingImage, PointLocator, small_jpeg
 from topoloc.map.side_nodes import describe_sides
 from topoloc.places.vlad import placed
+from topoloc.sequences.frame_view import FrameView
 from topoloc.shelf import Shelf
 from topoloc.slam.metric_points import keypoint_sigmas
 
@@ -40,6 +41,11 @@ class NodeDraft:
     points: dict[str, DraftPoints]
     sides: list[TopoNode]
     sources: list[MappingFrame]
+
+    def add(self, observed: dict[str, Observations]) -> None:
+        """What one more image saw of the points (`observe`)."""
+        for kind, observations in observed.items():
+            self.points[kind].observations.append(observations)
 
     def described(self, kind: str, config: MapConfig) -> Float32[np.ndarray, "n d"]:
         """The descriptors of its points of a kind, as the coarse localizer takes them (`placed`)."""
@@ -70,8 +76,8 @@ class Drafts:
         return self.shelf[self.rows[frame]].image
 
 
-def draft_node(frame: MappingFrame, locator: PointLocator, with_sides: bool, config: MapConfig) -> NodeDraft:
-    view = frame.view()
+def draft_node(frame: MappingFrame, view: FrameView, locator: PointLocator, with_sides: bool, config: MapConfig) -> NodeDraft:
+    """A node of this frame, of which `view` is what was read."""
     image = locator.image(frame, view)
     located, sources = locator.locate(frame, view, image)
     points = {}
@@ -88,12 +94,15 @@ def draft_node(frame: MappingFrame, locator: PointLocator, with_sides: bool, con
     return NodeDraft(frame, image, template_jpeg, points, sides, [frame, *sources])
 
 
-def observe(draft: NodeDraft, image: MappingImage, session_id: int, config: MapConfig) -> None:
+def observe(draft: NodeDraft, image: MappingImage, session_id: int, config: MapConfig) -> dict[str, Observations]:
+    """What an image sees of a draft's points, by their kinds."""
     cam_from_node = image.world_from_cam.inverse() @ draft.image.world_from_cam
+    observed = {}
     for kind, features in image.features.items():
         points, sigmas_px = draft.points[kind], keypoint_sigmas(features, config.points)
         known, seen_by = (points.features, points.points_cam, points.covariances), (features, sigmas_px, image.camera, cam_from_node)
-        points.observations.append(observe_points(*known, *seen_by, config.landmarks, session_id))
+        observed[kind] = observe_points(*known, *seen_by, config.landmarks, session_id)
+    return observed
 
 
 def finish_node(node_id: int, draft: NodeDraft, kind: str, config: MapConfig) -> TopoNode:

@@ -19,6 +19,7 @@ from topoloc.features.features import Features
 from topoloc.features.matching import MatchingConfig, match_features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.map.landmark_kernels import add_observations
 from topoloc.map.sums import LandmarkSums
 
 _CAUCHY_SCALE = 2.385  # of a residual in standard deviations
@@ -174,15 +175,10 @@ def _normal_equations(
     information, gradient = prior.copy(), np.einsum("nij,nj->ni", prior, offset)
     squares = np.einsum("ni,ni->n", gradient, offset)
     for seen in observations:
-        residuals, jacobians, in_front = _project(points[seen.rows], seen.normalized, seen.cam_from_node)
-        scaled = residuals / seen.sigmas[:, None]
-        square = np.sum(scaled**2, axis=1)
-        weights = np.where(in_front, 1.0 / (1.0 + square / _CAUCHY_SCALE**2), 0.0)
-        weighted = jacobians.transpose(0, 2, 1) * (weights / seen.sigmas**2)[:, None, None]
-        # a point occurs at most once in an image, so plain indexed addition is exact
-        information[seen.rows] += weighted @ jacobians
-        gradient[seen.rows] += np.einsum("nij,nj->ni", weighted, residuals)
-        squares[seen.rows] += np.where(in_front, square, 1e6)
+        pose = seen.cam_from_node
+        add_observations(
+            points, seen.rows, seen.normalized, seen.sigmas, pose.rotation, pose.translation, _CAUCHY_SCALE, information, gradient, squares
+        )
     return information, gradient, squares
 
 

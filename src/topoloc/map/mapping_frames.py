@@ -7,24 +7,29 @@ poses that all of them have.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain, groupby
+from typing import TypeVar
 
 import cv2
 
 from topoloc.errors import TrajectoryError
+from topoloc.features.bands import in_order
 from topoloc.features.extraction import extract_features
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.map.config import MapConfig
 from topoloc.map.sessions import Light, light_of
-from topoloc.sequences.frame import Image, StereoSequence
+from topoloc.sequences.frame import Image, StereoFrame, StereoSequence
 from topoloc.sequences.frame_view import FrameView, frame_view
 from topoloc.sequences.pictures import jpeg_of
 from topoloc.sequences.recording import has_scale
 from topoloc.slam.metric_points import MetricPoints, keypoint_sigmas, locate_points
 from topoloc.slam.motion_points import OtherPicture, choose_pictures, locate_by_motion, usual_step
+
+R = TypeVar("R")
 
 PLACE_QUALITY = 60  # of the place images' JPEG
 _KEPT_IMAGES = 48  # single pictures locate the points of several nodes; their features are found once
@@ -41,10 +46,12 @@ class MappingFrame:
     t_ns: int
     world_from_cam: Rigid3
 
+    def read(self) -> StereoFrame:
+        """Recordings are read by one thread, and videos best in their order."""
+        return self.sequence[self.index]
+
     def view(self, with_depth: bool = True) -> FrameView:
-        frame = self.sequence[self.index]
-        is_single = frame.right is None and frame.depth is None
-        return frame_view(frame, with_depth and not is_single)
+        return view_of(self.read(), with_depth)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +64,15 @@ class MappingImage:
     features: dict[str, Features]
     place_jpeg: bytes
     light: Light
+
+
+def view_of(frame: StereoFrame, with_depth: bool = True) -> FrameView:
+    """A frame that was read, made ready for measuring; a single picture has no depth in any case."""
+    return frame_view(frame, with_depth and not _is_single(frame))
+
+
+def _is_single(frame: StereoFrame) -> bool:
+    return frame.right is None and frame.depth is None
 
 
 def posed_frames(sequence: StereoSequence, session_id: int) -> list[MappingFrame]:
@@ -103,6 +119,13 @@ class PointLocator:
             self._sessions.setdefault(frame.session_id, []).append(frame)
         self._steps = {number: usual_step([frame.world_from_cam for frame in of_it]) for number, of_it in self._sessions.items()}
         self._images: OrderedDict[int, MappingImage] = OrderedDict()
+
+    def for_each(self, work: Callable[[tuple[MappingFrame, StereoFrame]], R], frames: Sequence[MappingFrame]) -> Iterator[R]:
+        """What work(frame, as read) gives, in their order; several frames at a time, but for single pictures, for which others are read."""
+        for _, of_session in groupby(frames, lambda frame: frame.session_id):
+            read = ((frame, frame.read()) for frame in of_session)
+            first = next(read)
+            yield from (map if _is_single(first[1]) else in_order)(work, chain([first], read))
 
     def image(self, frame: MappingFrame, view: FrameView) -> MappingImage:
         """The frame described, from memory where that is possible."""

@@ -15,7 +15,7 @@ from topoloc.geometry.rig import Rectification, StereoRig, rectify
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.frame import DepthImage, Image, StereoFrame
 from topoloc.sequences.pictures import grey_image
-from topoloc.sequences.registration_kernels import back_project, keep_nearest
+from topoloc.sequences.registration_kernels import back_project, keep_nearest, register_without_lens
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,10 +106,14 @@ def registered_depth(depth_image: DepthImage, camera: Camera) -> Float32[np.ndar
     if identity and depth_image.camera == camera:
         return depth_image.depth
     height, width = depth_image.depth.shape
-    pose, points = depth_image.cam_from_depth, np.empty((height * width, 3))
-    normalized = _normalized_pixels(depth_image.camera, width, height)
-    points = points[: back_project(depth_image.depth, normalized, pose.rotation, pose.translation, points)]
+    pose, normalized = depth_image.cam_from_depth, _normalized_pixels(depth_image.camera, width, height)
     registered = np.full((camera.height, camera.width), np.nan, np.float32)
+    if not camera.is_distorted:
+        focal, centre = (camera.fx, camera.fy), (camera.cx, camera.cy)
+        register_without_lens(depth_image.depth, normalized, pose.rotation, pose.translation, focal, centre, registered)
+        return registered
+    points = np.empty((height * width, 3))
+    points = points[: back_project(depth_image.depth, normalized, pose.rotation, pose.translation, points)]
     keep_nearest(camera.img_from_cam(points), points, registered)
     return registered
 

@@ -27,15 +27,36 @@ def back_project(depth, normalized, rotation, translation, points):
     return count
 
 
+@kernel(error_model="numpy", inline="always")
+def _keep(x, y, depth, registered):
+    height, width = registered.shape
+    if x >= -0.5 and y >= -0.5 and x < width - 0.5 and y < height - 0.5:
+        row, column = int(np.rint(y)), int(np.rint(x))
+        z = np.float32(depth)
+        if not registered[row, column] <= z:  # also where it is still NaN
+            registered[row, column] = z
+
+
+@kernel(error_model="numpy")
+def register_without_lens(depth, normalized, rotation, translation, focal, centre, registered):
+    """`back_project`, the pixels of a camera without distortion (focal lengths and principal point, x and y) and `keep_nearest` in one
+    pass, without the points in between; the same numbers to the bit."""
+    height, width = depth.shape
+    for row in range(height):
+        for column in range(width):
+            z = np.float64(depth[row, column])
+            if not z > 0.0:  # NaN compares false
+                continue
+            x, y = normalized[row * width + column, 0] * z, normalized[row * width + column, 1] * z
+            px = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation[0]
+            py = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation[1]
+            pz = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation[2]
+            if pz > 1e-9:
+                _keep(px / pz * focal[0] + centre[0], py / pz * focal[1] + centre[1], pz, registered)
+
+
 @kernel(error_model="numpy")
 def keep_nearest(pixels, points, registered):
     """Write each point's z into `registered` at its rounded pixel (NaN: none), where nothing nearer is."""
-    height, width = registered.shape
     for i in range(len(pixels)):
-        x, y = pixels[i, 0], pixels[i, 1]
-        if not (x >= -0.5 and y >= -0.5 and x < width - 0.5 and y < height - 0.5):
-            continue
-        row, column = int(np.rint(y)), int(np.rint(x))
-        z = np.float32(points[i, 2])
-        if not registered[row, column] <= z:  # also where it is still NaN
-            registered[row, column] = z
+        _keep(pixels[i, 0], pixels[i, 1], points[i, 2], registered)

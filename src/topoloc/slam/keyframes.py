@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -114,15 +115,18 @@ class KeyFrame:
     motion: Motion | None = None
     places: Shelf[PlaceView] = field(default_factory=lambda: Shelf[PlaceView]())
     place_row: int | None = None
+    coming_place: Future[PlaceView] | None = None
 
     @property
     def has_place(self) -> bool:
-        """Whether it is known how it looks."""
-        return self.place_row is not None
+        """Whether it is known how it looks, or will be."""
+        return self.place_row is not None or self.coming_place is not None
 
     @property
     def place(self) -> PlaceView | None:
-        """How it looks, where that is known."""
+        """How it looks, where that is known; waits for what a thread still looks at (`coming_place`)."""
+        if self.coming_place is not None:
+            self.place, self.coming_place = self.coming_place.result(), None
         return None if self.place_row is None else self.places[self.place_row]
 
     @place.setter

@@ -14,6 +14,7 @@ from typing import Annotated
 import numpy as np
 
 from topoloc.bounds import Above, AtLeast, Between
+from topoloc.features.bands import in_order
 from topoloc.features.features import Features
 from topoloc.geometry.rigid import Rigid3
 from topoloc.places.vlad import SurfVlad, VladConfig, learn_words_of, vlad
@@ -68,8 +69,7 @@ def find_links(
         return []
     proposals = _propose(keyframes, places, config)
     links = []
-    for done, (target, source) in enumerate(proposals):
-        link = _match(source, target, keyframes, config)
+    for done, link in enumerate(in_order(lambda pair: _match(pair[1], pair[0], keyframes, config), proposals)):
         if link is not None:
             links.append(link)
         progress("loops", done + 1, len(proposals))
@@ -77,7 +77,8 @@ def find_links(
     plausible = [link for link in links if _within_drift(link, keyframes, config)]
     clear = [link for link in plausible if not any(_contradicts(other, link, keyframes, config) for other in plausible)]
     supported = [link for link in clear if any(_supports(other, link, keyframes, rank, config) for other in clear)]
-    sure = [link for link in supported if not _is_rivalled(link, keyframes, places, config)]
+    are_rivalled = in_order(lambda link: _is_rivalled(link, keyframes, places, config), supported)
+    sure = [link for link, is_rivalled in zip(supported, are_rivalled, strict=True) if not is_rivalled]
     return [link for link in sure if any(_supports(other, link, keyframes, rank, config) for other in sure)]
 
 

@@ -8,15 +8,17 @@ from typing import Annotated
 import numpy as np
 
 from topoloc.bounds import AtLeast, Between
+from topoloc.features.bands import in_order
 from topoloc.features.extraction import extract_features
 from topoloc.features.features import Features
 from topoloc.features.kinds import FeatureConfig
 from topoloc.features.matching import MatchingConfig, match_features
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
+from topoloc.geometry.camera import Camera
 from topoloc.geometry.relative_pose import estimate_relative_pose
 from topoloc.geometry.rigid import Rigid3
-from topoloc.sequences.frame import StereoSequence
-from topoloc.sequences.frame_view import FrameView, frame_view
+from topoloc.sequences.frame import StereoFrame, StereoSequence
+from topoloc.sequences.frame_view import frame_view
 from topoloc.slam.metric_points import MetricPoints, MetricPointsConfig, locate_points
 
 
@@ -51,50 +53,54 @@ def measure_steps(sequence: StereoSequence, usable: list[int], config: MeasuredS
     """Steps spread over the frames `usable` (their rows, increasing), by the left pictures and the depth of each step's first frame; of
     a single camera by its pictures alone.
 
-    A step that cannot be measured, as too little is recognised, is left out.
+    A step that cannot be measured, as too little is recognised, is left out. All steps over one gap are sought before those over the next,
+    so that the recording is read in its order.
 
     Raises:
         RecordingError, CalibrationError, UnreadableImageError: from reading the recording.
     """
-    starts = np.unique(np.linspace(0, len(usable) - 1, config.num_steps).astype(int))
-    found = (_measure_from(sequence, usable, int(start), config) for start in starts)
-    return [step for step in found if step is not None]
+    starts = np.unique(np.linspace(0, len(usable) - 1, config.num_steps).astype(int)).tolist()
+    firsts: dict[int, _Seen] = {}
+    steps: dict[int, MeasuredStep] = {}
+
+    def measure(pair: tuple[int, int, StereoFrame | None, StereoFrame]) -> tuple[int, _Seen, MeasuredStep | None]:
+        start, other, frame, other_frame = pair
+        first = firsts[start] if frame is None else _seen(frame, config, is_first=True)
+        motion = _motion(first, last := _seen(other_frame, config, is_first=False), config)
+        if motion is None:
+            return start, first, None
+        first_from_last = first.view_from_cam.inverse() @ motion[0].inverse() @ last.view_from_cam
+        return start, first, MeasuredStep(usable[start], usable[other], first_from_last, motion[1], has_scale=first.points is not None)
+
+    for gap in config.gaps:  # backwards where the recording ends
+        pairs = ((start, start + gap if start + gap < len(usable) else start - gap) for start in starts if start not in steps)
+        pairs = [pair for pair in pairs if pair[1] >= 0]
+        read = ((a, b, None if a in firsts else sequence[usable[a]], sequence[usable[b]]) for a, b in pairs)
+        for start, first, step in in_order(measure, read):
+            firsts[start] = first
+            if step is not None:
+                steps[start] = step
+    return [steps[start] for start in starts if start in steps]
 
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    view: FrameView
+    camera: Camera
+    view_from_cam: Rigid3
     features: Features
     points: MetricPoints | None
 
 
-def _measure_from(sequence: StereoSequence, usable: list[int], start: int, config: MeasuredStepsConfig) -> MeasuredStep | None:
-    """The step from this frame over the widest gap that can be measured; backwards where the recording ends."""
-    first = _seen(sequence, usable[start], config, is_first=True)
-    for gap in config.gaps:
-        other = start + gap if start + gap < len(usable) else start - gap
-        if other < 0:
-            continue
-        last = _seen(sequence, usable[other], config, is_first=False)
-        step = _motion(first, last, config)
-        if step is not None:
-            motion, depth = step
-            first_from_last = first.view.view_from_cam.inverse() @ motion.inverse() @ last.view.view_from_cam
-            return MeasuredStep(usable[start], usable[other], first_from_last, depth, has_scale=first.points is not None)
-    return None
-
-
-def _seen(sequence: StereoSequence, index: int, config: MeasuredStepsConfig, is_first: bool) -> _Seen:
-    frame = sequence[index]
+def _seen(frame: StereoFrame, config: MeasuredStepsConfig, is_first: bool) -> _Seen:
     has_depth = is_first and (frame.right is not None or frame.depth is not None)
     view = frame_view(frame, with_depth=has_depth)
     features = extract_features(view.grey, config.features)
     if not has_depth:
-        return _Seen(view, features, None)
+        return _Seen(view.camera, view.view_from_cam, features, None)
     located = locate_points(features, view, config.points)
     rows = np.flatnonzero(located.valid)
     points = MetricPoints(located.points_cam[rows], located.covariances[rows], located.valid[rows])
-    return _Seen(view, features.select(rows), points)
+    return _Seen(view.camera, view.view_from_cam, features.select(rows), points)
 
 
 def _motion(first: _Seen, last: _Seen, config: MeasuredStepsConfig) -> tuple[Rigid3, float] | None:
@@ -105,11 +111,11 @@ def _motion(first: _Seen, last: _Seen, config: MeasuredStepsConfig) -> tuple[Rig
     points_img = last.features.points_img[matches.query_idx].astype(np.float64)
     if first.points is None:
         first_img = first.features.points_img[matches.train_idx].astype(np.float64)
-        moved = estimate_relative_pose(first_img, first.view.camera, points_img, last.view.camera)
+        moved = estimate_relative_pose(first_img, first.camera, points_img, last.camera)
         is_seen = moved is not None and np.count_nonzero(moved.inliers) >= config.min_inliers
         return (moved.second_from_first, 0.0) if is_seen and moved is not None else None
     points, covariances = first.points.points_cam[matches.train_idx], first.points.covariances[matches.train_idx]
-    pose = estimate_absolute_pose(points_img, points, last.view.camera, config.pose, point_covariances=covariances)
+    pose = estimate_absolute_pose(points_img, points, last.camera, config.pose, point_covariances=covariances)
     if pose is None or np.count_nonzero(pose.inliers) < config.min_inliers:
         return None
     return pose.cam_from_world, float(np.median(points[pose.inliers, 2]))

@@ -9,10 +9,12 @@ steps and the motion does not tell which.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 
 import numpy as np
 
+from topoloc.compiled import be_one_of_several
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.frame import StereoFrame
 from topoloc.shelf import Shelf
@@ -43,22 +45,25 @@ class Odometry:
         self._repeats: list[Rigid3] = []  # of the last frame before the camera was lost
         self._bias = DisparityBias()
         self._places = Shelf[PlaceView]()
+        self._looking = ThreadPoolExecutor(1, initializer=be_one_of_several)
+        self._looked_at: KeyFrame | None = None
 
-    def process(self, frame_idx: int, frame: StereoFrame) -> list[FramePose]:
-        """Where this frame is, and those before it whose place is known only now; nothing where that is not known."""
-        measured = self._measured(frame)
+    def process(self, frame_idx: int, frame: StereoFrame, measured: MeasuredView) -> list[FramePose]:
+        """Where this frame is, and those before it whose place is known only now; nothing where that is not known. `measured` is
+        `measured_view(frame)`."""
+        self._expect_bias(measured)
         pose = self._follow(frame_idx, frame, measured)
         return [pose] if pose is not None else self._lost(frame_idx, frame, measured)
 
     def finish(self) -> list[FramePose]:
         """The recording is at its end: the frames that were sought in vain until then."""
-        return self._begin_again() if len(self._missed) > 1 else []
+        poses = self._begin_again() if len(self._missed) > 1 else []
+        self._looking.shutdown()
+        return poses
 
-    def _measured(self, frame: StereoFrame) -> MeasuredView:
-        measured = measured_view(frame)
+    def _expect_bias(self, measured: MeasuredView) -> None:
         if measured.right is not None:
             self._bias.information = 1.0 / self._config.sigma_bias_px**2
-        return measured
 
     def _follow(self, frame_idx: int, frame: StereoFrame, measured: MeasuredView) -> FramePose | None:
         """Where the frame is, by its step from the last one."""
@@ -152,7 +157,7 @@ class Odometry:
         self._follow_from(keyframe, measured)
         self._checks.look_at_keyframe(keyframe, self._landmarks, measured)
         if self._is_new_place(keyframe):
-            keyframe.place = place_view(measured.view, self._config.places)
+            self._look(keyframe, measured)
 
     def _observations(self, ids: np.ndarray, values: np.ndarray, sigmas: np.ndarray) -> Observations:
         weights = np.full((len(ids), 3), 1.0 / self._config.sigma_px)
@@ -188,6 +193,13 @@ class Odometry:
         far = np.linalg.norm(motion.translation) > self._config.place_distance * np.median(depth)
         return bool(far or motion.angle() > np.deg2rad(self._config.place_angle_deg))
 
+    def _look(self, keyframe: KeyFrame, measured: MeasuredView) -> None:
+        """How a key frame looks is found while the next frames are followed; of one at a time, so that few pictures are held."""
+        if self._looked_at is not None:
+            assert self._looked_at.place is not None  # waits
+        keyframe.coming_place = self._looking.submit(place_view, measured.view, self._config.places)
+        self._looked_at = keyframe
+
     def _last_places(self, num: int) -> list[KeyFrame]:
         """The last key frames of this sub-map whose looks are known, newest first."""
         if self._reference is None:
@@ -215,7 +227,7 @@ class Odometry:
         num_keyframes, num_landmarks, num_lost = len(self._keyframes), self._landmarks.num, self._num_lost
         poses: list[FramePose] = []
         for frame_idx, frame in missed:
-            measured = self._measured(frame)
+            measured = measured_view(frame)
             pose = self._follow(frame_idx, frame, measured) if poses else None
             if pose is None:  # what came before it leads nowhere
                 poses, self._reference = [], None

@@ -116,6 +116,8 @@ def judge_poses(steps: Sequence[MeasuredStep], poses: _Poses, t_ns: Sequence[int
         return PoseVerdict(len(telling), 0)
     as_is = _Reading((), _misses(telling, _steps_of(telling, poses)))
     verdict = PoseVerdict(len(telling), as_is.num_agreeing)
+    if verdict.is_believed and not _is_noted(as_is):
+        return verdict
     readings = [*_by_convention(telling, poses), *_best_shift(telling, poses, t_ns)]
     if verdict.is_believed:  # of a way that is nearly straight and level, wrong poses may be nearly right
         better = [one for one in readings if _is_far_better(one, as_is) and not any("scale" in name for name in one.conventions)]
@@ -218,8 +220,12 @@ def _shifted(telling: Sequence[MeasuredStep], trajectory: Trajectory, t_ns: Sequ
 
 def _is_far_better(other: _Reading, as_is: _Reading) -> bool:
     """Does another reading explain most of what the steps miss by?"""
-    miss = float(np.median(as_is.misses))
-    return miss > _NOTED_MISS and float(np.median(other.misses)) < _FAR_BETTER * miss
+    return _is_noted(as_is) and float(np.median(other.misses)) < _FAR_BETTER * float(np.median(as_is.misses))
+
+
+def _is_noted(as_is: _Reading) -> bool:
+    """Do the steps miss by enough for another reading to be far better?"""
+    return float(np.median(as_is.misses)) > _NOTED_MISS
 
 
 def _as_body(telling: Sequence[MeasuredStep], poses: _Poses) -> Iterator[_Reading]:

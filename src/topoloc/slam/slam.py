@@ -21,6 +21,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.frame import StereoFrame, StereoSequence
 from topoloc.sequences.frame_view import frame_view
 from topoloc.sequences.recording import SequenceView
+from topoloc.slam.disparity import MeasuredView, measured_view
 from topoloc.slam.global_map import GlobalMapConfig, adjust_all, close_loops, join_submaps
 from topoloc.slam.input_checks import InputCheckConfig, InputChecks
 from topoloc.slam.keyframes import FramePose, KeyFrame, Landmarks, PlaceView
@@ -131,9 +132,8 @@ def with_slam_poses(sequences: Sequence[StereoSequence], result: SlamResult) -> 
 
 def _track(sequence: StereoSequence, odometry: Odometry, checks: InputChecks, progress: Progress) -> list[FramePose | None]:
     poses: list[FramePose | None] = [None] * len(sequence)
-    for i, frame in enumerate(_read_ahead(sequence)):
-        checks.check_rig(frame)
-        for pose in odometry.process(i, frame):
+    for i, (frame, measured) in enumerate(_read_ahead(sequence, checks)):
+        for pose in odometry.process(i, frame, measured):
             poses[pose.frame_idx] = pose
         progress(f"tracking {sequence.name}", i + 1, len(sequence))
     for pose in odometry.finish():
@@ -144,15 +144,21 @@ def _track(sequence: StereoSequence, odometry: Odometry, checks: InputChecks, pr
     return poses
 
 
-def _read_ahead(sequence: StereoSequence) -> Iterator[StereoFrame]:
-    """The frames, each read while the one before is being worked on."""
+def _read_ahead(sequence: StereoSequence, checks: InputChecks) -> Iterator[tuple[StereoFrame, MeasuredView]]:
+    """The frames, each read and made ready for measuring while the one before is being worked on."""
+
+    def read(index: int) -> tuple[StereoFrame, MeasuredView]:
+        frame = sequence[index]
+        checks.check_rig(frame)
+        return frame, measured_view(frame)
+
     with ThreadPoolExecutor(max_workers=1) as reader:
-        coming = reader.submit(sequence.__getitem__, 0)
+        coming = reader.submit(read, 0)
         for i in range(len(sequence)):
-            frame = coming.result()
+            ready = coming.result()
             if i + 1 < len(sequence):
-                coming = reader.submit(sequence.__getitem__, i + 1)
-            yield frame
+                coming = reader.submit(read, i + 1)
+            yield ready
 
 
 def _largest(keyframes: list[KeyFrame], links: list[Link], tracked: list[FramePose | None]) -> int:

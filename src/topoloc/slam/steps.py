@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from topoloc.bounds import Above, AtLeast, Between
+from topoloc.features.bands import in_order
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.stereo import ray_covariances
@@ -144,7 +145,7 @@ class StepSeeker:
     def repeats(self, prediction: Prediction) -> list[Rigid3]:
         """What moves a camera to where the last picture would look the same; nothing where nothing repeats itself."""
         itself, last = replace(self, measured=self.last.measured), self.last.cam_from_world
-        steps = (itself.seek(cam_from_world) for cam_from_world in self._starts(last, prediction))
+        steps = in_order(itself.seek, self._starts(last, prediction))
         shifts = [step.cam_from_world @ last.inverse() for step in steps if step is not None and step.share > self.config.repeat_share]
         shifts = [shift for shift in shifts if not self.is_same(shift, Rigid3.identity())]
         if not shifts:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.features.bands import in_order
 from topoloc.features.kinds import find_kind
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.fitted_weights import weights_of
@@ -83,9 +84,9 @@ def _correlated_errors(topomap: TopoMetricMap) -> SharedErrors:
 def with_repetitions(topomap: TopoMetricMap, progress: build.Progress | None = None) -> TopoMetricMap:
     """The map, told by which moves its nodes are found elsewhere in it."""
     opened, moves = OpenMap(topomap), dict[int, Float[np.ndarray, "k 4 4"]]()
-    for row, node_id in enumerate(opened.node_ids):
-        if len(found := opened.moves(row)):
-            moves[node_id] = found
+    for row, found in enumerate(in_order(opened.moves, range(len(opened.node_ids)))):
+        if len(found):
+            moves[opened.node_ids[row]] = found
         if progress is not None:
             progress("repetitions", row + 1, len(opened.node_ids))
     return replace(topomap, repetitions=Repetitions(digest_of(topomap.summaries), moves))
