@@ -116,11 +116,11 @@ def _best(found: list[WallProposal]) -> list[WallProposal]:
 
 
 def _compared(walls: SeenWalls, view: int, row: int) -> WallProposal | None:
-    """A view's strongest features compared with one side node: those of another place agree less often than all would."""
+    """A view compared with one side node."""
     config, side = walls.search.config.walls, walls.seen[view]
     node, local_map = walls.index.local_map(row)
     points = (local_map.descriptors, local_map.points_world, local_map.radii)
-    matches = match_pooled(side.features.descriptors[: walls.search.config.num_first_features], *points, config.matching)
+    matches = match_pooled(side.features.descriptors, *points, config.matching)
     agreeing = agreeing_pose(side.features, side.view.camera, node, matches)
     if agreeing is None or agreeing[0] < config.min_agreeing:
         return None
