@@ -198,6 +198,14 @@ def test_a_pose_that_is_not_clear_must_lead_those_elsewhere_by_what_its_kind_ask
     assert isinstance(answer(replace(search, weights=strict))[0], Localization) == is_answered
 
 
+def test_walls_need_not_lead_as_an_unclear_pose_of_nodes_must():
+    """Each of their points was held against all other walls."""
+    strict = replace(WEIGHTS, rivals=replace(WEIGHTS.rivals, unclear_lead=4.0))
+    for walls in (True, False):
+        search = believed([made_hypothesis(2.5, x=-9.0, walls=walls), made_hypothesis(2.5 - MIN_LEAD - 0.1)])
+        assert isinstance(answer(replace(search, weights=strict))[0], Localization) == walls
+
+
 def test_of_walls_and_nodes_the_one_with_much_more_for_it_is_believed():
     behind = 3.0 - MIN_LEAD - 0.1
     assert _along(_answered(made_hypothesis(behind), made_hypothesis(3.0, x=-9.0, walls=True))) == pytest.approx(-9.0)
