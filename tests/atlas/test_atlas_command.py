@@ -45,6 +45,18 @@ def test_an_atlas_is_made_added_to_and_emptied(room_map: Path, other_map: Path, 
     assert json.loads(_json(capsys, "info", where)) == json.loads(_json(capsys, "atlas", "info", where))
 
 
+def test_the_history_is_that_of_each_tile(own_atlas: Path, room_map: Path, capsys: pytest.CaptureFixture[str]):
+    told = json.loads(_json(capsys, "history", own_atlas))
+    assert [tile["tile_id"] for tile in told["tiles"]] == ["other", "room"]
+    alone = json.loads(_json(capsys, "history", room_map))["edits"]
+    assert told["tiles"][1]["edits"] == [edit | {"undoable": False} for edit in alone]
+    next((own_atlas / "tiles").glob("other-*.topo")).unlink()
+    assert main(["history", str(own_atlas)]) == 1
+    said = capsys.readouterr()
+    assert "error: tile other: " in said.err
+    assert "tile room" in said.out
+
+
 def test_check_names_the_tile_that_is_damaged(own_atlas: Path, capsys: pytest.CaptureFixture[str]):
     next((own_atlas / "tiles").glob("other-*.topo")).write_bytes(b"")
     assert main(["atlas", "info", str(own_atlas), "--check"]) == 1
