@@ -12,7 +12,10 @@ import pytest
 
 from built_room import unseen_views, write_pictures
 from schemas import check_result
+from topoloc.atlas.atlas import Atlas
+from topoloc.atlas.manifest import Tile
 from topoloc.cli import main
+from topoloc.errors import StoreError
 
 Complaint = Callable[..., str]
 
@@ -55,6 +58,19 @@ def test_the_history_is_that_of_each_tile(own_atlas: Path, room_map: Path, capsy
     said = capsys.readouterr()
     assert "error: tile other: " in said.err
     assert "tile room" in said.out
+
+
+def test_a_history_ends_where_the_store_is_silent(atlas: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    asked = list[str]()
+
+    def silent(self: Atlas, tile: Tile) -> Path:
+        asked.append(tile.tile_id)
+        raise StoreError("the store does not answer")
+
+    monkeypatch.setattr(Atlas, "map_path", silent)
+    assert main(["history", str(atlas)]) == 1
+    assert capsys.readouterr().err == "error: the store does not answer\n"
+    assert len(asked) == 1
 
 
 def test_check_names_the_tile_that_is_damaged(own_atlas: Path, capsys: pytest.CaptureFixture[str]):

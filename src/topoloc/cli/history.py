@@ -10,7 +10,7 @@ import tyro
 
 from topoloc.atlas.atlas import Atlas, is_atlas
 from topoloc.cli.output import File, print_facts, write_json
-from topoloc.errors import MapError
+from topoloc.errors import MapError, StoreError
 from topoloc.lifelong.earlier_recall import described
 from topoloc.map.edit import undoable_edits
 from topoloc.map.topomap import TopoMetricMap
@@ -44,6 +44,8 @@ class Command:
         for tile in atlas.manifest.tiles:
             try:
                 edits = _edits(str(atlas.map_path(tile)))
+            except StoreError:  # the others would be asked for as long, one after the other
+                raise
             except MapError as error:
                 print(f"error: tile {tile.tile_id}: {error}", file=sys.stderr)
                 num_missing += 1
