@@ -88,7 +88,7 @@ class Atlas:
 
 def tile_problem(atlas: Atlas, tile: Tile) -> str | None:
     """What is wrong with the bytes of a tile's files; None where they are those that the manifest names."""
-    for stored in (tile.map, tile.places):
+    for stored in tile.files:
         try:
             path = atlas.store.local(stored.name, stored.sha256)
             if path.stat().st_size != stored.num_bytes or sha256_of(path) != stored.sha256:

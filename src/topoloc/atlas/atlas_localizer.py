@@ -22,8 +22,8 @@ from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.config import AtlasConfig
 from topoloc.atlas.hearing import Hearing, Ranking
 from topoloc.atlas.near import Near, tiles_in_reach
-from topoloc.atlas.open_maps import Maps
-from topoloc.atlas.verdict import Heard, joint_result
+from topoloc.atlas.open_maps import Maps, OpenedMap
+from topoloc.atlas.verdict import Heard, joint_result, of_tile
 from topoloc.bounds import check_bounds
 from topoloc.errors import AtlasError, MapError, MissingExtraError, StoreError, WeightsError
 from topoloc.features.kinds import KINDS, FeatureConfig, check_available
@@ -121,6 +121,18 @@ class AtlasLocalizer:
         result = self._on_earth(joint_result(list(hearing.heard.values())))
         result = replace(result, times_ms=_all_times(hearing, clock) | {"total": 1e3 * (time.perf_counter() - start)})
         return result if t_ns is None else at_time(result, t_ns)
+
+    def lend(self, tile_id: str) -> OpenedMap:
+        """The map of a tile, which stays open until it is given back. Raises AtlasError, MapError."""
+        return self._maps.lend(tile_id, self._maps.tile_path(self.atlas, self.atlas.tile(tile_id)))
+
+    def give_back(self, opened: OpenedMap) -> None:
+        """The map that was lent may be closed."""
+        self._maps.give_back(opened)
+
+    def named(self, result: Localization | NotLocalized, tile_id: str) -> Localization | NotLocalized:
+        """What a tile's own map says, as the atlas says it: with the tile's name and its place in the atlas, where that is known."""
+        return self._on_earth(of_tile(result, self.atlas.tile(tile_id)))
 
     def _on_earth(self, result: Localization | NotLocalized) -> Localization | NotLocalized:
         """With the geoposes of tiles that know through others where on earth they lie."""

@@ -22,7 +22,9 @@ from topoloc.atlas.store import MANIFEST, Store, sha256_of
 from topoloc.errors import AtlasError, EmptyMapError
 from topoloc.geometry.geodesy import Georeference
 from topoloc.map.contents import map_id_of
+from topoloc.map.edit import undoable_edits
 from topoloc.map.topomap import TopoMetricMap
+from topoloc.map.undo_log import path_of_log
 from topoloc.places.shared_vocabulary import shared_vocabulary
 from topoloc.sequences.atomic import scratch_file
 
@@ -151,7 +153,6 @@ def add_joins(where: str, joins: Sequence[Join], between: Mapping[str, Tile], gr
 
 def tile_of(new: NewTile, store: Store) -> Tile:
     """What the manifest says of a map; its files are put into the store. Raises MapError, AtlasError."""
-    sha256 = sha256_of(new.path)
     scratch = scratch_file(Path(tempfile.gettempdir()) / "topoloc-tile.places")
     with TopoMetricMap.load(new.path) as topomap, scratch as places:
         if len(topomap.summaries) == 0:
@@ -159,13 +160,19 @@ def tile_of(new: NewTile, store: Store) -> Tile:
         vectors = place_vectors(topomap)
         versions = {kind: vocabulary.version for kind in vectors if (vocabulary := shared_vocabulary(kind)) is not None}
         write_vectors(places, vectors)
-        of_places = sha256_of(places)
         tile = _described(new, topomap, versions)
-        stored = StoredFile(f"{TILES}/{new.tile_id}-{sha256[:12]}.topo", sha256, new.path.stat().st_size)
-        vectors_stored = StoredFile(f"{TILES}/{new.tile_id}-{of_places[:12]}.places", of_places, places.stat().st_size)
-        store.put(vectors_stored.name, places)
-        store.put(stored.name, new.path)
-    return replace(tile, map=stored, places=vectors_stored, recipe=new.recipe)
+        vectors = _stored(store, f"{new.tile_id}.places", places)
+    undo = _stored(store, f"{new.tile_id}.undo", path_of_log(new.path)) if undoable_edits(new.path) else None
+    return replace(tile, map=_stored(store, f"{new.tile_id}.topo", new.path), places=vectors, recipe=new.recipe, undo=undo)
+
+
+def _stored(store: Store, name: str, path: Path) -> StoredFile:
+    """A file put into the store, under this name and what it holds."""
+    sha256 = sha256_of(path)
+    stem, _, suffix = name.rpartition(".")
+    stored = StoredFile(f"{TILES}/{stem}-{sha256[:12]}.{suffix}", sha256, path.stat().st_size)
+    store.put(stored.name, path)
+    return stored
 
 
 def _put(store: Store, new: Sequence[NewTile]) -> list[Tile]:
@@ -176,7 +183,7 @@ def _keep_files(store: Store, new: Sequence[NewTile], tiles: Sequence[Tile]) -> 
     """Put those again that were swept just before they were named: old files of the same contents."""
     names = set(store.ages())
     for one, tile in zip(new, tiles, strict=True):
-        if not {tile.map.name, tile.places.name} <= names:
+        if not {stored.name for stored in tile.files} <= names:
             tile_of(one, store)
 
 

@@ -52,7 +52,8 @@ class Tile:
     both None of a map that knows no place on earth. Tiles of one `world` share their coordinates; it is the tile's own id where nobody said
     so; `joint` says where that world lies among those that pictures join it with (`joins.py`), None where they join it with none.
     `atlas_from_world` brings the map's world into the atlas's, where that is known, be it through other tiles. `recipe` is a digest of the
-    recording and settings that the map was made of, where it was made for this atlas.
+    recording and settings that the map was made of, where it was made for this atlas. `undo` takes the map's last edits back
+    (`map/undo_log.py`), where that can be.
     """
 
     tile_id: str
@@ -72,6 +73,12 @@ class Tile:
     atlas_from_world: Rigid3 | None = None
     recipe: str | None = None
     joint: JointPose | None = None
+    undo: StoredFile | None = None
+
+    @property
+    def files(self) -> tuple[StoredFile, ...]:
+        """All that the tile consists of."""
+        return (self.map, self.places) if self.undo is None else (self.map, self.places, self.undo)
 
     @property
     def in_joint_world(self) -> JointPose:
@@ -94,6 +101,8 @@ class Tile:
         made_of: dict[str, Any] = {} if self.recipe is None else {"recipe": self.recipe}
         if self.joint is not None:
             made_of["joint"] = self.joint.to_json()
+        if self.undo is not None:
+            made_of["undo"] = self.undo.to_json()
         return made_of | {
             "id": self.tile_id,
             "map": self.map.to_json(),
@@ -148,7 +157,7 @@ class Manifest:
     @property
     def files(self) -> set[str]:
         """Names of all files that the tiles consist of."""
-        return {stored.name for tile in self.tiles for stored in (tile.map, tile.places)}
+        return {stored.name for tile in self.tiles for stored in tile.files}
 
     def with_tiles(self, tiles: Mapping[str, Tile], now: float, joins: Sequence[Join] = ()) -> Manifest:
         """The next one, of these tiles; files that it does not name any more are retired at `now`.
@@ -236,7 +245,7 @@ def _tile_of(row: dict[str, Any]) -> Tile:
     if box.shape != (2, 3) or not np.isfinite(box).all():
         raise ValueError("box_world is no two points")
     geo_box, georeference, pose, recipe = row["geo_box"], row["georeference"], row["atlas_from_world"], row.get("recipe")
-    joint = row.get("joint")
+    joint, undo = row.get("joint"), row.get("undo")
     focal = number(row["focal_px"], "focal_px")
     if focal <= 0.0:
         raise ValueError("focal_px is not above 0")
@@ -262,6 +271,7 @@ def _tile_of(row: dict[str, Any]) -> Tile:
         atlas_from_world=None if pose is None else Rigid3.from_matrix(np.array(pose, np.float64)),
         recipe=None if recipe is None else matching(_SHA256, recipe, "recipe"),
         joint=None if joint is None else JointPose.from_json(of(dict, joint, "joint")),
+        undo=None if undo is None else _file_of(of(dict, undo, "undo")),
     )
 
 

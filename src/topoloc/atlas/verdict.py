@@ -55,7 +55,7 @@ def joint_result(heard: Sequence[Heard]) -> Localization | NotLocalized:
     leads = [_lead(best.result, pose) for _, pose in rivals]
     if all(by >= MIN_LEAD for by in leads):
         others = (1.0 / best.result.probability) - 1.0 + sum(math.exp(-by) for by in leads)
-        return _of_tile(replace(best.result, probability=1.0 / (1.0 + others)), best.tile)
+        return of_tile(replace(best.result, probability=1.0 / (1.0 + others)), best.tile)
     return _ambiguity(best, rivals, leads)
 
 
@@ -88,7 +88,7 @@ def _ambiguity(best: Heard, rivals: Sequence[tuple[Tile, Localization]], leads: 
     refusal = NotLocalized(
         "ambiguous", result.candidates, result.num_matches, result.num_inliers, {}, detail, alternatives, result.provenance
     )
-    return _of_tile(replace(refusal, seen_camera=result.seen_camera), best.tile)
+    return of_tile(replace(refusal, seen_camera=result.seen_camera), best.tile)
 
 
 def _refusal(heard: Sequence[Heard]) -> NotLocalized:
@@ -98,11 +98,11 @@ def _refusal(heard: Sequence[Heard]) -> NotLocalized:
     assert isinstance(best.result, NotLocalized)
     result = best.result
     alternatives = tuple(replace(one, tile=best.tile.tile_id) for one in result.alternatives)
-    return _of_tile(replace(result, alternatives=alternatives), best.tile)
+    return of_tile(replace(result, alternatives=alternatives), best.tile)
 
 
-def _of_tile(result: R, tile: Tile) -> R:
-    """With the name of the tile, and the pose in the atlas's world where that is known."""
+def of_tile(result: R, tile: Tile) -> R:
+    """A tile's answer with its name, and the pose in the atlas's world where that is known."""
     pose, joint_pose, joint = None, None, None if tile.joint is None else tile.joint.joint
     if isinstance(result, Localization) and tile.atlas_from_world is not None:
         pose = tile.atlas_from_world @ result.world_from_cam

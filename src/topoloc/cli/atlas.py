@@ -115,7 +115,7 @@ def describe(where: str, manifest: Any) -> dict[str, Any]:
         "serial": manifest.serial,
         "num_tiles": len(tiles),
         "num_nodes": sum(tile.num_nodes for tile in manifest.tiles),
-        "bytes": sum(tile.map.num_bytes + tile.places.num_bytes for tile in manifest.tiles),
+        "bytes": sum(stored.num_bytes for tile in manifest.tiles for stored in tile.files),
         "origin": None if origin is None else {"lat": origin.lat, "lon": origin.lon, "h": origin.h},
         "worlds": worlds_of(manifest),
         "joins": [_join_facts(join, manifest) for join in manifest.joins],

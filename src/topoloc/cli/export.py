@@ -1,4 +1,4 @@
-"""topoloc export MAP|RESULTS OUT."""
+"""topoloc export MAP|ATLAS|RESULTS OUT."""
 
 from __future__ import annotations
 
@@ -8,21 +8,25 @@ from typing import Annotated
 
 import tyro
 
+from topoloc.atlas.atlas import Atlas, is_atlas
 from topoloc.cli.output import File, UsageError, check_outputs, progress_bar, write_json
+from topoloc.cli.tile_option import TileOption, check_tile_option, chosen_world, name_of_atlas, say_warning
 from topoloc.errors import TopolocError
 from topoloc.export.formats import ExportFormat, find_export_format, write_scene
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.viewer.map_scene import scene_of_map
 from topoloc.viewer.results_scene import scene_of_results
 from topoloc.viewer.scene import Scene
+from topoloc.viewer.world_scene import scene_of_world
 
 
 @dataclass(frozen=True)
 class Command:
     """What `topoloc export` takes."""
 
-    source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|RESULTS")]
-    """A map file, or results: the JSON lines of `topoloc localize --json`."""
+    source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS|RESULTS")]
+    """A map file; an atlas, of which the tiles are exported that share a world, those with most nodes; or results: the JSON lines of
+    `topoloc localize --json`."""
     out: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="OUT")]
     """What is written: a file such as points.ply, map.geojson, map.mcap, walk.tum, walk.kitti, or for COLMAP and nerfstudio a folder."""
     format: Annotated[
@@ -31,6 +35,8 @@ class Command:
     """The format; a folder is COLMAP's unless this says nerfstudio."""
     session: Annotated[int | None, tyro.conf.arg(metavar="ID", help_behavior_hint="(default: all)")] = None
     """Of a map, only the nodes of this session (`topoloc info --json` names them)."""
+    tile: TileOption = None
+    """Of an atlas: only this tile, in its own world."""
     json: File = None
     """Write what is printed as JSON to this file (- for standard output)."""
 
@@ -38,8 +44,9 @@ class Command:
         form = find_export_format(Path(self.out), self.format)
         outputs = [self.json] if form.folder is not None else [self.out, self.json]
         check_outputs(outputs, inputs=[self.source])
-        if Path(self.source).exists() and not Path(self.source).is_file():
-            raise TopolocError(f"{self.source} is no file: a map or results are exported")
+        check_tile_option(self.source, self.tile)
+        if Path(self.source).exists() and not Path(self.source).is_file() and not is_atlas(self.source):
+            raise TopolocError(f"{self.source} is no file and no atlas: a map, an atlas or results are exported")
         if Path(self.out).resolve() == Path(self.source).resolve():
             raise UsageError("OUT is what is to be exported")
         if not Path(self.out).absolute().parent.is_dir():
@@ -54,12 +61,22 @@ class Command:
         return 0
 
     def _scene(self, form: ExportFormat) -> Scene:
+        if is_atlas(self.source):
+            return self._scene_of_tiles(form)
         if not _is_map(Path(self.source)):
             if self.session is not None:
                 raise UsageError("--session is of maps, and this is none")
             return scene_of_results(Path(self.source))
         with TopoMetricMap.load(self.source) as topomap, progress_bar() as progress:
             return scene_of_map(topomap, Path(self.source).stem, self.session, form.with_points, progress)
+
+    def _scene_of_tiles(self, form: ExportFormat) -> Scene:
+        if self.session is not None:
+            raise UsageError("--session is of maps: the tiles of an atlas have sessions of their own")
+        atlas = Atlas.open(self.source)
+        world, name = chosen_world(atlas, self.tile), self.tile or name_of_atlas(self.source)
+        with progress_bar() as progress:
+            return scene_of_world(atlas, world, name, form.with_points, progress, say_warning)
 
 
 def _is_map(path: Path) -> bool:

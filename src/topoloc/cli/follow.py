@@ -1,30 +1,34 @@
-"""topoloc follow MAP SOURCE"""
+"""topoloc follow MAP|ATLAS SOURCE"""
 
 from __future__ import annotations
 
 import json
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Annotated
 
 import tyro
 
+from topoloc.atlas.config import AtlasConfig
 from topoloc.cli.features_option import ASKED_FEATURES, localizer_of
+from topoloc.cli.map_or_atlas import camera_for, is_atlas, open_atlas
 from topoloc.cli.output import File, Flag, Format, Topics, UsageError, ended_by_signals, open_recording
 from topoloc.cli.query_answers import QueryAnswer, answer_line
-from topoloc.cli.settings_file import read_settings
+from topoloc.cli.settings_file import Settings, read_settings
 from topoloc.errors import CalibrationError, UnreadableImageError
 from topoloc.export.ros_publisher import RosPublisher
 from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.localizer import LocalizerConfig
-from topoloc.localization.query_camera import CameraOfSize, camera_of_frame, named_camera
+from topoloc.localization.query_camera import CameraOfSize, camera_of_frame
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.frame import StereoFrame, StereoSequence
 from topoloc.sequences.live import LiveSource, is_live
 from topoloc.sequences.recording import single_pictures
 from topoloc.tracking.stream_result import StreamedPose
+from topoloc.tracking.tile_tracker import TileTracker
 from topoloc.tracking.tracker import Tracker, TrackerConfig
 
 ReadFrame = Callable[[], StereoFrame]
@@ -35,8 +39,8 @@ ReadFrame = Callable[[], StereoFrame]
 class Command:
     """What `topoloc follow` takes."""
 
-    map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP")]
-    """The map file."""
+    map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
+    """The map file; or an atlas: the tile is followed that recognises a picture, until another one does."""
     source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SOURCE")]
     """A webcam's number or device, an address (rtsp://, http://), a video, or a recording."""
     camera: Annotated[str | None, tyro.conf.arg(metavar="FILE|fx,fy,cx,cy|map", help_behavior_hint="(default: that of the recording)")] = (
@@ -59,10 +63,11 @@ class Command:
     def run(self) -> int:
         if self.camera == "unknown":
             raise UsageError("a stream needs a calibration: --camera FILE, fx,fy,cx,cy or map")
+        if self.ros is not None and is_atlas(self.map):
+            raise UsageError("--ros is of a map: the tiles of an atlas have worlds of their own")
         settings = read_settings(self.config)
-        with TopoMetricMap.load(self.map) as topomap, ended_by_signals() as is_ended:
-            of_size = None if self.camera is None else named_camera(self.camera, topomap)
-            tracker = Tracker(localizer_of(topomap, settings.of(LocalizerConfig), self.features), settings.of(TrackerConfig))
+        with self._tracker(settings) as tracker, ended_by_signals() as is_ended:
+            of_size = None if self.camera is None else camera_for(tracker.localizer, self.camera)
             robots = None if self.ros is None else RosPublisher(self.ros)
             for name, t_ns, read in self._pictures(is_ended):
                 if is_ended.is_set():
@@ -74,13 +79,26 @@ class Command:
                 print(answer_line(answer) if self.plain else json.dumps(answer.to_json()), flush=True)
         return 0
 
+    @contextmanager
+    def _tracker(self, settings: Settings) -> Iterator[Tracker | TileTracker]:
+        localizing, tracking = settings.of(LocalizerConfig), settings.of(TrackerConfig)
+        if not is_atlas(self.map):
+            with TopoMetricMap.load(self.map) as topomap:
+                yield Tracker(localizer_of(topomap, localizing, self.features), tracking)
+            return
+        tracker = TileTracker(open_atlas(self.map, localizing, self.features, settings.of(AtlasConfig)), tracking)
+        try:
+            yield tracker
+        finally:
+            tracker.close()
+
     def _pictures(self, is_ended: threading.Event) -> Iterator[tuple[str, int, ReadFrame]]:
         if is_live(self.source):
             return _captured(self.source, is_ended)
         return _recorded(single_pictures(open_recording(self.source, self.format, None, self.topics)))
 
 
-def _streamed(tracker: Tracker, t_ns: int, read: ReadFrame, of_size: CameraOfSize | None) -> StreamedPose:
+def _streamed(tracker: Tracker | TileTracker, t_ns: int, read: ReadFrame, of_size: CameraOfSize | None) -> StreamedPose:
     """The answer to the next picture. Raises CalibrationError where its camera is not known."""
     try:
         frame = read()

@@ -1,4 +1,4 @@
-"""topoloc georeference MAP --origin LAT,LON,H,HEADING | --gnss FILE | --points FILE."""
+"""topoloc georeference MAP|ATLAS --origin LAT,LON,H,HEADING | --gnss FILE | --points FILE."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 import tyro
 
 from topoloc.cli.output import File, UsageError, check_outputs, print_facts, write_json
+from topoloc.cli.tile_option import TileOption, edited_at
 from topoloc.cli.waiting import say_waiting
 from topoloc.errors import GeoreferenceError
 from topoloc.geometry.geodesy import GeoPoint, Georeference
@@ -24,8 +25,8 @@ from topoloc.map.topomap import TopoMetricMap
 class Command:
     """What `topoloc georeference` takes."""
 
-    map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP")]
-    """The map file; it is replaced by one that knows where on earth it lies."""
+    map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
+    """The map file; it is replaced by one that knows where on earth it lies. Or an atlas, with --tile."""
     origin: Annotated[str | None, tyro.conf.arg(metavar="LAT,LON,H,HEADING", help_behavior_hint="")] = None
     """Where the first mapping picture was taken (degrees, metres above the ellipsoid), and which way it looks: degrees clockwise from true
     north."""
@@ -37,6 +38,8 @@ class Command:
         str | None, tyro.conf.arg(metavar="x|-x|y|-y|z|-z", help_behavior_hint="(default: the axis nearest to the cameras' up)")
     ] = None
     """The axis of the map's world that is up; --points do not need it."""
+    tile: TileOption = None
+    """Of an atlas: the tile; those that share its world, or are joined with it, then know where they lie, too."""
     json: File = None
     """Write what is printed as JSON to this file (- for standard output)."""
 
@@ -46,11 +49,21 @@ class Command:
             raise UsageError("georeference takes a map and one of --origin, --gnss and --points")
         check_outputs([self.json], inputs=[path for path in (self.map, self.gnss, self.points) if path])
         origin = None if self.origin is None else _origin_from(self.origin)
-        with editing(self.map, say_waiting) as edit:
+        found, facts, fitted = edited_at(self.map, self.tile, lambda path: self._edited(path, origin))
+        if self.json != "-":
+            _print(found, facts, fitted)
+        write_json(self.json, facts)
+        return 0
+
+    def _edited(
+        self, path: Path, origin: tuple[GeoPoint, float] | None
+    ) -> tuple[Georeference, dict[str, Any], tuple[KnownPlaces, WorldFit] | None]:
+        """Where the map lies, with what is said of it, and what it was fitted to."""
+        with editing(path, say_waiting) as edit:
             topomap = edit.topomap
             posed = [image.world_from_cam for image in topomap.place_images] or [s.world_from_cam for s in topomap.summaries]
             if not posed:
-                raise GeoreferenceError(f"map {self.map} has no mapping picture")
+                raise GeoreferenceError(f"map {path} has no mapping picture")
             up = find_up(posed, self.up)
             found, fitted = self._found(topomap, posed[0], up, origin)
             edit.commit(replace(topomap, georeference=found), f"georeference {found.source}")
@@ -58,10 +71,7 @@ class Command:
         if fitted is not None:
             fit = fitted[1]
             facts |= {"num_points": len(fit.used), "num_used": int(fit.used.sum()), "residuals_m": fit.residuals_m.round(4).tolist()}
-        if self.json != "-":
-            _print(found, facts, fitted)
-        write_json(self.json, facts)
-        return 0
+        return found, facts, fitted
 
     def _found(
         self, topomap: TopoMetricMap, first: Rigid3, up: Up, origin: tuple[GeoPoint, float] | None

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
 from topoloc.atlas.atlas import Atlas, is_atlas
+from topoloc.atlas.manifest import Tile
 from topoloc.cli.output import File, print_facts, write_json
-from topoloc.errors import MapError, StoreError
+from topoloc.cli.tile_option import of_each_tile
 from topoloc.lifelong.earlier_recall import described
 from topoloc.map.edit import undoable_edits
 from topoloc.map.topomap import TopoMetricMap
@@ -28,40 +29,47 @@ class Command:
     def run(self) -> int:
         if is_atlas(self.map):
             return self._of_tiles()
-        facts, num_undoable = _edits(self.map), undoable_edits(self.map)
-        for number, edit in enumerate(facts, start=1):
-            edit["undoable"] = number > len(facts) - num_undoable
+        facts, num_undoable = _edits(self.map)
         if self.json != "-":
             _print_edits(facts, "nothing is known of how this map was made")
-            if num_undoable:
-                print(f"`topoloc undo {self.map}` takes the last one back" + (f"; {num_undoable} can be" if num_undoable > 1 else ""))
+            _print_undo(self.map, num_undoable)
         write_json(self.json, {"map": self.map, "edits": facts})
         return 0
 
     def _of_tiles(self) -> int:
-        """Tile by tile; one that cannot be read leaves the others. None can be taken back: an atlas keeps no undo files."""
-        atlas, tiles, num_missing = Atlas.open(self.map), list[dict[str, Any]](), 0
-        for tile in atlas.manifest.tiles:
-            try:
-                edits = _edits(str(atlas.map_path(tile)))
-            except StoreError:  # the others would be asked for as long, one after the other
-                raise
-            except MapError as error:
-                print(f"error: tile {tile.tile_id}: {error}", file=sys.stderr)
-                num_missing += 1
-                continue
+        atlas = Atlas.open(self.map)
+
+        def told(tile_id: str) -> dict[str, Any]:
+            edits, num_undoable = _edits_of_tile(atlas, atlas.tile(tile_id))
             if self.json != "-":
-                print(f"tile {tile.tile_id}")
+                print(f"tile {tile_id}")
                 _print_edits(edits, "nothing is known of how this tile was made")
-            tiles.append({"tile_id": tile.tile_id, "edits": [edit | {"undoable": False} for edit in edits]})
+                _print_undo(f"{self.map} --tile {tile_id}", num_undoable)
+            return {"edits": edits}
+
+        tiles, are_all_told = of_each_tile(atlas, list(atlas.manifest.by_id), told)
         write_json(self.json, {"atlas": self.map, "tiles": tiles})
-        return 1 if num_missing else 0
+        return 0 if are_all_told else 1
 
 
-def _edits(path: str) -> list[dict[str, Any]]:
-    """The edits of a map file, the first one first. Raises MapError."""
+def _edits_of_tile(atlas: Atlas, tile: Tile) -> tuple[list[dict[str, Any]], int]:
+    """As `_edits`. Raises MapError."""
+    log = None if tile.undo is None else atlas.store.local(tile.undo.name, tile.undo.sha256)
+    return _edits(atlas.map_path(tile), log)
+
+
+def _edits(path: str | Path, log: Path | None = None) -> tuple[list[dict[str, Any]], int]:
+    """The edits of a map file, the first one first, and how many of the last ones can be taken back, by the undo file beside it or
+    another one. Raises MapError."""
+    num_undoable = undoable_edits(path, log)
     with TopoMetricMap.load(path) as topomap:
-        return [asdict(edit) for edit in topomap.edits]
+        edits = [asdict(edit) for edit in topomap.edits]
+    return [edit | {"undoable": number > len(edits) - num_undoable} for number, edit in enumerate(edits, start=1)], num_undoable
+
+
+def _print_undo(where: str, num_undoable: int) -> None:
+    if num_undoable:
+        print(f"`topoloc undo {where}` takes the last one back" + (f"; {num_undoable} can be" if num_undoable > 1 else ""))
 
 
 def _print_edits(edits: list[dict[str, Any]], without: str) -> None:

@@ -1,4 +1,4 @@
-"""topoloc prune MAP [--max-mb N]."""
+"""topoloc prune MAP|ATLAS [--max-mb N]."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from typing import Annotated, Any
 
 import tyro
 
+from topoloc.atlas.atlas import Atlas, is_atlas
 from topoloc.cli.output import File, UsageError, check_outputs, write_json
 from topoloc.cli.settings_file import read_settings
+from topoloc.cli.tile_option import TileOption, check_tile_option, edited_at, of_each_tile
 from topoloc.cli.waiting import say_waiting
 from topoloc.lifelong.prune import PruneConfig, prune_map
 from topoloc.map.edit import editing
@@ -20,10 +22,13 @@ from topoloc.map.edit import editing
 class Command:
     """What `topoloc prune` takes."""
 
-    map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP")]
-    """The map file, which is replaced."""
+    map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
+    """The map file, which is replaced; or an atlas, whose tiles are, one after the other."""
     max_mb: Annotated[float | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: only what is gone is dropped)")] = None
-    """Megabytes that the file may have: every node keeps the landmarks that add most, and nodes that others hold go before it keeps few."""
+    """Megabytes that the file may have, of an atlas that of each tile: every node keeps the landmarks that add most, and nodes that others
+    hold go before it keeps few."""
+    tile: TileOption = None
+    """Of an atlas: only this tile is pruned."""
     json: File = None
     """Write what was dropped to this file (- for standard output)."""
     config: File = None
@@ -33,19 +38,33 @@ class Command:
         if self.max_mb is not None and not 0.0 < self.max_mb < 1e6:
             raise UsageError(f"--max-mb must be megabytes, not {self.max_mb:g}")
         check_outputs([self.json], inputs=[path for path in (self.map, self.config) if path])
+        check_tile_option(self.map, self.tile)
         config = read_settings(self.config).of(PruneConfig)
-        with editing(self.map, say_waiting) as edit:
+        if not is_atlas(self.map):
+            changes = self._pruned(Path(self.map), config, self.map)
+            write_json(self.json, {"map": self.map} | changes)
+            return 0
+        atlas = Atlas.open(self.map)
+        ids = list(atlas.manifest.by_id) if self.tile is None else [atlas.tile(self.tile).tile_id]
+        tiles, are_all_pruned = of_each_tile(
+            atlas, ids, lambda name: edited_at(self.map, name, lambda path: self._pruned(path, config, f"{self.map}, tile {name}"))
+        )
+        write_json(self.json, {"atlas": self.map, "tiles": tiles})
+        return 0 if are_all_pruned else 1
+
+    def _pruned(self, path: Path, config: PruneConfig, name: str) -> dict[str, Any]:
+        """What was dropped from a map file, which is said of it by its name."""
+        with editing(path, say_waiting) as edit:
             before = edit.path.stat().st_size
             pruned = prune_map(edit.topomap, edit.path, None if self.max_mb is None else round(self.max_mb * 1e6), config)
             changes = pruned.changes | {"bytes_before": before}
             walked_km = edit.topomap.length_m / 1e3
             if pruned.topomap is not edit.topomap:
                 edit.commit(pruned.topomap, "prune" if self.max_mb is None else f"prune to {self.max_mb:g} MB", changes)
-        changes["bytes"] = Path(self.map).stat().st_size
+        changes["bytes"] = path.stat().st_size
         if self.json != "-":
-            print(f"{self.map}: {describe_prune(changes, walked_km)}")
-        write_json(self.json, {"map": self.map} | changes)
-        return 0
+            print(f"{name}: {describe_prune(changes, walked_km)}")
+        return changes
 
 
 def describe_prune(changes: Mapping[str, Any], walked_km: float) -> str:

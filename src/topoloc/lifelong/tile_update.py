@@ -9,9 +9,10 @@ from typing import TypeVar
 
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import NewTile, replace_tile
-from topoloc.atlas.manifest import Tile
+from topoloc.atlas.manifest import StoredFile, Tile
 from topoloc.atlas.store import sha256_of
-from topoloc.errors import AtlasError
+from topoloc.errors import AtlasError, TopolocError
+from topoloc.map.undo_log import path_of_log
 from topoloc.sequences.atomic import scratch_folder
 
 _MAX_TRIES = 5
@@ -22,8 +23,8 @@ def edited_tile(where: str, tile_id: str, edit: Callable[[Path], T]) -> tuple[Ti
     """The tile with its map edited, in the same world and with the same joins, and what the edit says.
 
     Args:
-        edit: edits the map file at a path, a copy, as `map/edit.py` does; what it leaves beside it is dropped. It is called again where
-            another writer replaced the tile meanwhile.
+        edit: edits the map file at a path, a copy, as `map/edit.py` does; the undo file beside it is kept with the tile. It is called again
+            where another writer replaced the tile meanwhile.
 
     Raises:
         AtlasError: there is no such atlas or tile, it cannot be read or written, or others replaced it again and again.
@@ -34,18 +35,31 @@ def edited_tile(where: str, tile_id: str, edit: Callable[[Path], T]) -> tuple[Ti
         before = atlas.tile(tile_id)
         with scratch_folder("topoloc-tile-") as folder:
             path = folder / f"{tile_id}.topo"
-            _copy(atlas, before, path)
-            done = edit(path)
+            _copy(atlas, before.map, path)
+            if before.undo is not None:
+                _copy(atlas, before.undo, path_of_log(path))
+            done = _of_tile(edit, path, f"{where}, tile {tile_id}")
+            if sha256_of(path) == before.map.sha256:
+                return before, done
             after = replace_tile(where, NewTile(tile_id, path, before.world, before.recipe), before)
         if after is not None:
             return after.by_id[tile_id], done
     raise AtlasError(f"{where}: tile {tile_id} was replaced by others {_MAX_TRIES} times meanwhile; it stays as they left it")
 
 
-def _copy(atlas: Atlas, tile: Tile, path: Path) -> None:
+def _of_tile(edit: Callable[[Path], T], path: Path, name: str) -> T:
+    """What the edit says; its failures name the tile and not the copy."""
     try:
-        shutil.copyfile(atlas.map_path(tile), path)
+        return edit(path)
+    except TopolocError as error:
+        error.args = (str(error).replace(str(path), name), *error.args[1:])
+        raise
+
+
+def _copy(atlas: Atlas, stored: StoredFile, path: Path) -> None:
+    try:
+        shutil.copyfile(atlas.store.local(stored.name, stored.sha256), path)
     except OSError as error:
-        raise AtlasError(f"cannot copy the map of tile {tile.tile_id}: {error.strerror}") from None
-    if sha256_of(path) != tile.map.sha256:
-        raise AtlasError(f"{tile.map.name} of {atlas.store.where} is not the file that was added: its checksum is another")
+        raise AtlasError(f"cannot copy {stored.name} of {atlas.store.where}: {error.strerror}") from None
+    if sha256_of(path) != stored.sha256:
+        raise AtlasError(f"{stored.name} of {atlas.store.where} is not the file that was added: its checksum is another")

@@ -86,7 +86,7 @@ def undo_edit(path: str | Path, waits: Waits | None = None) -> Edit:
     with editing(path, waits) as edit:
         assert edit.topomap.file is not None, "a map that was just opened"
         last = max(edit.topomap.edits, key=lambda one: one.edit_id, default=None)
-        entries = entries_for(edit.path, edit.topomap.file.digest)
+        entries = entries_for(path_of_log(edit.path), edit.topomap.file.digest)
         if last is None or not entries:
             why = "it is as built" if last is None or last.edit_id <= 1 else f"what was before {last.name!r} is not kept"
             raise MapError(f"map {path}: nothing to undo: {why}")
@@ -100,11 +100,11 @@ def undo_edit(path: str | Path, waits: Waits | None = None) -> Edit:
     return last
 
 
-def undoable_edits(path: str | Path) -> int:
-    """How many of the last edits of a map file can be taken back. Raises MapError."""
+def undoable_edits(path: str | Path, log: Path | None = None) -> int:
+    """How many of the last edits of a map file can be taken back, by the undo file beside it or another one. Raises MapError."""
     path = Path(os.path.realpath(path))
     with closing(MapFile(path)) as file:
-        return len(entries_for(path, file.digest))
+        return len(entries_for(log or path_of_log(path), file.digest))
 
 
 @contextmanager

@@ -214,7 +214,7 @@ def check_header(path: Path) -> int:
             header = file.read(100)
             num_bytes = file.seek(0, os.SEEK_END)
     except IsADirectoryError:
-        hint = "an atlas; this takes one of its tiles, or another map" if (path / "atlas.json").is_file() else "a folder"
+        hint = "an atlas" if (path / "atlas.json").is_file() else "a folder"
         raise MapError(f"{path} is no map but {hint}") from None
     except (OSError, ValueError) as error:  # ValueError: a name with a null character
         raise MapError(f"cannot open map {path}: {getattr(error, 'strerror', error)}") from error

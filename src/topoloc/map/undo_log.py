@@ -42,9 +42,9 @@ def path_of_log(path: Path) -> Path:
     return path.with_name(f"{path.name}.undo")
 
 
-def entries_for(path: Path, digest: str) -> list[Entry]:
-    """The entries that lead back from the map file of this digest at `path`, the last edit's first. Raises MapError."""
-    with closing(_opened(path)) as log:
+def entries_for(log_path: Path, digest: str) -> list[Entry]:
+    """The entries of an undo file that lead back from the map file of this digest, the last edit's first. Raises MapError."""
+    with closing(_opened(log_path)) as log:
         rows = [Entry(*row) for row in log.execute("SELECT depth, before, after FROM entries ORDER BY depth DESC").fetchall()]
     found = list[Entry]()
     for entry in rows:
@@ -57,7 +57,7 @@ def entries_for(path: Path, digest: str) -> list[Entry]:
 def add_entry(path: Path, changed: Path) -> None:
     """What leads back from the file `changed` to that at `path`. Entries that lead elsewhere are dropped. Raises MapError, OSError."""
     before, after = (_digest_of(one) for one in (path, changed))
-    depth = max((entry.depth for entry in entries_for(path, before)), default=0) + 1
+    depth = max((entry.depth for entry in entries_for(path_of_log(path), before)), default=0) + 1
     with _rewritten(path) as log:
         _drop(log, depth)
         log.execute("INSERT INTO entries VALUES (?, ?, ?, NULL)", (depth, before, after))
@@ -80,15 +80,14 @@ def drop_entries(path: Path, depth: int) -> None:
 def write_before(path: Path, entry: Entry, target: Path) -> None:
     """The map file as it was before an edit, from the one at `path`, which is that after it. Raises MapError where the log is damaged."""
     try:
-        with closing(_opened(path)) as log:
+        with closing(_opened(path_of_log(path))) as log:
             _write_before(log, entry.depth, path, target)
     except (sqlite3.Error, zlib.error) as error:
         raise MapError(f"{path_of_log(path)} is damaged: {error}") from error
 
 
-def _opened(path: Path) -> sqlite3.Connection:
-    """The undo file of a map, or an empty one in memory where there is none."""
-    file = path_of_log(path)
+def _opened(file: Path) -> sqlite3.Connection:
+    """An undo file, or an empty one in memory where there is none."""
     remove_leftovers(file)
     if not file.exists():
         log = sqlite3.connect(":memory:", isolation_level=None)
@@ -112,7 +111,7 @@ def _rewritten(path: Path) -> Iterator[sqlite3.Connection]:
     """The undo file of a map, copied to be changed, and put in its place at the end."""
     with (
         replaced_file(path_of_log(path)) as temporary,
-        closing(_opened(path)) as before,
+        closing(_opened(path_of_log(path))) as before,
         closing(sqlite3.connect(temporary, isolation_level=None)) as log,
     ):
         before.backup(log)

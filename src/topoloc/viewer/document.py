@@ -67,8 +67,8 @@ def document_of(topomap: TopoMetricMap, name: str, results: Sequence[ResultSet] 
         "map": _facts(topomap, len(shown.points_world)),
         "points": {"world": _base64(shown.points_world.astype("<f4")), "rgb": _base64(shown.rgb)},
         "nodes": _nodes(topomap, shown.cameras, _pictures(shown.jpegs, budget.max_picture_bytes)),
-        "paths": [*_mapped_paths(topomap), *(_path_json(one.name, [p.translation for p in one.path]) for one in results if one.path)],
-        "results": [_results_json(one) for one in results if one.answers],
+        "paths": [*_mapped_paths(topomap), *(path_json(one.name, [p.translation for p in one.path]) for one in results if one.path)],
+        "results": [results_json(one) for one in results if one.answers],
     }
 
 
@@ -180,10 +180,10 @@ def _mapped_paths(topomap: TopoMetricMap) -> Iterator[dict[str, Any]]:
         nodes = [summary.world_from_cam for summary in topomap.summaries if summary.session_id == session.session_id]
         poses = images if len(images) > len(nodes) else nodes
         if poses:
-            yield _path_json(session.name, [pose.translation for pose in poses]) | {"session": session.session_id}
+            yield path_json(session.name, [pose.translation for pose in poses]) | {"session": session.session_id}
 
 
-def _path_json(name: str, positions: Sequence[Float[np.ndarray, "3"]]) -> dict[str, Any]:
+def path_json(name: str, positions: Sequence[Float[np.ndarray, "3"]]) -> dict[str, Any]:
     """A path as lines, a new one wherever the next position is far off; of a long one every k-th position."""
     path = np.array(positions).reshape(-1, 3)[:: max(1, -(-len(positions) // MAX_PATH))]
     steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
@@ -191,7 +191,7 @@ def _path_json(name: str, positions: Sequence[Float[np.ndarray, "3"]]) -> dict[s
     return {"name": name, "lines": [line.round(4).tolist() for line in np.split(path, gaps)]}
 
 
-def _results_json(results: ResultSet) -> dict[str, Any]:
+def results_json(results: ResultSet) -> dict[str, Any]:
     step = max(1, -(-len(results.answers) // MAX_RESULTS))
     return {"name": results.name, "num_answers": len(results.answers), "answers": [_rounded(dict(one)) for one in results.answers[::step]]}
 

@@ -1,4 +1,4 @@
-"""topoloc train MAP --coarse NAME."""
+"""topoloc train MAP|ATLAS --coarse NAME."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
+from topoloc.atlas.atlas import is_atlas
 from topoloc.cli.output import File, Flag, UsageError, check_outputs, progress_bar, write_json
 from topoloc.cli.settings_file import read_settings
+from topoloc.cli.tile_option import TileOption, edited_at
 from topoloc.map.checking import list_coarse
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.places.coarse import CoarseModel
@@ -24,8 +26,8 @@ from topoloc_training.coarse_training import CoarseTrainingConfig, train_coarse
 class Command:
     """What `topoloc train` takes."""
 
-    map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP")]
-    """The map file; it gets the coarse localizer, in the place of one of the same name."""
+    map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
+    """The map file; it gets the coarse localizer, in the place of one of the same name. Or an atlas, with --tile."""
     coarse: Literal["cnn-fc", "cnn-nn", "vlad-nn"]
     """The coarse localizer to train."""
     backbone: BackboneName = "squeezenet1_1"
@@ -35,6 +37,8 @@ class Command:
     what the map's own one knows: its output is widened by new nodes, and tuned."""
     default: Flag = False
     """From now on it answers where --coarse is not given."""
+    tile: TileOption = None
+    """Of an atlas: the tile whose map gets it."""
     out: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: MAP itself)")] = None
     """Write the map with the new coarse localizer to this file and leave MAP as it is."""
     checkpoint: File = None
@@ -45,25 +49,35 @@ class Command:
     """All other settings: a TOML file, as `topoloc config train` prints it."""
 
     def run(self) -> int:
-        target = Path(self.out or self.map)
+        if self.out is not None and is_atlas(self.map):
+            raise UsageError("--out is of a map: a tile gets its coarse localizer itself")
         if self.checkpoint is not None and self.coarse != "cnn-fc":
             raise UsageError("--checkpoint is for cnn-fc; the others are done in one go")
-        check_outputs([str(target), self.json, self.checkpoint], inputs=[path for path in (self.weights, self.config) if path is not None])
+        check_outputs(
+            [self.out or (None if is_atlas(self.map) else self.map), self.json, self.checkpoint],
+            inputs=[path for path in (self.weights, self.config) if path is not None],
+        )
         config = read_settings(self.config).of(CoarseTrainingConfig)
-        checkpoint = None if self.checkpoint is None else Path(self.checkpoint)
         start = time.perf_counter()
-        with progress_bar() as progress:
-            topomap = TopoMetricMap.load(self.map)
-            model = train_coarse(topomap, self.coarse, self.backbone, self.weights, config, progress, checkpoint)
-        store_coarse(Path(self.map), target, model, self.default)
-        (facts,) = [facts for facts in list_coarse(target) if facts["name"] == self.coarse]
+        facts, model = edited_at(self.map, self.tile, lambda path: self._trained(path, Path(self.out or path), config))
         facts |= {"seconds": round(time.perf_counter() - start, 1), "default": self.default}
         if self.json != "-":
-            print(f"{target}: {self.coarse} on {self.backbone}{_widened(model)}, {facts['bytes'] / 1e6:.2f} MB, {facts['seconds']:.0f} s")
+            size = f"{facts['bytes'] / 1e6:.2f} MB, {facts['seconds']:.0f} s"
+            print(f"{self.out or self.tile or self.map}: {self.coarse} on {self.backbone}{_widened(model)}, {size}")
         for warning in warnings_of(model):
             print(f"warning: {warning}", file=sys.stderr)
         write_json(self.json, facts)
         return 0
+
+    def _trained(self, path: Path, target: Path, config: CoarseTrainingConfig) -> tuple[dict[str, Any], CoarseModel]:
+        """What `target` says of its new coarse localizer, and that, learned from the map at `path`."""
+        checkpoint = None if self.checkpoint is None else Path(self.checkpoint)
+        with progress_bar() as progress:
+            topomap = TopoMetricMap.load(path)
+            model = train_coarse(topomap, self.coarse, self.backbone, self.weights, config, progress, checkpoint)
+        store_coarse(path, target, model, self.default)
+        (facts,) = [facts for facts in list_coarse(target) if facts["name"] == self.coarse]
+        return facts, model
 
 
 def _widened(model: CoarseModel) -> str:

@@ -52,17 +52,19 @@ export class Viewer {
   }
 
   nodePlace(node, matrix) {
+    const called = node.tile === undefined ? `${node.id}` : `${node.id} of ${node.tile}`;
     const show = () => {
       this.chosen.add(objects.frustumsOf([{ matrix, camera: node.camera }], this.depth, objects.COLOURS.selected));
       if (node.picture) this.addPicture(this.chosen, pictureAddress(node), matrix, node.camera);
       const session = this.document.map.sessions.find((one) => one.id === node.session);
       const said = [`At ${pointText(node.world_from_cam.translation)}.`, `${node.num_points} points.`];
       if (session) said.push(`Session ${session.name}${session.date ? `, ${session.date.slice(0, 10)}` : ""}.`);
-      const picture = node.picture && { address: pictureAddress(node), words: `what node ${node.id} shows` };
-      this.tell(`Node ${node.id}: ${node.name}`, said, picture);
+      const picture = node.picture && { address: pictureAddress(node), words: `what node ${called} shows` };
+      this.tell(`Node ${called}: ${node.name}`, said, picture);
     };
     const centre = node.world_from_cam.translation;
-    return { key: `node ${node.id}`, label: `${node.id}: ${node.name}`, group: "Nodes of the map", centre, matrix, show };
+    const group = node.tile === undefined ? "Nodes of the map" : `Nodes of ${node.tile}`;
+    return { key: `node ${called}`, label: `${node.id}: ${node.name}`, group, centre, matrix, show };
   }
 
   addResults(set, colour) {

@@ -1,0 +1,74 @@
+"""Atlases and maps made one atlas: every tile as it is, with the joins between them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from topoloc.atlas.atlas import Atlas, is_atlas, store_at, tile_problem
+from topoloc.atlas.editing import new_tiles, tile_of
+from topoloc.atlas.joins import Join
+from topoloc.atlas.manifest import Manifest, Tile
+from topoloc.atlas.store import Store
+from topoloc.errors import AtlasError
+
+
+def merge_atlases(sources: Sequence[str], where: str) -> Manifest:
+    """A new atlas at `where` of the tiles of all sources, atlases or map files. A map that two of them hold under one id is one tile.
+    Worlds of different sources are different ones, whatever they are called.
+
+    Raises:
+        AtlasError: an atlas is there already; two tiles of one id hold different maps; a file of a tile is missing or another; nothing can
+            be written.
+        MapError: a map is missing, damaged or empty.
+    """
+    store = store_at(where)
+    if store.manifest() is not None:
+        raise AtlasError(f"{where} is an atlas already; a merged one is new")
+    tiles, joins = dict[str, Tile](), list[Join]()
+    for source in sources:
+        if not is_atlas(source):
+            (new,) = new_tiles([source])
+            added = {new.tile_id: tile_of(new, store)}
+            _check_same(source, tiles, added)
+        else:
+            atlas = Atlas.open(source)
+            added = atlas.manifest.by_id
+            _check_same(source, tiles, added)
+            for tile in added.values():
+                _copy(atlas, tile, store)
+            joins += atlas.manifest.joins
+        tiles = _with_own_worlds(tiles, added) | tiles
+    after = Manifest().with_tiles(tiles, time.time(), joins)
+    if not store.commit(None, after.to_bytes()):
+        raise AtlasError(f"{where} became an atlas meanwhile; it stays as it is")
+    return after
+
+
+def _copy(atlas: Atlas, tile: Tile, store: Store) -> None:
+    problem = tile_problem(atlas, tile)
+    if problem is not None:
+        raise AtlasError(f"tile {tile.tile_id} of {atlas.store.where}: {problem}")
+    for stored in tile.files:
+        store.put(stored.name, atlas.store.local(stored.name, stored.sha256))
+
+
+def _check_same(source: str, known: Mapping[str, Tile], added: Mapping[str, Tile]) -> None:
+    for tile_id in known.keys() & added.keys():
+        if known[tile_id].map.sha256 != added[tile_id].map.sha256:
+            raise AtlasError(f"{source} has a tile {tile_id} too, of another map; `topoloc atlas add --id` gives a map another id")
+
+
+def _with_own_worlds(known: Mapping[str, Tile], added: Mapping[str, Tile]) -> dict[str, Tile]:
+    """Tiles whose worlds are called as none of those that are known; but for worlds that a tile of both lies in, which are the same."""
+    same = {added[tile_id].world: known[tile_id].world for tile_id in known.keys() & added.keys()}
+    taken = {tile.world for tile in known.values()}
+    names = dict[str, str]()
+    for world in sorted({tile.world for tile in added.values()}):
+        number, name = 2, same.get(world, world)
+        while world not in same and name in taken:
+            number, name = number + 1, f"{world[:90]}-{number}"
+        taken.add(name)
+        names[world] = name
+    return {tile_id: replace(tile, world=names[tile.world]) for tile_id, tile in added.items()}

@@ -1,0 +1,97 @@
+"""A stream through the tiles of an atlas: read from `TileTracker.process`.
+
+The atlas is asked until it names the tile that a picture shows. From there the stream is followed in that tile's map, as in any map
+(`tracker.py`). Where that has known nothing for a while, the atlas is asked again: the camera may have gone on into another tile.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from topoloc.atlas.atlas_localizer import AtlasLocalizer
+from topoloc.atlas.open_maps import OpenedMap
+from topoloc.errors import QueryError
+from topoloc.geometry.camera import Camera
+from topoloc.localization.query import check_size
+from topoloc.localization.result import Localization, NotLocalized
+from topoloc.places.coarse import Image
+from topoloc.sequences.frame_checks import time_problem
+from topoloc.tracking.stream_result import StreamedPose
+from topoloc.tracking.tracker import Tracker, TrackerConfig
+
+_ASK_EVERY_NS = 1_000_000_000
+"""The atlas is asked again where nothing was known for so long: a refusal costs as much as a dozen tracked pictures or more."""
+_KNOWN = ("localized", "tracked")
+
+
+class TileTracker:
+    """The state of one stream; its answers name their tile, in whose world their poses are.
+
+    Args:
+        localizer: the atlas. The tile that is followed stays open; `close` lets go of it.
+    """
+
+    def __init__(self, localizer: AtlasLocalizer, config: TrackerConfig | None = None) -> None:
+        self.localizer, self.config = localizer, config or TrackerConfig()
+        self._tile: tuple[str, OpenedMap, Tracker] | None = None
+        self._t_ns: int | None = None
+        self._asked_ns = self._known_ns = -_ASK_EVERY_NS
+
+    def process(self, image: Image, camera: Camera, t_ns: int) -> StreamedPose:
+        """Where was this picture, the next of the stream, taken?
+
+        Args:
+            t_ns: its time, nanoseconds, later than that of the picture before.
+
+        Raises:
+            QueryError: as of `Tracker.process`.
+            AtlasError: no tile can be read.
+            StoreError: the object store does not answer.
+        """
+        check_size(image, camera)
+        self._advance(t_ns)
+        answer = None if self._tile is None else self._named(self._tile[2].process(image, camera, t_ns))
+        if answer is not None and answer.state in _KNOWN:
+            self._known_ns = t_ns
+            return answer
+        if t_ns - max(self._known_ns, self._asked_ns) < _ASK_EVERY_NS and answer is not None:
+            return answer
+        self._asked_ns = t_ns
+        result = self.localizer.localize(image, camera, t_ns=t_ns)
+        if not isinstance(result, Localization):
+            return answer or StreamedPose(t_ns, "ambiguous" if result.reason == "ambiguous" else "lost", result)
+        assert result.provenance.tile is not None, "an atlas names the tile of its answer"
+        return self._begun(result.provenance.tile, image, camera, t_ns)
+
+    def miss(self, t_ns: int, result: NotLocalized) -> StreamedPose:
+        """The answer to a picture that could not be read. Raises QueryError as of `Tracker.miss`."""
+        self._advance(t_ns)
+        if self._tile is None:
+            return StreamedPose(t_ns, "lost", self.localizer.completed(result, t_ns))
+        return self._named(self._tile[2].miss(t_ns, result))
+
+    def close(self) -> None:
+        """Forget the stream; the tile that was followed may be closed."""
+        if self._tile is not None:
+            self.localizer.give_back(self._tile[1])
+        self._tile = None
+
+    def _advance(self, t_ns: int) -> None:
+        if problem := time_problem(t_ns):
+            raise QueryError(problem)
+        if self._t_ns is not None and t_ns < self._t_ns:
+            raise QueryError(f"the clock of the stream goes backwards: {t_ns / 1e9:.6f} s comes after {self._t_ns / 1e9:.6f} s")
+        self._t_ns = t_ns
+
+    def _begun(self, tile_id: str, image: Image, camera: Camera, t_ns: int) -> StreamedPose:
+        """The stream followed anew, in this tile."""
+        self.close()
+        opened = self.localizer.lend(tile_id)
+        self._tile = tile_id, opened, Tracker(opened.localizer, self.config)
+        answer = self._named(self._tile[2].process(image, camera, t_ns))
+        self._known_ns = t_ns
+        return answer
+
+    def _named(self, answer: StreamedPose) -> StreamedPose:
+        assert self._tile is not None
+        return replace(answer, result=self.localizer.named(answer.result, self._tile[0]))

@@ -1,0 +1,123 @@
+"""Commands that edit a map edit the tile of an atlas as they do a map file, and `undo` takes it back to the byte."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from topoloc.atlas.atlas import Atlas, tile_problem
+from topoloc.atlas.manifest import Manifest
+from topoloc.cli import main
+from topoloc.lifelong.tile_update import edited_tile
+from topoloc.map.edit import editing, undo_edit
+
+Complaint = Callable[..., str]
+ORIGIN = "51.5,-0.17,30,90"
+
+
+def _done(capsys: pytest.CaptureFixture[str], *args: object) -> dict[str, Any]:
+    capsys.readouterr()
+    assert main([*map(str, args), "--json", "-"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def _bytes(where: Path, tile_id: str) -> bytes:
+    atlas = Atlas.open(str(where))
+    tile = atlas.tile(tile_id)
+    assert tile_problem(atlas, tile) is None
+    return atlas.map_path(tile).read_bytes()
+
+
+def test_an_edit_of_a_tile_is_that_of_its_map_and_is_taken_back(
+    own_atlas: Path, room_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+    alone = Path(shutil.copy(room_map, tmp_path / "alone.topo"))
+    before, other = _bytes(own_atlas, "room"), _bytes(own_atlas, "other")
+    on_earth = _done(capsys, "georeference", alone, "--origin", ORIGIN)
+    assert _done(capsys, "georeference", own_atlas, "--tile", "room", "--origin", ORIGIN) == on_earth
+    assert _bytes(own_atlas, "room") == alone.read_bytes() != before
+    tile = Atlas.open(str(own_atlas)).tile("room")
+    assert tile.geo_box is not None
+    assert tile.undo is not None
+    pruned = _done(capsys, "prune", own_atlas, "--tile", "room", "--max-mb", f"{tile.map.num_bytes * 0.7e-6:.3f}")
+    (changes,) = pruned["tiles"]
+    assert (changes["tile_id"], changes["bytes"]) == ("room", len(_bytes(own_atlas, "room")))
+    assert changes["bytes"] < tile.map.num_bytes
+    edits = {one["tile_id"]: one["edits"] for one in _done(capsys, "history", own_atlas)["tiles"]}
+    assert [edit["undoable"] for edit in edits["room"]] == [False, True, True]
+    assert [edit["undoable"] for edit in edits["other"]] == [False]
+    assert _done(capsys, "undo", own_atlas, "--tile", "room")["undone"]["name"].startswith("prune")
+    assert _bytes(own_atlas, "room") == alone.read_bytes()
+    _done(capsys, "undo", own_atlas, "--tile", "room")
+    assert _bytes(own_atlas, "room") == before
+    assert Atlas.open(str(own_atlas)).tile("room").undo is None
+    assert _bytes(own_atlas, "other") == other
+
+
+def test_all_tiles_are_pruned_and_one_that_cannot_be_leaves_the_others(own_atlas: Path, capsys: pytest.CaptureFixture[str]):
+    atlas = Atlas.open(str(own_atlas))
+    pruned = _done(capsys, "prune", own_atlas)
+    assert {one["tile_id"] for one in pruned["tiles"]} == {"room", "other"}
+    atlas.map_path(atlas.tile("other")).write_bytes(b"rotten")
+    assert main(["prune", str(own_atlas), "--json", "-"]) == 1
+    captured = capsys.readouterr()
+    assert [one["tile_id"] for one in json.loads(captured.out)["tiles"]] == ["room"]
+    assert "other" in captured.err
+    assert captured.err.count("\n") == 1
+
+
+def test_an_undo_file_that_is_gone_or_another_one_costs_no_edit_of_another_tile(own_atlas: Path, complaint: Complaint):
+    edited_tile(str(own_atlas), "room", _note)
+    atlas = Atlas.open(str(own_atlas))
+    undo = atlas.tile("room").undo
+    assert undo is not None
+    assert Manifest.from_bytes(atlas.manifest.to_bytes(), "here").by_id["room"].undo == undo
+    path = atlas.store.local(undo.name, undo.sha256)
+    path.write_bytes(path.read_bytes()[:-1] + b"?")
+    assert "checksum" in (tile_problem(atlas, atlas.tile("room")) or "")
+    assert "checksum" in complaint("undo", own_atlas, "--tile", "room")
+    edited_tile(str(own_atlas), "other", _note)
+    undone = edited_tile(str(own_atlas), "other", undo_edit)[1]
+    assert undone.name == "note"
+
+
+@pytest.mark.parametrize(
+    ("args", "said", "status"),
+    [
+        (["undo", "ATLAS"], "--tile says which of its maps is meant (other, room)", 2),
+        (["undo", "ATLAS", "--tile", "room"], "tile room: nothing to undo: it is as built", 1),
+        (["undo", "ATLAS", "--tile", "attic"], "has no tile 'attic'", 1),
+        (["undo", "MAP", "--tile", "room"], "--tile is of an atlas", 2),
+        (["prune", "MAP", "--tile", "room"], "--tile is of an atlas", 2),
+        (["georeference", "ATLAS", "--origin", ORIGIN], "--tile says which", 2),
+        (["view", "MAP", "--tile", "room"], "--tile is of an atlas", 2),
+        (["export", "MAP", "out.ply", "--tile", "room"], "--tile is of an atlas", 2),
+        (["export", "ATLAS", "out.ply", "--session", "0"], "--session is of maps", 2),
+        (["view", "ATLAS", "--tile", "attic"], "has no tile 'attic'", 1),
+        (["follow", "ATLAS", "0", "--ros", "1"], "--ros is of a map", 2),
+    ],
+)
+def test_what_cannot_be_meant_is_said(
+    args: list[str],
+    said: str,
+    status: int,
+    own_atlas: Path,
+    room_map: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    complaint: Complaint,
+):
+    monkeypatch.chdir(tmp_path)
+    paths = {"ATLAS": str(own_atlas), "MAP": str(room_map)}
+    assert said in complaint(*(paths.get(arg, arg) for arg in args), status=status)
+
+
+def _note(path: Path) -> None:
+    with editing(path) as edit:
+        edit.commit(edit.topomap, "note")
