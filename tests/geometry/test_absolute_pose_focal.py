@@ -39,6 +39,60 @@ def test_exact_matches_give_pose_and_focal_length_among_outliers(focal: float):
     assert rotation_error(pose.cam_from_world, CAM_FROM_WORLD) < np.deg2rad(0.3)
 
 
+@pytest.mark.parametrize(("num", "num_right"), [(40, 12), (60, 12), (100, 30)])
+def test_the_right_focal_length_is_found_where_few_matches_are_right(num: int, num_right: int):
+    num_found = 0
+    for seed in range(20):
+        rng, focal = np.random.default_rng(seed), (340.0, 680.0, 1020.0)[seed % 3]
+        pixels, points, covariances = _scene(focal, rng, num, noise_px=1.0)
+        wrong, right = np.split(rng.permutation(num), [num - num_right])
+        pixels[wrong] = rng.uniform([0, 0], [639, 479], (len(wrong), 2))
+        found = estimate_pose_and_focal(pixels, points, UNKNOWN, CONFIG, point_covariances=covariances)
+        assert found is not None
+        num_found += found[1].fx == pytest.approx(focal, rel=0.1) and np.mean(found[0].inliers[right]) >= 0.8
+    assert num_found >= 18
+
+
+def test_of_random_matches_only_so_many_agree_as_by_chance():
+    rng = np.random.default_rng(0)
+    for num in (15, 40, 100):
+        pixels, points, covariances = _scene(600.0, rng, num=num)
+        pixels = rng.uniform([0, 0], [639, 479], pixels.shape)
+        found = estimate_pose_and_focal(pixels, points, UNKNOWN, CONFIG, point_covariances=covariances)
+        assert found is None or np.count_nonzero(found[0].inliers) <= 14
+
+
+def test_the_same_matches_give_the_same_bytes_and_useless_ones_change_nothing():
+    pixels, points, covariances = _scene(800.0, np.random.default_rng(3), num=60, noise_px=1.0)
+    pixels[:30] = pixels[30:]
+    first, again = (estimate_pose_and_focal(pixels, points, UNKNOWN, CONFIG, point_covariances=covariances) for _ in range(2))
+    broken = np.vstack([pixels, [np.nan, 1.0]]), np.vstack([points, [1.0, 2.0, 3.0]]), np.concatenate([covariances, covariances[:1]])
+    with_broken = estimate_pose_and_focal(broken[0], broken[1], UNKNOWN, CONFIG, point_covariances=broken[2])
+    assert first is not None
+    for other in (again, with_broken):
+        assert other is not None
+        assert first[1] == other[1]
+        assert np.array_equal(first[0].cam_from_world.matrix(), other[0].cam_from_world.matrix())
+        assert np.array_equal(first[0].covariance, other[0].covariance)
+        assert np.array_equal(first[0].inliers, other[0].inliers[:60])
+
+
+def test_the_inliers_gather_where_some_are_near_and_most_are_far():
+    """What is near agrees with a wrong focal length, too: a few rounds leave it at that, and the far ones out."""
+    street = RoughCamera.unknown(1241, 376)
+    for seed in range(12):
+        rng, camera = np.random.default_rng(seed), street.with_focal(720.0)
+        near = rng.uniform([0, 100, 5.0], [1240, 300, 6.5], (48, 3))
+        far = rng.uniform([434, 120, 40.0], [806, 250, 48.0], (112, 3))
+        pixels, z = np.split(np.vstack([near, far]), [2], axis=1)
+        points = CAM_FROM_WORLD.inverse().apply(np.column_stack([camera.normalized_from_img(pixels), np.ones(160)]) * z)
+        pixels += rng.normal(0.0, 1.0, pixels.shape)
+        found = estimate_pose_and_focal(pixels, points, street, CONFIG, point_covariances=np.zeros((160, 3, 3)))
+        assert found is not None
+        assert found[1].fx == pytest.approx(720.0, rel=0.015)
+        assert np.count_nonzero(found[0].inliers) >= 155
+
+
 def test_the_covariance_counts_what_is_not_known_of_the_focal_length():
     distances, plain = [], []
     for seed in range(40):

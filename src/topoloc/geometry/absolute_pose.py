@@ -28,7 +28,7 @@ _MAX_WIDENING = 3.0
 _OPENCV_MAX_ITERATIONS = 1000
 _OPENCV_CONFIDENCE = 0.99  # its default
 _MAX_SCALE_STEPS = 30
-_CAUCHY_SCALE = 2.3849  # 95 % efficiency on Gaussian residuals (Holland and Welsch, 1977)
+CAUCHY_SCALE = 2.3849  # 95 % efficiency on Gaussian residuals (Holland and Welsch, 1977)
 # What Cauchy's weights w do to Gaussian residuals r of two dimensions, so that the covariance is not biased by them:
 # E[w r^2] / 2, and E[w] E[w^2 r^2 / 2] / E[w - w^2 r^2 / c^2]^2, the M-estimator's variance over the inverse of its information.
 _MEAN_WEIGHTED_SQUARE = 0.6302
@@ -40,7 +40,8 @@ class AbsolutePoseConfig:
     """How a pose is found from 2-D/3-D matches."""
 
     method: Literal["poselib", "opencv"] = "poselib"
-    """PoseLib's RANSAC, or OpenCV's, which ends at 1000 iterations or a confidence of 0.99 and takes no seed."""
+    """PoseLib's RANSAC, or OpenCV's, which ends at 1000 iterations or a confidence of 0.99 and takes no seed. Of a camera that nobody
+    has calibrated always PoseLib's."""
     max_reprojection_error_px: Annotated[float, Above(0)] = 4.0
     """Matches that miss by less are inliers. With poselib the uncertainty of a point, projected, widens it up to threefold: in
     proportion to the standard deviation that it adds to `sigma_px`."""
@@ -72,7 +73,7 @@ class AbsolutePose:
 
 
 @dataclass(frozen=True, eq=False)
-class _Matches:
+class Matches:
     """The usable matches; pixels also on the plane z = 1, with their covariance there."""
 
     points_img: Float[np.ndarray, "n 2"]
@@ -80,6 +81,30 @@ class _Matches:
     covariances: Float[np.ndarray, "n 2 2"]
     points_world: Float[np.ndarray, "n 3"]
     point_covariances: Float[np.ndarray, "n 3 3"] | Float[np.ndarray, "0 3 3"]
+
+    @staticmethod
+    def of(
+        points_img: _Array,
+        normalized: Float[np.ndarray, "n 2"],
+        points_world: _Array,
+        point_covariances: _Array,
+        camera: Camera,
+        sigma_px: float,
+    ) -> Matches:
+        """Pixels, with what they are on the plane z = 1 and their standard deviation, of world points (metres) and their covariances."""
+        to_normalized = sigma_px * camera.normalized_jacobian(normalized)
+        return Matches(
+            points_img=np.ascontiguousarray(points_img, dtype=np.float64),
+            normalized=normalized,
+            covariances=to_normalized @ to_normalized.transpose(0, 2, 1),
+            points_world=np.ascontiguousarray(points_world, dtype=np.float64),
+            point_covariances=np.ascontiguousarray(point_covariances, dtype=np.float64),
+        )
+
+    def arguments(self, cam_from_world: Rigid3) -> tuple[_Array, _Array, _Array, _Array, _Array, _Array]:
+        """What all kernels take."""
+        rotation, translation = np.ascontiguousarray(cam_from_world.rotation), np.ascontiguousarray(cam_from_world.translation)
+        return rotation, translation, self.normalized, self.covariances, self.points_world, self.point_covariances
 
 
 def estimate_absolute_pose(
@@ -109,16 +134,9 @@ def estimate_absolute_pose(
     order = np.flatnonzero(usable)
     if priorities is not None:
         order = order[np.argsort(-priorities[order], kind="stable")]
-    matches = _Matches(
-        points_img=np.ascontiguousarray(points_img[order], dtype=np.float64),
-        normalized=normalized[order],
-        covariances=_normalized_covariances(camera, normalized[order], config.key_point_sigma_px),
-        points_world=np.ascontiguousarray(points_world[order], dtype=np.float64),
-        point_covariances=np.zeros((0, 3, 3))
-        if point_covariances is None
-        else np.ascontiguousarray(point_covariances[order], dtype=np.float64),
-    )
-    if not _spans_a_plane(matches.points_world) or not _spans_a_plane(np.insert(matches.normalized, 2, 0.0, axis=1)):
+    covariances = np.zeros((0, 3, 3)) if point_covariances is None else point_covariances[order]
+    matches = Matches.of(points_img[order], normalized[order], points_world[order], covariances, camera, config.key_point_sigma_px)
+    if not spans_a_plane(matches.points_world) or not spans_a_plane(np.insert(matches.normalized, 2, 0.0, axis=1)):
         return None
     if start is not None:
         cam_from_world = _refine_on_inliers(start, matches, camera, config)
@@ -130,10 +148,28 @@ def estimate_absolute_pose(
     return _with_evidence(cam_from_world, matches, camera, config, order, len(points_img))
 
 
-def _solve_with_poselib(matches: _Matches, camera: Camera, config: AbsolutePoseConfig, is_sorted: bool) -> Rigid3 | None:
+def _solve_with_poselib(matches: Matches, camera: Camera, config: AbsolutePoseConfig, is_sorted: bool) -> Rigid3 | None:
     # A pinhole of the same focal length in pixels that are already undistorted: thresholds keep their meaning, and
     # every model works alike. PoseLib adds no half pixel of its own.
     undistorted = matches.normalized * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    found = ransac_pose(undistorted, matches.points_world, camera, config, is_sorted)
+    return _refine_on_inliers(found[0], matches, camera, config) if found else None
+
+
+def ransac_pose(
+    undistorted: Float[np.ndarray, "n 2"],
+    points_world: Float[np.ndarray, "n 3"],
+    camera: Camera,
+    config: AbsolutePoseConfig,
+    is_sorted: bool = False,
+) -> tuple[Rigid3, int, float] | None:
+    """PoseLib's RANSAC alone, on n finite matches of pixels without distortion: cam_from_world, how many it misses by less than the
+    threshold, and the sum of all squared errors (px^2), each at most the threshold's; None where the samples gave no pose. The points'
+    uncertainty does not count.
+
+    Args:
+        is_sorted: the first matches are the likeliest right.
+    """
     pinhole = {
         "model": "PINHOLE",
         "width": camera.width,
@@ -149,29 +185,31 @@ def _solve_with_poselib(matches: _Matches, camera: Camera, config: AbsolutePoseC
         "progressive_sampling": is_sorted,
         "seed": config.seed,
     }
-    bundle = {"max_iterations": 0}  # the refinement below replaces it
-    pose, _ = poselib.estimate_absolute_pose(undistorted, matches.points_world, pinhole, ransac, bundle)
+    bundle = {"max_iterations": 0}  # the refinement on the inliers replaces it
+    pose, told = poselib.estimate_absolute_pose(undistorted, points_world, pinhole, ransac, bundle)
     matrix = np.asarray(pose.Rt, dtype=np.float64)
     if not np.isfinite(matrix).all():
         return None
-    return _refine_on_inliers(Rigid3(matrix[:, :3].copy(), matrix[:, 3].copy()), matches, camera, config)
+    loss = float(told["model_score"]) * ((camera.fx + camera.fy) / 2) ** 2  # PoseLib's is on the plane z = 1
+    return Rigid3(matrix[:, :3].copy(), matrix[:, 3].copy()), int(told["num_inliers"]), loss
 
 
-def _refine_on_inliers(cam_from_world: Rigid3, matches: _Matches, camera: Camera, config: AbsolutePoseConfig) -> Rigid3 | None:
+def _refine_on_inliers(cam_from_world: Rigid3, matches: Matches, camera: Camera, config: AbsolutePoseConfig) -> Rigid3 | None:
     for _ in range(2):  # the second time with the inliers of the first
-        inliers = _select_inliers(cam_from_world, matches, camera, config)
-        if not _spans_a_plane(matches.points_world[inliers]):
+        inliers = select_inliers(cam_from_world, matches, camera, config)
+        if not spans_a_plane(matches.points_world[inliers]):
             return None
-        cam_from_world = _refine(cam_from_world, matches, inliers, config.max_refinement_steps)
+        cam_from_world = refine_pose(cam_from_world, matches, inliers, config.max_refinement_steps)
     return cam_from_world
 
 
-def _refine(cam_from_world: Rigid3, matches: _Matches, active: Bool[np.ndarray, " n"], max_steps: int) -> Rigid3:
-    rotation, translation = refine(*_arguments(cam_from_world, matches), active, _CAUCHY_SCALE, max_steps)
+def refine_pose(cam_from_world: Rigid3, matches: Matches, active: Bool[np.ndarray, " n"], max_steps: int) -> Rigid3:
+    """The pose at which the active matches fit best, from one nearby."""
+    rotation, translation = refine(*matches.arguments(cam_from_world), active, CAUCHY_SCALE, max_steps)
     return Rigid3(rotation, translation)
 
 
-def _solve_with_opencv(matches: _Matches, camera: Camera, config: AbsolutePoseConfig, is_sorted: bool) -> Rigid3 | None:
+def _solve_with_opencv(matches: Matches, camera: Camera, config: AbsolutePoseConfig, is_sorted: bool) -> Rigid3 | None:
     del is_sorted  # OpenCV's RANSAC knows no order
     undistorted = matches.normalized * [camera.fx, camera.fy] + [camera.cx, camera.cy]
     try:
@@ -199,13 +237,13 @@ def _solve_with_opencv(matches: _Matches, camera: Camera, config: AbsolutePoseCo
 
 
 def _with_evidence(
-    cam_from_world: Rigid3, matches: _Matches, camera: Camera, config: AbsolutePoseConfig, order: np.ndarray, num_points: int
+    cam_from_world: Rigid3, matches: Matches, camera: Camera, config: AbsolutePoseConfig, order: np.ndarray, num_points: int
 ) -> AbsolutePose | None:
-    active = _select_inliers(cam_from_world, matches, camera, config)
-    if np.count_nonzero(active) < _MIN_POINTS or not _spans_a_plane(matches.points_world[active]):
+    active = select_inliers(cam_from_world, matches, camera, config)
+    if np.count_nonzero(active) < _MIN_POINTS or not spans_a_plane(matches.points_world[active]):
         return None
-    scale = _noise_scale(squared_errors(*_arguments(cam_from_world, matches))[active])
-    information, *_ = normal_equations(*_arguments(cam_from_world, matches), active, _CAUCHY_SCALE * scale)
+    scale = _noise_scale(squared_errors(*matches.arguments(cam_from_world))[active])
+    information, *_ = normal_equations(*matches.arguments(cam_from_world), active, CAUCHY_SCALE * scale, 6)
     inverse = _inverse(information)
     if inverse is None:
         return None
@@ -224,23 +262,11 @@ def _noise_scale(squares: Float[np.ndarray, " n"]) -> float:
     variance = 1.0
     for _ in range(_MAX_SCALE_STEPS):
         scaled = squares / variance
-        ratio = float(np.sum(scaled / (1.0 + scaled / _CAUCHY_SCALE**2))) / (_MEAN_WEIGHTED_SQUARE * num_free)
+        ratio = float(np.sum(scaled / (1.0 + scaled / CAUCHY_SCALE**2))) / (_MEAN_WEIGHTED_SQUARE * num_free)
         if ratio <= 1.001:
             break
         variance *= ratio
     return float(np.sqrt(variance))
-
-
-def _arguments(cam_from_world: Rigid3, matches: _Matches) -> tuple[_Array, _Array, _Array, _Array, _Array, _Array]:
-    """What all kernels take."""
-    return (
-        np.ascontiguousarray(cam_from_world.rotation),
-        np.ascontiguousarray(cam_from_world.translation),
-        matches.normalized,
-        matches.covariances,
-        matches.points_world,
-        matches.point_covariances,
-    )
 
 
 def _inverse(information: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"] | None:
@@ -255,25 +281,22 @@ def _inverse(information: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"] 
     return (inverse + inverse.T) / 2.0
 
 
-def _select_inliers(cam_from_world: Rigid3, matches: _Matches, camera: Camera, config: AbsolutePoseConfig) -> Bool[np.ndarray, " n"]:
+def select_inliers(cam_from_world: Rigid3, matches: Matches, camera: Camera, config: AbsolutePoseConfig) -> Bool[np.ndarray, " n"]:
+    """The matches that this pose explains: by the threshold, and, of uncertain points, by what they may miss it by."""
     errors_px = np.linalg.norm(camera.img_from_cam(cam_from_world.apply(matches.points_world)) - matches.points_img, axis=1)
     limit_px = config.max_reprojection_error_px  # NaN, behind the camera or outside its field, is not below it
     if config.method == "opencv" or len(matches.point_covariances) == 0:
         return errors_px <= limit_px
     # A plain threshold would cut the errors of uncertain points short, and what is left would look too precise.
-    squares = squared_errors(*_arguments(cam_from_world, matches))
+    squares = squared_errors(*matches.arguments(cam_from_world))
     return (squares <= (limit_px / config.key_point_sigma_px) ** 2) & (errors_px <= _MAX_WIDENING * limit_px)
 
 
-def _normalized_covariances(camera: Camera, normalized: Float[np.ndarray, "n 2"], sigma_px: float) -> Float[np.ndarray, "n 2 2"]:
-    to_normalized = sigma_px * camera.normalized_jacobian(normalized)
-    return to_normalized @ to_normalized.transpose(0, 2, 1)
-
-
-def _spans_a_plane(points: Float[np.ndarray, "n 3"]) -> bool:
+def spans_a_plane(points: Float[np.ndarray, "n 3"]) -> bool:
     """At least four points, not all on a line."""
     if len(points) < _MIN_POINTS:
         return False
     centred = points - points.mean(axis=0)
-    variances = np.linalg.eigvalsh(centred.T @ centred)
-    return bool(variances[1] > 1e-9 * variances[2])
+    scatter = centred.T @ centred  # of variances a <= b <= c: trace^2 - |scatter|^2 is 2 (ab + ac + bc), between 2 bc and 6 bc
+    total = float(np.trace(scatter)) ** 2
+    return total - float(np.vdot(scatter, scatter)) > 2e-9 * total

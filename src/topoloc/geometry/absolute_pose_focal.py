@@ -1,9 +1,9 @@
 """Pose and focal length together, for cameras that nobody has calibrated.
 
-PnP is tried with a handful of focal lengths a quarter apart: at an inlier threshold of some pixels the nearest of them is near
-enough to find the inliers. From the best one, Gauss-Newton refines the pose's six numbers and the logarithm of the focal length
-together. What is not known of the focal length and of the principal point, which is taken to be in the middle, is added to the pose's
-covariance.
+RANSAC is run with a handful of focal lengths a quarter apart, and no longer than it takes to beat the best so far: at an inlier threshold
+of some pixels the nearest of them is near enough to find the inliers. From the best ones, Gauss-Newton refines the pose's six numbers and
+the logarithm of the focal length together. What is not known of the focal length and of the principal point, which is taken to be in the
+middle, is added to the pose's covariance.
 """
 
 from __future__ import annotations
@@ -12,17 +12,37 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
+from topoloc.geometry.absolute_pose import (
+    CAUCHY_SCALE,
+    AbsolutePose,
+    AbsolutePoseConfig,
+    Matches,
+    estimate_absolute_pose,
+    ransac_pose,
+    refine_pose,
+    select_inliers,
+    spans_a_plane,
+)
+from topoloc.geometry.absolute_pose_kernels import normal_equations, solve_definite
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
 
+_Finite = tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]
+"""Pixels, points of the world (metres) and their covariances (m^2)."""
+
 _STEP = 1.25
-_MAX_ITERATIONS = 500  # of RANSAC for each focal length: enough for one match in four to be right
-_ROUNDS = 4
-_CAUCHY_SCALE = 2.3849
+_MIN_INLIERS = 4  # any sample agrees with three
+# Of RANSAC for each focal length: where one match in four is right, all of them miss it once in a hundred times. The focal lengths
+# beside the right one find most of its inliers too, by samples of their own.
+_MAX_ITERATIONS = 300
+# The best is not always next to the right focal length where few matches are right; a third start helps no more.
+_MAX_STARTS = 2
+# Inliers of a focal length far off are few, and gather over some rounds: five mostly; one picture of a street took more, and was 2.7 m
+# wrong without them.
+_MAX_ROUNDS = 20
 # How far the principal point lies from the middle (standard deviation, of the longer side); it trades places with a rotation.
 _CENTRE_SHARE = 0.01
 # Weak prior on the logarithm of the focal length (standard deviation): without it, what is seen of a wall alone fixes none.
@@ -45,83 +65,81 @@ def estimate_pose_and_focal(
 
     The focal length found lies in `rough`'s range. The covariance is that of the pose whatever the focal length.
     """
-    best = start or _search(points_img, points_world, rough, config, point_covariances)
-    if best is None:
+    usable = np.isfinite(points_img).all(axis=1) & np.isfinite(points_world).all(axis=1) & np.isfinite(point_covariances).all(axis=(1, 2))
+    finite = points_img[usable], points_world[usable], point_covariances[usable]
+    starts = [start] if start else _search(finite, rough, config)
+    refined = [one for each in starts if (one := _refined_together(each, finite, rough, config))]
+    if not refined:
         return None
-    cam_from_world, camera = best
+    _, cam_from_world, camera = max(refined, key=lambda one: one[0])
     pose = estimate_absolute_pose(points_img, points_world, camera, config, point_covariances=point_covariances, start=cam_from_world)
-    for _ in range(_ROUNDS):
-        if pose is None:
-            return None
-        pixels, points = points_img[pose.inliers], points_world[pose.inliers]
-        information, gradient = _normal_equations(pixels, points, point_covariances[pose.inliers], pose, camera, rough, config)
-        step = -np.linalg.solve(information, gradient)
-        focal = float(np.clip(camera.fx * math.exp(np.clip(step[6], -0.2, 0.2)), rough.min_focal, rough.max_focal))
-        has_converged = abs(math.log(focal / camera.fx)) < 1e-4
-        camera = rough.with_focal(focal)
-        moved = Rigid3.exp(step[:6]) @ pose.cam_from_world if not has_converged else pose.cam_from_world
-        pose = estimate_absolute_pose(points_img, points_world, camera, config, point_covariances=point_covariances, start=moved)
-        if has_converged:
-            break
     if pose is None:
         return None
-    inliers = pose.inliers
-    information, _ = _normal_equations(points_img[inliers], points_world[inliers], point_covariances[inliers], pose, camera, rough, config)
+    information, _ = _normal_equations(pose.cam_from_world, _matches(finite, camera, config), pose.inliers[usable], camera, rough)
     covariance = _whatever_the_focal(pose.covariance, information)
-    return replace(pose, covariance=covariance + _whatever_the_centre(points_world[inliers], pose, camera)), camera
+    return replace(pose, covariance=covariance + _whatever_the_centre(points_world[pose.inliers], pose, camera)), camera
 
 
-def _search(
-    points_img: Float[np.ndarray, "n 2"],
-    points_world: Float[np.ndarray, "n 3"],
-    rough: RoughCamera,
-    config: AbsolutePoseConfig,
-    point_covariances: Float[np.ndarray, "n 3 3"],
-) -> tuple[Rigid3, Camera] | None:
-    """The pose with most inliers of a handful of focal lengths."""
-    quick = replace(config, max_iterations=min(config.max_iterations, _MAX_ITERATIONS))
+def _search(finite: _Finite, rough: RoughCamera, config: AbsolutePoseConfig) -> list[tuple[Rigid3, Camera]]:
+    """Poses with the focal lengths that explain most; the middle ones are tried first: a right one makes the rest short."""
+    points_img, points_world, _ = finite
+    if len(points_img) < _MIN_INLIERS:
+        return []
     num_steps = max(1, math.ceil(math.log(rough.max_focal / rough.min_focal) / math.log(_STEP)))
-    exponents = (np.arange(num_steps) + 0.5) / num_steps
-    best: tuple[Rigid3, Camera] | None = None
-    most = 0
-    for focal in rough.min_focal * (rough.max_focal / rough.min_focal) ** exponents:
-        camera = rough.with_focal(float(focal))
-        pose = estimate_absolute_pose(points_img, points_world, camera, quick, point_covariances=point_covariances)
-        if pose is not None and np.count_nonzero(pose.inliers) > most:
-            best, most = (pose.cam_from_world, camera), int(np.count_nonzero(pose.inliers))
-    return best
+    exponents = sorted((np.arange(num_steps) + 0.5) / num_steps, key=lambda one: abs(one - 0.5))
+    found: list[tuple[float, Rigid3, Camera]] = []
+    most = _MIN_INLIERS - 1
+    for k, exponent in enumerate(exponents):
+        camera = rough.with_focal(rough.min_focal * (rough.max_focal / rough.min_focal) ** float(exponent))
+        enough = _num_iterations(most / len(points_img), config.confidence)
+        quick = replace(config, max_iterations=min(config.max_iterations, _MAX_ITERATIONS, enough), seed=config.seed + k)
+        cam_from_world, num_inliers, loss = ransac_pose(points_img, points_world, camera, quick) or (None, 0, math.inf)
+        if cam_from_world is not None and num_inliers >= _MIN_INLIERS:
+            found.append((loss, cam_from_world, camera))
+            most = max(most, num_inliers)
+    found.sort(key=lambda one: one[0])  # where most is far and flat, all focal lengths find it: their counts are alike, the errors are not
+    return [(cam_from_world, camera) for _, cam_from_world, camera in found[:_MAX_STARTS]]
+
+
+def _num_iterations(share: float, confidence: float) -> int:
+    """So many samples of three hit right matches alone once, at this confidence, where this share is right."""
+    return max(1, math.ceil(math.log(max(1.0 - confidence, 1e-9)) / math.log1p(-(min(share, 0.99) ** 3))))
+
+
+def _refined_together(
+    start: tuple[Rigid3, Camera], finite: _Finite, rough: RoughCamera, config: AbsolutePoseConfig
+) -> tuple[int, Rigid3, Camera] | None:
+    """The pose and the camera that fit the inliers best, and how many these are; they are chosen anew each round."""
+    cam_from_world, camera = start
+    num_inliers = 0
+    for _ in range(_MAX_ROUNDS):
+        matches = _matches(finite, camera, config)
+        inliers = select_inliers(cam_from_world, matches, camera, config)
+        num_inliers = int(np.count_nonzero(inliers))
+        if not spans_a_plane(matches.points_world[inliers]):
+            return None
+        cam_from_world = refine_pose(cam_from_world, matches, inliers, config.max_refinement_steps)
+        information, gradient = _normal_equations(cam_from_world, matches, inliers, camera, rough)
+        is_definite, step = solve_definite(information, -gradient)
+        if not is_definite:
+            return None
+        focal = float(np.clip(camera.fx * math.exp(np.clip(step[6], -0.2, 0.2)), rough.min_focal, rough.max_focal))
+        if abs(math.log(focal / camera.fx)) < 1e-4:
+            break
+        camera, cam_from_world = rough.with_focal(focal), Rigid3.exp(step[:6]) @ cam_from_world
+    return num_inliers, cam_from_world, camera
+
+
+def _matches(finite: _Finite, camera: Camera, config: AbsolutePoseConfig) -> Matches:
+    pixels, points_world, covariances = finite
+    return Matches.of(pixels, camera.normalized_from_img(pixels), points_world, covariances, camera, config.key_point_sigma_px)
 
 
 def _normal_equations(
-    pixels: Float[np.ndarray, "n 2"],
-    points_world: Float[np.ndarray, "n 3"],
-    point_covariances: Float[np.ndarray, "n 3 3"],
-    pose: AbsolutePose,
-    camera: Camera,
-    rough: RoughCamera,
-    config: AbsolutePoseConfig,
+    cam_from_world: Rigid3, matches: Matches, active: Bool[np.ndarray, " n"], camera: Camera, rough: RoughCamera
 ) -> tuple[Float[np.ndarray, "7 7"], Float[np.ndarray, " 7"]]:
-    """Gauss-Newton's, by the left perturbation of the pose and the logarithm of the focal length, on the plane z = 1.
-
-    As in `absolute_pose_kernels.normal_equations`. Noise is of pixels, so that it is the projection f (x / z) that moves with log f, by
-    itself; were the observations taken to move, their noise would make the focal length too long.
-    """
-    rotation = pose.cam_from_world.rotation
-    x, y, z = pose.cam_from_world.apply(points_world).T
-    u, v, w = x / z, y / z, 1.0 / z
-    zero = np.zeros_like(u)
-    projected = np.column_stack([u, v])
-    residuals = projected - camera.normalized_from_img(pixels)
-    by_point = np.stack([np.column_stack([w, zero, -u * w]), np.column_stack([zero, w, -v * w])], axis=1)
-    by_world = by_point @ rotation
-    spread = by_world @ point_covariances @ by_world.transpose(0, 2, 1) + (config.key_point_sigma_px / camera.fx) ** 2 * np.eye(2)
-    inverse = np.linalg.inv(spread)
-    by_rotation = np.stack([np.column_stack([-u * v, 1.0 + u * u, -v]), np.column_stack([-(1.0 + v * v), u * v, u])], axis=1)
-    jacobians = np.concatenate([by_point, by_rotation, projected[:, :, None]], axis=2)
-    squares = np.einsum("ni,nij,nj->n", residuals, inverse, residuals)
-    weighted = np.einsum("nia,nij->naj", jacobians, inverse) / (1.0 + squares / _CAUCHY_SCALE**2)[:, None, None]
-    information = np.einsum("naj,njb->ab", weighted, jacobians)
-    gradient = np.einsum("naj,nj->a", weighted, residuals)
+    """Gauss-Newton's, by the left perturbation of the pose and the logarithm of the focal length, with the prior on that."""
+    information, gradient, *_ = normal_equations(*matches.arguments(cam_from_world), active, CAUCHY_SCALE, 7)
     middle = math.sqrt(rough.min_focal * rough.max_focal)
     information[6, 6] += 1.0 / _PRIOR**2
     gradient[6] += math.log(camera.fx / middle) / _PRIOR**2

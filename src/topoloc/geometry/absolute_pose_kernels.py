@@ -47,19 +47,20 @@ def squared_errors(rotation, translation, normalized, covariances, points_world,
 
 
 @kernel()
-def normal_equations(rotation, translation, normalized, covariances, points_world, point_covariances, active, cauchy_scale):
+def normal_equations(rotation, translation, normalized, covariances, points_world, point_covariances, active, cauchy_scale, num_unknowns):
     """Gauss-Newton's normal equations of the whitened reprojection errors on the plane z = 1.
 
     `covariances` (n, 2, 2) are those of `normalized`; `point_covariances` is (n, 3, 3), or (0, 3, 3) for exact points.
     The derivative of an error by the left perturbation (translation, rotation) is D [I, -[p]x]; each match weighs
-    1 / (1 + e' S^-1 e / c^2), Cauchy's weight.
-    Returns the information (6, 6), the gradient (6), the Cauchy cost and the sum of the weighted squared residuals.
+    1 / (1 + e' S^-1 e / c^2), Cauchy's weight. The seventh unknown, of `num_unknowns` = 6 or 7, is the logarithm of the focal length:
+    noise is of pixels, so that it is the projection that moves with it; were the observations taken to move, it would come out too long.
+    Returns the information (k, k) and the gradient (k) of k unknowns, the Cauchy cost and the sum of the weighted squared residuals.
     """
-    information = np.zeros((6, 6))
-    gradient = np.zeros(6)
+    information = np.zeros((num_unknowns, num_unknowns))
+    gradient = np.zeros(num_unknowns)
     cost = 0.0
     squares = 0.0
-    jacobian = np.zeros((2, 6))
+    jacobian = np.zeros((2, 7))
     for i in range(len(normalized)):
         if not active[i]:
             continue
@@ -77,13 +78,14 @@ def normal_equations(rotation, translation, normalized, covariances, points_worl
         jacobian[1, 0], jacobian[1, 1], jacobian[1, 2] = 0.0, w, -v * w
         jacobian[0, 3], jacobian[0, 4], jacobian[0, 5] = -u * v, 1.0 + u * u, -v
         jacobian[1, 3], jacobian[1, 4], jacobian[1, 5] = -(1.0 + v * v), u * v, u
-        for a in range(6):
+        jacobian[0, 6], jacobian[1, 6] = u, v
+        for a in range(num_unknowns):
             p0 = weight * (jacobian[0, a] * i00 + jacobian[1, a] * i01)
             p1 = weight * (jacobian[0, a] * i01 + jacobian[1, a] * i11)
             gradient[a] += p0 * e0 + p1 * e1
-            for b in range(a, 6):
+            for b in range(a, num_unknowns):
                 information[a, b] += p0 * jacobian[0, b] + p1 * jacobian[1, b]
-    for a in range(6):
+    for a in range(num_unknowns):
         for b in range(a):
             information[a, b] = information[b, a]
     return information, gradient, cost, squares
@@ -93,10 +95,10 @@ def normal_equations(rotation, translation, normalized, covariances, points_worl
 def refine(rotation, translation, normalized, covariances, points_world, point_covariances, active, cauchy_scale, max_steps):
     """Iteratively reweighted Gauss-Newton under Cauchy's loss; ends where the cost falls no more. Returns (rotation, translation)."""
     information, gradient, cost, _ = normal_equations(
-        rotation, translation, normalized, covariances, points_world, point_covariances, active, cauchy_scale
+        rotation, translation, normalized, covariances, points_world, point_covariances, active, cauchy_scale, 6
     )
     for _ in range(max_steps):
-        is_definite, step = _solve_definite(information, -gradient)
+        is_definite, step = solve_definite(information, -gradient)
         if not is_definite:
             break
         turn = _exp_so3(step[3:])
@@ -108,7 +110,7 @@ def refine(rotation, translation, normalized, covariances, points_world, point_c
                 for j in range(3):
                     new_rotation[i, j] += turn[i, k] * rotation[k, j]
         information, gradient, new_cost, _ = normal_equations(
-            new_rotation, new_translation, normalized, covariances, points_world, point_covariances, active, cauchy_scale
+            new_rotation, new_translation, normalized, covariances, points_world, point_covariances, active, cauchy_scale, 6
         )
         if not new_cost <= cost:
             break
@@ -120,7 +122,7 @@ def refine(rotation, translation, normalized, covariances, points_world, point_c
 
 
 @kernel()
-def _solve_definite(matrix, right):
+def solve_definite(matrix, right):
     """(True, x) with matrix @ x = right by Cholesky's decomposition; (False, _) if not positive definite."""
     n = len(right)
     lower = np.zeros((n, n))
