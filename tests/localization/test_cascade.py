@@ -21,9 +21,14 @@ from topoloc.features.dense import DenseDescriptors
 from topoloc.features.features import Features
 from topoloc.features.kinds import KINDS, FeatureConfig
 from topoloc.geometry.alignment import translation_error
+from topoloc.geometry.calibration_check import CalibrationDoubt, SeenCamera
+from topoloc.localization.belief import Hypothesis
+from topoloc.localization.calibration_doubt import doubt_of_calibration
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.pose_fit import PoseFit
 from topoloc.localization.query import Query
+from topoloc.localization.refine import say_on
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Search, Trace
 from topoloc.map.build import BuildConfig
@@ -99,11 +104,45 @@ def test_around_an_expected_pose_the_second_kind_is_heard_on_what_the_first_is_n
 ):
     """A twin of the place is no less likely where a stream that was placed wrongly expects it."""
     changed("sift", _useless)
-    monkeypatch.setattr("topoloc.localization.asking.say_on", lambda search, hypothesis: says)
+    monkeypatch.setattr("topoloc.localization.asking.say_on", lambda search, hypothesis: (says, None))
     assert _is_right(Localizer(topomap).localize(PICTURE, CAMERA, TRUTH)), "it is settled: nobody else is heard"
     monkeypatch.setattr(Search, "is_settled", property(lambda search: False))
     result = Localizer(topomap).localize(PICTURE, CAMERA, TRUTH)
     assert _is_right(result) == result.localized == (says > 0.0)
+
+
+@pytest.mark.parametrize(("more", "answers"), [(100.0, "sift"), (-100.0, "surf")])
+def test_a_pose_that_both_hold_is_that_of_the_kind_for_which_more_speaks(
+    topomap: TopoMetricMap, monkeypatch: pytest.MonkeyPatch, more: float, answers: str
+):
+    """In other light the points of the first kind are found by chance, around any pose that is nearly right."""
+
+    def says(search: Search, hypothesis: Hypothesis) -> tuple[float, Hypothesis | None]:
+        said, of_last = say_on(search, hypothesis)
+        assert of_last is not None
+        return said, replace(of_last, log_odds=hypothesis.log_odds + more)
+
+    monkeypatch.setattr("topoloc.localization.asking.say_on", says)
+    monkeypatch.setattr(Search, "is_settled", property(lambda search: False))
+    result = Localizer(topomap).localize(PICTURE, CAMERA, TRUTH)
+    assert _is_right(result)
+    assert result.provenance.features == answers
+
+
+def test_a_pose_that_contradicts_its_calibration_is_not_saved_by_coarser_features(topomap: TopoMetricMap, monkeypatch: pytest.MonkeyPatch):
+    """They see too little to contradict it, and the pose is as wrong."""
+
+    def doubted(search: Search, fit: PoseFit) -> tuple[SeenCamera | None, CalibrationDoubt | None]:
+        seen, _ = doubt_of_calibration(search, fit)
+        shift = np.array([2.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+        doubt = CalibrationDoubt(200.0, 1.0, 300.0, np.zeros(2), np.zeros(2), True, False, shift)
+        return seen, doubt if search.query.feature_config.kind == "sift" else None
+
+    monkeypatch.setattr("topoloc.localization.answer.doubt_of_calibration", doubted)
+    monkeypatch.setattr(Search, "is_settled", property(lambda search: False))
+    result = Localizer(topomap).localize(PICTURE, CAMERA)
+    assert isinstance(result, NotLocalized)
+    assert "the calibration is doubtful" in result.detail
 
 
 def test_what_the_first_kind_leaves_open_the_second_answers(topomap: TopoMetricMap, changed: Callable[..., list[int]]):

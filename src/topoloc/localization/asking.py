@@ -9,11 +9,11 @@ from itertools import islice
 
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.answer import Verdict, answer, final_answer
-from topoloc.localization.belief import Belief
+from topoloc.localization.belief import Belief, Hypothesis
 from topoloc.localization.evidence import Evidence
 from topoloc.localization.propose import least_inliers, propose, propose_briefly, propose_more
 from topoloc.localization.refine import best_case, hypothesis_of, say_on
-from topoloc.localization.result import Localization
+from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Proposal, Search
 
 _LEAST_SECOND = 1.4  # log odds of a pose that only the features asked first found: twins of the true place come to 1.2
@@ -71,7 +71,7 @@ class Asking:
             _follow_up(search, propose(search, self.prior) if number else self._first_proposals)
             is_last = search.is_stopped or search.is_settled or search.is_last
             verdict = final_answer(search) if is_last else answer(search)
-            if search.is_stopped or (is_last and isinstance(verdict[0], Localization)):
+            if search.is_stopped or (is_last and isinstance(verdict[0], Localization)) or _is_of_another_camera(verdict[0]):
                 return verdict
             is_open = number == 0 and self.prior is not None and not is_last
             if is_open and verdict[1] and (seconded := self._seconded())[1]:
@@ -84,16 +84,29 @@ class Asking:
         return verdict
 
     def _seconded(self) -> Verdict:
-        """What the first kind of features believes; the last one is heard on it."""
+        """What the first kind of features believes; the last one is heard on it. The pose is that of the one for which more speaks: in
+        other light the first one's points are found by chance, and hold the pose where it is."""
         first, last = self.searches[0], self.searches[-1]
-        weights = first.weights.rivals
-        believed = [one for one in first.belief.hypotheses if one.probability >= first.config.evidence.min_probability]
-        seconded = Belief()
-        for one in believed:
-            log_odds = one.log_odds if one.is_from_walls else one.log_odds + say_on(last, one)
-            if one.is_from_walls or log_odds >= _LEAST_SECOND:
-                seconded = seconded.given(replace(one, log_odds=log_odds), first.config.evidence, weights)
-        return final_answer(replace(first, belief=seconded))
+        evidence, weights = first.config.evidence, first.weights.rivals
+        seconded, by_last = Belief(), dict[int, Hypothesis]()
+        for one in (one for one in first.belief.hypotheses if one.probability >= evidence.min_probability):
+            said, of_last = (0.0, None) if one.is_from_walls else say_on(last, one)
+            heard = replace(one, log_odds=one.log_odds + said)
+            if one.is_from_walls or heard.log_odds >= _LEAST_SECOND:
+                seconded = seconded.given(heard, evidence, weights)
+            if of_last is not None and of_last.log_odds > one.log_odds:
+                by_last[id(heard)] = replace(of_last, log_odds=heard.log_odds)
+        verdict = final_answer(replace(first, belief=seconded))
+        best = seconded.best(weights)
+        if not isinstance(verdict[0], Localization) or best is None or id(best) not in by_last:
+            return verdict
+        return final_answer(replace(last, belief=Belief().given(by_last[id(best)], evidence, last.weights.rivals)))
+
+
+def _is_of_another_camera(result: Localization | NotLocalized) -> bool:
+    """Was the pose refused because the picture contradicts its calibration? What other features say of the place, less precisely, is as
+    wrong: the calibration is the same."""
+    return isinstance(result, NotLocalized) and result.seen_camera is not None
 
 
 def _follow_up(search: Search, proposals: Iterable[Proposal]) -> None:

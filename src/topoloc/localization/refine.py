@@ -118,15 +118,16 @@ def best_case(search: Search, proposal: Proposal) -> Evidence | None:
         return _at_best(replace(counted, num_by_chance=_by_chance(search, final)), final)
 
 
-def say_on(search: Search, hypothesis: Hypothesis) -> float:
-    """What these features say on a pose of others, in logarithms of odds: little where few of them match anything, as in the dark."""
+def say_on(search: Search, hypothesis: Hypothesis) -> tuple[float, Hypothesis | None]:
+    """What these features say on a pose of others, in logarithms of odds: little where few of them match anything, as in the dark. And the
+    pose that they make of it, None where it is none."""
     final = _around(search, hypothesis.fit)
     if final.num_inliers < search.config.evidence.min_found:
-        return 0.0
+        return 0.0, None
     weighed = weigh(search, Proposal("other features", final, is_guided=True), final)
     num_matches = len(_unguided(search, final).matches) if weighed is None else weighed.evidence.num_matches
     log_odds = -_MOST_SAID if weighed is None else weighed.log_odds  # None: it is hopeless
-    return float(np.clip(log_odds, -_MOST_SAID, _MOST_SAID)) * num_matches / (num_matches + _FEW_MATCHES)
+    return float(np.clip(log_odds, -_MOST_SAID, _MOST_SAID)) * num_matches / (num_matches + _FEW_MATCHES), weighed
 
 
 def _evidence(search: Search, proposal: Proposal, final: PoseFit, covariance: Float[np.ndarray, "6 6"]) -> Evidence | None:
