@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from topoloc.geometry.camera import Camera
+from topoloc.localization import calibration_doubt
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.result import Localization
+from topoloc.localization.pose_fit import PoseFit
+from topoloc.localization.result import Localization, NotLocalized
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.open import open_sequence
 
@@ -46,3 +48,29 @@ def test_a_wrong_focal_length_is_named(localizer: Localizer, queries: Path, scal
             way = np.linalg.norm(result.world_from_cam.translation - frame.world_from_cam.translation)
             assert way < 3.0 * np.sqrt(np.trace(result.camera_covariance[:3, :3]))
     assert num_named >= 0.8 * len(open_sequence(queries))
+
+
+def test_another_camera_is_named_only_where_it_explains_the_picture_better(
+    localizer: Localizer, queries: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """What a map is off by may ask for a camera that shows the points no nearer to where they must be."""
+    gains = list[float]()
+
+    def gain(before: PoseFit, after: PoseFit) -> float:
+        assert num_nearer(before, before) == 0.0
+        assert num_nearer(after, before) < 0.0
+        gains.append(num_nearer(before, after))
+        return gains[-1]
+
+    num_nearer = calibration_doubt._gain
+    monkeypatch.setattr(calibration_doubt, "_gain", gain)
+    frame = open_sequence(queries)[0]
+    assert frame.camera is not None
+    doubted = localizer.localize(frame.image, with_focal(frame.camera, 1.08))
+    assert gains[-1] > 2.0 * calibration_doubt._LEAST_GAIN
+    monkeypatch.setattr(calibration_doubt, "_gain", lambda before, after: 0.0)
+    believed = localizer.localize(frame.image, with_focal(frame.camera, 1.08))
+    assert "the picture says f" in (doubted.detail if isinstance(doubted, NotLocalized) else str(doubted.calibration_doubt))
+    assert isinstance(believed, Localization)
+    assert believed.calibration_doubt is None
+    assert believed.seen_camera is not None, "what it shows still counts beside what others do"

@@ -2,7 +2,8 @@
 
 A wrong focal length or principal point gives a pose that is wrong, and as sure as any. What is left of the points' errors shows it
 (`geometry/calibration_check.py`); where it does, the points are sought once more around the pose and the camera that it leads to, until
-nothing changes, so that the camera named is the picture's own and not half way there.
+nothing changes, so that the camera named is the picture's own and not half way there. It must explain the picture better than the
+calibration does: where the map itself is off, as at a bend that was seen from one lane alone, another camera fits no worse, and no better.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from topoloc.localization.search import Search
 
 _SUSPECT, _NAMED = (3.0, 0.01), (5.0, 0.035)  # sigmas, and share of the focal length or of the picture's width
 _ROUNDS, _SETTLED = 4, 0.003
+_NEAR_PX, _LEAST_GAIN = (1.0, 2.0), 3.0  # of a picture of 640 pixels; standard deviations by which points so near become more, in all
 
 
 def verdicts_of(results: Iterable[Localization | NotLocalized]) -> list[CalibrationVerdict]:
@@ -54,11 +56,11 @@ def doubt_of_calibration(search: Search, fit: PoseFit) -> tuple[SeenCamera | Non
         return None, None
     if not any(_contradicts(fit, found, fit.camera, *_SUSPECT)):
         return seen_beside(fit.camera, fit.camera, found, fit.node_id), None
-    calibrated, first, place = fit.camera, fit.pose.cam_from_world, fit.node_id
+    by_calibration, calibrated, first, place = fit, fit.camera, fit.pose.cam_from_world, fit.node_id
     fit, found = _settled(search, fit, found)
     seen = seen_beside(calibrated, fit.camera, found, place)
     is_of_focal_length, is_of_centre = _contradicts(fit, found, calibrated, *_NAMED)
-    if not (is_of_focal_length or is_of_centre):
+    if not (is_of_focal_length or is_of_centre) or _gain(by_calibration, fit) < _LEAST_GAIN:
         return seen, None
     camera, scale = camera_of_picture(fit.camera, found), search.query.scale
     sigma = math.sqrt(inflation(fit.num_inliers, search.rho) * found.covariance[0, 0])
@@ -85,6 +87,20 @@ def _settled(search: Search, fit: PoseFit, found: PictureCalibration) -> tuple[P
         if max(abs(math.log(found.scale)), float(np.abs(found.offset).max())) < _SETTLED:
             break
     return fit, found
+
+
+def _gain(before: PoseFit, after: PoseFit) -> float:
+    """By how many more points lie where they must be seen, in standard deviations of their numbers, summed over how near that is."""
+    counts = [(_num_within(before, px), _num_within(after, px)) for px in _NEAR_PX]
+    return sum((then - now) / math.sqrt(max(now, 1)) for now, then in counts)
+
+
+def _num_within(fit: PoseFit, px: float) -> int:
+    """How many of the fit's points are seen within so many pixels, in a picture whose longer side is 640, of where they must be."""
+    assert fit.pose is not None
+    seen = fit.seen_points(1.0)
+    offsets = fit.camera.img_from_cam(fit.pose.cam_from_world.apply(seen.points_world)) - seen.points_img
+    return int(np.count_nonzero(np.linalg.norm(offsets, axis=1) < px * max(fit.camera.width, fit.camera.height) / 640.0))
 
 
 def _measured(search: Search, fit: PoseFit) -> PictureCalibration | None:
