@@ -7,10 +7,12 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import pytest
 
 from topoloc.atlas.atlas import Atlas, tile_problem
+from topoloc.atlas.editing import create_atlas, new_tiles
 from topoloc.atlas.manifest import Manifest
 from topoloc.cli import main
 from topoloc.lifelong.tile_update import edited_tile
@@ -121,3 +123,15 @@ def test_what_cannot_be_meant_is_said(
 def _note(path: Path) -> None:
     with editing(path) as edit:
         edit.commit(edit.topomap, "note")
+
+
+def test_an_edit_in_an_object_store_is_taken_back(room_map: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    pytest.importorskip("fsspec", reason="the extra cluster is not installed")
+    monkeypatch.setenv("TOPOLOC_CACHE", str(tmp_path / "cache"))
+    where = f"memory://{uuid4().hex}/campus"
+    create_atlas(where, new_tiles([str(room_map)]))
+    edited_tile(where, "room", _note)
+    assert Atlas.open(where).tile("room").undo is not None
+    assert main(["undo", where, "--tile", "room"]) == 0
+    atlas = Atlas.open(where)
+    assert atlas.map_path(atlas.tile("room")).read_bytes() == room_map.read_bytes()

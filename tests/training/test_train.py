@@ -13,6 +13,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from topoloc.atlas.atlas import Atlas
+from topoloc.atlas.editing import NewTile, create_atlas
 from topoloc.cli import main
 from topoloc.map.checking import list_coarse
 from topoloc.map.topomap import TopoMetricMap
@@ -107,6 +109,8 @@ class Barred:
         if name == "torch":
             raise ModuleNotFoundError(name, name=name)
 sys.meta_path.insert(0, Barred())
+from topoloc.atlas.atlas import Atlas
+from topoloc.atlas.editing import NewTile, create_atlas
 from topoloc.cli import main
 sys.exit(main(sys.argv[1:]))
 """
@@ -125,3 +129,17 @@ def test_mapping_and_asking_surf_vlad_loads_no_torch(copied_map: Path, queries: 
     command = [sys.executable, "-c", code, "localize", str(copied_map), str(queries)]
     answer = subprocess.run(command, capture_output=True, text=True, env=dict(os.environ), timeout=120, check=False)
     assert answer.stdout.splitlines()[-1] == "False", answer.stderr
+
+
+def test_a_tile_of_an_atlas_learns_alone(
+    copied_map: Path, small: tuple[str, ...], weights_file: Path, tmp_path: Path, complaint: Callable[..., str]
+):
+    campus = str(tmp_path / "campus")
+    create_atlas(campus, [NewTile(name, copied_map, name) for name in ("room", "hall")])
+    words = ("train", campus, "--coarse", "cnn-nn", "--weights", str(weights_file), *small)
+    assert main([*words, "--tile", "hall"]) == 0
+    atlas = Atlas.open(campus)
+    known = {tile.tile_id: sorted(TopoMetricMap.load(atlas.map_path(tile)).coarse_models) for tile in atlas.manifest.tiles}
+    assert known == {"room": ["surf-vlad"], "hall": ["cnn-nn", "surf-vlad"]}
+    assert "--tile says which" in complaint(*words, status=2)
+    assert "--out is of a map" in complaint(*words, "--tile", "hall", "--out", str(tmp_path / "out.topo"), status=2)
