@@ -6,7 +6,7 @@ Recordings as by `topoloc simulate corridor corridor_map --laps 1` and
 `topoloc simulate corridor corridor_reverse --reverse --mono --take 6` (of a map of two laps take the first: `corridor_map@0:269`), with
 exact truth. A query sees something twice where at least 50 map points that were seen from the other side lie in one of its views to the
 sides, as truth has it. Right is within 0.5 m and 5 degrees, far off beyond 0.5 m or 10 degrees. The same queries are asked without side
-nodes (`walls.num_ranked=0`) for comparison.
+nodes (`walls.num_places=0`) for comparison.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def main() -> None:
         f"{len(topomap.nodes)} nodes, {len(topomap.sides.nodes)} side nodes; {len(frames)} queries, {len(seen_twice)} see something twice"
     )
     figures = {"with side nodes": asked(Localizer(topomap), frames)}
-    without = LocalizerConfig(walls=WallsConfig(num_ranked=0))
+    without = LocalizerConfig(walls=WallsConfig(num_places=0))
     figures["without"] = asked(Localizer(topomap, without), frames)
     for name, f in figures.items():
         print(

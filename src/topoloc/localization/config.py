@@ -58,12 +58,14 @@ class ViewpointsConfig:
 class WallsConfig:
     """How the walls along the way are asked."""
 
-    num_ranked: Annotated[int, Between(0, 10_000)] = 8
-    """Side nodes that are compared with each view; 0 asks none. More of them add more wrong poses than right ones."""
+    num_places: Annotated[int, Between(0, 10_000)] = 8
+    """Places along the way that are compared with both views; 0 asks none."""
+    apart: Annotated[float, Above(0)] = 2.0
+    """They are so many D_thresh apart."""
     min_agreeing: Annotated[int, AtLeast(3)] = 8
-    """Matches of a view with a side node that must agree on one pose, for it to be recognised: from elsewhere there are 5 to 7."""
+    """Matches of both views with the walls of a place that must agree on one pose, for it to be recognised."""
     num_hypotheses: Annotated[int, Between(1, 1000)] = 6
-    """First poses of each view that are looked into."""
+    """First poses that are looked into."""
     num_nodes: Annotated[int, Between(1, 1000)] = 4
     """Side nodes whose points are sought in each view around a pose."""
     min_distance: Annotated[float, AtLeast(0)] = 5.0

@@ -5,7 +5,7 @@ matched with those of the nodes; PnP on the matches gives the camera's global po
 loop of hypotheses (`asking.py`): first poses are proposed (`propose.py`), the cheapest and likeliest first; each is refined in the same
 way, its evidence counted (`refine.py`), and it joins what is believed (`belief.py`), until that is settled. A pose is reported only where
 the evidence for it is strong and nothing else in the map explains the image as well. One candidate, no guided step, no look-alikes,
-viewpoints and walls (`num_candidates=1`, `guided.num_nodes=0`, `look_alikes.max_groups=0`, `viewpoints.num_nodes=0`, `walls.num_ranked=0`)
+viewpoints and walls (`num_candidates=1`, `guided.num_nodes=0`, `look_alikes.max_groups=0`, `viewpoints.num_nodes=0`, `walls.num_places=0`)
 give the paper's own behaviour.
 """
 

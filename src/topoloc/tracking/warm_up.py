@@ -15,7 +15,6 @@ from jaxtyping import Float32, UInt8
 
 from topoloc.compiled import is_kept
 from topoloc.features.extraction import FeatureConfig, extract_features
-from topoloc.features.features import Matches
 from topoloc.features.matching import MatchingConfig, match_features
 from topoloc.features.surf_detector_kernels import integral_image
 from topoloc.geometry.camera import Camera
@@ -65,8 +64,8 @@ def warm_up(progress: Progress | None = None) -> None:
 
         def look_to_the_sides() -> None:
             node = TopoMetricMap.load(map_file).nodes[0]
-            rows = np.arange(len(node.features), dtype=np.int32)
-            agreeing_pose(node.features, node.camera, node, Matches(rows, rows, np.zeros(len(rows), np.float32)))
+            points = node.points_cam.astype(np.float64)
+            agreeing_pose(points[:, :2] / points[:, 2:], points)
 
         def follow() -> None:
             tracker = Tracker(Localizer(TopoMetricMap.load(map_file)))

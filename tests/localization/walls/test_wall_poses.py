@@ -7,30 +7,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from topoloc.features.features import Features, Matches
-from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.walls.wall_poses import agreeing_pose
-from topoloc.map.topomap import NodeSummary, TopoNode
 
-NODE_CAMERA = Camera.pinhole(480, 430, 240.0, 240.0, -240.0, 216.0)
-QUERY_CAMERA = Camera.pinhole(600, 500, 310.0, 310.0, 900.0, 250.0)
-WORLD_FROM_NODE = Rigid3(exp_so3(np.array([0.2, -1.1, 0.4])), np.array([3.0, -7.0, 1.5]))
 NUM_POINTS, NODE_DEPTH = 60, 1.4
 
 
 @dataclass(frozen=True, eq=False)
 class Wall:
-    """What a side node keeps of a wall, what a side view sees of it, and the matches between the two; row k is the same point."""
+    """A wall before an upright camera, and where another one sees its points; row k of both is a match, right where `is_right`."""
 
-    node: TopoNode
-    features: Features
-    matches: Matches
-
-
-def _features(points_img: np.ndarray) -> Features:
-    one, zero = np.ones(len(points_img), np.float32), np.zeros(len(points_img), np.float32)
-    return Features(points_img.astype(np.float32), one, zero, one, np.ones((len(one), 1), np.float32))
+    points: np.ndarray
+    seen: np.ndarray
+    is_right: np.ndarray
 
 
 def _wall(side_from_node: Rigid3, share_wrong: float = 0.0, seed: int = 0, thickness: float = 0.0) -> Wall:
@@ -40,28 +29,19 @@ def _wall(side_from_node: Rigid3, share_wrong: float = 0.0, seed: int = 0, thick
     across, up = rng.uniform(-1.25, 1.25, NUM_POINTS), rng.uniform(-1.0, 1.0, NUM_POINTS)
     points_node = np.column_stack([across + 2.75, up, NODE_DEPTH - rng.uniform(0.0, thickness, NUM_POINTS)])
     wrong = rng.random(NUM_POINTS) < share_wrong
-    train_idx = np.arange(NUM_POINTS)
-    train_idx[wrong] = rng.integers(0, NUM_POINTS, np.count_nonzero(wrong))
-    node = TopoNode(
-        NodeSummary(0, "walk", "a", 0, WORLD_FROM_NODE, NUM_POINTS),
-        NODE_CAMERA,
-        _features(NODE_CAMERA.img_from_cam(points_node)),
-        points_node.astype(np.float32),
-        np.zeros((NUM_POINTS, 6), np.float32),
-        b"",
-    )
-    seen = _features(QUERY_CAMERA.img_from_cam(side_from_node.apply(points_node)))
-    rows = np.arange(NUM_POINTS, dtype=np.int32)
-    return Wall(node, seen, Matches(rows, train_idx.astype(np.int32), np.zeros(NUM_POINTS, np.float32)))
+    rows = np.arange(NUM_POINTS)
+    rows[wrong] = rng.integers(0, NUM_POINTS, np.count_nonzero(wrong))
+    seen = side_from_node.apply(points_node)
+    return Wall(points_node[rows], seen[:, :2] / seen[:, 2:], rows == np.arange(NUM_POINTS))
 
 
 def _asked(wall: Wall) -> tuple[int, Rigid3] | None:
-    return agreeing_pose(wall.features, QUERY_CAMERA, wall.node, wall.matches)
+    return agreeing_pose(wall.seen, wall.points)
 
 
 def _side_from_node(found: tuple[int, Rigid3] | None) -> Rigid3:
     assert found is not None
-    return found[1] @ WORLD_FROM_NODE
+    return found[1]
 
 
 def _upright(turn: float, along: float, up: float, nearer: float) -> Rigid3:
@@ -77,9 +57,9 @@ def test_the_pose_is_found_among_wrong_matches():
         turn, along, up, nearer, share_wrong = rng.uniform([-0.35, -7.0, -0.5, -1.5, 0.0], [0.35, 1.0, 0.5, 0.5, 0.6])
         truth = _upright(turn, along, up, nearer)
         wall = _wall(truth, share_wrong, seed=len(near))
-        if not (truth.apply(wall.node.points_cam.astype(np.float64))[:, 2] > 0.3).all():
+        if not (truth.apply(wall.points)[:, 2] > 0.3).all():
             continue
-        num_right = np.count_nonzero(wall.matches.train_idx == wall.matches.query_idx)
+        num_right = np.count_nonzero(wall.is_right)
         found = _asked(wall)
         assert found is not None
         assert num_right - 1 <= found[0] < num_right + 0.25 * NUM_POINTS  # of many pairs not the very best may be drawn
@@ -110,9 +90,8 @@ def test_a_camera_that_is_not_quite_level_is_found_all_the_same(not_level: tuple
 
 def test_a_wall_and_its_mirror_image_have_no_pose_in_common():
     wall = _wall(_upright(0.0, -4.0, 0.0, 0.2))
-    points_img = wall.features.points_img.copy()
-    points_img[:, 0] = 2.0 * points_img[:, 0].mean() - points_img[:, 0]
-    right, mirrored = _asked(wall), _asked(replace(wall, features=replace(wall.features, points_img=points_img)))
+    turned = wall.seen * np.array([-1.0, 1.0]) + np.array([2.0 * wall.seen[:, 0].mean(), 0.0])
+    right, mirrored = _asked(wall), _asked(replace(wall, seen=turned))
     assert right is not None
     assert right[0] == NUM_POINTS
     assert mirrored is None or mirrored[0] < 0.3 * NUM_POINTS
@@ -126,20 +105,16 @@ def test_chance_agrees_little():
 @pytest.mark.parametrize("num_matches", [0, 1, 2])
 def test_too_few_matches_give_none(num_matches: int):
     wall = _wall(_upright(0.1, -4.0, 0.0, 0.2))
-    rows = np.arange(num_matches, dtype=np.int32)
-    assert _asked(replace(wall, matches=Matches(rows, rows, np.zeros(num_matches, np.float32)))) is None
+    assert agreeing_pose(wall.seen[:num_matches], wall.points[:num_matches]) is None
 
 
 def test_three_that_agree_are_enough_and_three_that_do_not_are_none():
-    wall = _wall(_upright(0.1, -4.0, 0.0, 0.2))
-    rows, distances = np.array([3, 20, 41], np.int32), np.zeros(3, np.float32)
-    found = _asked(replace(wall, matches=Matches(rows, rows, distances)))
+    wall, rows = _wall(_upright(0.1, -4.0, 0.0, 0.2)), [3, 20, 41]
+    found = agreeing_pose(wall.seen[rows], wall.points[rows])
     assert found is not None
     assert found[0] == 3
-    points_img = wall.features.points_img.copy()
-    points_img[rows[1:], 1] += np.array([250.0, -250.0], np.float32)
-    moved = replace(wall, features=replace(wall.features, points_img=points_img), matches=Matches(rows, rows, distances))
-    assert _asked(moved) is None
+    moved = wall.seen[rows] + np.array([[0.0, 0.0], [0.0, 0.8], [0.0, -0.8]])
+    assert agreeing_pose(moved, wall.points[rows]) is None
 
 
 @pytest.mark.parametrize("turn", [0.9, -0.9])
@@ -149,6 +124,5 @@ def test_cameras_turned_by_too_much_are_not_considered(turn: float):
 
 
 def test_matches_of_one_point_alone_give_none():
-    wall = _wall(_upright(0.0, -4.0, 0.0, 0.2))
-    same = np.full(10, 5, np.int32)
-    assert _asked(replace(wall, matches=Matches(same, same, np.zeros(10, np.float32)))) is None
+    wall, same = _wall(_upright(0.0, -4.0, 0.0, 0.2)), [5] * 10
+    assert agreeing_pose(wall.seen[same], wall.points[same]) is None

@@ -47,7 +47,7 @@ PLACES = (
         {"corridor_night": 1, "corridor_evening": 1, "corridor_day": 6},
         {"demo/night": 3, "street_rain": 8, _KITCHEN: 12, _ZED: 10, _STREET_1: 8},
     ),
-    AskedPlace("corridor_map@0:268:2", {"corridor_reverse": 1}, asks_walls=True),  # one lap, in one direction
+    AskedPlace("corridor_map@0:268:2", {"corridor_reverse": 1}, {_KITCHEN: 12, _ZED: 10, "demo/night": 3}, asks_walls=True),  # one lap
     AskedPlace(
         "demo/map_lap1",
         {"demo/day": 1, "demo/night": 1},

@@ -1,8 +1,8 @@
 """First poses from the walls along the way: the last resort, for who comes back along a way that was mapped in one direction only.
 
-The image's views to the left and to the right (`features/side_views.py`) are compared with the map's side nodes that look most like
-them; what their matches suggest (`wall_poses.py`) is followed up in both views together (`wall_matching.py`). Walls repeat
-themselves, doors above all: so it also counts how many of the key points found look more like the
+The image's views to the left and to the right (`features/side_views.py`) are compared with the side nodes that must show the same from
+the places that both look like (`wall_places.py`); what the matches of both agree on (`wall_poses.py`) is followed up in both together
+(`wall_matching.py`). Walls repeat themselves, doors above all: so it also counts how many of the key points found look more like the
 map's point here than like any that the side nodes show elsewhere. Where the map has nodes
 that look the same way, they would have been recognised, so poses there are not considered.
 """
@@ -12,10 +12,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float32, UInt8
 
 from topoloc.features.extraction import extract_normalized, normalize_image
 from topoloc.features.features import Features
@@ -34,15 +34,15 @@ from topoloc.localization.pose_fit import PoseFit
 from topoloc.localization.query import Query
 from topoloc.localization.search import Proposal, Search
 from topoloc.localization.walls.wall_index import WallIndex
-from topoloc.localization.walls.wall_matching import SeenSide, SideMatches, count_sides, estimate_pose, match_sides, nearest_sides
+from topoloc.localization.walls.wall_matching import SeenSide, SideMatches, count_sides, estimate_pose, match_sides, nearest_sides, together
+from topoloc.localization.walls.wall_places import name_places
 from topoloc.localization.walls.wall_poses import agreeing_pose
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class WallProposal(Proposal):
-    """A first pose from view `view` and a side node, on which `num_agreeing` of their matches agree."""
+    """A first pose on which `num_agreeing` of the matches of both views with the walls of one place agree."""
 
-    view: int
     num_agreeing: int
     cam_from_world: Rigid3
     walls: SeenWalls
@@ -50,27 +50,37 @@ class WallProposal(Proposal):
 
 @dataclass(frozen=True, eq=False)
 class SeenWalls:
-    """Both sides of a query image, and the rows of the side nodes that look most like each."""
+    """Both sides of a query image, and the places that both look like (world_from_cam), the likeliest first."""
 
     search: Search
     index: WallIndex
     seen: list[SeenSide]
-    ranked: list[list[int]]
+    places: list[Rigid3]
 
     @staticmethod
     def of(search: Search, index: WallIndex) -> SeenWalls:
-        query, seen, ranked = search.query, [], []
+        query, seen, likeness = search.query, list[SeenSide](), list[Float32[np.ndarray, " sides"]]()
         assert isinstance(query.lens, Camera)
         for view in side_views(query.lens, index.view_config):
             picture = view.picture(query.grey)
             features = query.shared.once(query, (view.name, index.view_config), partial(_features_of, query, view, picture))
             seen.append(SeenSide(view, features, view.in_picture(features, query.lens)))
-            ranked.append([node.node_id for node in index.coarse.rank(picture, features, search.config.walls.num_ranked)])
-        return SeenWalls(search, index, seen, ranked)
+            likeness.append(index.likeness(picture, features))
+        apart = search.config.walls.apart * search.map.d_thresh
+        return SeenWalls(search, index, seen, name_places(index, seen, likeness).likeliest(search.config.walls.num_places, apart))
 
     @property
     def camera(self) -> Camera:
         return self.search.query.camera
+
+    def rows_around(self, side: SeenSide, cam_from_world: Rigid3) -> list[int]:
+        """The side nodes that show what a side must show from a pose."""
+        return nearest_sides(side.view, cam_from_world, self.index.centres, self.index.axes, self.search.config.walls.num_nodes)
+
+    @cached_property
+    def rows_of_places(self) -> list[int]:
+        """The side nodes that show what must be seen from any of the places."""
+        return sorted({row for place in self.places for side in self.seen for row in self.rows_around(side, place.inverse())})
 
 
 def _features_of(query: Query, view: SideView, picture: UInt8[np.ndarray, "a b"]) -> Features:
@@ -85,22 +95,16 @@ def propose_walls(search: Search) -> Iterator[Proposal]:
     if (
         is_settled
         or search.is_repeated
-        or config.num_ranked == 0
+        or config.num_places == 0
         or isinstance(search.query.lens, RoughCamera)
         or (index := search.map.walls) is None
     ):
         return
     with search.query.clock.stage("walls"):
         walls = SeenWalls.of(search, index)
-        found = _compared_with_ranked(walls)
-        chosen = [proposal for view in range(len(walls.seen)) for proposal in _best([one for one in found if one.view == view])]
+        found = [proposal for place in walls.places if (proposal := _compared(walls, place)) is not None]
+        chosen = _best(found)
     yield from chosen
-
-
-def _compared_with_ranked(walls: SeenWalls) -> list[WallProposal]:
-    """What each view has in common with the side nodes that look most like it."""
-    pairs = [(view, row) for view, rows in enumerate(walls.ranked) for row in rows]
-    return [proposal for view, row in pairs if (proposal := _compared(walls, view, row)) is not None]
 
 
 def _best(found: list[WallProposal]) -> list[WallProposal]:
@@ -115,19 +119,20 @@ def _best(found: list[WallProposal]) -> list[WallProposal]:
     return kept
 
 
-def _compared(walls: SeenWalls, view: int, row: int) -> WallProposal | None:
-    """A view compared with one side node."""
-    config, side = walls.search.config.walls, walls.seen[view]
-    node, local_map = walls.index.local_map(row)
-    points = (local_map.descriptors, local_map.points_world, local_map.radii)
-    matches = match_pooled(side.features.descriptors, *points, config.matching)
-    agreeing = agreeing_pose(side.features, side.view.camera, node, matches)
+def _compared(walls: SeenWalls, place: Rigid3) -> WallProposal | None:
+    """Both views compared with what they must show from a place."""
+    config, cam_from_place = walls.search.config.walls, place.inverse()
+    sides = _sides_around(walls, cam_from_place)
+    matches = [match_pooled(side.features.descriptors, m.descriptors, m.points_world, m.radii, config.matching) for side, m in sides]
+    found = together(sides, matches)
+    if found is None:
+        return None
+    seen = walls.camera.normalized_from_img(found.features.points_img[found.matches.query_idx].astype(np.float64))
+    agreeing = agreeing_pose(seen, cam_from_place.apply(found.local_map.points_world[found.matches.train_idx]))
     if agreeing is None or agreeing[0] < config.min_agreeing:
         return None
-    num_agreeing, side_from_world = agreeing
-    fit = PoseFit(side.in_picture, walls.camera, walls.camera, local_map, matches, None)
-    cam_from_world = side.view.cam_from_side @ side_from_world
-    return WallProposal("walls", fit, is_guided=True, view=view, num_agreeing=num_agreeing, cam_from_world=cam_from_world, walls=walls)
+    fit = PoseFit(found.features, walls.camera, walls.camera, found.local_map, found.matches, None)
+    return WallProposal("walls", fit, is_guided=True, num_agreeing=agreeing[0], cam_from_world=agreeing[1] @ cam_from_place, walls=walls)
 
 
 def refine_wall(proposal: WallProposal) -> PoseFit | None:
@@ -189,9 +194,8 @@ def _sides_around(walls: SeenWalls, cam_from_world: Rigid3) -> list[tuple[SeenSi
 
 
 def _around(walls: SeenWalls, side: SeenSide, cam_from_world: Rigid3) -> LocalMap | None:
-    index, num_nodes = walls.index, walls.search.config.walls.num_nodes
-    rows = nearest_sides(side.view, cam_from_world, index.centres, index.axes, num_nodes)
-    return LocalMap.pooled([index.local_map(row)[1] for row in rows]) if rows and len(side.features) else None
+    rows = walls.rows_around(side, cam_from_world)
+    return LocalMap.pooled([walls.index.local_map(row) for row in rows]) if rows and len(side.features) else None
 
 
 def _estimate(walls: SeenWalls, found: SideMatches, near: Rigid3, max_error_px: float) -> AbsolutePose | None:
@@ -205,15 +209,14 @@ def _estimate(walls: SeenWalls, found: SideMatches, near: Rigid3, max_error_px: 
 
 
 def _num_distinct(walls: SeenWalls, final: PoseFit) -> int:
-    """How many inliers look more like the map's point here than like any point that the ranked side nodes show elsewhere."""
+    """How many inliers look more like the map's point here than like any point that the side nodes of the other places show elsewhere."""
     assert final.pose is not None
     rows, columns = (index[final.pose.inliers] for index in (final.matches.query_idx, final.matches.train_idx))
     descriptors, points_world = final.features.descriptors[rows], final.local_map.points_world[columns]
     here = np.sum(descriptors * final.local_map.descriptors[columns], axis=1)
     away = 1.5 * walls.search.config.walls.min_distance * walls.search.map.d_thresh
     centre = points_world.mean(axis=0)
-    for row in sorted({row for of_view in walls.ranked for row in of_view}):
-        _, other = walls.index.local_map(row)
+    for other in map(walls.index.local_map, walls.rows_of_places):
         is_far = np.linalg.norm(other.points_world - centre, axis=1) > away
         if is_far.any():
             here = np.where((descriptors @ other.descriptors[is_far].T).max(axis=1) >= here, np.inf, here)

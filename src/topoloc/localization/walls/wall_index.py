@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from topoloc.errors import MapError
+from topoloc.features.features import Features
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.walls.wall_matching import of_picture
 from topoloc.map.memory import RememberedNodes
-from topoloc.map.topomap import SideNodes, TopoMetricMap, TopoNode, in_rows
+from topoloc.map.topomap import SideNodes, TopoMetricMap, in_rows
+from topoloc.places.coarse import Image
 from topoloc.places.vlad import SurfVlad
 
 
@@ -22,15 +24,27 @@ class WallIndex:
 
     def __init__(self, topomap: TopoMetricMap, sides: SideNodes) -> None:
         self.coarse, self.centres = _ranking_of(sides)
-        self.axes = np.array([summary.world_from_cam.rotation[:, 2] for summary in sides.summaries])
+        self.world_from_sides = [summary.world_from_cam for summary in sides.summaries]
+        self.axes = np.array([pose.rotation[:, 2] for pose in self.world_from_sides])
+        self.middles = np.array(
+            [pose.inverse().apply(centre[None])[0] for pose, centre in zip(self.world_from_sides, self.centres, strict=True)]
+        )
+        """The centres in the side nodes' own frames."""
         self.view_config = topomap.config.sides.views
         self.local_map = RememberedNodes(lambda row: _read(sides, row))
 
+    def likeness(self, picture: Image, features: Features) -> Float32[np.ndarray, " sides"]:
+        """How much each side node looks like a view; 0 where it is not among those compared."""
+        scores = np.zeros(len(self.world_from_sides), np.float32)
+        for node in self.coarse.rank(picture, features, len(scores)):
+            scores[node.node_id] = node.score
+        return scores
 
-def _read(sides: SideNodes, row: int) -> tuple[TopoNode, LocalMap]:
+
+def _read(sides: SideNodes, row: int) -> LocalMap:
     node = sides.nodes[row]
     assert node.summary.of_node is not None, "a side node is one of a node"
-    return node, of_picture(LocalMap.of_node(node), node.summary.of_node)
+    return of_picture(LocalMap.of_node(node), node.summary.of_node)
 
 
 def _ranking_of(sides: SideNodes) -> tuple[SurfVlad, Float[np.ndarray, "nodes 3"]]:

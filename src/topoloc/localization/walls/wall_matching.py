@@ -54,23 +54,23 @@ class SideCounts:
 
 def match_sides(sides: list[tuple[SeenSide, LocalMap]], cam_from_world: Rigid3, config: GuidedConfig) -> SideMatches | None:
     """Both sides' guided matches, each with the points that it is given. None without any."""
-    query_idx, train_idx, distances, num_features, num_points = [], [], [], 0, 0
-    for side, local_map in sides:
-        matches = match_guided(side.features, local_map, side.view.from_world(cam_from_world), side.view.camera, config)
-        query_idx.append(matches.query_idx + num_features)
-        train_idx.append(matches.train_idx + num_points)
-        distances.append(matches.distances)
-        num_features, num_points = num_features + len(side.features), num_points + len(local_map.radii)
-    if sum(map(len, query_idx)) == 0:
+    guided = [match_guided(side.features, m, side.view.from_world(cam_from_world), side.view.camera, config) for side, m in sides]
+    return together(sides, guided)
+
+
+def together(sides: list[tuple[SeenSide, LocalMap]], matches: list[Matches]) -> SideMatches | None:
+    """The matches of each side with the points that it is given, as one. None without any."""
+    if sum(map(len, matches)) == 0:
         return None
-    matches = Matches(
-        *(
-            np.concatenate(part).astype(dtype)
-            for part, dtype in zip((query_idx, train_idx, distances), (np.int32, np.int32, np.float32), strict=True)
-        )
+    first_features = np.cumsum([0, *(len(side.features) for side, _ in sides)])
+    first_points = np.cumsum([0, *(len(local_map.radii) for _, local_map in sides)])
+    joined = Matches(
+        np.concatenate([one.query_idx + first for one, first in zip(matches, first_features, strict=False)]).astype(np.int32),
+        np.concatenate([one.train_idx + first for one, first in zip(matches, first_points, strict=False)]).astype(np.int32),
+        np.concatenate([one.distances for one in matches]).astype(np.float32),
     )
     features = Features.concatenate([side.in_picture for side, _ in sides])
-    return SideMatches(features, LocalMap.pooled([local_map for _, local_map in sides]), matches)
+    return SideMatches(features, LocalMap.pooled([local_map for _, local_map in sides]), joined)
 
 
 def count_sides(sides: list[tuple[SeenSide, LocalMap]], cam_from_world: Rigid3, config: GuidedConfig) -> SideCounts:

@@ -1,8 +1,8 @@
-"""First poses from walls seen from the other side: where might a side view have been taken?
+"""First poses from walls seen from the other side: where might a picture have been taken?
 
-A side view and a side node show the same wall. PnP on their matches does not say from where: the points lie in one plane, and a plane has
-a second pose that looks nearly the same from the other slant. But people and robots carry cameras upright: two cameras that saw the same
-wall differ by a turn about the vertical and a shift, which two matches give (Kukelova, Bujnak and Pajdla, 2010: pose of a camera
+PnP on matches with a wall does not say from where it was seen: the points lie in one plane, and a plane has a second pose that looks
+nearly the same from the other slant. But people and robots carry cameras upright: two cameras that saw the same walls differ by a turn
+about the vertical and a shift, which two matches give (Kukelova, Bujnak and Pajdla, 2010: pose of a camera
 with known vertical direction). The pose that most of the matches agree with is the first one; how level the cameras were follows later.
 """
 
@@ -13,11 +13,8 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.features.features import Features, Matches
-from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.walls.wall_kernels import largest_agreement
-from topoloc.map.topomap import TopoNode
 
 _NUM_PAIRS = 1500
 _LARGEST_TURN = math.radians(35.0)
@@ -26,23 +23,24 @@ _NEAREST, _FARTHEST = 0.2, 100.0  # metres of depth that the points of a pair ma
 _TOLERANCE, _TOLERANCE_SHARE = 0.02, 0.015  # in tangents: for a camera that is not quite level, more off the axis
 
 
-def agreeing_pose(features: Features, camera: Camera, node: TopoNode, matches: Matches) -> tuple[int, Rigid3] | None:
-    """How many matches of a side view's features with a side node's agree on one upright pose, and that side_from_world.
+def agreeing_pose(seen: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "n 3"]) -> tuple[int, Rigid3] | None:
+    """How many matches agree on one upright pose, and that cam_from_upright. None with fewer than three matches that agree.
 
-    Poses turned by more than 35 degrees from the side node's are not considered. None with fewer than three matches that agree.
+    Args:
+        seen: where the camera sees each matched point, as tangents (x / z, y / z).
+        points: the same points (metres) in the frame of a camera that is held upright as well and looks about the same way: poses turned
+            by more than 35 degrees from it are not considered.
     """
-    if len(matches) < 3:
+    if len(seen) < 3:
         return None
-    seen = camera.normalized_from_img(features.points_img[matches.query_idx].astype(np.float64))
-    points_node = node.points_cam[matches.train_idx].astype(np.float64)
-    turns, shifts = _poses_of_pairs(seen, points_node)
+    turns, shifts = _poses_of_pairs(seen, points)
     if len(turns) == 0:
         return None
     tolerances = _TOLERANCE + _TOLERANCE_SHARE * np.sum(seen**2, axis=1)
-    best, num_agreeing = largest_agreement(seen, points_node, turns, shifts, tolerances, _NEAREST)
+    best, num_agreeing = largest_agreement(seen, points, turns, shifts, tolerances, _NEAREST)
     if num_agreeing < 3:
         return None
-    return num_agreeing, _upright(float(turns[best]), shifts[best]) @ node.summary.world_from_cam.inverse()
+    return num_agreeing, _upright(float(turns[best]), shifts[best])
 
 
 def _upright(turn: float, shift: Float[np.ndarray, " 3"]) -> Rigid3:
@@ -53,7 +51,7 @@ def _upright(turn: float, shift: Float[np.ndarray, " 3"]) -> Rigid3:
 def _poses_of_pairs(
     seen: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k 3"]]:
-    """Turns about the vertical and shifts (side_from_node) that explain pairs of matches; the pairs are the same at every call.
+    """Turns about the vertical and shifts (cam_from_upright) that explain pairs of matches; the pairs are the same at every call.
 
     With depths d of the two points, (u, v) where they are seen and e = d1 - d2 = z' cos - x' sin for the turn, where ' is a difference:
     v1 d1 - v2 d2 = y' and u1 d1 - u2 d2 = x' cos + z' sin. Without d2 that is a cos + b sin + c = 0.
