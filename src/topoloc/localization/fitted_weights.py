@@ -63,8 +63,8 @@ class RivalWeights:
 class WallWeights:
     """Of the evidence for a pose that the walls let expect (`walls/`), in logarithms of odds.
 
-    sigma_px: standard deviation of a key point found at such a slant; least_shared_errors: rho (`correlated_errors.py`) is at least this,
-    for what is wrong with a wall seen at a slant is wrong with all points on it.
+    sigma_px: standard deviation of a key point found at such a slant. few_points: from n points the covariance is this over n times as
+    large as independent errors would have it: where few are found, guided matching has drawn most of them to the pose itself.
     """
 
     found: float
@@ -77,7 +77,7 @@ class WallWeights:
     even_share: float
     bias: float
     sigma_px: float
-    least_shared_errors: float
+    few_points: float
 
     @property
     def in_order(self) -> tuple[float, ...]:

@@ -6,13 +6,10 @@ import numpy as np
 import pytest
 
 from built_corridor import WIDE, back, built_corridor
-from topoloc.features.extraction import extract_features
-from topoloc.features.kinds import FeatureConfig
-from topoloc.features.side_views import SideViewConfig, side_views
+from topoloc.features.side_views import SideView, SideViewConfig, side_views
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.walls.wall_index import WallIndex
-from topoloc.localization.walls.wall_matching import SeenSide
-from topoloc.localization.walls.wall_places import WallPlaces, name_places
+from topoloc.localization.walls.wall_places import NamedPlaces, likeliest_places
 
 APART = 1.0
 
@@ -25,57 +22,49 @@ def index() -> WallIndex:
 
 
 @pytest.fixture(scope="module")
-def seen() -> list[SeenSide]:
-    """Both sides of a grey picture, left first: what they show does not matter here."""
-    grey = np.zeros((WIDE.height, WIDE.width), np.uint8)
-    views = side_views(WIDE, SideViewConfig())
-    found = [view.within(extract_features(view.picture(grey), FeatureConfig())) for view in views]
-    return [SeenSide(view, features, view.in_picture(features, WIDE)) for view, features in zip(views, found, strict=True)]
+def views() -> list[SideView]:
+    return list(side_views(WIDE, SideViewConfig()))
 
 
-def _all_alike(index: WallIndex) -> list[np.ndarray]:
-    return [np.ones(len(index.axes), np.float32)] * 2
+def _named(index: WallIndex, views: list[SideView]) -> list[NamedPlaces]:
+    return [NamedPlaces.of(view, index, np.ones(len(index.axes), np.float32)) for view in views]
 
 
-def test_each_side_node_names_a_place_that_looks_back_at_its_wall(index: WallIndex, seen: list[SeenSide]):
-    places = name_places(index, seen, _all_alike(index))
-    assert len(places.world_from_cams) == len(index.axes)  # one view each: to the left who comes back sees what was to the right
-    way_back = back(5.0).rotation[:, 2]
-    assert (places.axes @ way_back > 0.9).all()
-    for row, world_from_cam in enumerate(places.world_from_cams):
-        side = seen[places.views[row]]
-        side_from_world = side.view.from_world(world_from_cam.inverse())
-        pixels = side.view.camera.img_from_cam(side_from_world.apply(index.centres))
-        inside = (pixels > 0).all(axis=1) & (pixels[:, 0] < side.view.camera.width) & (pixels[:, 1] < side.view.camera.height)
-        assert inside.any()
+def test_each_side_node_names_a_place_that_looks_back_at_its_wall(index: WallIndex, views: list[SideView]):
+    named = _named(index, views)
+    assert sum(len(of_view.likeness) for of_view in named) == len(index.axes)  # to the left who comes back sees what was to the right
+    for view, of_view in zip(views, named, strict=True):
+        assert (of_view.rotations[:, :, 2] @ back(5.0).rotation[:, 2] > 0.9).all()
+        for rotation, centre in zip(of_view.rotations, of_view.centres, strict=True):
+            side_from_world = view.from_world(Rigid3(rotation, centre).inverse())
+            pixels = view.camera.img_from_cam(side_from_world.apply(index.centres))
+            assert ((pixels > 0).all(axis=1) & (pixels[:, 0] < view.camera.width) & (pixels[:, 1] < view.camera.height)).any()
 
 
-def test_a_place_that_both_views_name_comes_before_one_that_is_more_like_one_of_them(index: WallIndex, seen: list[SeenSide]):
+def test_a_place_that_both_views_name_comes_before_one_that_is_more_like_one_of_them(index: WallIndex, views: list[SideView]):
     """Along the corridor (y): both views a little like one place, one view more like another."""
-    of_view = name_places(index, seen, _all_alike(index))
-    ways = of_view.centres[:, 1]
-    right, twin = float(np.median(ways)), float(ways.max())
+    named = _named(index, views)
+    ways = [of_view.centres[:, 1] for of_view in named]
+    right, twin = float(np.median(ways[0])), float(ways[0].max())
     assert twin - right > APART
-    rows = {view: np.flatnonzero(of_view.views == view) for view in (0, 1)}
-    places = WallPlaces(of_view.centres, of_view.axes, of_view.likeness.copy(), of_view.views, of_view.world_from_cams)
-    places.likeness[:] = 0.0
-    for view in (0, 1):
-        places.likeness[rows[view][np.argmin(abs(ways[rows[view]] - right))]] = 0.5
-    places.likeness[rows[0][np.argmax(ways[rows[0]])]] = 0.8
-    first = places.likeliest(1, APART)[0]
-    assert abs(first.translation[1] - right) < APART
+    for of_view, of_way in zip(named, ways, strict=True):
+        of_view.likeness[:] = 0.0
+        of_view.likeness[np.argmin(abs(of_way - right))] = 0.5
+    named[0].likeness[np.argmax(ways[0])] = 0.8
+    assert abs(likeliest_places(named, 1, APART)[0].translation[1] - right) < APART
+    assert abs(likeliest_places(named[:1], 1, APART)[0].translation[1] - twin) < APART
 
 
-def test_places_are_apart_and_as_many_as_are_asked_for(index: WallIndex, seen: list[SeenSide]):
-    places = name_places(index, seen, _all_alike(index))
-    chosen = places.likeliest(3, APART)
+def test_places_are_apart_and_as_many_as_are_asked_for(index: WallIndex, views: list[SideView]):
+    chosen = likeliest_places(_named(index, views), 3, APART)
     assert 1 < len(chosen) <= 3
     centres = np.array([one.translation for one in chosen])
     for k in range(len(centres)):
         assert (np.linalg.norm(np.delete(centres, k, axis=0) - centres[k], axis=1) >= APART).all()
-    assert places.likeliest(0, APART) == []
+    assert likeliest_places(_named(index, views), 0, APART) == []
 
 
 def test_nothing_named_is_no_place():
-    nothing = WallPlaces(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.float32), np.zeros(0, int), list[Rigid3]())
-    assert nothing.likeliest(8, APART) == []
+    nothing = NamedPlaces(np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0, np.float32))
+    assert likeliest_places([nothing, nothing], 8, APART) == []
+    assert likeliest_places([], 8, APART) == []

@@ -18,6 +18,7 @@ import argparse
 import datetime
 import json
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -41,7 +42,7 @@ from topoloc_paper.fit.evidence import (
 )
 from topoloc_paper.fit.rivals import MIN_HARD_PAIRS, fit_rivals, num_mistaken, pairs_of
 from topoloc_paper.fit.tried_poses import TriedPose, ask_place, load_poses, save_poses
-from topoloc_paper.fit.walls import fit_walls
+from topoloc_paper.fit.walls import fit_walls, told_by_walls
 
 
 def main() -> None:
@@ -129,14 +130,15 @@ def fit_walls_alone(kind: str, poses: list[TriedPose]) -> FittedWeights:
     """The weights in use with those of the walls fitted anew."""
     before = weights_of(kind)
     walls, num = fit_walls(poses, before.walls)
-    told = [pose for pose in decided(poses) if pose.evidence.num_distinct is not None]
+    told = told_by_walls(poses)
     for name, weights in (("in use", before.walls), ("fitted", walls)):
         log_odds = np.array([log_odds_of(pose.evidence, replace(before, walls=weights)) for pose in told])
         part = Judged("walls", log_odds, np.array([pose.is_right for pose in told], dtype=bool))
         clearest = max(log_odds[~part.is_right], default=-99.0)
         print(f"{name}: {weights}\n  {verdict(part)}; log odds of the clearest wrong pose {clearest:.1f}")
     places = ", ".join(dict.fromkeys(pose.queries for pose in told))
-    corpus = before.corpus.replace("walls taken over", f"walls fitted to {num} poses of {places} (--walls)") if num else before.corpus
+    said = f"walls fitted to {num} poses of {places} (--walls)"
+    corpus = re.sub(r"walls (taken over|fitted to [^;.]*)", said, before.corpus) if num else before.corpus
     return replace(before, walls=walls, corpus=corpus, date=datetime.date.today().isoformat())
 
 

@@ -1,7 +1,7 @@
 """The weights of the evidence for a pose that the walls along the way let expect.
 
 As those of the nodes: a logistic regression in which nothing that speaks for a pose may count against it, drawn to the weights in use, for
-there are few such poses. Whether a pose is precise enough is asked apart (`evidence.precision_of`), so a wrong one is one that is far off;
+there are few such poses. Whether a pose is precise enough is asked apart (`evidence.precision_of`), so a wrong one is one of another place;
 the weight of the doubt is given.
 """
 
@@ -19,13 +19,23 @@ from topoloc_paper.fit.tried_poses import TriedPose
 
 MIN_POSES = 20
 """Right ones, and wrong ones; to fewer nothing is fitted."""
+_OTHER_PLACE_M, _OTHER_PLACE_DEG = 1.0, 20.0
 _STRENGTH = 3.0
 """Of the weights in use, in squared distances from them."""
 
 
+def told_by_walls(poses: list[TriedPose]) -> list[TriedPose]:
+    """The poses of walls that are right or of another place: one that is a metre off at its own place is only imprecise."""
+    return [pose for pose in decided(poses) if pose.evidence.num_distinct is not None and (pose.is_right or _is_elsewhere(pose))]
+
+
+def _is_elsewhere(pose: TriedPose) -> bool:
+    return pose.error_m is None or pose.error_deg is None or pose.error_m > _OTHER_PLACE_M or pose.error_deg > _OTHER_PLACE_DEG
+
+
 def fit_walls(poses: list[TriedPose], before: WallWeights) -> tuple[WallWeights, int]:
     """The weights, and the number of poses that they were fitted to; `before` and 0 where these are too few."""
-    told = [pose for pose in decided(poses) if pose.evidence.num_distinct is not None]
+    told = told_by_walls(poses)
     is_right = np.array([pose.is_right for pose in told], dtype=bool)
     if min(np.count_nonzero(is_right), np.count_nonzero(~is_right)) < MIN_POSES:
         return before, 0

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import UInt8
 
 from topoloc.features.extraction import extract_normalized, normalize_image
 from topoloc.features.features import Features
@@ -35,7 +35,7 @@ from topoloc.localization.query import Query
 from topoloc.localization.search import Proposal, Search
 from topoloc.localization.walls.wall_index import WallIndex
 from topoloc.localization.walls.wall_matching import SeenSide, SideMatches, count_sides, estimate_pose, match_sides, nearest_sides, together
-from topoloc.localization.walls.wall_places import name_places
+from topoloc.localization.walls.wall_places import NamedPlaces, likeliest_places
 from topoloc.localization.walls.wall_poses import agreeing_pose
 
 
@@ -59,15 +59,15 @@ class SeenWalls:
 
     @staticmethod
     def of(search: Search, index: WallIndex) -> SeenWalls:
-        query, seen, likeness = search.query, list[SeenSide](), list[Float32[np.ndarray, " sides"]]()
+        query, seen, named = search.query, list[SeenSide](), list[NamedPlaces]()
         assert isinstance(query.lens, Camera)
         for view in side_views(query.lens, index.view_config):
             picture = view.picture(query.grey)
             features = query.shared.once(query, (view.name, index.view_config), partial(_features_of, query, view, picture))
             seen.append(SeenSide(view, features, view.in_picture(features, query.lens)))
-            likeness.append(index.likeness(picture, features))
+            named.append(NamedPlaces.of(view, index, index.likeness(picture, features)))
         apart = search.config.walls.apart * search.map.d_thresh
-        return SeenWalls(search, index, seen, name_places(index, seen, likeness).likeliest(search.config.walls.num_places, apart))
+        return SeenWalls(search, index, seen, likeliest_places(named, search.config.walls.num_places, apart))
 
     @property
     def camera(self) -> Camera:
@@ -158,7 +158,7 @@ def weigh_wall(proposal: WallProposal, final: PoseFit) -> Hypothesis | None:
     if pose is None or final.num_inliers < search.config.walls.min_found:
         return None
     counts = count_sides(_sides_around(walls, pose.cam_from_world), pose.cam_from_world, _guided(walls, search.config.walls.rounds[-1][0]))
-    inflated = inflation(final.num_inliers, max(search.rho, search.weights.walls.least_shared_errors))
+    inflated = inflation(final.num_inliers, search.rho) + search.weights.walls.few_points / final.num_inliers
     covariance = inflated * pose.covariance
     depths = pose.cam_from_world.apply(final.local_map.points_world[final.matches.train_idx[pose.inliers]])[:, 2]
     points_img = final.features.points_img[final.matches.query_idx[pose.inliers]].astype(np.float64)

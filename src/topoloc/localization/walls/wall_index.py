@@ -16,7 +16,10 @@ from topoloc.places.vlad import SurfVlad
 
 
 class WallIndex:
-    """A map's side nodes, opened: what ranks them, what they show, and their points.
+    """A map's side nodes, opened: what ranks them, where they are, and their points.
+
+    Row k: `rotations` and `positions` are the poses (world_from_side, metres), `centres` the middle of what is shown in the world and
+    `middles` the same in the side camera's frame.
 
     Raises:
         MapError: what ranks the side nodes is missing or not of them.
@@ -24,18 +27,20 @@ class WallIndex:
 
     def __init__(self, topomap: TopoMetricMap, sides: SideNodes) -> None:
         self.coarse, self.centres = _ranking_of(sides)
-        self.world_from_sides = [summary.world_from_cam for summary in sides.summaries]
-        self.axes = np.array([pose.rotation[:, 2] for pose in self.world_from_sides])
-        self.middles = np.array(
-            [pose.inverse().apply(centre[None])[0] for pose, centre in zip(self.world_from_sides, self.centres, strict=True)]
-        )
-        """The centres in the side nodes' own frames."""
+        self.rotations = np.array([summary.world_from_cam.rotation for summary in sides.summaries])
+        self.positions = np.array([summary.world_from_cam.translation for summary in sides.summaries])
+        self.middles = np.einsum("nji,nj->ni", self.rotations, self.centres - self.positions)
         self.view_config = topomap.config.sides.views
         self.local_map = RememberedNodes(lambda row: _read(sides, row))
 
+    @property
+    def axes(self) -> Float[np.ndarray, "nodes 3"]:
+        """The ways in which the side nodes look."""
+        return self.rotations[:, :, 2]
+
     def likeness(self, picture: Image, features: Features) -> Float32[np.ndarray, " sides"]:
         """How much each side node looks like a view; 0 where it is not among those compared."""
-        scores = np.zeros(len(self.world_from_sides), np.float32)
+        scores = np.zeros(len(self.positions), np.float32)
         for node in self.coarse.rank(picture, features, len(scores)):
             scores[node.node_id] = node.score
         return scores

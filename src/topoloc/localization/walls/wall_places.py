@@ -10,72 +10,65 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int
 
+from topoloc.features.side_views import SideView
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.walls.wall_index import WallIndex
-from topoloc.localization.walls.wall_matching import SeenSide
+
+_NUM_NAMED = 64  # of the side nodes that a view looks like, those that may name a place first
+_SAME_WAY = 0.5  # cosine of the angle between the ways in which two cameras look that stand in the same place
 
 
 @dataclass(frozen=True, eq=False)
-class WallPlaces:
-    """Row k: a place that one view names by one side node: where the camera would be, and which way it looks (world), and how alike the two
-    are."""
+class NamedPlaces:
+    """The places that one view names, row k by one side node: `rotations` and `centres` are those of the camera (world_from_cam, metres),
+    `likeness` says how alike the two look."""
 
+    rotations: Float[np.ndarray, "n 3 3"]
     centres: Float[np.ndarray, "n 3"]
-    axes: Float[np.ndarray, "n 3"]
     likeness: Float32[np.ndarray, " n"]
-    views: Int[np.ndarray, " n"]
-    world_from_cams: list[Rigid3]
 
-    def likeliest(self, num_places: int, apart: float) -> list[Rigid3]:
-        """The places (world_from_cam) that both views together name first, `apart` (metres) and more from each other.
+    @staticmethod
+    def of(view: SideView, index: WallIndex, likeness: Float32[np.ndarray, " sides"]) -> NamedPlaces:
+        """By all side nodes of the other hand: one of the same hand was seen by who walked the same way.
 
-        Each view counts with the most alike side node that names the place, within that distance and less than 60 degrees turned.
+        Args:
+            likeness: how much each side node looks like the view.
         """
-        left = np.argsort(-self._together(apart), kind="stable")
-        chosen: list[int] = []
-        while len(left) and len(chosen) < num_places:
-            chosen.append(int(left[0]))
-            left = left[~self._beside(left, chosen[-1], apart)]
-        return [self.world_from_cams[k] for k in chosen]
+        ahead = -view.cam_from_side.rotation[0, 2]  # on the left a side camera's x axis points ahead, on the right back
+        along = index.middles[:, 0]
+        rows = np.flatnonzero(ahead * along < 0.0)
+        centres = index.positions[rows] + 2.0 * along[rows, None] * index.rotations[rows, :, 0]
+        return NamedPlaces(index.rotations[rows] @ view.cam_from_side.rotation.T, centres, likeness[rows])
 
-    def _together(self, apart: float) -> Float[np.ndarray, " n"]:
-        """The likeness of each place by both views."""
-        total = np.zeros(len(self.likeness))
-        for view in np.unique(self.views):
-            of_view = np.flatnonzero(self.views == view)
-            for k in range(len(total)):
-                near = of_view[self._beside(of_view, k, apart)]
-                total[k] += self.likeness[near].max() if len(near) else 0.0
-        return total
+    def near(self, other: NamedPlaces, apart: float) -> Bool[np.ndarray, "n m"]:
+        """Is each of these the same place as each of the others, `apart` metres from it at most and less than 60 degrees turned?"""
+        away = np.linalg.norm(self.centres[:, None] - other.centres[None], axis=2)
+        return (away < apart) & (self.rotations[:, :, 2] @ other.rotations[:, :, 2].T > _SAME_WAY)
 
-    def _beside(self, rows: Int[np.ndarray, " m"], k: int, apart: float) -> np.ndarray:
-        near = np.linalg.norm(self.centres[rows] - self.centres[k], axis=1) < apart
-        return near & (self.axes[rows] @ self.axes[k] > 0.5)
+    def rows(self, rows: Int[np.ndarray, " m"]) -> NamedPlaces:
+        return NamedPlaces(self.rotations[rows], self.centres[rows], self.likeness[rows])
 
 
-def name_places(index: WallIndex, seen: list[SeenSide], likeness: list[Float32[np.ndarray, " sides"]]) -> WallPlaces:
-    """What each view names by each side node of the other hand: a node of the same hand was seen in the same direction.
+def likeliest_places(named: list[NamedPlaces], num_places: int, apart: float) -> list[Rigid3]:
+    """The places (world_from_cam) that all views together name first, `apart` (metres) and more from each other.
 
-    Args:
-        likeness: how much each side node looks like each view.
+    Each view counts with the most alike side node by which it names the place.
     """
-    poses, scores, views = list[Rigid3](), list[float](), list[int]()
-    for number, (side, of_view) in enumerate(zip(seen, likeness, strict=True)):
-        ahead = -side.view.cam_from_side.rotation[0, 2]  # on the left a side camera's x axis points ahead, on the right back
-        for row in range(len(of_view)):
-            along = index.middles[row, 0]
-            if ahead * along >= 0.0:
-                continue
-            world_from_side = index.world_from_sides[row] @ Rigid3(np.eye(3), np.array([2.0 * along, 0.0, 0.0]))
-            poses.append(world_from_side @ side.view.cam_from_side.inverse())
-            scores.append(float(of_view[row]))
-            views.append(number)
-    return WallPlaces(
-        np.array([pose.translation for pose in poses]).reshape(-1, 3),
-        np.array([pose.rotation[:, 2] for pose in poses]).reshape(-1, 3),
-        np.array(scores, np.float32),
-        np.array(views, int),
-        poses,
-    )
+    chosen: list[Rigid3] = []
+    if not named:
+        return chosen
+    first = [view.rows(np.argsort(-view.likeness, kind="stable")[:_NUM_NAMED]) for view in named]
+    places = NamedPlaces(*(np.concatenate([getattr(view, name) for view in first]) for name in ("rotations", "centres", "likeness")))
+    together = np.zeros(len(places.likeness))
+    for view in named:
+        together += np.where(places.near(view, apart), view.likeness, 0.0).max(axis=1, initial=0.0)
+    same, left = places.near(places, apart), np.ones(len(together), bool)
+    for k in np.argsort(-together, kind="stable"):
+        if len(chosen) == num_places:
+            break
+        if left[k]:
+            chosen.append(Rigid3(places.rotations[k], places.centres[k]))
+            left &= ~same[k]
+    return chosen
