@@ -19,7 +19,7 @@ from jaxtyping import UInt8
 
 from topoloc.features.extraction import extract_normalized, normalize_image
 from topoloc.features.features import Features
-from topoloc.features.matching import match_pooled
+from topoloc.features.matching import MatchingConfig, match_features, match_pooled
 from topoloc.features.side_views import SideView, side_views
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig
 from topoloc.geometry.camera import Camera
@@ -37,6 +37,8 @@ from topoloc.localization.walls.wall_index import WallIndex
 from topoloc.localization.walls.wall_matching import SeenSide, SideMatches, count_sides, estimate_pose, match_sides, nearest_sides, together
 from topoloc.localization.walls.wall_places import NamedPlaces, likeliest_places
 from topoloc.localization.walls.wall_poses import agreeing_pose
+
+_NEAREST = MatchingConfig(ratio=0.0, mutual=False)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -78,9 +80,10 @@ class SeenWalls:
         return nearest_sides(side.view, cam_from_world, self.index.centres, self.index.axes, self.search.config.walls.num_nodes)
 
     @cached_property
-    def rows_of_places(self) -> list[int]:
-        """The side nodes that show what must be seen from any of the places."""
-        return sorted({row for place in self.places for side in self.seen for row in self.rows_around(side, place.inverse())})
+    def of_places(self) -> LocalMap:
+        """All that must be seen of the walls from any of the places."""
+        rows = sorted({row for place in self.places for side in self.seen for row in self.rows_around(side, place.inverse())})
+        return LocalMap.pooled([self.index.local_map(row) for row in rows])
 
 
 def _features_of(query: Query, view: SideView, picture: UInt8[np.ndarray, "a b"]) -> Features:
@@ -213,14 +216,14 @@ def _num_distinct(walls: SeenWalls, final: PoseFit) -> int:
     assert final.pose is not None
     rows, columns = (index[final.pose.inliers] for index in (final.matches.query_idx, final.matches.train_idx))
     descriptors, points_world = final.features.descriptors[rows], final.local_map.points_world[columns]
-    here = np.sum(descriptors * final.local_map.descriptors[columns], axis=1)
+    products = np.sum(descriptors * final.local_map.descriptors[columns], axis=1)
+    distances = np.sqrt(np.maximum(2.0 - 2.0 * products, 0.0))
     away = 1.5 * walls.search.config.walls.min_distance * walls.search.map.d_thresh
-    centre = points_world.mean(axis=0)
-    for other in map(walls.index.local_map, walls.rows_of_places):
-        is_far = np.linalg.norm(other.points_world - centre, axis=1) > away
-        if is_far.any():
-            here = np.where((descriptors @ other.descriptors[is_far].T).max(axis=1) >= here, np.inf, here)
-    return int(np.count_nonzero(np.isfinite(here)))
+    is_far = np.linalg.norm(walls.of_places.points_world - points_world.mean(axis=0), axis=1) > away
+    elsewhere = match_features(descriptors, walls.of_places.descriptors[is_far], _NEAREST)
+    rivals = np.full(len(rows), np.inf)
+    rivals[elsewhere.query_idx] = elsewhere.distances
+    return int(np.count_nonzero(distances < rivals))
 
 
 def _is_mapped(search: Search, cam_from_world: Rigid3) -> bool:
