@@ -16,9 +16,8 @@ from jaxtyping import Float, Float32, Int32
 from topoloc.bounds import Between
 from topoloc.features.bands import run_in_bands
 from topoloc.features.features import Matches
-from topoloc.features.matching_kernels import GROUP, ROWS, TILE, multiply, reject_rivalled
+from topoloc.features.matching_kernels import GROUP, ROWS, TILE, find_nearest
 
-_ROWS_AT_ONCE = 32  # a multiple of ROWS; their products are read again while they are still in the cache
 _LOWES_RATIO = 0.8
 _FLANN_KDTREE = 1
 _FLANN_NEIGHBOURS = 8  # of these the nearest that is no twin is the rival
@@ -115,13 +114,8 @@ def _nearest(
     nearest_idx, products = np.empty(len(padded), np.int32), np.empty(len(padded), np.float32)
 
     def run(first_pair: int, last_pair: int) -> None:
-        table = np.empty((_ROWS_AT_ONCE, TILE * len(packed)), np.float32)
-        for start in range(ROWS * first_pair, ROWS * last_pair, _ROWS_AT_ONCE):
-            rows = slice(start, min(start + _ROWS_AT_ONCE, ROWS * last_pair))
-            multiply(padded[rows], packed, table)
-            block = table[: rows.stop - start]  # whole rows: a part of them would be another type to Numba, compiled apart
-            nearest_idx[rows] = np.argmax(block[:, : len(train)], axis=1)
-            reject_rivalled(block, len(train), nearest_idx[rows], ratio, points, radii, products[rows])
+        rows = slice(ROWS * first_pair, ROWS * last_pair)
+        find_nearest(padded[rows], packed, len(train), ratio, points, radii, nearest_idx[rows], products[rows])
 
     run_in_bands(run, len(padded) // ROWS, num_threads)
     return nearest_idx[: len(query)], products[: len(query)]
