@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from topoloc.features.matching import MatchingConfig, match_features, match_pooled
+from topoloc.features.matching import Matcher, MatchingConfig, match_features, match_pooled
 from topoloc.features.matching_kernels import TILE
 
 
@@ -165,3 +165,26 @@ def test_broken_map_descriptors_are_nobodys_match_and_break_no_other():
     train[17], train[50:90] = np.nan, blurred(query, 2)
     matches = match_features(query, train, MatchingConfig(ratio=0.0, mutual=False))
     assert np.array_equal(matches.train_idx, np.arange(50, 90))
+
+
+@pytest.mark.parametrize("method", ["exact", "flann"])
+def test_more_of_the_same_features_are_matched_as_if_they_were_the_first(method: str):
+    """Also mutual: one of the first loses its match to a later one that is nearer."""
+    train = random_descriptors(0, 500)
+    query = np.concatenate([blurred(train[:120], 1, 0.1), random_descriptors(2, 81), blurred(train[:200], 3, 0.02)])
+    points, radii = np.random.default_rng(4).uniform(0, 2, (500, 3)), np.full(500, 0.1)
+    config = MatchingConfig(ratio=0.9, method=method)
+    matcher = Matcher(query, train, (points, radii), config)
+    for count in (120, 201, None):
+        found, at_once = matcher.of_first(count), match_pooled(query[:count], train, points, radii, config)
+        assert np.array_equal(found.query_idx, at_once.query_idx)
+        assert np.array_equal(found.train_idx, at_once.train_idx)
+        assert np.array_equal(found.distances, at_once.distances)
+    first, every = set(Matcher(query, train, (points, radii), config).of_first(120).query_idx), set(found.query_idx)
+    assert len(first - every) > 50
+
+
+def test_of_equal_query_features_the_first_is_matched():
+    train = random_descriptors(0, 30)
+    query = np.concatenate([train, train])
+    assert np.array_equal(match_features(query, train, MatchingConfig()).query_idx, np.arange(30))

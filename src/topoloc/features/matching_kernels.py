@@ -43,34 +43,37 @@ def _are_twins(points, radii, a, b):
 
 
 @kernel()
-def find_nearest(query, packed, num_columns, ratio, points, radii, out_winner, out_product):
+def find_nearest(query, packed, num_columns, ratio, points, radii, out_winner, out_product, column_largest):
     """Of each query row the column of its largest product (the first of equal ones) and that product; -1 if a rival comes within the ratio
     test, or where nothing is comparable (NaN).
 
     `query` and `packed` are as `multiply` takes them, of which columns from `num_columns` on do not count. Column k belongs to the map
     point `points[k]`; columns within `radii` of the winner's point are its twins and no rivals. No points at all (0, 3): every other
-    column is a rival. A ratio of 0 switches the test off.
+    column is a rival. A ratio of 0 switches the test off. There are as many rows as `out_winner` is long; `column_largest` is lifted to
+    the largest product of each column.
     """
     table, lanes = np.empty((ROWS_AT_ONCE, TILE * packed.shape[0]), np.float32), np.empty(TILE, np.float32)
     for start in range(0, query.shape[0], ROWS_AT_ONCE):
         stop = min(start + ROWS_AT_ONCE, query.shape[0])
         multiply(query[start:stop], packed, table)
-        for k in range(stop - start):
+        for k in range(min(stop, len(out_winner)) - start):
             row = table[k]
             row[num_columns:] = -np.inf  # so that whole tiles can be looked at
-            best = _largest(row, lanes)
+            best = _largest(row, lanes, column_largest)
             out_product[start + k] = best
             out_winner[start + k] = -1 if best == -np.inf else _unrivalled(row, lanes, best, ratio, points, radii)
 
 
 @kernel()
-def _largest(row, lanes):
+def _largest(row, lanes, column_largest):
     """Of whole tiles of products; those that are NaN do not count. `lanes[j]` becomes the largest of the columns j of all tiles."""
     lanes[:] = -np.inf
     for tile in range(len(row) // TILE):
-        part = row[tile * TILE : (tile + 1) * TILE]
+        part, above = row[tile * TILE : (tile + 1) * TILE], column_largest[tile * TILE : (tile + 1) * TILE]
         for j in range(TILE):  # each lane by itself, so that it runs many at a time
             lanes[j] = part[j] if part[j] > lanes[j] else lanes[j]
+        for j in range(TILE):
+            above[j] = part[j] if part[j] > above[j] else above[j]
     best = lanes[0]
     for j in range(1, TILE):
         best = max(best, lanes[j])
