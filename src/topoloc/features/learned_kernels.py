@@ -131,18 +131,24 @@ def turned_to_unit_length(planes):
 def sample_levels(coarse, fine, weights, points_img, stride):
     """As `sample_descriptors`, of the sum of two levels (`dense.TwoLevels`) whose finer grid has that stride."""
     rows, columns, size = fine.shape[0], fine.shape[1], coarse.shape[2]
-    out = np.empty((len(points_img), size), np.float32)
+    out, mixed = np.empty((len(points_img), size), np.float32), np.empty(fine.shape[2], np.float32)
     for k in range(len(points_img)):
         u = min(max((points_img[k, 0] + np.float32(0.5)) / stride - np.float32(0.5), np.float32(0)), np.float32(columns - 1))
         v = min(max((points_img[k, 1] + np.float32(0.5)) / stride - np.float32(0.5), np.float32(0)), np.float32(rows - 1))
         x, y = min(int(u), columns - 2), min(int(v), rows - 2)
         s, t = np.float32(u - x), np.float32(v - y)
         value = out[k]
-        value[:] = np.float32(0)
+        value[:], mixed[:] = np.float32(0), np.float32(0)
         for below in range(2):
             for right in range(2):
                 share = (t if below else 1 - t) * (s if right else 1 - s)
-                _add_levels(coarse, fine, weights, y + below, x + right, share, value)
+                _add_coarse(coarse, y + below, x + right, share, value)
+                for i in range(len(mixed)):
+                    mixed[i] += share * fine[y + below, x + right, i]
+        for i in range(0, len(mixed), 4):
+            a, b, c, d = weights[i], weights[i + 1], weights[i + 2], weights[i + 3]
+            for j in range(size):
+                value[j] += mixed[i] * a[j] + mixed[i + 1] * b[j] + mixed[i + 2] * c[j] + mixed[i + 3] * d[j]
         total = np.float32(1e-12)
         for j in range(size):
             total += value[j] * value[j]
@@ -208,21 +214,16 @@ def _add_fine(row, x, by_four, size, sums):
 
 
 @kernel(fastmath={"contract"})
-def _add_levels(coarse, fine, weights, y, x, share, out):
-    """Adds this share of the sum of two levels at a point of the finer grid: the coarser one enlarged, the finer one weighted."""
+def _add_coarse(coarse, y, x, share, out):
+    """Adds this share of the coarser of two levels, enlarged, at a point of the finer grid."""
     above, left = max((y - 1) // 2, 0), max((x - 1) // 2, 0)
     below, right = min((y + 1) // 2, coarse.shape[0] - 1), min((x + 1) // 2, coarse.shape[1] - 1)
     t = np.float32(0.25) if y % 2 else np.float32(0.75)
     s = np.float32(0.25) if x % 2 else np.float32(0.75)
     a, b, c, d = coarse[above, left], coarse[above, right], coarse[below, left], coarse[below, right]
-    shares = (share * (1 - t) * (1 - s), share * (1 - t) * s, share * t * (1 - s), share * t * s)
+    p, q, r, z = share * (1 - t) * (1 - s), share * (1 - t) * s, share * t * (1 - s), share * t * s
     for j in range(len(out)):
-        out[j] += shares[0] * a[j] + shares[1] * b[j] + shares[2] * c[j] + shares[3] * d[j]
-    for k in range(0, weights.shape[0], 4):
-        p, q, r, z = share * fine[y, x, k], share * fine[y, x, k + 1], share * fine[y, x, k + 2], share * fine[y, x, k + 3]
-        a, b, c, d = weights[k], weights[k + 1], weights[k + 2], weights[k + 3]
-        for j in range(len(out)):
-            out[j] += p * a[j] + q * b[j] + r * c[j] + z * d[j]
+        out[j] += p * a[j] + q * b[j] + r * c[j] + z * d[j]
 
 
 @kernel(error_model="numpy", fastmath={"reassoc", "contract"})

@@ -115,9 +115,9 @@ class Matcher:
 
     def _of_rows(self, query: Float32[np.ndarray, "n d"]) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
         """The nearest train row of each query row, -1 where the ratio test fails, and their scalar product."""
-        num_known = len(self._nearest[0])
-        more = _nearest(query[num_known:], self._packed, self._compared_with, self._column_largest, self._num_threads)
-        self._nearest = tuple(np.concatenate([known, new]) for known, new in zip(self._nearest, more, strict=True))
+        train_idx, products = self._nearest
+        more = _nearest(query[len(train_idx) :], self._packed, self._compared_with, self._column_largest, self._num_threads)
+        self._nearest = np.concatenate([train_idx, more[0]]), np.concatenate([products, more[1]])
         return self._nearest
 
     @property
