@@ -106,7 +106,7 @@ def run_network(image: UInt8[np.ndarray, "h w"], network: str, num_threads: int 
     return NetworkAnswer(scores, dense, None if places is None else places[0])
 
 
-@functools.lru_cache(maxsize=4)
+@functools.lru_cache(maxsize=6)
 def _session(network: str, path: Path, num_threads: int, size: tuple[int, int], process_id: int) -> Any:
     """The network made ready for pictures of one size, in some 10 ms, after which each takes 0.8 of the time; a forked child makes its own.
 
