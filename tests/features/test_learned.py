@@ -11,9 +11,10 @@ import pytest
 from tiny_network import STRIDE, cells, write_network
 from topoloc.errors import MissingExtraError, WeightsError
 from topoloc.features import learned
+from topoloc.features.dense import Planes
 from topoloc.features.kinds import check_available, learned_kind
 from topoloc.features.learned import LearnedConfig, extract_learned, run_network
-from topoloc.features.learned_kernels import find_maxima, sample_descriptors
+from topoloc.features.learned_kernels import find_maxima, refined, sample_descriptors
 
 CONFIG = LearnedConfig("xfeat", 64, min_score=0.05)
 
@@ -37,7 +38,9 @@ def _bumps(centres: list[tuple[float, float]], height: int, width: int) -> np.nd
 
 def test_key_points_lie_at_the_tops_to_a_fraction_of_a_pixel():
     centres = [(20.3, 15.8), (40.0, 30.0), (55.5, 9.25), (9.9, 38.6)]
-    points, found = find_maxima(_bumps(centres, 48, 64), 48, 64, 4, np.float32(0.1))
+    scores = _bumps(centres, 48, 64)
+    pixels, found = find_maxima(scores, 48, 64, 4, np.float32(0.1))
+    points = refined(scores, pixels)
     order = np.argsort(-found)
     np.testing.assert_allclose(points[order], centres, atol=0.01)
     np.testing.assert_allclose(found[order], [0.9, 0.8, 0.7, 0.6], atol=0.06)
@@ -46,6 +49,7 @@ def test_key_points_lie_at_the_tops_to_a_fraction_of_a_pixel():
 def test_none_lies_at_the_border_or_in_what_continues_the_picture():
     scores = _bumps([(30.0, 20.0), (3.0, 20.0), (4.0, 40.0), (59.0, 10.0), (60.0, 30.0), (20.0, 45.0), (45.0, 44.0), (40.0, 2.0)], 64, 64)
     points, _ = find_maxima(scores, 48, 64, 4, np.float32(0.1))  # the picture ends at row 48, the scores do not
+    assert len(find_maxima(scores, 8, 64, 4, np.float32(0.1))[0]) == len(find_maxima(scores, 48, 7, 4, np.float32(0.1))[0]) == 0
     np.testing.assert_allclose(points[np.argsort(points[:, 0])], [(4.0, 40.0), (30.0, 20.0), (59.0, 10.0)], atol=0.01)
 
 
@@ -57,6 +61,22 @@ def test_weak_ones_and_those_beside_stronger_ones_are_none_and_of_equals_there_i
     points, found = find_maxima(scores, 32, 32, 4, np.float32(0.1))
     assert sorted(np.rint(points).tolist()) == [[10.0, 10.0], [20.0, 20.0]]
     np.testing.assert_array_equal(found, np.array([0.5, 0.2], np.float32))
+
+
+def test_key_points_are_what_no_window_exceeds():
+    """Against all windows of random scores of few values, so that many are equal."""
+    scores = np.random.default_rng(7).integers(0, 30, (40, 56)).astype(np.float32) / 30
+    pixels, found = find_maxima(scores, 37, 50, 4, np.float32(0.3))
+    expected = []
+    for y in range(4, 33):
+        for x in range(4, 46):
+            window = scores[y - 2 : y + 3, x - 2 : x + 3]
+            first = np.argwhere(window == window.max())[0]  # row by row
+            if scores[y, x] > 0.3 and first.tolist() == [2, 2]:
+                expected.append([x, y])
+    assert pixels.tolist() == expected
+    assert len(expected) > 20
+    np.testing.assert_array_equal(found, scores[pixels[:, 1], pixels[:, 0]])
 
 
 # descriptors between the grid's points
@@ -91,8 +111,10 @@ def test_descriptors_are_bilinear_and_of_unit_length():
 @pytest.mark.parametrize(("height", "width"), [(96, 128), (100, 131), (33, 64), (31, 40)])
 def test_pictures_of_any_size_are_continued_by_their_border(network: Path, height: int, width: int):
     picture = np.random.default_rng(2).integers(0, 256, (height, width), dtype=np.uint8)
-    scores, dense, places = run_network(picture, "xfeat")
-    assert places is None
+    answer = run_network(picture, "xfeat")
+    assert answer.places is None
+    assert isinstance(answer.dense, Planes)
+    scores, dense = answer.scores, answer.dense.planes
     assert scores.shape == (32 * -(-height // 32), 32 * -(-width // 32))
     assert dense.shape == (64, scores.shape[0] // STRIDE, scores.shape[1] // STRIDE)
     np.testing.assert_allclose(scores[:height, :width], picture / 255.0, atol=1e-6)
@@ -108,7 +130,9 @@ def test_features_are_the_strongest_first_with_the_descriptors_of_their_places(n
     np.testing.assert_allclose(features.points_img, [(70, 20), (20, 30), (50, 50), (90, 60)], atol=0.1)
     assert (np.diff(features.responses) < 0).all()
     assert (np.ptp(features.sizes_px), np.ptp(features.angles)) == (0.0, 0.0)
-    expected = _bilinear(run_network(picture, "xfeat")[1], features.points_img, STRIDE)
+    dense = run_network(picture, "xfeat").dense
+    assert isinstance(dense, Planes)
+    expected = _bilinear(dense.planes, features.points_img, STRIDE)
     np.testing.assert_allclose(features.descriptors, expected, atol=1e-4)
     np.testing.assert_array_equal(extract_learned(picture, LearnedConfig("xfeat", 64, 2, 0.05)).points_img, features.points_img[:2])
 

@@ -3,7 +3,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from topoloc.features.matching import MatchingConfig, match_features, match_pooled
+from topoloc.features.matching import Matcher, MatchingConfig, match_features, match_pooled
+from topoloc.features.matching_kernels import TILE
 
 
 def unit(rows: np.ndarray) -> np.ndarray:
@@ -134,3 +135,56 @@ def test_the_wider_radius_of_the_two_decides():
     points = np.array([[0.0, 0.0, 5.0], [0.0, 0.0, 5.5]])
     assert len(match_pooled(descriptor, train, points, np.array([0.1, 0.6]), config)) == 1
     assert len(match_pooled(descriptor, train, points, np.array([0.1, 0.4]), config)) == 0
+
+
+@pytest.mark.parametrize("num_train", [TILE - 1, TILE, TILE + 1, 3 * TILE + 7])
+@pytest.mark.parametrize("ratio", [0.0, 0.8, 0.95])
+def test_the_nearest_and_its_rivals_are_those_of_the_whole_table(num_train: int, ratio: float):
+    """Whatever tile and lane they lie in; of equal ones the first, and columns that only fill the last tile never."""
+    train = random_descriptors(1, num_train)
+    query = blurred(train[np.random.default_rng(4).integers(0, num_train, 70)], 2, 0.15)
+    train[num_train // 2] = blurred(query[7:8], 2, 0.1)[0]
+    if num_train > TILE:
+        train[TILE] = train[0] = query[5]  # two equal columns of one lane
+    points, radii = np.random.default_rng(3).uniform(0, 2, (num_train, 3)), np.full(num_train, 0.8)
+    matches = match_pooled(query, train, points, radii, MatchingConfig(ratio=ratio, mutual=False))
+    products = np.array([[float(np.sum(q.astype(np.float64) * t)) for t in train] for q in query])  # a BLAS rounds columns differently
+    expected = dict[int, int]()
+    for row, of_row in enumerate(products):
+        winner = int(of_row.argmax())
+        limit = min(of_row[winner], 1 - (1 - of_row[winner]) / ratio**2) if ratio else np.inf
+        rivals = np.flatnonzero((of_row >= limit) & (np.linalg.norm(points - points[winner], axis=1) > 0.8))
+        if not np.any(rivals != winner):
+            expected[row] = winner
+    assert dict(zip(matches.query_idx.tolist(), matches.train_idx.tolist(), strict=True)) == expected
+    assert len(expected) > 0
+
+
+def test_broken_map_descriptors_are_nobodys_match_and_break_no_other():
+    query, train = random_descriptors(0, 40), random_descriptors(1, 120)
+    train[17], train[50:90] = np.nan, blurred(query, 2)
+    matches = match_features(query, train, MatchingConfig(ratio=0.0, mutual=False))
+    assert np.array_equal(matches.train_idx, np.arange(50, 90))
+
+
+@pytest.mark.parametrize("method", ["exact", "flann"])
+def test_more_of_the_same_features_are_matched_as_if_they_were_the_first(method: str):
+    """Also mutual: one of the first loses its match to a later one that is nearer."""
+    train = random_descriptors(0, 500)
+    query = np.concatenate([blurred(train[:120], 1, 0.1), random_descriptors(2, 81), blurred(train[:200], 3, 0.02)])
+    points, radii = np.random.default_rng(4).uniform(0, 2, (500, 3)), np.full(500, 0.1)
+    config = MatchingConfig(ratio=0.9, method=method)
+    matcher = Matcher(query, train, (points, radii), config)
+    for count in (120, 201, None):
+        found, at_once = matcher.of_first(count), match_pooled(query[:count], train, points, radii, config)
+        assert np.array_equal(found.query_idx, at_once.query_idx)
+        assert np.array_equal(found.train_idx, at_once.train_idx)
+        assert np.array_equal(found.distances, at_once.distances)
+    first, every = set(Matcher(query, train, (points, radii), config).of_first(120).query_idx), set(found.query_idx)
+    assert len(first - every) > 50
+
+
+def test_of_equal_query_features_the_first_is_matched():
+    train = random_descriptors(0, 30)
+    query = np.concatenate([train, train])
+    assert np.array_equal(match_features(query, train, MatchingConfig()).query_idx, np.arange(30))

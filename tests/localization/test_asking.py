@@ -28,8 +28,8 @@ def test_by_all_means_after_a_glance_is_by_all_means(localizer: Localizer, monke
     picture = Picture(unseen_views()[0][0], CAMERA)
     at_once, named = localizer.ask(picture)
     asking, num_matched = localizer.asking(picture), list[int]()
-    matched = propose.match_pooled
-    monkeypatch.setattr(propose, "match_pooled", lambda *args: num_matched.append(1) or matched(*args))
+    matcher = propose.Matcher
+    monkeypatch.setattr(propose, "Matcher", lambda *args: num_matched.append(1) or matcher(*args))
     glance, _ = asking.at_a_glance()
     assert num_matched == [1]
     result, named_later = asking.by_all_means()

@@ -17,7 +17,7 @@ from room_stream import room_stream
 from tiny_network import write_network
 from tiny_world import CAMERA
 from topoloc.errors import FeatureKindError, WeightsError
-from topoloc.features.dense import DenseDescriptors
+from topoloc.features.dense import DenseDescriptors, Planes
 from topoloc.features.features import Features
 from topoloc.features.kinds import KINDS, FeatureConfig
 from topoloc.geometry.alignment import translation_error
@@ -170,7 +170,7 @@ def test_dense_descriptors_tell_what_is_found_of_what_must_be_in_view(
 ):
     changed("surf", _useless)
     monkeypatch.setattr(DenseDescriptors, "agrees", lambda dense, points_img, descriptors: np.full(len(points_img), agrees))
-    changed("sift", lambda features: replace(features, dense=DenseDescriptors(np.zeros((128, 2, 2), np.float32), 4.0)))
+    changed("sift", lambda features: replace(features, dense=Planes(np.zeros((128, 2, 2), np.float32), 4.0)))
     trace = Trace()
     Localizer(topomap).localize(PICTURE, CAMERA, trace=trace)
     even_share = max(tried.hypothesis.evidence.even_share for tried in trace.tried if tried.hypothesis is not None)

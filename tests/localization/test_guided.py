@@ -11,7 +11,7 @@ from topoloc.features.features import Features
 from topoloc.features.kinds import SURF
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization.guided import GuidedConfig, count_by_chance, match_guided, visible_points
+from topoloc.localization.guided import GuidedConfig, count_by_chance, expected_key_points, match_guided, visible_points
 from topoloc.localization.local_map import LocalMap
 from topoloc.map.topomap import NodeSummary, TopoNode
 
@@ -110,3 +110,20 @@ def test_a_kind_without_scale_and_angle_is_matched_however_large_and_turned():
     assert len(matches) > 100
     assert np.array_equal(matches.query_idx, matches.train_idx)
     assert len(match_guided(constant, LocalMap.of_node(node), cam_from_world, CAMERA, GUIDED)) < 0.3 * len(matches)
+
+
+def test_a_lens_without_distortion_expects_points_where_one_with_next_to_none_does():
+    """The one is projected in a kernel, the other by the camera itself; some points lie behind the camera, some beside the picture."""
+    local_map = LocalMap.of_node(_node(np.random.default_rng(5)))
+    lens = Camera("OPENCV", 640, 480, (500.0, 500.0, 320.0, 240.0, 0.0, 0.0, 1e-15, 0.0))
+    assert lens.is_distorted
+    for cam_from_world in (
+        Rigid3(exp_so3(np.array([0.1, 0.5, 0.3])), np.array([0.2, 0.1, 0.4])),
+        Rigid3(np.eye(3), np.array([0, 0, -3.0])),
+    ):
+        plain, by_camera = (expected_key_points(local_map, cam_from_world, camera) for camera in (CAMERA, lens))
+        np.testing.assert_allclose(plain, by_camera, rtol=1e-6)
+        assert 0 < np.isnan(plain[:, 0]).sum() < len(plain)
+        (rows, pixels), (lens_rows, lens_pixels) = (visible_points(local_map, cam_from_world, camera) for camera in (CAMERA, lens))
+        np.testing.assert_array_equal(rows, lens_rows)
+        np.testing.assert_allclose(pixels, lens_pixels, rtol=1e-9)

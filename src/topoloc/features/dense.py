@@ -6,29 +6,85 @@ finding: where a pose is right, the descriptor most like the map point's, of all
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from topoloc.features.learned_kernels import is_most_similar_here, turned_to_unit_length
+from topoloc.features.learned_kernels import (
+    is_most_similar_here,
+    levels_of_unit_length,
+    sample_descriptors,
+    sample_levels,
+    turned_to_unit_length,
+)
 
 _RADIUS = 4  # grid steps to each side among which the most similar descriptor is sought
 
 
-@dataclass(frozen=True, eq=False)
-class DenseDescriptors:
-    """As a network gives them: `planes`, not of unit length, one descriptor each `stride_px` pixels; that of pixel (x, y) lies at column
-    (x + 0.5) / stride_px - 0.5."""
+class DenseDescriptors(ABC):
+    """One descriptor each `stride_px` pixels; that of pixel (x, y) lies at column (x + 0.5) / stride_px - 0.5."""
 
-    planes: Float32[np.ndarray, "d rows columns"]
     stride_px: float
+
+    @property
+    @abstractmethod
+    def size(self) -> int:
+        """Numbers a descriptor."""
+
+    @abstractmethod
+    def at(self, points_img: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n d"]:
+        """Descriptors of unit length between those of the grid, bilinear."""
+
+    @abstractmethod
+    def _unit_grid(self) -> Float32[np.ndarray, "rows columns d"]:
+        """All of the grid, of unit length."""
 
     @cached_property
     def _grid(self) -> Float32[np.ndarray, "rows columns d"]:
-        return turned_to_unit_length(self.planes)
+        return self._unit_grid()
 
     def agrees(self, points_img: Float[np.ndarray, "n 2"], descriptors: Float32[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
         """Is the descriptor most like each of these, of all within 4 grid steps to each side of its point, at most one step off?"""
         return is_most_similar_here(self._grid, points_img.astype(np.float32), descriptors, np.float32(self.stride_px), _RADIUS)
+
+
+@dataclass(frozen=True, eq=False)
+class Planes(DenseDescriptors):
+    """As most networks give them: one plane a number, not of unit length."""
+
+    planes: Float32[np.ndarray, "d rows columns"]
+    stride_px: float
+
+    @property
+    def size(self) -> int:
+        return self.planes.shape[0]
+
+    def at(self, points_img: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n d"]:
+        return sample_descriptors(self.planes, points_img, np.float32(self.stride_px))
+
+    def _unit_grid(self) -> Float32[np.ndarray, "rows columns d"]:
+        return turned_to_unit_length(self.planes)
+
+
+@dataclass(frozen=True, eq=False)
+class TwoLevels(DenseDescriptors):
+    """As a network gives them that only ever adds two levels up: `coarse`, enlarged to twice its rows and columns (bilinear), and `fine`
+    times `weights`. Both are linear, and far fewer descriptors are asked for than there are: so they are added up where they are."""
+
+    coarse: Float32[np.ndarray, "half_rows half_columns d"]
+    fine: Float32[np.ndarray, "rows columns k"]
+    weights: Float32[np.ndarray, "k d"]
+    stride_px: float
+
+    @property
+    def size(self) -> int:
+        return self.coarse.shape[2]
+
+    def at(self, points_img: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n d"]:
+        return sample_levels(self.coarse, self.fine, self.weights, points_img, np.float32(self.stride_px))
+
+    def _unit_grid(self) -> Float32[np.ndarray, "rows columns d"]:
+        return levels_of_unit_length(self.coarse, self.fine, self.weights)

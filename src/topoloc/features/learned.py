@@ -2,7 +2,7 @@
 
 All networks come as ONNX files of one form and run in ONNX Runtime: grey in [0, 1] goes in, its sides multiples of 32; out come the score
 of each pixel being a key point, and descriptors on a coarser grid; of some networks also a level by which places are known again. Key
-points are the maxima of the scores, to a fraction of a pixel by a parabola through each and its neighbours.
+points are the maxima of the scores, the strongest to a fraction of a pixel by a parabola through each and its neighbours.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from jaxtyping import Float32, UInt8
 
 from topoloc import compiled
 from topoloc.errors import WeightsError
-from topoloc.features.dense import DenseDescriptors
+from topoloc.features.dense import DenseDescriptors, Planes, TwoLevels
 from topoloc.features.features import Features
-from topoloc.features.learned_kernels import find_maxima, sample_descriptors
-from topoloc.features.network_files import find_network, open_network
+from topoloc.features.learned_kernels import find_maxima, refined
+from topoloc.features.network_files import KnownNetwork, find_network, open_network
 
 _SIDE_MULTIPLE = 32
 _BORDER_PX = 4
@@ -52,17 +52,17 @@ def extract_learned(image: UInt8[np.ndarray, "h w"], config: LearnedConfig) -> F
         WeightsError: the network's file is missing, damaged or another network's.
     """
     height, width = image.shape
-    scores, dense, places = run_network(image, config.network, config.num_threads)
-    if dense.shape[0] != config.descriptor_size:
-        raise WeightsError(f"the network {config.network} gives descriptors of {dense.shape[0]} numbers, not {config.descriptor_size}")
-    points_img, found = find_maxima(scores, height, width, _BORDER_PX, np.float32(config.min_score))
+    answer = run_network(image, config.network, config.num_threads)
+    scores, dense = answer.scores, answer.dense
+    if dense.size != config.descriptor_size:
+        raise WeightsError(f"the network {config.network} gives descriptors of {dense.size} numbers, not {config.descriptor_size}")
+    pixels, found = find_maxima(scores, height, width, _BORDER_PX, np.float32(config.min_score))
     order = np.argsort(-found, kind="stable")[: config.max_features]
-    points_img = points_img[order]
-    stride_px = scores.shape[0] / dense.shape[1]
-    descriptors = sample_descriptors(dense, points_img, np.float32(stride_px))
+    points_img = refined(scores, pixels[order])
     sizes, angles = np.full(len(order), SIZE_PX, np.float32), np.zeros(len(order), np.float32)
-    cells = None if places is None else mean_cells(places, height / scores.shape[0], width / scores.shape[1])
-    return Features(points_img, sizes, angles, found[order], descriptors, cells, DenseDescriptors(dense, stride_px))
+    of_picture = (height / scores.shape[0], width / scores.shape[1])
+    cells = None if answer.places is None else mean_cells(answer.places, *of_picture)
+    return Features(points_img, sizes, angles, found[order], dense.at(points_img), cells, dense)
 
 
 def mean_cells(level: Float32[np.ndarray, "c h w"], height_share: float, width_share: float) -> Float32[np.ndarray, "rows columns c"]:
@@ -78,28 +78,49 @@ def mean_cells(level: Float32[np.ndarray, "c h w"], height_share: float, width_s
 
 def check_network(network: str) -> None:
     """Is the network there? Raises as `extract_learned`."""
-    _session(network, find_network(network), compiled.num_threads(), os.getpid())
+    _opened(network, find_network(network))
 
 
-def run_network(
-    image: UInt8[np.ndarray, "h w"], network: str, num_threads: int | None = None
-) -> tuple[
-    Float32[np.ndarray, "padded_h padded_w"], Float32[np.ndarray, "d grid_h grid_w"], Float32[np.ndarray, "c level_h level_w"] | None
-]:
-    """The scores and the dense descriptors (not normalised) of a picture, which is continued by its border to the sides asked; and the
-    level by which places are known again, where the network has one."""
+@dataclass(frozen=True, eq=False)
+class NetworkAnswer:
+    """Scores of the pixels, descriptors, and the level by which places are known again, where the network has one."""
+
+    scores: Float32[np.ndarray, "padded_h padded_w"]
+    dense: DenseDescriptors
+    places: Float32[np.ndarray, "c level_h level_w"] | None
+
+
+def run_network(image: UInt8[np.ndarray, "h w"], network: str, num_threads: int | None = None) -> NetworkAnswer:
+    """What a network says of a picture, which is continued by its border to the sides asked."""
     height, width = image.shape
     padding = [(0, -side % _SIDE_MULTIPLE) for side in (height, width)]
     grey = np.pad(image, padding, mode="edge").astype(np.float32) / np.float32(255.0)
-    session = _session(network, find_network(network), num_threads or compiled.num_threads(), os.getpid())
-    scores, dense, *places = session.run(None, {"image": grey[None, None]})
-    return scores[0, 0], dense[0], places[0][0] if places else None
+    session = _session(network, find_network(network), num_threads or compiled.num_threads(), grey.shape, os.getpid())
+    names = [output.name for output in session.get_outputs()]
+    of = dict(zip(names, session.run(names, {"image": grey[None, None]}), strict=True))
+    scores, places = of["scores"][0, 0], of.get("places")
+    if "coarse" in of:
+        dense = TwoLevels(of["coarse"][0], of["fine"][0], of["fine_weights"], len(scores) / of["fine"].shape[1])
+    else:
+        dense = Planes(of["descriptors"][0], len(scores) / of["descriptors"].shape[2])
+    return NetworkAnswer(scores, dense, None if places is None else places[0])
 
 
-@functools.lru_cache(maxsize=8)
-def _session(network: str, path: Path, num_threads: int, process_id: int) -> Any:
-    """The network made ready; a forked child makes its own."""
-    known, session = open_network(path, num_threads)
+@functools.lru_cache(maxsize=6)
+def _session(network: str, path: Path, num_threads: int, size: tuple[int, int], process_id: int) -> Any:
+    """The network made ready for pictures of one size, in some 10 ms, after which each takes 0.8 of the time; a forked child makes its own.
+
+    Each holds some 100 bytes a pixel, so few are kept.
+    """
+    return _named(network, path, *open_network(path, num_threads, size))
+
+
+@functools.lru_cache(maxsize=16)
+def _opened(network: str, path: Path) -> Any:
+    return _named(network, path, *open_network(path, num_threads=1))
+
+
+def _named(network: str, path: Path, known: KnownNetwork, session: Any) -> Any:
     if known.name != network:
         raise WeightsError(f"network {path}: holds {known.name}, not {network}")
     return session

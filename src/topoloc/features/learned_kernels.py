@@ -9,33 +9,70 @@ _RADIUS = 2
 
 @kernel()
 def find_maxima(scores, height, width, border, min_score):
-    """Pixels (x, y) that score more than all others within two pixels, moved to the top of the parabola through each and its neighbours;
-    and their scores. Of equal ones the first counts. The picture has `height` rows and `width` columns, the scores may have more."""
-    points, found = np.empty((height * width // 9 + 1, 2), np.float32), np.empty(height * width // 9 + 1, np.float32)
-    count = 0
-    for y in range(max(border, _RADIUS), height - max(border, _RADIUS)):
-        row = scores[y]
-        for x in range(max(border, _RADIUS), width - max(border, _RADIUS)):
-            score = row[x]
-            if score <= min_score or score <= row[x - 1] or score < row[x + 1]:
-                continue
-            if not _is_maximum(scores, y, x):
-                continue
-            points[count, 0] = x + _top(row[x - 1], score, row[x + 1])
-            points[count, 1] = y + _top(scores[y - 1, x], score, scores[y + 1, x])
-            found[count] = score
-            count += 1
-    return points[:count].copy(), found[:count].copy()
+    """Pixels (x, y) that score more than all others within two pixels and more than `min_score`, row by row; and their scores. Of equal
+    ones the first counts. The picture has `height` rows and `width` columns, the scores may have more."""
+    pixels, found = np.empty((height * width // 9 + 1, 2), np.int32), np.empty(height * width // 9 + 1, np.float32)
+    border = max(border, _RADIUS)
+    count, num_columns = 0, max(width - 2 * border, 0)
+    along = np.empty((2 * _RADIUS + 1, num_columns), np.float32)  # the largest along each row's window, of as many rows as a window has
+    around = np.empty(num_columns, np.float32)
+    for y in range(border - _RADIUS, min(height - border + _RADIUS, height) if num_columns else 0):
+        _largest_of_windows(scores[y], border, along[y % len(along)])
+        middle = y - _RADIUS
+        if middle < border:
+            continue
+        _largest_of_rows(along, around)
+        row = scores[middle][border : border + num_columns]
+        for x in range(num_columns):
+            if row[x] >= around[x] and row[x] > min_score and _is_first_maximum(scores, middle, border + x):
+                pixels[count, 0], pixels[count, 1], found[count] = border + x, middle, row[x]
+                count += 1
+    return pixels[:count].copy(), found[:count].copy()
 
 
 @kernel()
-def _is_maximum(scores, y, x):
+def _largest_of_windows(row, border, out):
+    """The largest score within two pixels along a row, of each from `border` on."""
+    n = len(out)
+    a, b, c = row[border - 2 : border - 2 + n], row[border - 1 : border - 1 + n], row[border : border + n]
+    d, e = row[border + 1 : border + 1 + n], row[border + 2 : border + 2 + n]
+    for x in range(n):  # without branches, so that it runs many pixels at a time
+        left = a[x] if a[x] > b[x] else b[x]
+        right = d[x] if d[x] > e[x] else e[x]
+        beside = left if left > right else right
+        out[x] = c[x] if c[x] > beside else beside
+
+
+@kernel()
+def _largest_of_rows(rows, out):
+    a, b, c, d, e = rows[0], rows[1], rows[2], rows[3], rows[4]
+    for x in range(len(out)):
+        above = a[x] if a[x] > b[x] else b[x]
+        below = c[x] if c[x] > d[x] else d[x]
+        both = above if above > below else below
+        out[x] = e[x] if e[x] > both else both
+
+
+@kernel()
+def _is_first_maximum(scores, y, x):
+    """Of a pixel that nothing within two pixels exceeds: is none before it equal?"""
     score = scores[y, x]
-    for v in range(y - _RADIUS, y + _RADIUS + 1):
+    for v in range(y - _RADIUS, y + 1):
         for u in range(x - _RADIUS, x + _RADIUS + 1):
-            if scores[v, u] > score or (scores[v, u] == score and (v < y or (v == y and u < x))):
+            if scores[v, u] == score and (v < y or u < x):
                 return False
     return True
+
+
+@kernel()
+def refined(scores, pixels):
+    """Pixels (x, y) moved to the top of the parabola through the scores of each and its neighbours."""
+    points = np.empty((len(pixels), 2), np.float32)
+    for k in range(len(pixels)):
+        x, y = pixels[k, 0], pixels[k, 1]
+        points[k, 0] = x + _top(scores[y, x - 1], scores[y, x], scores[y, x + 1])
+        points[k, 1] = y + _top(scores[y - 1, x], scores[y, x], scores[y + 1, x])
+    return points
 
 
 @kernel()
@@ -88,6 +125,105 @@ def turned_to_unit_length(planes):
             for c in range(size):
                 grid[y, x, c] *= scale
     return grid
+
+
+@kernel(fastmath={"contract"})
+def sample_levels(coarse, fine, weights, points_img, stride):
+    """As `sample_descriptors`, of the sum of two levels (`dense.TwoLevels`) whose finer grid has that stride."""
+    rows, columns, size = fine.shape[0], fine.shape[1], coarse.shape[2]
+    out, mixed = np.empty((len(points_img), size), np.float32), np.empty(fine.shape[2], np.float32)
+    for k in range(len(points_img)):
+        u = min(max((points_img[k, 0] + np.float32(0.5)) / stride - np.float32(0.5), np.float32(0)), np.float32(columns - 1))
+        v = min(max((points_img[k, 1] + np.float32(0.5)) / stride - np.float32(0.5), np.float32(0)), np.float32(rows - 1))
+        x, y = min(int(u), columns - 2), min(int(v), rows - 2)
+        s, t = np.float32(u - x), np.float32(v - y)
+        value = out[k]
+        value[:], mixed[:] = np.float32(0), np.float32(0)
+        for below in range(2):
+            for right in range(2):
+                share = (t if below else 1 - t) * (s if right else 1 - s)
+                _add_coarse(coarse, y + below, x + right, share, value)
+                for i in range(len(mixed)):
+                    mixed[i] += share * fine[y + below, x + right, i]
+        for i in range(0, len(mixed), 4):
+            a, b, c, d = weights[i], weights[i + 1], weights[i + 2], weights[i + 3]
+            for j in range(size):
+                value[j] += mixed[i] * a[j] + mixed[i + 1] * b[j] + mixed[i + 2] * c[j] + mixed[i + 3] * d[j]
+        total = np.float32(1e-12)
+        for j in range(size):
+            total += value[j] * value[j]
+        scale = np.float32(1) / np.sqrt(total)
+        for j in range(size):
+            value[j] *= scale
+    return out
+
+
+@kernel(fastmath={"contract", "reassoc"})
+def levels_of_unit_length(coarse, fine, weights):
+    """(rows, columns, d) descriptors of unit length, of two levels (`dense.TwoLevels`), whose columns and k are multiples of four."""
+    rows, columns, size = fine.shape[0], fine.shape[1], coarse.shape[2]
+    grid = np.empty((rows, columns, size), np.float32)
+    blend, sums = np.empty((coarse.shape[1] + 2, size), np.float32), np.empty(4 * size, np.float32)
+    by_four = weights.copy().reshape(weights.shape[0] // 4, 4 * size)
+    for y in range(rows):
+        _blend_rows(coarse, y, blend)
+        for x in range(0, columns, 4):  # four at a time, so that the weights are read a quarter as often
+            for half in range(2):
+                before, here, after = blend[x // 2 + half], blend[x // 2 + half + 1], blend[x // 2 + half + 2]
+                for j in range(size):
+                    most = np.float32(0.75) * here[j]
+                    sums[2 * half * size + j] = most + np.float32(0.25) * before[j]
+                    sums[2 * half * size + size + j] = most + np.float32(0.25) * after[j]
+            _add_fine(fine[y], x, by_four, size, sums)
+            for k in range(4):
+                total = np.float32(1e-12)
+                for j in range(size):
+                    total += sums[k * size + j] * sums[k * size + j]
+                scale, out = np.float32(1) / np.sqrt(total), grid[y, x + k]
+                for j in range(size):
+                    out[j] = sums[k * size + j] * scale
+    return grid
+
+
+@kernel(fastmath={"contract", "reassoc"})
+def _blend_rows(coarse, y, out):
+    """What row y of a grid twice as fine lies between, with the first and the last column once more at the ends."""
+    above, below = coarse[max((y - 1) // 2, 0)], coarse[min((y + 1) // 2, coarse.shape[0] - 1)]
+    t = np.float32(0.25) if y % 2 else np.float32(0.75)
+    for x in range(coarse.shape[1]):
+        for j in range(coarse.shape[2]):
+            out[x + 1, j] = (1 - t) * above[x, j] + t * below[x, j]
+    out[0], out[-1] = out[1], out[-2]
+
+
+@kernel(fastmath={"contract", "reassoc"})
+def _add_fine(row, x, by_four, size, sums):
+    """Adds what the finer level says of four pixels from x on; `sums` holds one descriptor after the other, `by_four` four weights of k."""
+    for k in range(by_four.shape[0]):
+        w = by_four[k]
+        a0, a1, a2, a3 = row[x, 4 * k], row[x, 4 * k + 1], row[x, 4 * k + 2], row[x, 4 * k + 3]
+        b0, b1, b2, b3 = row[x + 1, 4 * k], row[x + 1, 4 * k + 1], row[x + 1, 4 * k + 2], row[x + 1, 4 * k + 3]
+        c0, c1, c2, c3 = row[x + 2, 4 * k], row[x + 2, 4 * k + 1], row[x + 2, 4 * k + 2], row[x + 2, 4 * k + 3]
+        d0, d1, d2, d3 = row[x + 3, 4 * k], row[x + 3, 4 * k + 1], row[x + 3, 4 * k + 2], row[x + 3, 4 * k + 3]
+        for j in range(size):
+            w0, w1, w2, w3 = w[j], w[size + j], w[2 * size + j], w[3 * size + j]
+            sums[j] = sums[j] + a0 * w0 + a1 * w1 + a2 * w2 + a3 * w3
+            sums[size + j] = sums[size + j] + b0 * w0 + b1 * w1 + b2 * w2 + b3 * w3
+            sums[2 * size + j] = sums[2 * size + j] + c0 * w0 + c1 * w1 + c2 * w2 + c3 * w3
+            sums[3 * size + j] = sums[3 * size + j] + d0 * w0 + d1 * w1 + d2 * w2 + d3 * w3
+
+
+@kernel(fastmath={"contract"})
+def _add_coarse(coarse, y, x, share, out):
+    """Adds this share of the coarser of two levels, enlarged, at a point of the finer grid."""
+    above, left = max((y - 1) // 2, 0), max((x - 1) // 2, 0)
+    below, right = min((y + 1) // 2, coarse.shape[0] - 1), min((x + 1) // 2, coarse.shape[1] - 1)
+    t = np.float32(0.25) if y % 2 else np.float32(0.75)
+    s = np.float32(0.25) if x % 2 else np.float32(0.75)
+    a, b, c, d = coarse[above, left], coarse[above, right], coarse[below, left], coarse[below, right]
+    p, q, r, z = share * (1 - t) * (1 - s), share * (1 - t) * s, share * t * (1 - s), share * t * s
+    for j in range(len(out)):
+        out[j] += p * a[j] + q * b[j] + r * c[j] + z * d[j]
 
 
 @kernel(error_model="numpy", fastmath={"reassoc", "contract"})

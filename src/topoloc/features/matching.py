@@ -16,9 +16,8 @@ from jaxtyping import Float, Float32, Int32
 from topoloc.bounds import Between
 from topoloc.features.bands import run_in_bands
 from topoloc.features.features import Matches
-from topoloc.features.matching_kernels import GROUP, ROWS, TILE, multiply, reject_rivalled
+from topoloc.features.matching_kernels import GROUP, ROWS, TILE, find_nearest
 
-_ROWS_AT_ONCE = 32  # a multiple of ROWS; their products are read again while they are still in the cache
 _LOWES_RATIO = 0.8
 _FLANN_KDTREE = 1
 _FLANN_NEIGHBOURS = 8  # of these the nearest that is no twin is the rival
@@ -47,6 +46,11 @@ class MatchingConfig:
         return self if self.ratio is not None else replace(self, ratio=ratio)
 
 
+_ANY_NEAREST = MatchingConfig(ratio=0.0)
+_Compared = tuple[int, float, Float32[np.ndarray, "p 3"], Float32[np.ndarray, " p"]]
+"""How many train features there are, the ratio, and their points and radii."""
+
+
 def match_features(
     query_descriptors: Float32[np.ndarray, "n d"],
     train_descriptors: Float32[np.ndarray, "m d"],
@@ -54,7 +58,7 @@ def match_features(
     num_threads: int | None = None,
 ) -> Matches:
     """Matches between two images, at most one for a query feature, in the order of the query features."""
-    return _match(query_descriptors, train_descriptors, _NO_POINTS, _NO_RADII, config, num_threads)
+    return Matcher(query_descriptors, train_descriptors, None, config, num_threads).of_first()
 
 
 def match_pooled(
@@ -70,61 +74,95 @@ def match_pooled(
     Neighbouring nodes hold the same physical point more than once, and such twins are no rivals of each other in the ratio
     test: features whose points lie within the larger of their two `train_radii` (metres: what the depth error allows) are twins.
     """
-    points, radii = train_points_world.astype(np.float32), train_radii.astype(np.float32)
-    return _match(query_descriptors, train_descriptors, points, radii, config, num_threads)
+    return Matcher(query_descriptors, train_descriptors, (train_points_world, train_radii), config, num_threads).of_first()
 
 
-def _match(
-    query: Float32[np.ndarray, "n d"],
-    train: Float32[np.ndarray, "m d"],
-    points: Float32[np.ndarray, "p 3"],
-    radii: Float32[np.ndarray, " p"],
-    config: MatchingConfig,
-    num_threads: int | None,
-) -> Matches:
-    if len(query) == 0 or len(train) == 0:
-        return Matches(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros(0, np.float32))
-    config = config.resolved(_LOWES_RATIO)
-    if config.method == "exact":
-        assert config.ratio is not None
-        train_idx, products = _nearest(query, train, config.ratio, points, radii, num_threads)
-    else:
-        train_idx, products = _nearest_flann(query, train, points, radii, config)
-    query_idx = np.flatnonzero(train_idx >= 0).astype(np.int32)
-    if config.mutual and len(query_idx):
-        # Only the columns that won are asked back: far cheaper than column maxima of the whole table.
-        asked, of_asked = np.unique(train_idx[query_idx], return_inverse=True)
-        back_idx, _ = _nearest(train[asked], query, 0.0, _NO_POINTS, _NO_RADII, num_threads)
-        query_idx = query_idx[back_idx[of_asked] == query_idx]
+class Matcher:
+    """As `match_pooled`, of the first query features, and then of more of them: what was compared already is not compared again.
+
+    Args:
+        of_map: the points (m, 3) of the train features and their radii (m), metres; None where each feature is a point of its own.
+    """
+
+    def __init__(
+        self,
+        query_descriptors: Float32[np.ndarray, "n d"],
+        train_descriptors: Float32[np.ndarray, "m d"],
+        of_map: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, " m"]] | None,
+        config: MatchingConfig,
+        num_threads: int | None = None,
+    ) -> None:
+        self._query, self._train = query_descriptors, train_descriptors
+        self._points, self._radii = (_NO_POINTS, _NO_RADII) if of_map is None else (each.astype(np.float32) for each in of_map)
+        self._config, self._num_threads = config.resolved(_LOWES_RATIO), num_threads
+        self._nearest = np.zeros(0, np.int32), np.zeros(0, np.float32)
+        self._packed = _packed(train_descriptors)
+        self._column_largest = np.full(TILE * len(self._packed), -np.inf, np.float32)
+
+    def of_first(self, count: int | None = None) -> Matches:
+        """Matches of so many query features, all without a number; no fewer than were asked for before."""
+        query = self._query[:count]
+        if len(query) == 0 or len(self._train) == 0:
+            return Matches(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros(0, np.float32))
+        if self._config.method == "flann":
+            return self._by_flann(query)
+        train_idx, products = self._of_rows(query)
+        query_idx = np.flatnonzero(train_idx >= 0).astype(np.int32)
+        if self._config.mutual:
+            query_idx = query_idx[products[query_idx] >= self._column_largest[train_idx[query_idx]]]
+            query_idx = np.sort(query_idx[np.unique(train_idx[query_idx], return_index=True)[1]])  # of equal ones the first
+        return _matches(query_idx, train_idx, products)
+
+    def _of_rows(self, query: Float32[np.ndarray, "n d"]) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
+        """The nearest train row of each query row, -1 where the ratio test fails, and their scalar product."""
+        train_idx, products = self._nearest
+        more = _nearest(query[len(train_idx) :], self._packed, self._compared_with, self._column_largest, self._num_threads)
+        self._nearest = np.concatenate([train_idx, more[0]]), np.concatenate([products, more[1]])
+        return self._nearest
+
+    @property
+    def _compared_with(self) -> _Compared:
+        assert self._config.ratio is not None
+        return len(self._train), self._config.ratio, self._points, self._radii
+
+    def _by_flann(self, query: Float32[np.ndarray, "n d"]) -> Matches:
+        train_idx, products = _nearest_flann(query, self._train, self._points, self._radii, self._config)
+        query_idx = np.flatnonzero(train_idx >= 0).astype(np.int32)
+        if self._config.mutual and len(query_idx):
+            asked, of_asked = np.unique(train_idx[query_idx], return_inverse=True)
+            back_idx = Matcher(self._train[asked], query, None, _ANY_NEAREST, self._num_threads)._of_rows(self._train[asked])[0]
+            query_idx = query_idx[back_idx[of_asked] == query_idx]
+        return _matches(query_idx, train_idx, products)
+
+
+def _matches(query_idx: Int32[np.ndarray, " k"], train_idx: Int32[np.ndarray, " n"], products: Float32[np.ndarray, " n"]) -> Matches:
+    """Of these query rows, whose nearest train rows and products with them are told of all."""
     distances = np.sqrt(np.maximum(2.0 - 2.0 * products[query_idx], 0.0)).astype(np.float32)
     return Matches(query_idx, train_idx[query_idx], distances)
 
 
 def _nearest(
     query: Float32[np.ndarray, "n d"],
-    train: Float32[np.ndarray, "m d"],
-    ratio: float,
-    points: Float32[np.ndarray, "p 3"],
-    radii: Float32[np.ndarray, " p"],
+    packed: Float32[np.ndarray, "tiles groups width"],
+    compared: _Compared,
+    column_largest: Float32[np.ndarray, " columns"],
     num_threads: int | None,
 ) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
-    """The nearest train row of each query row, -1 where the ratio test fails, and their scalar product."""
-    packed = _packed(train)
+    """The nearest train row of each query row, -1 where the ratio test fails, and their scalar product; `column_largest` is lifted."""
     padded = np.zeros((-(-len(query) // ROWS) * ROWS, GROUP * packed.shape[1]), np.float32)
     padded[: len(query), : query.shape[1]] = query
-    nearest_idx, products = np.empty(len(padded), np.int32), np.empty(len(padded), np.float32)
+    nearest_idx, products = np.empty(len(query), np.int32), np.empty(len(query), np.float32)
+    of_bands = list[np.ndarray]()
 
     def run(first_pair: int, last_pair: int) -> None:
-        table = np.empty((_ROWS_AT_ONCE, TILE * len(packed)), np.float32)
-        for start in range(ROWS * first_pair, ROWS * last_pair, _ROWS_AT_ONCE):
-            rows = slice(start, min(start + _ROWS_AT_ONCE, ROWS * last_pair))
-            multiply(padded[rows], packed, table)
-            block = table[: rows.stop - start]  # whole rows: a part of them would be another type to Numba, compiled apart
-            nearest_idx[rows] = np.argmax(block[:, : len(train)], axis=1)
-            reject_rivalled(block, len(train), nearest_idx[rows], ratio, points, radii, products[rows])
+        rows, of_band = slice(ROWS * first_pair, ROWS * last_pair), np.full_like(column_largest, -np.inf)
+        find_nearest(padded[rows], packed, *compared, nearest_idx[rows], products[rows], of_band)
+        of_bands.append(of_band)
 
     run_in_bands(run, len(padded) // ROWS, num_threads)
-    return nearest_idx[: len(query)], products[: len(query)]
+    for of_band in of_bands:
+        np.maximum(column_largest, of_band, out=column_largest)
+    return nearest_idx, products
 
 
 def _packed(train: Float32[np.ndarray, "m d"]) -> Float32[np.ndarray, "tiles groups width"]:

@@ -1,8 +1,9 @@
 """Files of networks of local features: which are known, where they lie, and whether a file is one.
 
 All are ONNX of one contract: input `image` (1, 1, h, w), grey in [0, 1], sides multiples of 32; outputs `scores` (1, 1, h, w) and
-`descriptors` (1, c, h/s, w/s); some have a third output, `places` (1, c, h/p, w/p), by which places are known again. Each says in its
-metadata which network it is. Ours lies in the package, others in the user's cache.
+`descriptors` (1, c, h/s, w/s), or two levels that descriptors are the sum of (`dense.TwoLevels`): `coarse` (1, h/2s, w/2s, c), `fine`
+(1, h/s, w/s, k) and `fine_weights` (k, c); some have one more output, `places` (1, c, h/p, w/p), by which places are known again. Each says
+in its metadata which network it is. Ours lies in the package, others in the user's cache.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from topoloc.errors import MissingExtraError, WeightsError
 
 CONTRACT = 1
 """Version of what a file's inputs and outputs mean (`topoloc_version` of its metadata)."""
-_OUTPUTS = (["scores", "descriptors"], ["scores", "descriptors", "places"])
+_LEVELS = ["coarse", "fine", "fine_weights"]
+_OUTPUTS = [["scores", *dense, *places] for dense in (["descriptors"], _LEVELS) for places in ([], ["places"])]
 _SHIPPED = Path(__file__).parent / "networks"
 _SMALLEST = 64  # pixels of the picture that a file is tried with
 
@@ -95,8 +97,12 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "topoloc"
 
 
-def open_network(path: Path, num_threads: int) -> tuple[KnownNetwork, Any]:
+def open_network(path: Path, num_threads: int, size: tuple[int, int] | None = None) -> tuple[KnownNetwork, Any]:
     """Which network an ONNX file is, and its session of ONNX Runtime, which several threads may run at once.
+
+    Args:
+        size: rows and columns of the pictures that it is run on, where all have the same: ONNX Runtime then knows what lies where, and
+            adds levels up as convolutions write them.
 
     Raises:
         MissingExtraError: ONNX Runtime is not installed.
@@ -110,6 +116,8 @@ def open_network(path: Path, num_threads: int) -> tuple[KnownNetwork, Any]:
     options.log_severity_level = 4
     options.intra_op_num_threads = num_threads
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # beside another busy program it would eat a core
+    for axis, length in zip(("h", "w"), size or (), strict=False):
+        options.add_free_dimension_override_by_name(axis, length)
     try:
         session = onnxruntime.InferenceSession(read_bytes(path), options, providers=["CPUExecutionProvider"])
         properties = session.get_modelmeta().custom_metadata_map
@@ -128,8 +136,8 @@ def open_network(path: Path, num_threads: int) -> tuple[KnownNetwork, Any]:
 def check_network(path: Path) -> KnownNetwork:
     """Which network a ready ONNX file is; it is tried on a small picture, too. Raises as `open_network`."""
     network, session = open_network(path, num_threads=1)
-    scores, descriptors, *_ = map(np.asarray, session.run(None, {"image": np.zeros((1, 1, _SMALLEST, _SMALLEST), np.float32)}))
-    if scores.shape != (1, 1, _SMALLEST, _SMALLEST) or descriptors.ndim != 4 or not np.isfinite(descriptors).all():
+    scores, dense, *_ = map(np.asarray, session.run(None, {"image": np.zeros((1, 1, _SMALLEST, _SMALLEST), np.float32)}))
+    if scores.shape != (1, 1, _SMALLEST, _SMALLEST) or dense.ndim != 4 or not np.isfinite(dense).all():
         raise WeightsError(f"network {path}: its outputs are not scores and descriptors of the picture")
     return network
 

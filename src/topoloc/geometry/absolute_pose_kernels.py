@@ -6,33 +6,37 @@ from topoloc.compiled import kernel
 
 
 @kernel()
-def _whitened(rotation, translation, normalized, covariance, point_world, point_covariances, i):
+def _whitened(rotation, translation, normalized, covariances, points_world, point_covariances, i):
     """(u, v, 1/z, e, S^-1, e' S^-1 e) of match i, with e = projected - observed on the plane z = 1; the last is infinite behind.
 
-    S = `covariance` + D R P R' D' with D the projection's derivative and P the point's covariance, absent if there are none.
+    S = the pixel's covariance + D R P R' D' with D the projection's derivative and P the point's covariance, absent if there are none.
+    Rows are not taken out of the arrays: a view of each would cost more than the arithmetic.
     """
-    x = rotation[0, 0] * point_world[0] + rotation[0, 1] * point_world[1] + rotation[0, 2] * point_world[2] + translation[0]
-    y = rotation[1, 0] * point_world[0] + rotation[1, 1] * point_world[1] + rotation[1, 2] * point_world[2] + translation[1]
-    z = rotation[2, 0] * point_world[0] + rotation[2, 1] * point_world[1] + rotation[2, 2] * point_world[2] + translation[2]
+    px, py, pz = points_world[i, 0], points_world[i, 1], points_world[i, 2]
+    x = rotation[0, 0] * px + rotation[0, 1] * py + rotation[0, 2] * pz + translation[0]
+    y = rotation[1, 0] * px + rotation[1, 1] * py + rotation[1, 2] * pz + translation[1]
+    z = rotation[2, 0] * px + rotation[2, 1] * py + rotation[2, 2] * pz + translation[2]
     if not z > 1e-6:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.inf
     u, v, w = x / z, y / z, 1.0 / z
-    s00, s01, s11 = covariance[0, 0], covariance[0, 1], covariance[1, 1]
+    s00, s01, s11 = covariances[i, 0, 0], covariances[i, 0, 1], covariances[i, 1, 1]
     if len(point_covariances) > 0:
-        p = point_covariances[i]
+        p00, p01, p02 = point_covariances[i, 0, 0], point_covariances[i, 0, 1], point_covariances[i, 0, 2]
+        p10, p11, p12 = point_covariances[i, 1, 0], point_covariances[i, 1, 1], point_covariances[i, 1, 2]
+        p20, p21, p22 = point_covariances[i, 2, 0], point_covariances[i, 2, 1], point_covariances[i, 2, 2]
         a0, b0 = w * (rotation[0, 0] - u * rotation[2, 0]), w * (rotation[1, 0] - v * rotation[2, 0])
         a1, b1 = w * (rotation[0, 1] - u * rotation[2, 1]), w * (rotation[1, 1] - v * rotation[2, 1])
         a2, b2 = w * (rotation[0, 2] - u * rotation[2, 2]), w * (rotation[1, 2] - v * rotation[2, 2])
-        pa0, pb0 = p[0, 0] * a0 + p[0, 1] * a1 + p[0, 2] * a2, p[0, 0] * b0 + p[0, 1] * b1 + p[0, 2] * b2
-        pa1, pb1 = p[1, 0] * a0 + p[1, 1] * a1 + p[1, 2] * a2, p[1, 0] * b0 + p[1, 1] * b1 + p[1, 2] * b2
-        pa2, pb2 = p[2, 0] * a0 + p[2, 1] * a1 + p[2, 2] * a2, p[2, 0] * b0 + p[2, 1] * b1 + p[2, 2] * b2
+        pa0, pb0 = p00 * a0 + p01 * a1 + p02 * a2, p00 * b0 + p01 * b1 + p02 * b2
+        pa1, pb1 = p10 * a0 + p11 * a1 + p12 * a2, p10 * b0 + p11 * b1 + p12 * b2
+        pa2, pb2 = p20 * a0 + p21 * a1 + p22 * a2, p20 * b0 + p21 * b1 + p22 * b2
         s00 += a0 * pa0 + a1 * pa1 + a2 * pa2
         s01 += a0 * pb0 + a1 * pb1 + a2 * pb2
         s11 += b0 * pb0 + b1 * pb1 + b2 * pb2
     determinant = s00 * s11 - s01 * s01
     if not determinant > 0.0:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.inf
-    e0, e1 = u - normalized[0], v - normalized[1]
+    e0, e1 = u - normalized[i, 0], v - normalized[i, 1]
     i00, i01, i11 = s11 / determinant, -s01 / determinant, s00 / determinant
     return u, v, w, e0, e1, i00, i01, i11, e0 * e0 * i00 + 2.0 * e0 * e1 * i01 + e1 * e1 * i11
 
@@ -42,7 +46,7 @@ def squared_errors(rotation, translation, normalized, covariances, points_world,
     """Squared Mahalanobis length of each match's reprojection error; infinite behind the camera."""
     squares = np.empty(len(normalized))
     for i in range(len(normalized)):
-        squares[i] = _whitened(rotation, translation, normalized[i], covariances[i], points_world[i], point_covariances, i)[8]
+        squares[i] = _whitened(rotation, translation, normalized, covariances, points_world, point_covariances, i)[8]
     return squares
 
 
@@ -65,7 +69,7 @@ def normal_equations(rotation, translation, normalized, covariances, points_worl
         if not active[i]:
             continue
         u, v, w, e0, e1, i00, i01, i11, squared = _whitened(
-            rotation, translation, normalized[i], covariances[i], points_world[i], point_covariances, i
+            rotation, translation, normalized, covariances, points_world, point_covariances, i
         )
         if squared == np.inf:
             cost += 1e6  # a step that puts a match behind the camera is not taken

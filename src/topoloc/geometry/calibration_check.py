@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.geometry.calibration_check_kernels import calibration_equations
 from topoloc.geometry.camera import MODELS, Camera
 from topoloc.geometry.rigid import Rigid3
 
@@ -108,10 +109,9 @@ def calibration_of_picture(
     pose, free = cam_from_world, np.zeros(3)  # logarithm of the scale, offset
     information, squares = np.eye(9), np.zeros(len(rows))
     for _ in range(_ROUNDS):
-        residuals, jacobians, inverse = _linearised(observed, points_world, point_covariances, pose, free, sigma_px / camera.fx)
-        squares = np.einsum("ni,nij,nj->n", residuals, inverse, residuals)
-        weighted = (inverse @ jacobians / (1.0 + squares / _CAUCHY_SCALE**2)[:, None, None]).reshape(-1, 9)
-        information, gradient = weighted.T @ jacobians.reshape(-1, 9), weighted.T @ residuals.reshape(-1)
+        rotation, translation = np.ascontiguousarray(pose.rotation), np.ascontiguousarray(pose.translation)
+        of_points = (observed, points_world, point_covariances, sigma_px / camera.fx, _CAUCHY_SCALE)
+        information, gradient, squares = calibration_equations(rotation, translation, free, *of_points)
         information[6:, 6:] += np.eye(3) / _PRIOR**2
         gradient[6:] += free / _PRIOR**2
         try:
@@ -141,24 +141,3 @@ def seen_beside(calibrated: Camera, camera: Camera, found: PictureCalibration, p
     own = camera_of_picture(camera, found)
     way = np.array([own.cx - calibrated.cx, own.cy - calibrated.cy]) / calibrated.fx
     return SeenCamera(np.array([math.log(own.fx / calibrated.fx), *way]), found.covariance, place)
-
-
-def _linearised(
-    observed: Float[np.ndarray, "n 2"],
-    points_world: Float[np.ndarray, "n 3"],
-    point_covariances: Float[np.ndarray, "n 3 3"],
-    pose: Rigid3,
-    free: Float[np.ndarray, " 3"],
-    sigma: float,
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 9"], Float[np.ndarray, "n 2 2"]]:
-    """Residuals, their derivatives by the pose's left perturbation, the scale's logarithm and the offset; inverse covariances."""
-    x, y, z = pose.apply(points_world).T
-    u, v, w, scale = x / z, y / z, 1.0 / z, math.exp(free[0])
-    zero, one = np.zeros_like(u), np.ones_like(u)
-    by_point = scale * np.stack([np.column_stack([w, zero, -u * w]), np.column_stack([zero, w, -v * w])], axis=1)
-    by_rotation = scale * np.stack([np.column_stack([-u * v, 1.0 + u * u, -v]), np.column_stack([-(1.0 + v * v), u * v, u])], axis=1)
-    projected = scale * np.column_stack([u, v])
-    by_free = np.stack([np.column_stack([projected[:, 0], one, zero]), np.column_stack([projected[:, 1], zero, one])], axis=1)
-    by_world = by_point @ pose.rotation
-    spread = by_world @ point_covariances @ by_world.transpose(0, 2, 1) + sigma**2 * np.eye(2)
-    return projected + free[1:] - observed, np.concatenate([by_point, by_rotation, by_free], axis=2), np.linalg.inv(spread)

@@ -19,7 +19,7 @@ from topoloc.features.features import Features, Matches
 from topoloc.features.kinds import FeatureKind, GuidedThresholds
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.guided_kernels import match_projections
+from topoloc.localization.guided_kernels import expected_of_points, match_projections, project_without_lens
 from topoloc.localization.local_map import LocalMap
 
 
@@ -104,17 +104,22 @@ def _find(
 
 def visible_points(local_map: LocalMap, cam_from_world: Rigid3, camera: Camera) -> tuple[Int[np.ndarray, " v"], Float[np.ndarray, "v 2"]]:
     """The map points that lie in the camera's view, by their rows, and where they must be seen."""
-    pixels = _pixels_in_view(cam_from_world.apply(local_map.points_world), camera)
+    _, pixels = _projected(local_map, cam_from_world, camera)
     rows = np.flatnonzero(np.isfinite(pixels[:, 0]))
     return rows, pixels[rows]
 
 
-def _pixels_in_view(points_cam: Float[np.ndarray, "n 3"], camera: Camera) -> Float[np.ndarray, "n 2"]:
-    """Pixels of points, NaN where they are out of view."""
+def _projected(local_map: LocalMap, cam_from_world: Rigid3, camera: Camera) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 2"]]:
+    """The map points in the camera (metres), and their pixels, NaN where they are out of view."""
+    if not camera.is_distorted:
+        rotation, translation = np.ascontiguousarray(cam_from_world.rotation), np.ascontiguousarray(cam_from_world.translation)
+        lens = (camera.fx, camera.fy), (camera.cx, camera.cy)
+        return project_without_lens(local_map.points_world, rotation, translation, *lens, camera.width, camera.height)
+    points_cam = cam_from_world.apply(local_map.points_world)
     pixels = camera.img_from_cam(points_cam)
     with np.errstate(invalid="ignore"):
         inside = (pixels >= -0.5).all(axis=1) & (pixels[:, 0] < camera.width - 0.5) & (pixels[:, 1] < camera.height - 0.5)
-    return np.where(inside[:, None], pixels, np.nan)
+    return points_cam, np.where(inside[:, None], pixels, np.nan)
 
 
 def expected_key_points(local_map: LocalMap, cam_from_world: Rigid3, camera: Camera) -> Float32[np.ndarray, "n 5"]:
@@ -122,15 +127,9 @@ def expected_key_points(local_map: LocalMap, cam_from_world: Rigid3, camera: Cam
 
     The surface is taken to face the node's camera; `max_scale` and `max_turn` leave room for its slant.
     """
-    points_cam = cam_from_world.apply(local_map.points_world)
-    pixels = _pixels_in_view(points_cam, camera)
-    inside = np.isfinite(pixels[:, 0])
-    z = np.where(inside, points_cam[:, 2], 1.0)
-    directions = local_map.directions @ cam_from_world.rotation.T
-    turned = directions[:, :2] - points_cam[:, :2] / z[:, None] * directions[:, 2:]
-    turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-9)
-    expected = np.column_stack([pixels, local_map.sizes * camera.fx / z, turned])
-    return np.where(inside[:, None], expected, np.nan).astype(np.float32)
+    points_cam, pixels = _projected(local_map, cam_from_world, camera)
+    rotation = np.ascontiguousarray(cam_from_world.rotation)
+    return expected_of_points(points_cam, pixels, local_map.sizes, local_map.directions, rotation, float(camera.fx))
 
 
 def largest_shift(features: Features, matches: Matches, expected: Float32[np.ndarray, "n 5"], camera: Camera, within_px: float) -> int:

@@ -1,4 +1,4 @@
-"""Numba kernel of guided matching: which key point lies where a map point must be seen, and looks like it?"""
+"""Numba kernels of guided matching: where must a map point be seen? And which key point lies there, and looks like it?"""
 
 from __future__ import annotations
 
@@ -30,7 +30,10 @@ def match_projections(
         cells[k] = row * num_columns + column
         starts[cells[k] + 1] += 1
     starts = np.cumsum(starts)
-    order = np.argsort(cells, kind="mergesort")
+    order, free = np.empty(len(seen), np.int64), starts.copy()
+    for k in range(len(seen)):  # those of a cell in their own order
+        order[free[cells[k]]] = k
+        free[cells[k]] += 1
     found = np.full(len(expected), -1, np.int32)
     similarities = np.zeros(len(expected), np.float32)
     for n in range(len(expected)):
@@ -62,3 +65,38 @@ def match_projections(
         if best_k >= 0 and best >= min_similarity and best - second >= min_margin:
             found[n], similarities[n] = best_k, best
     return found, similarities
+
+
+@kernel(error_model="numpy")
+def project_without_lens(points_world, rotation, translation, focal, centre, width, height):
+    """Points in the camera (n, 3), metres, and their pixels (n, 2), NaN where they are out of view, of a camera without distortion."""
+    points_cam, pixels = np.empty((len(points_world), 3)), np.empty((len(points_world), 2))
+    for n in range(len(points_world)):
+        p = points_world[n]
+        for i in range(3):
+            points_cam[n, i] = rotation[i, 0] * p[0] + rotation[i, 1] * p[1] + rotation[i, 2] * p[2] + translation[i]
+        x, y, z = points_cam[n, 0], points_cam[n, 1], points_cam[n, 2]
+        u, v = x / z * focal[0] + centre[0], y / z * focal[1] + centre[1]
+        is_in_view = z > 1e-9 and u >= -0.5 and v >= -0.5 and u < width - 0.5 and v < height - 0.5
+        pixels[n, 0], pixels[n, 1] = (u, v) if is_in_view else (np.nan, np.nan)
+    return points_cam, pixels
+
+
+@kernel(error_model="numpy")
+def expected_of_points(points_cam, pixels, sizes, directions, rotation, focal):
+    """Rows (x, y, size, cosine and sine of the angle), float32, at which points must be seen whose pixels are known; NaN where these are.
+
+    `sizes` (metres) and `directions` (unit vectors, world) are those of what the points' descriptors describe, `focal` is in pixels.
+    """
+    expected = np.full((len(pixels), 5), np.nan, np.float32)
+    for n in range(len(pixels)):
+        if not np.isfinite(pixels[n, 0]):
+            continue
+        x, y, z, d = points_cam[n, 0], points_cam[n, 1], points_cam[n, 2], directions[n]
+        along = rotation[2, 0] * d[0] + rotation[2, 1] * d[1] + rotation[2, 2] * d[2]
+        right = rotation[0, 0] * d[0] + rotation[0, 1] * d[1] + rotation[0, 2] * d[2] - x / z * along
+        down = rotation[1, 0] * d[0] + rotation[1, 1] * d[1] + rotation[1, 2] * d[2] - y / z * along
+        length = max(np.sqrt(right * right + down * down), 1e-9)
+        expected[n, 0], expected[n, 1], expected[n, 2] = pixels[n, 0], pixels[n, 1], sizes[n] * focal / z
+        expected[n, 3], expected[n, 4] = right / length, down / length
+    return expected

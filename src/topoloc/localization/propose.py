@@ -23,11 +23,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from topoloc.features.matching import match_pooled
+from topoloc.features.matching import Matcher
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.belief import Hypothesis, is_same_pose
 from topoloc.localization.guided import largest_shift, match_expected, match_guided
+from topoloc.localization.local_map import LocalMap
 from topoloc.localization.map_facts.repetition import LEAST_SHIFT
 from topoloc.localization.pose_fit import PoseFit, fit_pose
 from topoloc.localization.search import Proposal, Search, Source
@@ -68,7 +69,7 @@ def propose_more(search: Search) -> Iterator[Proposal]:
 
 def propose_briefly(search: Search, least: float) -> Proposal | None:
     """What retrieval by the strongest features alone leads to; None where fewer than `least` of them agree."""
-    brief = _matched(search, "retrieval", _ranked(search), least, search.config.num_first_features)
+    brief = _matched(search, "retrieval", _matcher(search, _ranked(search)), least, search.config.num_first_features)
     return brief if brief.fit.num_inliers >= least else None
 
 
@@ -91,20 +92,27 @@ def _near(search: Search, world_from_cam: Rigid3) -> list[NodeScore]:
 
 def _pooled(search: Search, source: Source, rows: list[int], least: float) -> Proposal:
     """These nodes' points together. The strongest features are nearly always enough, or agree in fewer than `least`; else all are tried."""
-    config = search.config
-    proposal = _matched(search, source, rows, least, config.num_first_features)
+    config, matcher = search.config, _matcher(search, rows)
+    proposal = _matched(search, source, matcher, least, config.num_first_features)
     is_open = least <= proposal.fit.num_inliers < config.num_clear_inliers
     if is_open and len(search.query.features) > config.num_first_features:
-        proposal = _matched(search, source, rows, least)
+        proposal = _matched(search, source, matcher, least)
     return proposal
 
 
-def _matched(search: Search, source: Source, rows: list[int], least: float, max_features: int | None = None) -> Proposal:
-    """Matches with the points of these nodes, and robust PnP, where as many as `least` may agree on a pose."""
-    query, local_map = search.query, search.map.local_map(rows)
+def _matcher(search: Search, rows: list[int]) -> tuple[LocalMap, Matcher]:
+    """The points of these nodes, and what matches the query's features with them."""
+    points = search.map.local_map(rows)
+    return points, Matcher(
+        search.query.features.descriptors, points.descriptors, (points.points_world, points.radii), search.config.matching
+    )
+
+
+def _matched(search: Search, source: Source, of_nodes: tuple[LocalMap, Matcher], least: float, max_features: int | None = None) -> Proposal:
+    """Matches with the points of nodes, and robust PnP, where as many as `least` may agree on a pose."""
+    query, (local_map, matcher) = search.query, of_nodes
     with query.clock.stage("matching"):
-        descriptors = query.features.descriptors[:max_features]
-        matches = match_pooled(descriptors, local_map.descriptors, local_map.points_world, local_map.radii, search.config.matching)
+        matches = matcher.of_first(max_features)
     if len(matches) < max(search.config.min_matches, least):
         return Proposal(source, PoseFit(query.features, query.lens, query.camera, local_map, matches, None), is_guided=False)
     with query.clock.stage("pnp"):

@@ -12,7 +12,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from topoloc.features.matching import match_pooled
+from topoloc.features.features import Matches
+from topoloc.features.matching import Matcher
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.belief import Hypothesis
@@ -125,7 +126,7 @@ def say_on(search: Search, hypothesis: Hypothesis) -> tuple[float, Hypothesis | 
     if final.num_inliers < search.config.evidence.min_found:
         return 0.0, None
     weighed = weigh(search, Proposal("other features", final, is_guided=True), final)
-    num_matches = len(_unguided(search, final).matches) if weighed is None else weighed.evidence.num_matches
+    num_matches = len(_unguided(search, final).of_first()) if weighed is None else weighed.evidence.num_matches
     log_odds = -_MOST_SAID if weighed is None else weighed.log_odds  # None: it is hopeless
     return float(np.clip(log_odds, -_MOST_SAID, _MOST_SAID)) * num_matches / (num_matches + _FEW_MATCHES), weighed
 
@@ -146,11 +147,12 @@ def _evidence(search: Search, proposal: Proposal, final: PoseFit, covariance: Fl
         may_be_hopeless = log_odds < 2.0 * _HOPELESS
     if log_odds_of(_at_best(counted, final), search.weights) < _HOPELESS:  # whatever the unguided matches say
         return None
+    matcher = _unguided(search, final)
     if may_be_hopeless:
-        of_strongest = _with_unguided(search, counted, _unguided(search, final, search.config.num_first_features), final)
+        of_strongest = _with_unguided(search, counted, _fit_of(final, matcher.of_first(search.config.num_first_features)), final)
         if log_odds_of(of_strongest, search.weights) < 2.0 * _HOPELESS:  # whatever those of the other features say
             return None
-    return _with_unguided(search, counted, _unguided(search, final), final)
+    return _with_unguided(search, counted, _fit_of(final, matcher.of_first()), final)
 
 
 def _counted(search: Search, final: PoseFit, covariance: Float[np.ndarray, "6 6"]) -> Evidence:
@@ -203,11 +205,15 @@ def _with_unguided(search: Search, evidence: Evidence, unguided: PoseFit, final:
     return replace(evidence, num_matches=len(unguided.matches), num_inliers=num_agreeing)
 
 
-def _unguided(search: Search, final: PoseFit, max_features: int | None = None) -> PoseFit:
-    """Matches of the strongest features with the points around the final pose that owe nothing to it."""
+def _unguided(search: Search, final: PoseFit) -> Matcher:
+    """Of features with the points around the final pose, without any pose's say."""
     points = final.local_map
     positions = folded(points.points_world, _repeats(search, final))  # copies of a point are no rivals of it
-    matches = match_pooled(final.features.descriptors[:max_features], points.descriptors, positions, points.radii, search.config.matching)
+    return Matcher(final.features.descriptors, points.descriptors, (positions, points.radii), search.config.matching)
+
+
+def _fit_of(final: PoseFit, matches: Matches) -> PoseFit:
+    """Matches that owe nothing to the final pose, as a fit without one."""
     return replace(final, matches=matches, pose=None)
 
 

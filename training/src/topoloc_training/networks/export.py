@@ -1,8 +1,9 @@
 """Networks of local features to ONNX, all by one contract, so that one extractor serves every kind.
 
 Input `image` (1, 1, h, w) float32, grey in [0, 1], h and w multiples of 32. Outputs `scores` (1, 1, h, w) in [0, 1] and
-`descriptors` (1, c, h/s, w/s), not of unit length: pixel (x, y) lies at ((x + 0.5) / s - 0.5, (y + 0.5) / s - 0.5) of it. A network
-may have a third, `places` (1, c, h/p, w/p), by which places are known again; its class then names all three as `outputs`.
+`descriptors` (1, c, h/s, w/s), not of unit length: pixel (x, y) lies at ((x + 0.5) / s - 0.5, (y + 0.5) / s - 0.5) of it, or the two
+levels that these are the sum of (`lean.py`). A network may have a third, `places` (1, c, h/p, w/p), by which places are known again; its
+class then names all three as `outputs`.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from torch import Tensor, nn
 
 from topoloc.sequences.atomic import replaced_file
 from topoloc_training.networks.edgepoint2 import SIZES, EdgePoint2
+from topoloc_training.networks.lean import made_lean
 from topoloc_training.networks.xfeat import UNUSED, XFeat
 
 VERSION = 1
@@ -60,6 +62,7 @@ def export(network: nn.Module, path: Path, properties: dict[str, str]) -> None:
                 dynamo=False,
             )
         model = onnx.load(part)
+        made_lean(model)
         onnx.helper.set_model_props(model, {"topoloc_version": str(VERSION), **properties})
         onnx.save(model, part)
 
