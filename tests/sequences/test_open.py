@@ -101,7 +101,7 @@ def test_a_folder_with_an_at_sign_in_its_name(tmp_path: Path):
     assert len(open_sequence(f"{tmp_path / 'me@home'}@0")) == 1
 
 
-@pytest.mark.parametrize("name", ["kitti", "euroc", "tum", "seven_scenes"])
+@pytest.mark.parametrize("name", ["kitti", "tum", "seven_scenes"])
 def test_a_left_frame_is_described_as_the_whole_one_and_its_other_picture_not_read(name: str, request: pytest.FixtureRequest):
     recording = sequence_subset(open_sequence(request.getfixturevalue(name)), [1])
     whole = frame_view(recording[0], with_depth=False)
