@@ -22,7 +22,7 @@ from topoloc.shelf import Shelf
 from topoloc.slam.keyframes import KeyFrame
 from topoloc.slam.place_matching import PlaceMatch, PlaceMatchingConfig, match_places
 
-_VLAD_BYTES = 16_000_000  # in memory: each is looked at once or twice, in their order
+_VLAD_BYTES = 4_000_000  # in memory: each is looked at once or twice, in their order
 
 
 @dataclass(frozen=True)
