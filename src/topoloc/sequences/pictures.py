@@ -20,7 +20,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8, UInt16
+from jaxtyping import Float32, UInt8
 from PIL import (  # the readers make themselves known to Pillow
     BmpImagePlugin,  # noqa: F401
     ExifTags,
@@ -36,7 +36,6 @@ from PIL import Image as Pillow
 
 from topoloc.errors import UnreadableImageError
 from topoloc.sequences.frame import Image
-from topoloc.sequences.png import png_pixels
 
 PICTURE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp", ".heic", ".heif"})
 MAX_PIXELS = 100_000_000
@@ -69,20 +68,14 @@ def read_image(path: Path | PictureBytes) -> Image:
     Raises:
         UnreadableImageError: missing, empty, truncated, damaged, no picture, or of more than 100 megapixels.
     """
-    with _pixels(path) as picture:
-        if isinstance(picture, np.ndarray):
-            return picture if picture.dtype == np.uint8 else _eight_bits(picture)
+    with _decoded(path) as picture:
         if picture.mode in _GREY:
             return np.array(picture.convert("L"))
         if picture.mode in _GREY_16:
-            return _eight_bits(np.array(picture).astype(np.uint16))
+            return cv2.convertScaleAbs(np.array(picture).astype(np.uint16), alpha=1.0 / 257.0)
         if picture.mode == "F":
             raise UnreadableImageError(f"{path}: pixels of type float32, not of 8 or 16 bits")
-        return np.array(picture if picture.mode == "RGB" else picture.convert("RGB"))
-
-
-def _eight_bits(pixels: UInt16[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
-    return cv2.convertScaleAbs(pixels, alpha=1.0 / 257.0)
+        return np.array(picture.convert("RGB"))
 
 
 def grey_image(image: Image) -> UInt8[np.ndarray, "h w"]:
@@ -96,14 +89,10 @@ def read_depth(path: Path | PictureBytes, units_per_metre: float) -> Float32[np.
     Raises:
         UnreadableImageError: as `read_image`, or not a picture of one channel of 16 bits.
     """
-    with _pixels(path) as picture:
-        if isinstance(picture, np.ndarray) and picture.dtype == np.uint16:
-            units = picture
-        elif not isinstance(picture, np.ndarray) and picture.mode in _GREY_16:
-            units = np.array(picture).astype(np.uint16)
-        else:
-            pixels = "8 bits" if isinstance(picture, np.ndarray) else picture.mode
-            raise UnreadableImageError(f"{path}: depth must be one channel of 16 bits, not pixels of {pixels}")
+    with _decoded(path) as picture:
+        if picture.mode not in _GREY_16:
+            raise UnreadableImageError(f"{path}: depth must be one channel of 16 bits, not pixels of {picture.mode}")
+        units = np.array(picture).astype(np.uint16)
     depth = units.astype(np.float32) / np.float32(units_per_metre)
     depth[(units == 0) | (units == 65535)] = np.nan
     return depth
@@ -176,10 +165,9 @@ def _read_bytes(path: Path | PictureBytes) -> bytes:
 
 
 @contextmanager
-def _opened(path: Path | PictureBytes, data: bytes | None = None) -> Iterator[ImageFile.ImageFile]:
-    """The picture (of `data`, where they were read already) with its header read. What the body raises of a damaged file comes as
-    UnreadableImageError, too."""
-    data = _read_bytes(path) if data is None else data
+def _opened(path: Path | PictureBytes) -> Iterator[ImageFile.ImageFile]:
+    """The picture with its header read. What the body raises of a damaged file comes as UnreadableImageError, too."""
+    data = _read_bytes(path)
     try:
         types = _known_types(path)
         picture = Pillow.open(io.BytesIO(data), formats=types)
@@ -203,13 +191,8 @@ def _opened(path: Path | PictureBytes, data: bytes | None = None) -> Iterator[Im
 
 
 @contextmanager
-def _pixels(path: Path | PictureBytes) -> Iterator[Pillow.Image | np.ndarray]:
-    """The picture decoded: of a usual PNG as an array of 8 or 16 bits, else by Pillow."""
-    data = _read_bytes(path)
-    with _opened(path, data) as picture:
-        if picture.format == "PNG" and (pixels := png_pixels(data)) is not None:
-            yield pixels
-            return
+def _decoded(path: Path | PictureBytes) -> Iterator[Pillow.Image]:
+    with _opened(path) as picture:
         picture.load()
         if picture.mode == "P" or picture.getexif().get(ExifTags.Base.Orientation, 1) != 1:
             upright = ImageOps.exif_transpose(picture)
