@@ -58,8 +58,8 @@ def set_num_threads(number: int) -> None:
 
     Unless it is said these are 2, and 1 for the networks of learned coarse localizers. The answers do not depend on it, but for the last
     digits of such a network's scores. Holds for topoloc in this process and for the libraries that it calls: OpenCV, FAISS, and PyTorch
-    where it is loaded. Of several threads that share a `Localizer`, each uses as many. NumPy's own number is set before Python starts
-    (`OPENBLAS_NUM_THREADS`).
+    where it is loaded. Of several threads that share a `Localizer`, each uses as many. NumPy's own number is set before it is loaded
+    (`OPENBLAS_NUM_THREADS`; the command line sets 1 where it is not set).
 
     Raises:
         ValueError: `number` is below 1.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import pickle
 import sqlite3
@@ -142,16 +143,25 @@ class _Unpickler(pickle.Unpickler):
 
 def bytes_of(value: Any, apart: Container[int] = ()) -> int:
     """Bytes of the arrays and byte strings in a value, its fields and items, those of mappings too; objects of these `id` do not count."""
-    if id(value) in apart:
-        return 0
-    if isinstance(value, np.ndarray):
-        return value.nbytes
-    if isinstance(value, bytes):
-        return len(value)
-    if isinstance(value, dict):
-        return sum(bytes_of(item, apart) for item in value.values())
-    if isinstance(value, list | tuple):
-        return sum(bytes_of(item, apart) for item in value)
-    if is_dataclass(value) and not isinstance(value, type):
-        return sum(bytes_of(getattr(value, name), apart) for name in value.__dataclass_fields__)
-    return 0
+    total, left = 0, [value]
+    while left:  # no recursion: a draft has hundreds of parts, and is counted whenever a picture has seen it
+        one = left.pop()
+        if id(one) in apart:
+            continue
+        if isinstance(one, np.ndarray):
+            total += one.nbytes
+        elif isinstance(one, bytes):
+            total += len(one)
+        elif isinstance(one, dict):
+            left.extend(one.values())
+        elif isinstance(one, list | tuple):
+            left.extend(one)
+        else:
+            left.extend([getattr(one, name) for name in _fields_of(type(one))])
+    return total
+
+
+@functools.cache
+def _fields_of(kind: type) -> tuple[str, ...]:
+    """Of a dataclass; else none."""
+    return tuple(kind.__dataclass_fields__) if is_dataclass(kind) else ()

@@ -271,3 +271,11 @@ def test_fifty_megapixels_need_little_memory_and_no_matplotlib(room_map: Path, t
     status, peak, matplotlib_loaded = last.split()
     assert (status, matplotlib_loaded) == ("0", "False")
     assert int(peak) * (1 if sys.platform == "darwin" else 1024) < 1.5e9
+
+
+@pytest.mark.parametrize(("given", "expected"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3")])
+def test_blas_has_one_thread_unless_the_user_says_otherwise(given: dict[str, str], expected: str):
+    environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"} | given
+    code = "import os, sys, topoloc.cli; print(os.environ['OPENBLAS_NUM_THREADS'], 'numpy' in sys.modules)"
+    said = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True).stdout
+    assert said.split() == [expected, "False"]

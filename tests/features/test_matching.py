@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from topoloc.features.matching import Matcher, MatchingConfig, match_features, match_pooled
+from topoloc.features.matching import Matcher, MatchingConfig, alike_pairs, match_features, match_pooled
 from topoloc.features.matching_kernels import TILE
 
 
@@ -188,3 +188,12 @@ def test_of_equal_query_features_the_first_is_matched():
     train = random_descriptors(0, 30)
     query = np.concatenate([train, train])
     assert np.array_equal(match_features(query, train, MatchingConfig()).query_idx, np.arange(30))
+
+
+@pytest.mark.parametrize(("num_few", "num_many", "size"), [(128, 1501, 64), (3, 1, 64), (70, 300, 66), (0, 5, 64), (5, 0, 64)])
+def test_pairs_that_are_alike_are_all_that_have_this_product_in_their_order(num_few: int, num_many: int, size: int):
+    few, many = random_descriptors(1, num_few, size), random_descriptors(2, num_many, size)
+    rows, columns = alike_pairs(few, many, 0.2)
+    expected = np.nonzero(few @ many.T >= np.float32(0.2))
+    np.testing.assert_array_equal(rows, expected[0])
+    np.testing.assert_array_equal(columns, expected[1])

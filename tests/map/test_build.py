@@ -18,6 +18,7 @@ from topoloc.map.build import BuildConfig, build_map
 from topoloc.map.landmarks import LandmarkConfig
 from topoloc.map.nodes import NodeConfig, NodePoses, node_distances
 from topoloc.map.topomap import Edge, TopoMetricMap, TopoNode
+from topoloc.sequences.recording import left_frame
 
 ALONE = BuildConfig(nodes=NodeConfig(d_thresh=0.35, lambda_rot=1.0), other_kinds=())
 
@@ -146,6 +147,26 @@ def test_each_picture_is_read_once(tiny_recording: Path):
     recording = CountedReads(topoloc.open_sequence(f"{tiny_recording}@0:5"))
     build_map(recording, ALONE)
     assert recording.reads == [1] * 5
+
+
+class CountedHalves(CountedReads):
+    """One whose frames can be read without their right pictures, too; counts these reads apart."""
+
+    def __init__(self, base: topoloc.StereoSequence) -> None:
+        super().__init__(base)
+        self.halves = [0] * len(base)
+
+    def left_frame(self, index: int) -> topoloc.StereoFrame:
+        self.halves[index] += 1
+        return left_frame(self.base, index)
+
+
+def test_the_right_picture_of_what_is_no_node_is_not_read(tiny_recording: Path):
+    recording = CountedHalves(topoloc.open_sequence(f"{tiny_recording}@0:5"))
+    names = {node.summary.name for node in build_map(recording, ALONE).nodes}
+    assert 0 < len(names) < 5
+    assert [name in names for name in recording.names] == [bool(reads) for reads in recording.reads]
+    assert [reads + halves for reads, halves in zip(recording.reads, recording.halves, strict=True)] == [1] * 5
 
 
 def test_an_unreadable_picture_is_named(own_recording: Path):

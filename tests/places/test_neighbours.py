@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import faiss
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from topoloc.places.neighbours import PlaceIndex
+from topoloc.places.neighbours import PlaceIndex, visual_words
 
 
 def unit(array: np.ndarray) -> np.ndarray:
@@ -55,3 +56,15 @@ def test_cells_look_further_where_one_node_has_most_images():
     node_ids = np.concatenate([np.zeros(900, np.int64), np.arange(1, 9)])
     ranking = PlaceIndex(vectors, node_ids, max_exact=100).rank_nodes(unit(np.ones(8)), 3)
     assert len({score.node_id for score in ranking}) == 3
+
+
+def test_words_do_not_depend_on_the_number_of_threads_which_stays_as_it_was():
+    descriptors, before, words = unit(np.random.default_rng(4).standard_normal((3000, 16))), faiss.omp_get_max_threads(), []
+    try:
+        for number in (1, 3):
+            faiss.omp_set_num_threads(number)
+            words.append(visual_words(descriptors, 32, seed=0))
+            assert faiss.omp_get_max_threads() == number
+    finally:
+        faiss.omp_set_num_threads(before)
+    np.testing.assert_array_equal(*words)

@@ -34,10 +34,12 @@ def test_a_turned_pair_is_rectified_and_says_how_it_turned():
     camera = Camera("OPENCV", 320, 240, (*tiny_world.CAMERA.params, -0.1, 0.02, 0.0, 0.0))
     left, right = (tiny_world.render(panels, pose, camera)[0] for pose in (world_from_left, world_from_right))
     rig = StereoRig(camera, camera, right_from_left)
-    view = frame_view(StereoFrame("a", 0, left, camera, right=right, rig=rig))
+    frame = StereoFrame("a", 0, left, camera, right=right, rig=rig)
+    view = frame_view(frame)
     assert view.rig is not None
     assert view.rig.is_rectified
     assert view.right_grey is not None
+    np.testing.assert_array_equal(frame_view(replace(frame, right=None), with_depth=False).grey, view.grey)
     world_from_view = world_from_left @ view.view_from_cam.inverse()
     for seen, pose in ((view.grey, world_from_view), (view.right_grey, world_from_view @ view.rig.right_from_left.inverse())):
         expected, _ = tiny_world.render(panels, pose, view.camera)

@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 from tiny_recordings import assert_same_pose, picture, write
 
-from topoloc.errors import RecordingError, UnknownFormatError
+from topoloc.errors import RecordingError, UnknownFormatError, UnreadableImageError
 from topoloc.sequences.frame import StereoSequence
+from topoloc.sequences.frame_view import frame_view
 from topoloc.sequences.open import FORMATS, open_sequence
-from topoloc.sequences.recording import natural_key, parse_selection, sequence_subset
+from topoloc.sequences.recording import Recording, SequenceView, left_frame, natural_key, parse_selection, sequence_subset
 
 
 @pytest.mark.parametrize("name", ["kitti", "euroc", "tum", "seven_scenes"])
@@ -98,6 +99,28 @@ def test_a_folder_with_an_at_sign_in_its_name(tmp_path: Path):
     write(tmp_path / "me@home" / "a.png", picture(0))
     assert len(open_sequence(tmp_path / "me@home")) == 1
     assert len(open_sequence(f"{tmp_path / 'me@home'}@0")) == 1
+
+
+@pytest.mark.parametrize("name", ["kitti", "tum", "seven_scenes"])
+def test_a_left_frame_is_described_as_the_whole_one_and_its_other_picture_not_read(name: str, request: pytest.FixtureRequest):
+    recording = sequence_subset(open_sequence(request.getfixturevalue(name)), [1])
+    whole = frame_view(recording[0], with_depth=False)
+    assert isinstance(recording, SequenceView)
+    base = recording.base
+    assert isinstance(base, Recording)
+    other = base.right or base.depth
+    assert other is not None
+    other.paths[1].unlink()
+    with pytest.raises(UnreadableImageError):
+        recording[0]
+    left = left_frame(recording, 0)
+    assert left.right is None
+    assert left.depth is None
+    assert left.world_from_cam is recording.poses[0]
+    view = frame_view(left, with_depth=False)
+    np.testing.assert_array_equal(view.picture, whole.picture)
+    assert view.camera == whole.camera
+    np.testing.assert_array_equal(view.view_from_cam.matrix(), whole.view_from_cam.matrix())
 
 
 def test_a_subset_keeps_its_order_and_its_bounds(plain: Callable[..., Path]):

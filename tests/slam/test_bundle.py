@@ -134,3 +134,15 @@ def test_anchors_hold_all_poses_and_a_wrong_one_bends_nothing():
     told.append(Anchor(keyframes[6], Rigid3.exp(np.full(6, 0.4)) @ there[6], 1e6 * np.eye(6)))
     adjust_bundle(keyframes, [], landmarks, BundleConfig(max_steps=60, min_decrease=1e-9), told)
     assert pose_errors(keyframes, there).max() < 0.005
+
+
+def test_what_a_long_walk_remembers_is_kept_small():
+    keyframes, landmarks, _, points = world(2)
+    seen = keyframes[0].observations
+    seen.append(Observations(np.array([7]), np.ones((1, 3)), np.ones((1, 3)), np.ones(1, np.bool_)))
+    arrays = [seen.landmark_ids, seen.measured, seen.weights, seen.active]
+    assert sum(array.nbytes for array in arrays) <= 29 * len(seen.active)
+    for _ in range(200):
+        landmarks.add(points)
+    assert len(landmarks.positions) <= 1.25 * landmarks.num + len(points)
+    np.testing.assert_array_equal(landmarks.positions[landmarks.num - len(points) : landmarks.num], points)

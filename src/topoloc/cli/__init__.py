@@ -13,6 +13,10 @@ import os
 import sys
 from typing import Any, TextIO
 
+# Before NumPy is loaded, which reads it then. BLAS's own threads wait for each other by spinning: that takes more of the processors than
+# the products here are worth, and with as many threads as there are processors the last digits would depend on the machine.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 # name -> the module, which holds a dataclass of the settings, `Command`, with `run`; and what `topoloc --help` says of it
 COMMANDS = {
     "demo": ("topoloc.cli.demo", "the whole pipeline on the built-in lab: mapped by day, asked by day, by night and with another camera"),

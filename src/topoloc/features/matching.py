@@ -11,12 +11,12 @@ from typing import Annotated, Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int32
+from jaxtyping import Float, Float32, Int, Int32
 
 from topoloc.bounds import Between
 from topoloc.features.bands import run_in_bands
 from topoloc.features.features import Matches
-from topoloc.features.matching_kernels import GROUP, ROWS, TILE, find_nearest
+from topoloc.features.matching_kernels import GROUP, ROWS, TILE, find_alike, find_nearest
 
 _LOWES_RATIO = 0.8
 _FLANN_KDTREE = 1
@@ -75,6 +75,21 @@ def match_pooled(
     test: features whose points lie within the larger of their two `train_radii` (metres: what the depth error allows) are twins.
     """
     return Matcher(query_descriptors, train_descriptors, (train_points_world, train_radii), config, num_threads).of_first()
+
+
+def alike_pairs(
+    few: Float32[np.ndarray, "n d"], many: Float32[np.ndarray, "m d"], min_similarity: float
+) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    """Rows of `few` and of `many` whose descriptors have a scalar product of at least `min_similarity` (above 0), by rows of `few`, then of
+    `many`."""
+    found, count = np.empty((1024, 2), np.int64), 0
+    if len(few) and len(many):
+        # the few are what is kept at hand, so that nothing of the many is laid out anew
+        packed = _packed(few)
+        found, count = find_alike(_padded(many, packed), packed, len(few), np.float32(min_similarity), found, count)
+    found = found[:count]
+    found = found[np.argsort(found[:, 1], kind="stable")]
+    return found[:, 1], found[:, 0]
 
 
 class Matcher:
@@ -149,8 +164,7 @@ def _nearest(
     num_threads: int | None,
 ) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
     """The nearest train row of each query row, -1 where the ratio test fails, and their scalar product; `column_largest` is lifted."""
-    padded = np.zeros((-(-len(query) // ROWS) * ROWS, GROUP * packed.shape[1]), np.float32)
-    padded[: len(query), : query.shape[1]] = query
+    padded = _padded(query, packed)
     nearest_idx, products = np.empty(len(query), np.int32), np.empty(len(query), np.float32)
     of_bands = list[np.ndarray]()
 
@@ -163,6 +177,13 @@ def _nearest(
     for of_band in of_bands:
         np.maximum(column_largest, of_band, out=column_largest)
     return nearest_idx, products
+
+
+def _padded(query: Float32[np.ndarray, "n d"], packed: Float32[np.ndarray, "tiles groups width"]) -> Float32[np.ndarray, "n2 d2"]:
+    """Descriptors with zeros to whole groups of rows and components, as `multiply` takes them beside `packed`."""
+    padded = np.zeros((-(-len(query) // ROWS) * ROWS, GROUP * packed.shape[1]), np.float32)
+    padded[: len(query), : query.shape[1]] = query
+    return padded
 
 
 def _packed(train: Float32[np.ndarray, "m d"]) -> Float32[np.ndarray, "tiles groups width"]:

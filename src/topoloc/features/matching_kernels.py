@@ -35,6 +35,29 @@ def multiply(query, packed, out):
 
 
 @kernel()
+def find_alike(query, packed, num_columns, least, found, count):
+    """Append (row, column) of all products of at least `least` to `found` (k, 2), which holds `count` of them; returns the (grown) array
+    and the new count. `query` and `packed` as of `multiply`; columns from `num_columns` on do not count."""
+    products = np.empty((ROWS, TILE * packed.shape[0]), np.float32)
+    for i in range(0, query.shape[0] - ROWS + 1, ROWS):
+        multiply(query[i : i + ROWS], packed, products)
+        for row in range(ROWS):
+            total = np.int32(0)
+            for column in range(num_columns):  # without a branch, so that it runs eight columns at a time
+                total += np.int32(products[row, column] >= least)
+            if total == 0:
+                continue
+            while count + total > found.shape[0]:
+                found = np.concatenate((found, np.empty_like(found)))
+            for column in range(num_columns):
+                if products[row, column] >= least:
+                    found[count, 0] = i + row
+                    found[count, 1] = column
+                    count += 1
+    return found, count
+
+
+@kernel()
 def _are_twins(points, radii, a, b):
     squared = np.float32(0.0)
     for axis in range(3):

@@ -149,7 +149,7 @@ def _visit_all_images(
     nodes = NearestNodes(NodePoses.of(drafts.world_from_nodes), node_config.lambda_rot)
     images: list[PlaceImage] = []
     lights, vlads, cells = [], {kind: Shelf[np.ndarray]() for kind in config.kinds}, {kind: [] for kind in config.kinds}
-    read = ((frame, None if frame in drafts.rows else frame.read()) for frame in frames)
+    read = ((frame, None if frame in drafts.rows else frame.read_left()) for frame in frames)
     visits = in_order(lambda one: _visit(*one, drafts, nodes, words, config), read)
     for done, (frame, visit) in enumerate(zip(frames, visits, strict=True)):
         for row, observed in visit.observed.items():

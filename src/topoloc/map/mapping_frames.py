@@ -25,7 +25,7 @@ from topoloc.map.sessions import Light, light_of
 from topoloc.sequences.frame import Image, StereoFrame, StereoSequence
 from topoloc.sequences.frame_view import FrameView, frame_view
 from topoloc.sequences.pictures import jpeg_of
-from topoloc.sequences.recording import has_scale
+from topoloc.sequences.recording import has_scale, left_frame
 from topoloc.slam.metric_points import MetricPoints, keypoint_sigmas, locate_points
 from topoloc.slam.motion_points import OtherPicture, choose_pictures, locate_by_motion, usual_step
 
@@ -49,6 +49,10 @@ class MappingFrame:
     def read(self) -> StereoFrame:
         """Recordings are read by one thread, and videos best in their order."""
         return self.sequence[self.index]
+
+    def read_left(self) -> StereoFrame:
+        """As `read`, but for the right or depth picture: whoever only describes the frame needs none."""
+        return left_frame(self.sequence, self.index)
 
     def view(self, with_depth: bool = True) -> FrameView:
         return view_of(self.read(), with_depth)

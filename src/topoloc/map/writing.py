@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from topoloc.errors import MapError
+from topoloc.features.bands import in_order
 from topoloc.geometry.rigid import Rigid3
 from topoloc.map.config import config_to_text
 from topoloc.map.contents import MapContents, NextIds, map_id_of
@@ -62,6 +63,10 @@ def write_map(topomap: MapContents, path: Path) -> None:
         raise MapError(f"cannot write map {path}: {error}") from error
 
 
+_Blobs = tuple[list[bytes], list[bytes]]
+"""A node's points, and what each session knows of them."""
+
+
 class _Writer:
     """Rows put in, with their checksums, counted; what all of them are goes into the table `map` at the end."""
 
@@ -88,8 +93,9 @@ class _Writer:
         for model in sorted(topomap.coarse_models.values(), key=lambda model: model.name):
             self._insert_model(model)
         if topomap.sides is not None:
-            for node in topomap.sides.nodes:
-                self._insert_node(node, topomap.sides.kind, {}, SIDE)
+            kind_of_sides = topomap.sides.kind
+            for (of_side,) in in_order(_packed, ([(node, kind_of_sides)] for node in topomap.sides.nodes)):
+                self._insert_node(*of_side, {}, SIDE)
             for model in topomap.sides.coarse_models.values():
                 self._insert_model(model, SIDE)
         if topomap.repetitions is not None:
@@ -99,11 +105,13 @@ class _Writer:
         self._database.execute("COMMIT")
 
     def _write_nodes(self, topomap: MapContents, session_ids: Mapping[str, int]) -> None:
-        for row, node in enumerate(topomap.nodes):
-            self._insert_node(node, topomap.kind, session_ids)
+        others = sorted(topomap.other_kinds.items())
+        read = ([(node, topomap.kind), *((nodes[row], kind) for kind, nodes in others)] for row, node in enumerate(topomap.nodes))
+        for (node, kind, blobs), *of_others in in_order(_packed, read):
+            self._insert_node(node, kind, blobs, session_ids)
             self._insert("node_templates", node.summary.node_id, node.template_jpeg)
-            for kind, nodes in sorted(topomap.other_kinds.items()):
-                self._insert_points(nodes[row], kind)
+            for of_other in of_others:
+                self._insert_points(*of_other)
 
     def _write_images(self, topomap: MapContents, session_ids: Mapping[str, int]) -> int:
         """Images without an id get the next ones; returns the one after them."""
@@ -148,7 +156,7 @@ class _Writer:
             self._insert("map", key, value)
         self._insert("map", "digest", digest_of({table: [c for _, c in sorted(rows)] for table, rows in self._checksums.items()}))
 
-    def _insert_node(self, node: TopoNode, kind: str, session_ids: Mapping[str, int], prefix: str = "") -> None:
+    def _insert_node(self, node: TopoNode, kind: str, blobs: _Blobs, session_ids: Mapping[str, int], prefix: str = "") -> None:
         camera_json = json.dumps(node.camera.to_json(), sort_keys=True)
         if camera_json not in self._camera_ids:
             self._camera_ids[camera_json] = len(self._camera_ids) + 1
@@ -157,15 +165,14 @@ class _Writer:
         owner = s.of_node if prefix else session_ids.get(s.recording, s.session_id)
         row = (s.node_id, owner, s.name, s.t_ns, self._camera_ids[camera_json], _pose_bytes(s.world_from_cam), len(node.features))
         self._insert(f"{prefix}nodes", *row)
-        self._insert_points(node, kind, prefix)
+        self._insert_points(node, kind, blobs, prefix)
 
-    def _insert_points(self, node: TopoNode, kind: str, prefix: str = "") -> None:
-        f, node_id = node.features, node.summary.node_id
-        blobs = [array_packed(array) for array in arrays_of(node, kind)]
-        self._insert(f"{prefix}node_points", node_id, kind, len(f), f.descriptors.shape[1], *blobs)
+    def _insert_points(self, node: TopoNode, kind: str, blobs: _Blobs, prefix: str = "") -> None:
+        (of_points, of_sums), f, node_id = blobs, node.features, node.summary.node_id
+        self._insert(f"{prefix}node_points", node_id, kind, len(f), f.descriptors.shape[1], *of_points)
         if not prefix:
-            for sums in node.sums:
-                self._insert("landmark_sums", node_id, kind, sums.session_id, len(sums.rows), sums_bytes(sums))
+            for sums, blob in zip(node.sums, of_sums, strict=True):
+                self._insert("landmark_sums", node_id, kind, sums.session_id, len(sums.rows), blob)
 
     def _insert_model(self, model: CoarseModel, prefix: str = "") -> None:
         self._insert(f"{prefix}coarse_models", model.name, json.dumps(model.settings, sort_keys=True), _arrays_bytes(model.arrays))
@@ -175,6 +182,13 @@ class _Writer:
         self._database.execute(f"INSERT INTO {table} VALUES ({', '.join('?' * (len(row) + 1))})", (*row, checksum))
         names = list(TABLES[table])
         self._checksums[table].append((tuple(row[names.index(name)] for name in ORDER[table].split(", ")), checksum))
+
+
+def _packed(nodes: Sequence[tuple[TopoNode, str]]) -> list[tuple[TopoNode, str, _Blobs]]:
+    """Nodes by kinds of features, with their points and sums as the file keeps them; several threads may do so at a time."""
+    return [
+        (node, kind, ([array_packed(a) for a in arrays_of(node, kind)], [sums_bytes(sums) for sums in node.sums])) for node, kind in nodes
+    ]
 
 
 def copy_in_order(database: sqlite3.Connection, path: Path) -> None:

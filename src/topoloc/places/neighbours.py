@@ -132,6 +132,12 @@ def visual_words(descriptors: Float32[np.ndarray, "n d"], num_words: int, seed: 
     """The k-means centres of descriptors, fewer where there are few of them."""
     num_words = max(1, min(num_words, len(descriptors) // 40))
     kmeans = faiss.Kmeans(descriptors.shape[1], num_words, niter=20, seed=seed + 1, min_points_per_centroid=1)
-    kmeans.train(np.ascontiguousarray(descriptors))
+    # A tenth of a second for one thread; several wait for each other by spinning, at two hundred places, for longer than that.
+    before = faiss.omp_get_max_threads()
+    faiss.omp_set_num_threads(1)
+    try:
+        kmeans.train(np.ascontiguousarray(descriptors))
+    finally:
+        faiss.omp_set_num_threads(before)
     assert kmeans.centroids is not None
     return np.asarray(kmeans.centroids, np.float32).reshape(num_words, -1)

@@ -38,7 +38,7 @@ class FrameView:
 def frame_view(frame: StereoFrame, with_depth: bool = True) -> FrameView:
     """Rectify a stereo pair, or bring depth into the picture's camera.
 
-    Without `with_depth` only the picture itself is made ready.
+    Without `with_depth` only the picture itself is made ready; what was read without its right picture (`left_frame`) is rectified, too.
 
     Raises:
         CalibrationError: the frame has no camera.
@@ -46,7 +46,7 @@ def frame_view(frame: StereoFrame, with_depth: bool = True) -> FrameView:
     """
     if frame.camera is None:
         raise CalibrationError(f"{frame.name}: no calibration; put a camera.json into the recording's folder")
-    if frame.right is not None and frame.rig is not None:
+    if frame.rig is not None and (frame.right is not None or not with_depth):
         return _stereo_view(frame.image, frame.right if with_depth else None, frame.rig)
     if frame.depth is not None or not with_depth:
         depth = registered_depth(frame.depth, frame.camera) if with_depth and frame.depth is not None else None

@@ -80,18 +80,20 @@ class Recording:
             IndexError: no such frame.
             UnreadableImageError: a picture is missing, broken, or of another size than its camera.
         """
-        path = self.root / self.names[index]
-        camera = self.camera if self.cameras is None else self.cameras[index]
-        image = _read_as(path, camera)
-        frame = StereoFrame(self.names[index], self.t_ns[index], image, camera, world_from_cam=self.poses[index])
-        if camera is None:
-            frame = replace(frame, noted_focal=exif_focal_length(path, image.shape[1], image.shape[0]))
+        frame = self.left_frame(index)
         if self.right is not None:
-            right = _read_as(self.right.paths[index], self.right.rig.right)
-            return replace(frame, right=right, rig=self.right.rig)
+            return replace(frame, right=_read_as(self.right.paths[index], self.right.rig.right))
         if self.depth is not None:
-            return replace(frame, depth=_depth_image(self.depth, index, camera))
+            return replace(frame, depth=_depth_image(self.depth, index, frame.camera))
         return frame
+
+    def left_frame(self, index: int) -> StereoFrame:
+        """Read one frame but for its right or depth picture. Raises as the whole frame does."""
+        path = self.root / self.names[index]
+        camera, rig = self.camera if self.cameras is None else self.cameras[index], None if self.right is None else self.right.rig
+        image = _read_as(path, camera)
+        focal = exif_focal_length(path, image.shape[1], image.shape[0]) if camera is None else None
+        return StereoFrame(self.names[index], self.t_ns[index], image, camera, rig=rig, world_from_cam=self.poses[index], noted_focal=focal)
 
 
 @runtime_checkable
@@ -100,6 +102,15 @@ class _Paired(Protocol):
 
     def single(self) -> StereoSequence:
         """The same recording without them."""
+        ...
+
+
+@runtime_checkable
+class _PartlyRead(Protocol):
+    """A sequence whose right and depth pictures are files of their own."""
+
+    def left_frame(self, index: int) -> StereoFrame:
+        """A frame without them, which are not read."""
         ...
 
 
@@ -154,6 +165,14 @@ def single_pictures(sequence: StereoSequence) -> StereoSequence:
     if isinstance(sequence, SequenceView):
         return replace(sequence, base=single_pictures(sequence.base))
     return sequence.single() if isinstance(sequence, _Paired) else sequence
+
+
+def left_frame(sequence: StereoSequence, index: int) -> StereoFrame:
+    """A frame of which only the left (or colour) picture is asked: right and depth pictures are not read, where that is possible. A
+    pair's rig is there, for it says how the left picture is rectified. Raises as the sequence does."""
+    if type(sequence) is SequenceView:  # one that reads otherwise is asked itself
+        return replace(left_frame(sequence.base, sequence.indices[index]), world_from_cam=sequence.poses[index])
+    return sequence.left_frame(index) if isinstance(sequence, _PartlyRead) else sequence[index]
 
 
 def notes_of(sequence: StereoSequence) -> list[str]:

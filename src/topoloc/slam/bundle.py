@@ -134,7 +134,13 @@ def adjust_bundle(
 
 
 def _landmarks_of(keyframes: Sequence[KeyFrame]) -> Int[np.ndarray, " n"]:
-    return np.unique(np.concatenate([k.observations.landmark_ids[k.observations.active] for k in keyframes]))
+    """Ascending. All of a long walk's observations are never side by side."""
+    of_each = [k.observations.landmark_ids[k.observations.active] for k in keyframes]
+    first = min((int(ids.min()) for ids in of_each if len(ids)), default=0)
+    is_seen = np.zeros(max((int(ids.max()) + 1 - first for ids in of_each if len(ids)), default=0), np.bool_)
+    for ids in of_each:
+        is_seen[ids - first] = True
+    return np.flatnonzero(is_seen) + first
 
 
 def _camera_row(keyframe: KeyFrame) -> list[float]:

@@ -82,8 +82,8 @@ class BundleParts:
             starts=np.searchsorted(rows[order], np.arange(last - first + 1)),
             frames=np.repeat(np.array(seeing, np.int32), [len(rows) for rows in sources])[order],
             sources=np.concatenate(sources)[order],
-            measured=np.where(weights > 0.0, measured, 0.0),
-            weights=weights,
+            measured=np.where(weights > 0.0, measured, 0.0).astype(np.float64),
+            weights=weights.astype(np.float64),
         )
 
 

@@ -9,9 +9,18 @@ from __future__ import annotations
 import numpy as np
 
 from topoloc.compiled import kernel
-from topoloc.slam.tracking_kernels import sample_bilinear
 
 _OPTIONS = {"error_model": "numpy", "fastmath": {"reassoc", "contract", "arcp"}}
+
+
+@kernel(**_OPTIONS)
+def _sample_row(image, x, y, row):
+    """Bilinear samples at x, x + 1, ... of one height, all at the same fraction of a pixel: a loop that vectorises."""
+    left, top = int(np.floor(x)), int(np.floor(y))
+    fx, fy = np.float32(x - left), np.float32(y - top)
+    upper, lower = image[top, left : left + len(row) + 1], image[top + 1, left : left + len(row) + 1]
+    for k in range(len(row)):
+        row[k] = (1 - fy) * (upper[k] * (1 - fx) + upper[k + 1] * fx) + fy * (lower[k] * (1 - fx) + lower[k + 1] * fx)
 
 
 @kernel(**_OPTIONS)
@@ -20,10 +29,10 @@ def _normalized_patch(image, x, y, half, patch):
     side = 2 * half + 1
     mean = np.float32(0)
     for j in range(side):
+        row = patch[j]
+        _sample_row(image, x - half, y + j - half, row)
         for i in range(side):
-            value = sample_bilinear(image, x + i - half, y + j - half)
-            patch[j, i] = value
-            mean += value
+            mean += row[i]
     mean /= side * side
     norm = np.float32(0)
     for j in range(side):
@@ -90,18 +99,19 @@ def _refine_disparity(patch, half, right, x, y, disparity, num_iterations):
     sigma = np.float32(np.inf)
     window = np.empty((side, side), np.float32)
     slope = np.empty((side, side), np.float32)
+    samples = np.empty(side + 2, np.float32)  # of a row, and one more at each end
     for _ in range(num_iterations):
         xr = x - disparity
         if xr - half - 1 < 0 or xr + half + 2 >= width:
             return disparity, np.float32(np.inf)
         mean, slope_mean = np.float32(0), np.float32(0)
         for j in range(side):
+            _sample_row(right, xr - half - 1, y + j - half, samples)
+            values, slopes = window[j], slope[j]
             for i in range(side):
-                xx, yy = xr + i - half, y + j - half
-                window[j, i] = sample_bilinear(right, xx, yy)
-                slope[j, i] = np.float32(0.5) * (sample_bilinear(right, xx + 1, yy) - sample_bilinear(right, xx - 1, yy))
-                mean += window[j, i]
-                slope_mean += slope[j, i]
+                values[i], slopes[i] = samples[i + 1], np.float32(0.5) * (samples[i + 2] - samples[i])
+                mean += values[i]
+                slope_mean += slopes[i]
         mean /= side * side
         slope_mean /= side * side
         gain = np.float32(0)

@@ -57,7 +57,9 @@ class Landmarks:
         ids = np.arange(self.num, self.num + len(points_world))
         self.num += len(points_world)
         if self.num > len(self.positions):
-            self.positions = np.concatenate([self.positions, np.full((max(self.num, len(self.positions)), 3), np.nan)])
+            # by a quarter: of a long walk's landmarks no more room stays empty than that
+            more = max(self.num - len(self.positions), len(self.positions) // 4)
+            self.positions = np.concatenate([self.positions, np.full((more, 3), np.nan)])
         self.positions[ids] = points_world
         return ids
 
@@ -66,13 +68,18 @@ class Landmarks:
 class Observations:
     """What one key frame sees of landmarks: pixel and disparity (x, y, d) and the inverse of their standard deviations.
 
-    An unknown disparity has weight 0. `active` is False for what has been found to be wrong.
+    An unknown disparity has weight 0. `active` is False for what has been found to be wrong. All of it is kept in single precision, which
+    is that of the pictures' measurements: of a long walk nothing else takes as much memory.
     """
 
     landmark_ids: Int[np.ndarray, " n"]
     measured: Float[np.ndarray, "n 3"]
     weights: Float[np.ndarray, "n 3"]
     active: Bool[np.ndarray, " n"]
+
+    def __post_init__(self) -> None:
+        self.landmark_ids = np.asarray(self.landmark_ids, np.int32)
+        self.measured, self.weights = np.asarray(self.measured, np.float32), np.asarray(self.weights, np.float32)
 
     def append(self, other: Observations) -> None:
         self.landmark_ids = np.concatenate([self.landmark_ids, other.landmark_ids])

@@ -22,6 +22,8 @@ from topoloc.shelf import Shelf
 from topoloc.slam.keyframes import KeyFrame
 from topoloc.slam.place_matching import PlaceMatch, PlaceMatchingConfig, match_places
 
+_VLAD_BYTES = 4_000_000  # in memory: each is looked at once or twice, in their order
+
 
 @dataclass(frozen=True)
 class LoopConfig:
@@ -106,7 +108,7 @@ def rank_places(keyframes: Sequence[KeyFrame], config: VladConfig, num: int | No
     if sum(num_features) == 0:
         return
     words = learn_words_of(num_features, lambda row: features(row).descriptors, config)
-    vlads = Shelf(vlad(features(row).descriptors, words) for row in range(len(keyframes)))
+    vlads = Shelf((vlad(features(row).descriptors, words) for row in range(len(keyframes))), _VLAD_BYTES)
     localizer, blank = SurfVlad.fit(words, vlads, np.arange(len(keyframes)), config), np.zeros((1, 1), np.uint8)
     for row in range(len(keyframes)):
         yield [score.node_id for score in localizer.rank(blank, features(row), num or len(keyframes))]

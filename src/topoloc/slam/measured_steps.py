@@ -19,6 +19,7 @@ from topoloc.geometry.relative_pose import estimate_relative_pose
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.frame import StereoFrame, StereoSequence
 from topoloc.sequences.frame_view import frame_view
+from topoloc.sequences.recording import left_frame
 from topoloc.slam.metric_points import MetricPoints, MetricPointsConfig, locate_points
 
 
@@ -75,7 +76,7 @@ def measure_steps(sequence: StereoSequence, usable: list[int], config: MeasuredS
     for gap in config.gaps:  # backwards where the recording ends
         pairs = ((start, start + gap if start + gap < len(usable) else start - gap) for start in starts if start not in steps)
         pairs = [pair for pair in pairs if pair[1] >= 0]
-        read = ((a, b, None if a in firsts else sequence[usable[a]], sequence[usable[b]]) for a, b in pairs)
+        read = ((a, b, None if a in firsts else sequence[usable[a]], left_frame(sequence, usable[b])) for a, b in pairs)
         for start, first, step in in_order(measure, read):
             firsts[start] = first
             if step is not None:

@@ -27,6 +27,8 @@ from topoloc.slam.place_matching import match_places, place_view
 from topoloc.slam.steps import LastFrame, OdometryConfig, Step, StepSeeker, Tracks
 from topoloc.slam.tracking import find_corners
 
+_PLACE_BYTES = 16_000_000  # of places in memory, about 80: the last few are asked, and comparing two takes ten times as long as reading
+
 
 class Odometry:
     """The state of one recording's odometry. `keyframes` and `landmarks` are those of all recordings, and are added to."""
@@ -44,7 +46,7 @@ class Odometry:
         self._history = MotionHistory(config.prediction)
         self._repeats: list[Rigid3] = []  # of the last frame before the camera was lost
         self._bias = DisparityBias()
-        self._places = Shelf[PlaceView]()
+        self._places = Shelf[PlaceView](max_bytes=_PLACE_BYTES)
         self._looking = ThreadPoolExecutor(1, initializer=be_one_of_several)
         self._looked_at: KeyFrame | None = None
 

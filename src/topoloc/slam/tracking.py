@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from topoloc.bounds import Above, AtLeast, Between
 from topoloc.features.bands import run_in_bands
-from topoloc.slam.tracking_kernels import refine_tracks
+from topoloc.slam.tracking_kernels import best_of_cells, refine_tracks
 
 
 @dataclass(frozen=True)
@@ -100,18 +100,11 @@ def find_corners(
     rows, columns = height // side, width // side
     strength = cv2.cornerMinEigenVal(grey, 3)
     threshold = max(config.min_quality * float(strength.max()), config.min_eigenvalue)
-    peaks = np.where(strength >= cv2.dilate(strength, np.ones((3, 3), np.uint8)), strength, 0.0)
-    border = config.patch_half_px + 3
-    peaks[:border], peaks[-border:], peaks[:, :border], peaks[:, -border:] = 0.0, 0.0, 0.0, 0.0
     top, left = (height - rows * side) // 2, (width - columns * side) // 2
-    cells = peaks[top : top + rows * side, left : left + columns * side].reshape(rows, side, columns, side)
-    cells = cells.transpose(0, 2, 1, 3).reshape(rows * columns, side * side)
-    best = np.argmax(cells, axis=1)
     cell_of = np.floor((occupied_img - [left, top]) / side).astype(np.int64)
     inside = ((cell_of >= 0) & (cell_of < [columns, rows])).all(axis=1)
-    free = np.ones(rows * columns, np.bool_)
-    free[cell_of[inside, 1] * columns + cell_of[inside, 0]] = False
-    chosen = np.flatnonzero(free & (cells[np.arange(len(cells)), best] > threshold))
-    y = chosen // columns * side + best[chosen] // side + top
-    x = chosen % columns * side + best[chosen] % side + left
-    return np.column_stack([x, y]).astype(np.float32)
+    is_free = np.ones((rows, columns), np.bool_)
+    is_free[cell_of[inside, 1], cell_of[inside, 0]] = False
+    corners = np.empty((rows * columns, 2), np.float32)
+    border = config.patch_half_px + 3
+    return corners[: best_of_cells(strength, is_free, side, top, left, border, np.float32(threshold), corners)]

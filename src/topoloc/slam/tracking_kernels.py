@@ -1,4 +1,4 @@
-"""Numba kernel: a tracked point brought to where it looks most like the picture it was first seen in.
+"""Numba kernels: a tracked point brought to where it looks most like the picture it was first seen in; corners to begin with.
 
 Point trackers step from frame to frame and drift a little at each; the patch of the last key frame does not.
 """
@@ -130,3 +130,38 @@ def refine_tracks(reference, image, points_ref, points, scales, half, num_iterat
             refined[n, 0], refined[n, 1] = x, y
             noise = norm * norm * max(np.float32(1) - scores[n] * scores[n], np.float32(0)) / (side * side)
             sigmas[n] = scale * np.sqrt(noise * (a + c) / (2 * determinant))
+
+
+@kernel()
+def _is_peak(strength, y, x):
+    value = strength[y, x]
+    for row in range(y - 1, y + 2):
+        for column in range(x - 1, x + 2):
+            if strength[row, column] > value:
+                return False
+    return True
+
+
+@kernel()
+def best_of_cells(strength, is_free, side, top, left, border, threshold, corners):
+    """Fill `corners` with x, y of the strongest peak of each free cell, row by row of the grid; returns their number.
+
+    `is_free` (rows, columns) are the cells, `side` pixels wide, the first of them at (left, top). Only what is stronger than `threshold`
+    and at least `border` (1 or more) pixels inside the picture counts; of equal ones the first.
+    """
+    height, width = strength.shape
+    count = 0
+    for row in range(is_free.shape[0]):
+        first_y, last_y = max(top + row * side, border), min(top + (row + 1) * side, height - border)
+        for column in range(is_free.shape[1]):
+            if not is_free[row, column]:
+                continue
+            best, best_x, best_y = threshold, -1, -1
+            for y in range(first_y, last_y):
+                for x in range(max(left + column * side, border), min(left + (column + 1) * side, width - border)):
+                    if strength[y, x] > best and _is_peak(strength, y, x):
+                        best, best_x, best_y = strength[y, x], x, y
+            if best_x >= 0:
+                corners[count, 0], corners[count, 1] = best_x, best_y
+                count += 1
+    return count

@@ -58,7 +58,7 @@ def _gather(keyframes: Sequence[KeyFrame], ids: Int[np.ndarray, " n"]) -> _Seen:
     for number, keyframe in enumerate(keyframes):
         observed = keyframe.observations
         chosen = np.flatnonzero(np.isin(observed.landmark_ids, ids))
-        points_img = observed.measured[chosen, :2]
+        points_img = observed.measured[chosen, :2].astype(np.float64)
         world_from_cam = keyframe.cam_from_world.inverse()
         directions = keyframe.stereo.camera.rays_from_img(points_img) @ world_from_cam.rotation.T
         centres = np.tile(world_from_cam.translation, (len(chosen), 1))

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from topoloc.features.matching import MatchingConfig, match_features
+from topoloc.features.matching import MatchingConfig, alike_pairs, match_features
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.local_map import LocalMap
@@ -60,7 +60,7 @@ def shifts_of(node: LocalMap, around: LocalMap, min_share: float = 0.5) -> Float
             resemble each other, too, and smooth surfaces any part of themselves.
     """
     points, descriptors = node.points_world[:_NUM_POINTS], node.descriptors[:_NUM_POINTS]
-    rows, columns = np.nonzero(descriptors @ around.descriptors.T >= _MIN_SIMILARITY)
+    rows, columns = alike_pairs(descriptors, around.descriptors, _MIN_SIMILARITY)
     shifts = around.points_world[columns] - points[rows]
     far = np.linalg.norm(shifts, axis=1) > LEAST_SHIFT
     rows, shifts = rows[far], shifts[far]

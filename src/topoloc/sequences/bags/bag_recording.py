@@ -83,11 +83,10 @@ class BagRecording:
             IndexError: no such frame.
             UnreadableImageError: a picture is damaged, or of another size than its camera.
         """
-        image = self._picture(self.left, index, self.camera)
-        frame = StereoFrame(self.names[index], self.t_ns[index], image, self.camera, world_from_cam=self.poses[index])
+        frame = self.left_frame(index)
         if self.right is not None:
             right, rig = self.right
-            return replace(frame, right=self._picture(right, index, rig.right), rig=rig)
+            return replace(frame, right=self._picture(right, index, rig.right))
         if self.depth is not None:
             pictures, camera, cam_from_depth = self.depth
             message, name = self._message(pictures, index)
@@ -95,6 +94,11 @@ class BagRecording:
             _check_size(name, depth.shape, camera)
             return replace(frame, depth=DepthImage(depth, camera, cam_from_depth))
         return frame
+
+    def left_frame(self, index: int) -> StereoFrame:
+        """Read one frame but for its right or depth picture. Raises as the whole frame does."""
+        image, rig = self._picture(self.left, index, self.camera), None if self.right is None else self.right[1]
+        return StereoFrame(self.names[index], self.t_ns[index], image, self.camera, rig=rig, world_from_cam=self.poses[index])
 
     def _picture(self, pictures: Pictures, index: int, camera: Camera | None) -> Image:
         message, name = self._message(pictures, index)
