@@ -61,7 +61,7 @@ class SessionPosesConfig:
     """Sigma of its rotation, radians a metre of the way and a radian of the turn, beside half a milliradian."""
     widened: Annotated[float, Above(0)] = 3.0
     """The map's answers are trusted as if their sigmas were so many times as large: neighbours share errors of the map."""
-    motion_factors: Annotated[tuple[float, ...], Above(0)] = (0.3, 1.0, 3.0, 10.0)
+    motion_factors: Annotated[tuple[float, ...], Above(0)] = (0.5, 1.0, 3.0, 10.0)
     """Of stereo, RGB-D and given poses it is measured by how many times the motion's sigmas are as large: which of these ..."""
     answer_factors: Annotated[tuple[float, ...], Above(0)] = (1.0 / 3.0, 1.0)
     """... and, beside `widened`, which of these for the answers' sigmas agrees best with what the answers say of the motion."""
