@@ -2,11 +2,13 @@
 
     python benchmarks/living_map.py MAP_SEQ [WALK ...] --ask NAME=SEQ [NAME=SEQ ...] [--step 1]
         [--trajectory slam] [--prune] [--budget 1.5] [--unlimited] [--alone] [--ask-each] [--features surf,topoloc-net]
+        [--settings FILE.toml]
 
 `topoloc build` maps MAP_SEQ by its own poses; each WALK then joins by `topoloc update`: of stereo or RGB-D by `--trajectory` (slam, as a
 user has it who carries a camera and nothing else), of a single camera by the map's answers. WALK=LIGHT names the light. With `--prune` the
 map is pruned after each, with `--budget F` to F times the bytes of the map as it was built. Beside it stand the map never updated and,
-with `--unlimited`, the same map that is never pruned.
+with `--unlimited`, the same map that is never pruned. `--settings` are those of `update` and `prune`: with `min_inliers = 10000` in the
+table `[update]` every picture of a session becomes a node, so that a budget binds.
 
 Printed for each walk: bytes, nodes, processor time and the memory at most of `update` and of `prune`; with `--alone` what building the
 walk alone takes. At the end (with `--ask-each` after each walk, too) every `step`-th picture of each NAME is asked as a single picture:
@@ -90,6 +92,7 @@ class LivingMap:
         self.args, self.folder = args, folder
         self.never, self.living, self.unlimited = (folder / f"{name}.topo" for name in ("never", "living", "unlimited"))
         self.features = ["--features", args.features] if args.features else []
+        self.settings = ["--config", args.settings] if args.settings else []
         self.updated = [self.living, self.unlimited] if args.unlimited else [self.living]
         if not self.never.exists():
             self.say(f"build {args.map_sequence}: {run('build', args.map_sequence, self.never, *self.features)}; {size(self.never)}")
@@ -107,7 +110,7 @@ class LivingMap:
         path, _, light = walk.partition("=")
         first = open_sequence(path)[0]
         trajectory = "map" if first.right is None and first.depth is None else self.args.trajectory
-        words = ["--trajectory", trajectory, *(["--light", light] if light else [])]
+        words = ["--trajectory", trajectory, *(["--light", light] if light else []), *self.settings]
         costs = list[Cost]()
         for topo in self.updated:
             costs.append(run("update", topo, path, *words))
@@ -117,7 +120,7 @@ class LivingMap:
             self.say(f"  alone: {alone}; update / build {costs[0].seconds / alone.seconds:.2f}")
         if self.args.prune or self.budget is not None:
             words = [] if self.budget is None else ["--max-mb", f"{self.budget:.3f}"]
-            cost = run("prune", self.living, *words)
+            cost = run("prune", self.living, *words, *self.settings)
             self.say(f"  pruned {' '.join(words)}: {cost}; {size(self.living)}, {self.share():.2f} of the first map's bytes")
 
     def share(self) -> float:
@@ -137,6 +140,7 @@ def main() -> None:
     parser.add_argument("--step", type=int, default=1)
     parser.add_argument("--trajectory", default="slam")
     parser.add_argument("--features")
+    parser.add_argument("--settings", type=Path)
     parser.add_argument("--prune", action="store_true")
     parser.add_argument("--budget", type=float)
     parser.add_argument("--unlimited", action="store_true")

@@ -1,11 +1,11 @@
-"""topoloc prune MAP|ATLAS [--max-mb N]."""
+"""topoloc prune MAP|ATLAS [--max-mb N] [--descriptors coarse]."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -27,6 +27,8 @@ class Command:
     max_mb: Annotated[float | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: only what is gone is dropped)")] = None
     """Megabytes that the file may have, of an atlas that of each tile: every node keeps the landmarks that add most, and nodes that others
     hold go before it keeps few."""
+    descriptors: Annotated[Literal["fine", "coarse"] | None, tyro.conf.arg(help_behavior_hint="(default: as [prune] says, fine)")] = None
+    """With `coarse` descriptors are rounded, to a third of their bytes, before anything goes that may be there."""
     tile: TileOption = None
     """Of an atlas: only this tile is pruned."""
     json: File = None
@@ -40,6 +42,7 @@ class Command:
         check_outputs([self.json], inputs=[path for path in (self.map, self.config) if path])
         check_tile_option(self.map, self.tile)
         config = read_settings(self.config).of(PruneConfig)
+        config = config if self.descriptors is None else replace(config, descriptors=self.descriptors)
         if not is_atlas(self.map):
             changes = self._pruned(Path(self.map), config, self.map)
             write_json(self.json, {"map": self.map} | changes)
@@ -60,7 +63,9 @@ class Command:
             changes = pruned.changes | {"bytes_before": before}
             walked_km = edit.topomap.length_m / 1e3
             if pruned.topomap is not edit.topomap:
-                edit.commit(pruned.topomap, "prune" if self.max_mb is None else f"prune to {self.max_mb:g} MB", changes)
+                to_size = "" if self.max_mb is None else f" to {self.max_mb:g} MB"
+                how = ", descriptors coarse" if config.descriptors == "coarse" else ""
+                edit.commit(pruned.topomap, f"prune{to_size}{how}", changes)
         changes["bytes"] = path.stat().st_size
         if self.json != "-":
             print(f"{name}: {describe_prune(changes, walked_km)}")

@@ -1,4 +1,5 @@
-"""A map made smaller: read from `prune_map`. What is gone goes first, then what adds least.
+"""A map made smaller: read from `prune_map`. What is gone goes first, then, where it is wanted, descriptors' last digits
+(`coarse_descriptors.py`), then what adds least.
 
 A landmark is gone where pictures that found their other landmarks again never found this one. For a budget, nodes that others hold are
 left out while else every node would keep few landmarks (`fewer_nodes.py`). Every node that stays then keeps so many as fit: those with
@@ -13,13 +14,14 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from topoloc.bounds import AtLeast, Between, check_bounds
 from topoloc.errors import MapError
+from topoloc.lifelong.coarse_descriptors import with_coarse_descriptors
 from topoloc.lifelong.earlier_recall import earlier_recall
 from topoloc.lifelong.fewer_nodes import fewest_dropped, holds_of, without_nodes
 from topoloc.lifelong.overlay import Changed, Overlay
@@ -54,6 +56,10 @@ class PruneConfig:
     """... none of whose place another one recognises fewer landmarks than so many."""
     num_compared: Annotated[int, Between(1, 1000)] = 12
     """Nodes near a node that may hold it."""
+    descriptors: Literal["fine", "coarse"] = "fine"
+    """Coarse: rounded to steps of ..."""
+    descriptor_step: Annotated[float, Between(0.04, 1.5)] = 0.64
+    """... so many root mean squares of a descriptor's numbers, before any landmark goes that may be there."""
     max_gone_share: Annotated[float, AtLeast(0)] = 0.7
     """Of a node's landmarks at most this share is taken for gone."""
     earlier_asked: Annotated[int, Between(0, 10_000)] = 24
@@ -124,6 +130,8 @@ def prune_map(topomap: TopoMetricMap, path: Path, max_bytes: int | None = None, 
     config = config or PruneConfig()
     check_bounds(config)
     counted = _with_counts_together(topomap, config)
+    if config.descriptors == "coarse":
+        counted = with_coarse_descriptors(counted, config.descriptor_step)
     file = _FileSize.of(path, topomap.kinds) if counted is topomap else _as_written(counted, path)
     fewer = counted if max_bytes is None else _with_fewer_nodes(counted, file, max_bytes, config)
     file = file if fewer is counted else _as_written(fewer, path)

@@ -2,7 +2,8 @@
 
 The session's motion is that of its poses (given, or SLAM's) in any world of their own; of a single camera without poses, see
 `single_camera_poses.py`. One rigid transform must explain most of what the map answers, but for a drift; the motion and
-the answers are then brought to agree as a pose graph, in which the map stands still.
+the answers are then brought to agree as a pose graph, in which the map stands still, each trusted as far as the session itself shows
+(`motion_trust.py`).
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from jaxtyping import Bool, Float
 from topoloc.bounds import Above, AtLeast, Between
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.rigid import Rigid3, covariance_of_inverse
+from topoloc.lifelong.motion_trust import SeenStep, Trust, measured_trust
 from topoloc.lifelong.scale_of_motion import ScaleConfig
 from topoloc.lifelong.session_calibration import check_by_other_focal_lengths, check_calibration
 from topoloc.lifelong.straightened_walk import BendConfig
@@ -59,6 +61,10 @@ class SessionPosesConfig:
     """Sigma of its rotation, radians a metre of the way and a radian of the turn, beside half a milliradian."""
     widened: Annotated[float, Above(0)] = 3.0
     """The map's answers are trusted as if their sigmas were so many times as large: neighbours share errors of the map."""
+    motion_factors: Annotated[tuple[float, ...], Above(0)] = (0.5, 1.0, 3.0, 10.0)
+    """Of stereo, RGB-D and given poses it is measured by how many times the motion's sigmas are as large: which of these ..."""
+    answer_factors: Annotated[tuple[float, ...], Above(0)] = (1.0 / 3.0, 1.0)
+    """... and, beside `widened`, which of these for the answers' sigmas agrees best with what the answers say of the motion."""
     rival_share: Annotated[float, Between(0, 1)] = 0.3
     """Of a single camera, answers that agree about one way are believed if fewer than this share of them agree about another one."""
     contradiction: Annotated[float, Above(0)] = 0.1
@@ -120,16 +126,25 @@ def poses_by_motion(
 
 
 def held_by(
-    name: str, own: Mapping[int, Rigid3], answers: Mapping[int, Localization | None], d_thresh: float, config: SessionPosesConfig
+    name: str,
+    own: Mapping[int, Rigid3],
+    answers: Mapping[int, Localization | None],
+    d_thresh: float,
+    config: SessionPosesConfig,
+    trust: Trust | None = None,
 ) -> SessionPoses:
     """A motion of its own world held in place by what a map answers to some of its pictures, all by their numbers.
+
+    Args:
+        trust: how far to trust the two; without, it is measured.
 
     Raises:
         TrajectoryError: the map recognises too little of it, or not as the motion says.
     """
     localized = {index: result for index, result in answers.items() if result is not None}
     agreeing = _agreeing(name, own, localized, len(answers), d_thresh, config)
-    return SessionPoses(_held(max(own) + 1, own, {k: localized[k] for k in agreeing}, config), answers, agreeing)
+    anchors = {k: localized[k] for k in agreeing}
+    return SessionPoses(_held(own, anchors, trust or _trust(own, anchors, config), config), answers, agreeing)
 
 
 def _agreeing(
@@ -204,29 +219,46 @@ def _ways(own: Mapping[int, Rigid3]) -> dict[int, float]:
     return dict(zip(own, np.concatenate([[0.0], np.cumsum(steps)]).tolist(), strict=True))
 
 
-def _held(
-    num_frames: int, own: Mapping[int, Rigid3], anchors: Mapping[int, Localization], config: SessionPosesConfig
-) -> list[Rigid3 | None]:
+def _held(own: Mapping[int, Rigid3], anchors: Mapping[int, Localization], trust: Trust, config: SessionPosesConfig) -> list[Rigid3 | None]:
     """The motion held in place by the anchors: a pose graph whose first node is the map's world, which does not move."""
     indices = list(own)
     first = min(anchors)
     world_from_own = anchors[first].world_from_cam @ own[first].inverse()
     cam_from_worlds = [Rigid3.identity(), *((world_from_own @ own[k]).inverse() for k in indices)]
-    edges = [_motion(row, own[a], own[b], config) for row, (a, b) in enumerate(pairwise(indices), 1)]
+    steps = [_motion(own[a], own[b], config) for a, b in pairwise(indices)]
+    edges = [Edge(row, row + 1, step, trust.motion**2 * spread, is_loop=False) for row, (step, spread) in enumerate(steps, 1)]
     row_of = {index: row for row, index in enumerate(indices, 1)}
     for index, answer in anchors.items():
-        covariance = config.widened**2 * covariance_of_inverse(answer.world_from_cam, answer.covariance)
+        covariance = (trust.answers * config.widened) ** 2 * covariance_of_inverse(answer.world_from_cam, answer.covariance)
         edges.append(Edge(0, row_of[index], answer.world_from_cam.inverse(), covariance, is_loop=True))
     optimised = optimise_graph(cam_from_worlds, edges, config.graph)[1:]
-    poses: list[Rigid3 | None] = [None] * num_frames
+    poses: list[Rigid3 | None] = [None] * (max(own) + 1)
     for index, cam_from_world in zip(indices, optimised, strict=True):
         poses[index] = cam_from_world.inverse()
     return poses
 
 
-def _motion(row: int, own_from_a: Rigid3, own_from_b: Rigid3, config: SessionPosesConfig) -> Edge:
+def _trust(own: Mapping[int, Rigid3], anchors: Mapping[int, Localization], config: SessionPosesConfig) -> Trust:
+    """Of the motion from anchor to anchor and of the anchors, not widened: what neighbours share does not scatter."""
+    seen, moved, spread = list[SeenStep](), Rigid3.identity(), np.zeros((6, 6))
+    before = None
+    for index, pose in own.items():
+        if before is not None:
+            step, of_step = _motion(before, pose, config)
+            adjoint = step.adjoint()
+            moved, spread = step @ moved, adjoint @ spread @ adjoint.T + of_step
+        before = pose
+        if index in anchors:
+            answer = anchors[index]
+            of_answer = covariance_of_inverse(answer.world_from_cam, answer.covariance)
+            seen.append(SeenStep(moved, spread, answer.world_from_cam.inverse(), of_answer))
+            moved, spread = Rigid3.identity(), np.zeros((6, 6))
+    return measured_trust(seen, config.motion_factors, config.answer_factors)
+
+
+def _motion(own_from_a: Rigid3, own_from_b: Rigid3, config: SessionPosesConfig) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
+    """b_from_a, and the covariance of its left perturbation."""
     b_from_a = own_from_b.inverse() @ own_from_a
     way = float(np.linalg.norm(b_from_a.translation))
     sigma_m, sigma_rad = 0.001 + config.drift * way, 0.0005 + config.turn_drift * (way + b_from_a.angle())
-    covariance: Float[np.ndarray, "6 6"] = np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3)
-    return Edge(row, row + 1, b_from_a, covariance, is_loop=False)
+    return b_from_a, np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3)

@@ -15,6 +15,7 @@ import numpy as np
 from topoloc.errors import CalibrationError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.lifelong.adjusted_walk import adjusted_walk
+from topoloc.lifelong.motion_trust import Trust
 from topoloc.lifelong.scale_of_motion import in_metres, largest_agreement
 from topoloc.lifelong.session_calibration import check_by_other_focal_lengths, check_calibration
 from topoloc.lifelong.session_poses import Progress, SessionPoses, SessionPosesConfig, held_by
@@ -105,7 +106,7 @@ def held_stretch(
         if len(within) < config.min_agreeing:
             return None, _unrivalled(own, of_it, agreeing, d_thresh, config)
         try:
-            held = held_by(name, metric, within, d_thresh, config)
+            held = held_by(name, metric, within, d_thresh, config, Trust())  # the unit's drift is no random walk
         except TrajectoryError:
             return None, _unrivalled(own, of_it, agreeing, d_thresh, config)
         agreeing = held.agreeing
