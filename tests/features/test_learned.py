@@ -155,7 +155,7 @@ def test_the_same_on_any_number_of_threads(network: Path):
 
 
 def test_cells_are_means_over_the_picture_and_nothing_beyond_it(network: Path):
-    learned._session.cache_clear()
+    learned.close_networks()
     write_network(network, outputs=("scores", "descriptors", "places"))
     picture = np.random.default_rng(4).integers(0, 256, (96, 144), dtype=np.uint8)  # continued to 96x160
     features = extract_learned(picture, CONFIG)
@@ -187,13 +187,13 @@ def test_a_network_that_is_damaged_missing_or_another_is_told_in_one_line(networ
     write_network(network.with_name("edgepoint2-t32.onnx"), "edgepoint2-s64")
     assert "holds edgepoint2-s64, not edgepoint2-t32" in _refused("edgepoint2-t32")
     assert "`topoloc weights get edgepoint2-e64`" in _refused("edgepoint2-e64")
-    learned._session.cache_clear()
+    learned.close_networks()
     network.write_bytes(network.read_bytes()[:500])
     assert "cut short, damaged, or not ONNX" in _refused()
 
 
 def test_without_onnx_runtime_the_extra_is_named(network: Path, monkeypatch: pytest.MonkeyPatch):
-    learned._session.cache_clear()
+    learned.close_networks()
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     for ask in (lambda: extract_learned(np.zeros((64, 64), np.uint8), CONFIG), lambda: check_available("xfeat"), learned_kind):
         with pytest.raises(MissingExtraError, match=r"pip install 'topoloc\[learned\]'"):

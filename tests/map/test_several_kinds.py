@@ -113,7 +113,7 @@ def test_kinds_that_cannot_be_had_are_told_before_the_work(tiny_recording: Path)
 
 def test_beside_surf_stand_the_learned_ones_that_are_here_unless_others_are_named(monkeypatch: pytest.MonkeyPatch):
     assert MapConfig().kinds == ["surf", learned_kind()]
-    learned._session.cache_clear()
+    learned.close_networks()
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     assert MapConfig().kinds == ["surf"]
     assert MapConfig(other_kinds=("sift",)).kinds == ["surf", "sift"]

@@ -120,6 +120,12 @@ def _opened(network: str, path: Path) -> Any:
     return _named(network, path, *open_network(path, num_threads=1))
 
 
+def close_networks() -> None:
+    """Let go of all networks that are open; the next picture opens its own again."""
+    _session.cache_clear()
+    _opened.cache_clear()
+
+
 def _named(network: str, path: Path, known: KnownNetwork, session: Any) -> Any:
     if known.name != network:
         raise WeightsError(f"network {path}: holds {known.name}, not {network}")
