@@ -1,6 +1,6 @@
 """Does topoloc know when it is wrong? What is asked of uncertainty, ambiguity and other cameras, beside what is measured.
 
-    python benchmarks/honesty.py [--shared ../shared] [--rendered FOLDER] [--step 3]
+    python benchmarks/honesty.py [--shared ../shared] [--rendered FOLDER] [--step 3] [--features surf|learned|both]
 
 The places are those of `real_recordings.py`, a map of the kitchen that holds only a third of it, and the demo's lab. FOLDER may
 hold recordings by `topoloc simulate`: `corridor_map`, `corridor_day`, `corridor_night`. `--step 3` asks every third
@@ -19,17 +19,17 @@ import cv2
 import numpy as np
 
 from real_recordings import PLACES, Place
+from topoloc.cli.features_option import localizer_of
 from topoloc.demo.recordings import SHIPPED
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.evidence import EvidenceConfig, tolerated_translation
-from topoloc.localization.localizer import Localizer
+from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.building import build_map
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.map.build import BuildConfig
 from topoloc.map.nodes import NodeConfig
-from topoloc.map.topomap import TopoMetricMap
 from topoloc.sequences.open import open_sequence
 from topoloc_paper.fit.corpus import read_rigid
 from topoloc_paper.fit.pictures import darkened, drawn_pictures
@@ -79,6 +79,7 @@ def main() -> None:
     parser.add_argument("--shared", type=Path, default=Path(os.environ.get("TOPOLOC_SHARED", "../shared")))
     parser.add_argument("--rendered", type=Path)
     parser.add_argument("--step", type=int, default=3)
+    parser.add_argument("--features", help="of the maps' kinds of features those that are asked, as of `topoloc localize`")
     arguments = parser.parse_args()
     data = arguments.shared.resolve() / "data"
     places = [place for place in PLACES if "30 of 50" not in place.name] + [BEYOND]
@@ -95,16 +96,16 @@ def main() -> None:
                 build_map(open_sequence(data / place.mapping), BuildConfig(nodes=NodeConfig(d_thresh=place.d_thresh))),
                 place.mapping,
             )
-        ask_place(place, places, topomap, data, arguments.step, groups)
+        localizer = localizer_of(topomap, LocalizerConfig(), arguments.features)
+        ask_place(place, places, localizer, data, arguments.step, groups)
         for name, asked in groups.items():
             if name.startswith(place.name):
                 print(line(name, asked), flush=True)
     summary(groups)
 
 
-def ask_place(place: Place, places: list[Place], topomap: TopoMetricMap, data: Path, step: int, groups: dict[str, Asked]) -> None:
+def ask_place(place: Place, places: list[Place], localizer: Localizer, data: Path, step: int, groups: dict[str, Asked]) -> None:
     """Own queries as they are, dark, by other cameras; then queries from elsewhere."""
-    localizer = Localizer(topomap)
     world_from_truth = read_rigid(data / place.map_from_truth) if place.map_from_truth else Rigid3.identity()
     sequence = open_sequence(data / place.queries)
 
