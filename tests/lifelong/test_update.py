@@ -16,13 +16,16 @@ import pytest
 from tiny_world import CAMERA, Panel, path_pose, render, room, smooth_texture, tum_line, write_stereo_recording
 from topoloc import Localizer, TopoMetricMap, open_sequence
 from topoloc.cli import main
+from topoloc.errors import TrajectoryError
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.lifelong.update import UpdateConfig, update_map
 from topoloc.localization.map_facts.building import build_map
 from topoloc.localization.result import Localization
 from topoloc.map.build import BuildConfig
 from topoloc.map.checking import damages
 from topoloc.map.edit import editing
+from topoloc.sequences.recording import SequenceView
 
 ON = np.arange(3.0, 24.0, 0.75)
 ELSEWHERE = Rigid3(exp_so3(np.array([0.3, -0.2, 1.1])), np.array([5.0, -3.0, 2.0]))
@@ -97,6 +100,26 @@ def test_a_session_goes_on_from_what_is_mapped(map_file: Path, second_half: Path
         assert {summary.session_id for summary in topomap.summaries} == {0, 1}
     assert main(["undo", str(map_file)]) == 0
     assert map_file.read_bytes() == before
+
+
+def test_stretches_that_nothing_joins_are_each_held_by_the_map(map_file: Path, second_half: Path):
+    """As SLAM leaves them where it was lost between them; one that contradicts the map has no poses, and takes no other with it."""
+    sequence = open_sequence(second_half)
+    cut, end = 12, 24
+    moved = Rigid3(exp_so3(np.array([-0.5, 0.2, 0.4])), np.array([1.0, 2.0, -3.0]))
+    first = [pose if k < cut else None for k, pose in enumerate(sequence.poses)]
+    second = [moved @ pose if pose is not None and cut <= k < end else None for k, pose in enumerate(sequence.poses)]
+    bent = [pose and Rigid3(pose.rotation, 2.0 * pose.translation) for pose in second]
+    truth = [path_pose(float(k)) for k in ON]
+    for poses, apart, known in ((first, (second,), range(end)), (first, (bent,), range(cut)), (bent, (first,), range(cut))):
+        with TopoMetricMap.load(map_file) as topomap:
+            view = SequenceView(sequence, list(range(len(sequence))), poses, apart)
+            update = update_map(topomap, view, "slam", UpdateConfig(earlier_asked=0))
+        posed = update.sequence.poses
+        assert [k for k, pose in enumerate(posed) if pose is not None] == list(known)
+        assert max(translation_error(truth[k], pose) for k, pose in enumerate(posed) if pose is not None) < 0.02
+    with TopoMetricMap.load(map_file) as topomap, pytest.raises(TrajectoryError, match="a metre of its poses is"):
+        update_map(topomap, SequenceView(sequence, list(range(len(sequence))), bent, ([None] * len(sequence),)), "slam")
 
 
 def test_a_session_that_shows_nothing_new_adds_counts_alone(map_file: Path, tmp_path: Path):

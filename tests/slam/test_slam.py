@@ -91,6 +91,9 @@ def test_elsewhere_after_a_long_darkness_is_a_submap_of_its_own_and_the_smaller_
     assert (result.num_submaps, result.num_joined) == (2, 1)
     assert all(pose is None for pose in result.poses[0][:18])
     assert all(pose is not None for pose in result.poses[0][18:])
+    (apart,) = result.apart[0]  # its poses are known among themselves
+    assert [pose is not None for pose in apart] == [True] * 6 + [False] * 20
+    assert errors(here, apart[:6]).max() < 0.02
 
 
 def test_the_same_place_after_a_long_darkness_is_joined_again():

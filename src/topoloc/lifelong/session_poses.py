@@ -28,6 +28,7 @@ from topoloc.localization.result import Localization, NotLocalized
 from topoloc.map.config import MapConfig
 from topoloc.map.nodes import place_nodes
 from topoloc.sequences.frame import StereoSequence
+from topoloc.sequences.recording import SequenceView
 from topoloc.slam.bundle import BundleConfig
 from topoloc.slam.pose_graph import Edge, PoseGraphConfig, optimise_graph
 from topoloc.slam.single_camera_config import SingleCameraConfig
@@ -100,7 +101,7 @@ class SessionPoses:
 def poses_by_motion(
     sequence: StereoSequence, localizer: Localizer, of_map: MapConfig, config: SessionPosesConfig, progress: Progress
 ) -> SessionPoses:
-    """Of a session that has poses of its own, in any world. Frames so far apart as nodes of the map are asked.
+    """Of a session that has poses of its own, in any world, or in several, one a stretch. Frames about as far apart as nodes are asked.
 
     Raises:
         TrajectoryError: the map recognises too little of it, or not as its poses say.
@@ -109,20 +110,57 @@ def poses_by_motion(
     """
     d_thresh = of_map.nodes.d_thresh
     assert d_thresh is not None, "a map's own configuration is resolved"
-    own = {index: pose for index, pose in enumerate(sequence.poses) if pose is not None}
-    indices = list(own)
-    asked = [indices[k] for k in place_nodes(list(own.values()), of_map.nodes)]
-    answers: dict[int, Localization | None] = {}
+    stretches = (sequence.poses, *(sequence.apart if isinstance(sequence, SequenceView) else ()))
+    motions = [own for poses in stretches if (own := _known(poses))]
+    if not motions:
+        raise TrajectoryError(f"{sequence.name}: none of its frames has a pose; the map stays as it is")
+    asked = [_as_nodes(own, of_map) for own in motions]
+    indices = sorted({index for of_motion in asked for index in of_motion})
     results = list[Localization | NotLocalized]()
-    for done, index in enumerate(asked):
+    for done, index in enumerate(indices):
         frame = sequence[index]
-        results.append(result := localizer.localize(frame.image, frame.camera))
-        answers[index] = result if isinstance(result, Localization) else None
-        progress(f"localizing {sequence.name}", done + 1, len(asked))
+        results.append(localizer.localize(frame.image, frame.camera))
+        progress(f"localizing {sequence.name}", done + 1, len(indices))
     check_calibration(sequence.name, results)
-    if config.min_agreeing > sum(result.localized for result in results) and len(asked) >= config.min_agreeing:
-        check_by_other_focal_lengths(sequence, asked, localizer)
-    return held_by(sequence.name, own, answers, d_thresh, config)
+    if config.min_agreeing > sum(result.localized for result in results) and len(indices) >= config.min_agreeing:
+        check_by_other_focal_lengths(sequence, indices, localizer)
+    answers = {index: result if isinstance(result, Localization) else None for index, result in zip(indices, results, strict=True)}
+    return _all_held(sequence.name, motions, [{index: answers[index] for index in of_motion} for of_motion in asked], d_thresh, config)
+
+
+def _known(poses: Sequence[Rigid3 | None]) -> dict[int, Rigid3]:
+    return {index: pose for index, pose in enumerate(poses) if pose is not None}
+
+
+def _as_nodes(own: Mapping[int, Rigid3], of_map: MapConfig) -> list[int]:
+    """Frames of a motion about as far apart as nodes of the map."""
+    indices = list(own)
+    return [indices[k] for k in place_nodes(list(own.values()), of_map.nodes)]
+
+
+def _all_held(
+    name: str,
+    motions: Sequence[Mapping[int, Rigid3]],
+    answers: Sequence[Mapping[int, Localization | None]],
+    d_thresh: float,
+    config: SessionPosesConfig,
+) -> SessionPoses:
+    """Each stretch held by what the map answers to its own pictures; stretches that the map does not hold have no poses. Raises
+    TrajectoryError, that of the first stretch, where it holds none."""
+    held, refused = list[SessionPoses](), list[TrajectoryError]()
+    for own, of_motion in zip(motions, answers, strict=True):
+        try:
+            held.append(held_by(name, own, of_motion, d_thresh, config))
+        except TrajectoryError as error:
+            refused.append(error)
+    if not held:
+        raise refused[0]
+    world_from_cams: list[Rigid3 | None] = [None] * max(len(one.world_from_cams) for one in held)
+    for one in held:
+        for index, pose in _known(one.world_from_cams).items():
+            world_from_cams[index] = pose
+    every = {index: answer for of_motion in answers for index, answer in of_motion.items()}
+    return SessionPoses(world_from_cams, every, sorted(index for one in held for index in one.agreeing))
 
 
 def held_by(

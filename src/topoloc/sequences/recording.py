@@ -116,11 +116,16 @@ class _PartlyRead(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SequenceView:
-    """Some frames of another sequence, in this order, with these poses."""
+    """Some frames of another sequence, in this order, with these poses.
+
+    `apart` are poses of stretches of which nobody knows how they lie to the others: each in a world of its own, a pose a frame, None
+    outside of the stretch.
+    """
 
     base: StereoSequence
     indices: list[int]
     poses: list[Rigid3 | None]
+    apart: tuple[list[Rigid3 | None], ...] = ()
 
     @property
     def name(self) -> str:

@@ -51,11 +51,13 @@ class SlamResult:
     """`poses[r][i]` is world_from_cam of frame i of recording r, None where it is not known.
 
     `num_submaps` counts the stretches in which tracking was never lost for good; of these `num_joined` share one world, the largest
-    by frames of the first recording, and the frames of the others have no pose. `right_residuals_px` are distances between where
+    by frames of the first recording, and the frames of the others have no pose. Theirs are `apart[r]`, one list as `poses[r]` for each
+    sub-map, in its own world, as odometry left them. `right_residuals_px` are distances between where
     landmarks are found in the right pictures and where they should be.
     """
 
     poses: list[list[Rigid3 | None]]
+    apart: list[list[list[Rigid3 | None]]]
     num_keyframes: int
     num_loops: int
     num_submaps: int
@@ -97,6 +99,7 @@ def run_slam(
     links = _optimise(keyframes, links, joined, landmarks, config, progress)
     return SlamResult(
         poses=_world_poses(tracked, joined),
+        apart=[_poses_apart(of_recording, joined) for of_recording in tracked],
         num_keyframes=len(keyframes),
         num_loops=len(links),
         num_submaps=len({keyframe.submap for keyframe in keyframes}),
@@ -119,7 +122,7 @@ def posed_by_slam(
 
 
 def with_slam_poses(sequences: Sequence[StereoSequence], result: SlamResult) -> list[StereoSequence]:
-    """The recordings with the poses that `run_slam` has found in them.
+    """The recordings with the poses that `run_slam` has found in them, and those of stretches that stayed apart.
 
     Raises:
         RecordingError: one of them shares no place with the others.
@@ -127,7 +130,10 @@ def with_slam_poses(sequences: Sequence[StereoSequence], result: SlamResult) -> 
     for sequence, poses in zip(sequences, result.poses, strict=True):
         if not any(poses):
             raise RecordingError(f"{sequence.name}: no place of it was recognised in {sequences[0].name}; map it alone")
-    return [SequenceView(sequence, list(range(len(sequence))), poses) for sequence, poses in zip(sequences, result.poses, strict=True)]
+    return [
+        SequenceView(sequence, list(range(len(sequence))), poses, tuple(apart))
+        for sequence, poses, apart in zip(sequences, result.poses, result.apart, strict=True)
+    ]
 
 
 def _track(sequence: StereoSequence, odometry: Odometry, checks: InputChecks, progress: Progress) -> list[FramePose | None]:
@@ -193,3 +199,9 @@ def _world_poses(tracked: list[list[FramePose | None]], joined: list[int]) -> li
     poses = [[p.world_from_cam() if p is not None and p.keyframe.submap in joined else None for p in one] for one in tracked]
     world_from_any = next(pose for one in poses for pose in one if pose is not None).inverse()
     return [[world_from_any @ pose if pose is not None else None for pose in one] for one in poses]
+
+
+def _poses_apart(tracked: list[FramePose | None], joined: list[int]) -> list[list[Rigid3 | None]]:
+    """Of each sub-map that is not among the joined ones, world_from_cam of its frames in its own world."""
+    submaps = sorted({pose.keyframe.submap for pose in tracked if pose is not None} - set(joined))
+    return [[p.world_from_cam() if p is not None and p.keyframe.submap == submap else None for p in tracked] for submap in submaps]
