@@ -126,20 +126,22 @@ def ask(
 
 
 def walked(folder: Path, args: Args) -> None:
-    frames = range(0, 100, args.walk_step)
-    print(f"{folder.name}: day_left against night_right, {len(frames)} places; told apart: more inliers than with any other place")
+    """The night walk against the day's on the same side of the path, and on the other side."""
+    frames = range(0, 101 - args.walk_step, args.walk_step)
+    apart = np.abs(np.subtract.outer(frames, frames)) >= _APART
     for kind in args.kinds:
-        sets = [
-            [extract(grey_image(read_image(folder / walk / f"Image{i:03}.jpg")), kind, args.features) for i in frames]
-            for walk in ("day_left", "night_right")
-        ]
-        counts = np.array([[inliers(day, night) for night in sets[1]] for day in sets[0]])
-        apart = np.abs(np.subtract.outer(frames, frames)) >= _APART
-        best_other = np.where(apart, counts, 0).max(0)
-        same = np.diag(counts)
-        told = int((same > best_other).sum())
-        middles = f"inliers same place {np.median(same):4.0f}, best other {np.median(best_other):4.0f}"
-        print(f"  {kind:16} told apart {told:2} of {len(frames)}  {middles}")
+        sets = {
+            walk: [extract(grey_image(read_image(folder / walk / f"Image{i:03}.jpg")), kind, args.features) for i in frames]
+            for walk in ("day_right", "day_left", "night_right")
+        }
+        for walk in ("day_right", "day_left"):
+            counts = np.array([[inliers(day, night) for night in sets["night_right"]] for day in sets[walk]])
+            best_other, same = np.where(apart, counts, 0).max(0), np.diag(counts)
+            told = int((same > best_other).sum())
+            middles = f"inliers same place {np.median(same):4.0f}, best other {np.median(best_other):4.0f}"
+            print(
+                f"{walk} against night_right: {kind:16} told apart (more inliers than any other place) {told:2} of {len(frames)}  {middles}"
+            )
 
 
 def inliers(day: Features, night: Features) -> int:
