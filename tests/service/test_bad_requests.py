@@ -72,6 +72,22 @@ def test_pictures_that_are_none(client: httpx.Client, view: Path, kind: str):
     _check(client.post(LOCALIZE, content=data, headers={"content-type": "image/jpeg"}), status)
 
 
+def test_who_sends_too_much_slowly_reads_why_all_the_same(service: Running):
+    """A connection that is closed while its client sends is reset, and with it what the client has not read yet."""
+    address, part = urlsplit(service.url), bytes(32_000)
+    with socket.create_connection((address.hostname, address.port or 80), 20.0) as sending:
+        head = (
+            f"POST {LOCALIZE} HTTP/1.1\r\nHost: {address.netloc}\r\nContent-Type: image/jpeg\r\nContent-Length: {100 * len(part)}\r\n\r\n"
+        )
+        sending.sendall(head.encode())
+        for _ in range(100):
+            sending.sendall(part)
+            time.sleep(0.002)
+        answer = b"".join(iter(lambda: sending.recv(65_536), b""))
+    assert answer.startswith(b"HTTP/1.1 413 ")
+    assert b"a request has at most" in answer
+
+
 @pytest.mark.parametrize(
     "camera",
     [

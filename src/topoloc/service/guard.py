@@ -31,6 +31,7 @@ BEARER_PROTOCOL = "bearer."
 _OPEN_PATHS = ("/healthz", "/")
 _OPEN_FOLDERS = ("/static/",)
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
+_LINGER_S, _LINGER_BYTES = 1.0, 64_000_000  # of what a refused request still sends, thrown away unread
 
 
 @dataclass(frozen=True)
@@ -153,7 +154,20 @@ class _Request:
         if self.scope["type"] == "websocket":
             await self._refuse(refusal, "websocket.http.response")
             return
+        if refusal.status < 500 and not self.header("expect"):
+            await self._discard_rest()
         await self._refuse(refusal, "http.response")
+
+    async def _discard_rest(self) -> None:
+        """For a moment: a connection that is closed while its client still sends is reset, and the client never reads why."""
+        end, left = time.perf_counter() + _LINGER_S, _LINGER_BYTES
+        while not self._is_whole and left > 0:
+            try:
+                message = await asyncio.wait_for(self._receive(), max(end - time.perf_counter(), 0.001))
+            except TimeoutError:
+                return
+            left -= len(message.get("body", b""))
+            self._is_whole = not message.get("more_body", False)
 
     async def _refuse(self, refusal: Refusal, kind: str) -> None:
         body = json.dumps({"error": refusal.text, "request_id": self.id}).encode()
