@@ -138,7 +138,7 @@ def fit_walls_alone(kind: str, poses: list[TriedPose]) -> FittedWeights:
         print(f"{name}: {weights}\n  {verdict(part)}; log odds of the clearest wrong pose {clearest:.1f}")
     places = ", ".join(dict.fromkeys(pose.queries for pose in told))
     said = f"walls fitted to {num} poses of {places} (--walls)"
-    corpus = re.sub(r"walls (taken over|fitted to [^;.]*)", said, before.corpus) if num else before.corpus
+    corpus = re.sub(r"[Ww]alls:? (taken over|fitted to [^;]*)", said, before.corpus) if num else before.corpus
     return replace(before, walls=walls, corpus=corpus, date=datetime.date.today().isoformat())
 
 
