@@ -17,12 +17,15 @@ from topoloc.sequences.camera_json import read_camera_json
 from topoloc_training.net import teacher as teaching
 from topoloc_training.net import train as training
 from topoloc_training.net.network import TopolocNet
-from topoloc_training.net.pairs import find_pairs
+from topoloc_training.net.pairs import Pair, find_pairs
 from topoloc_training.net.teacher import learn
 from topoloc_training.net.train import TrainNet, train
-from topoloc_training.net.views import draw_sample
+from topoloc_training.net.views import Shares, draw_sample
 from topoloc_training.networks.edgepoint2 import EdgePoint2
 from topoloc_training.networks.export import export
+from topoloc_training.networks.exported import freeze_norms, load_exported
+
+PLAIN = Shares(pairs=0.0, walls=0.0, slants=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +76,7 @@ def test_training_goes_on_where_it_was_stopped(config: TrainNet, tmp_path: Path,
 
 def test_the_network_comes_nearer_to_its_teacher(config: TrainNet, tmp_path: Path):
     lessons = learn(config.pictures, config.teacher, tmp_path)
-    sample = draw_sample(lessons, [], 0.0, np.random.default_rng(0))
+    sample = draw_sample(lessons, [], [], PLAIN, np.random.default_rng(0))
     torch.manual_seed(0)
     network = TopolocNet().train()
     optimizer = torch.optim.AdamW(network.parameters(), lr=5e-3)
@@ -101,9 +104,41 @@ def test_training_begins_with_what_fits_of_an_earlier_state(config: TrainNet, tm
         assert begun["lateral.bias"].shape == (64,)
 
 
+def test_training_begins_with_an_exported_network(tmp_path: Path):
+    torch.manual_seed(3)
+    before, after = TopolocNet().eval(), TopolocNet().eval()
+    for norm in (module for module in before.modules() if isinstance(module, torch.nn.BatchNorm2d)):
+        torch.nn.init.uniform_(norm.weight, 0.5, 1.5)
+        torch.nn.init.uniform_(norm.running_mean, -0.2, 0.2)
+    export(before, tmp_path / "before.onnx", {"topoloc_network": "topoloc-net"})
+    load_exported(after, tmp_path / "before.onnx")
+    picture = torch.rand(1, 1, 64, 96)
+    with torch.no_grad():
+        for was, now in zip(before(picture), after(picture), strict=True):
+            torch.testing.assert_close(now, was, rtol=1e-3, atol=1e-4)
+        freeze_norms(after.train())
+        torch.testing.assert_close(after(picture)[1], before(picture)[1], rtol=1e-3, atol=1e-4)
+    export(EdgePoint2("s64").eval(), tmp_path / "other.onnx", {"topoloc_network": "edgepoint2-s64"})
+    with pytest.raises(ValueError, match="another network"):
+        load_exported(after, tmp_path / "other.onnx")
+
+
+def test_walls_are_learned_of_each_other_alone(config: TrainNet, tmp_path: Path):
+    lessons = learn(config.pictures, config.teacher, tmp_path)
+    pixels = np.stack(np.meshgrid(np.arange(200, 420.0), np.arange(80, 260.0)), axis=-1).reshape(-1, 2).astype(np.float32)
+    pair = (0, 1, Pair(lessons.paths[0], lessons.paths[1], pixels, pixels))
+    shares = Shares(pairs=0.0, walls=1.0, slants=0.0)
+    sample = draw_sample(lessons, [], [pair], shares, np.random.default_rng(0))
+    assert not sample.is_taught
+    assert not sample.inside.any()
+    of_teacher, to_teacher, across, score, place = (float(part.detach()) for part in training._step(TopolocNet(), [sample]))
+    assert of_teacher == to_teacher == score == place == 0.0
+    assert across > 1.0
+
+
 def test_scores_are_learned_where_the_teacher_saw_the_very_pixels(config: TrainNet, tmp_path: Path):
     lessons = learn(config.pictures, config.teacher, tmp_path)
-    sample = draw_sample(lessons, [], 0.0, np.random.default_rng(3))
+    sample = draw_sample(lessons, [], [], PLAIN, np.random.default_rng(3))
     assert sample.inside[0].all()
     assert not sample.inside[1].any()
     learned = (sample.scores[0] * 255).round().astype(np.uint8)

@@ -60,15 +60,15 @@ def find_pairs(day_folder: str, other_folder: str) -> list[Pair]:
             if distance[i] > _REACH:
                 break
             if i not in clouds:
-                clouds[i] = _cloud(days[int(i)])
+                clouds[i] = located_pixels(days[int(i)])
             pixels, points = clouds[i]
-            seen, at = _project(points, np.linalg.inv(pose) @ day_poses[i], frame.camera)
+            seen, at = seen_by(points, np.linalg.inv(pose) @ day_poses[i], frame.camera)
             if len(seen) >= _FEWEST:
                 pairs.append(Pair(str(days.root / days.names[i]), str(others.root / others.names[j]), pixels[seen], at))
     return pairs
 
 
-def _cloud(frame: StereoFrame) -> tuple[np.ndarray, np.ndarray]:
+def located_pixels(frame: StereoFrame) -> tuple[np.ndarray, np.ndarray]:
     """Pixels of the left picture, every other row and column, and their points in the left camera."""
     if frame.right is None or frame.rig is None:
         raise RecordingError(f"{frame.name}: no stereo pair")
@@ -84,7 +84,7 @@ def _cloud(frame: StereoFrame) -> tuple[np.ndarray, np.ndarray]:
     return np.column_stack([x, y]).astype(np.float32), points
 
 
-def _project(points: np.ndarray, other_from_day: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+def seen_by(points: np.ndarray, other_from_day: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Which points the other picture sees, and where. Nearest in its cell wins."""
     local = points @ other_from_day[:3, :3].T + other_from_day[:3, 3]
     front = np.flatnonzero(local[:, 2] > 0.3)

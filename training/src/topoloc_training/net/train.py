@@ -10,20 +10,26 @@ import json
 import math
 import os
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
 import tyro
 from torch import Tensor, nn
 
+from topoloc.sequences.open import open_sequence
 from topoloc_training.net.losses import likeness, peaks, placed, sampled, told_apart
 from topoloc_training.net.network import KIND, STRIDE, TopolocNet
 from topoloc_training.net.pairs import Pair, find_pairs
+from topoloc_training.net.side_pairs import find_side_pairs
 from topoloc_training.net.teacher import HEIGHT, learn
-from topoloc_training.net.views import Sample, draw_sample
+from topoloc_training.net.views import Sample, Shares, draw_sample
 from topoloc_training.networks.export import export
+from topoloc_training.networks.exported import freeze_norms, load_exported
 
 _LOG_EVERY = 100
 _SAVE_EVERY = 250
@@ -41,8 +47,12 @@ class TrainNet:
     """Folders of pictures; `FOLDER::2` takes every other one."""
     pairs: list[str] = field(default_factory=list)
     """Pairs of recordings of one rendered place, `DAY:OTHER`: the day's with stereo, both with truth."""
+    walls: list[str] = field(default_factory=list)
+    """The same, `OUT:BACK`, of a way that was walked both ways: its walls are learned as views to the sides show them."""
     out: Path = Path("net")
     """Folder of the state, of the log and of the network."""
+    name: Literal["topoloc-net", "topoloc-net-sides"] = KIND
+    """Which of the two networks that ship it is to be: the one of pictures, or of what they show to the sides."""
     steps: int = 8000
     batch: int = 4
     """Samples a step; each gives two views."""
@@ -50,9 +60,15 @@ class TrainNet:
     """Learning rate, falling to nothing by a cosine."""
     pair_share: float = 0.3
     """Share of samples that come from pairs."""
+    wall_share: float = 0.0
+    """Share of samples that come from walls."""
+    slants: float = 0.0
+    """Share of the other samples that show a picture as if it hung on a wall, from both of its ends (`slants.py`)."""
     seed: int = 1
     start: Path | None = None
-    """State of an earlier training to begin with; what it lacks begins at random."""
+    """State of an earlier training to begin with, what it lacks begins at random; or the network's ONNX file, with `--frozen-norms`."""
+    frozen_norms: bool = False
+    """Leave the batch norms as they are: in an ONNX file they were folded into what comes before them."""
     threads: int = 1
     minutes: float = 1e9
     """Stop after so long; the state is kept."""
@@ -62,22 +78,26 @@ def train(config: TrainNet) -> None:
     """Train, or go on training, and export the averaged network."""
     torch.set_num_threads(config.threads)
     config.out.mkdir(parents=True, exist_ok=True)
-    pairs = [pair for names in config.pairs for pair in _cached_pairs(names, config.out)]
+    pairs = [pair for names in config.pairs for pair in _cached_pairs(names, config.out, find_pairs)]
+    walls = [pair for names in config.walls for pair in _cached_pairs(names, config.out, partial(_side_pairs, config.out / "sides"))]
     folders = config.pictures + sorted({path for names in config.pairs for path in _picture_folders(names)})
+    folders += [str(config.out / "sides")] if walls else []
     lessons = learn(folders, config.teacher, config.out / "lessons")
     rows = {os.path.realpath(path): i for i, path in enumerate(lessons.paths)}
-    known = [(rows[os.path.realpath(p.day)], rows[os.path.realpath(p.other)], _cut(p)) for p in pairs]
+    known, known_walls = ([(rows[os.path.realpath(p.day)], rows[os.path.realpath(p.other)], _cut(p)) for p in of] for of in (pairs, walls))
+    shares = Shares(config.pair_share if known else 0.0, config.wall_share, config.slants)
     torch.manual_seed(config.seed)
     network, average, optimizer, step = _begin(config)
     begun = step
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda taken: _rate(begun + taken, config.steps))
     network.train()
+    if config.frozen_norms:
+        freeze_norms(network)
     end, sums, since = time.monotonic() + 60 * config.minutes, np.zeros(5), time.monotonic()
     while step < config.steps and time.monotonic() < end:
         # The generator follows from the step, so that a resumed run goes on as the first would have.
         generator = np.random.default_rng([config.seed, step])
-        share = config.pair_share if known else 0.0
-        parts = _step(network, [draw_sample(lessons, known, share, generator) for _ in range(config.batch)])
+        parts = _step(network, [draw_sample(lessons, known, known_walls, shares, generator) for _ in range(config.batch)])
         loss = torch.stack([weight * part for weight, part in zip(_WEIGHTS, parts, strict=True)]).sum()
         optimizer.zero_grad()
         loss.backward()
@@ -93,8 +113,8 @@ def train(config: TrainNet) -> None:
             _log(config.out, line | {n: round(float(v) / _LOG_EVERY, 4) for n, v in zip(names, sums, strict=True)})
             sums, since = np.zeros(5), time.monotonic()
         if step % _SAVE_EVERY == 0:
-            _save(config.out, network, average, optimizer, step)
-    _save(config.out, network, average, optimizer, step)
+            _save(config, network, average, optimizer, step)
+    _save(config, network, average, optimizer, step)
 
 
 def _step(network: TopolocNet, samples: list[Sample]) -> tuple[Tensor, ...]:
@@ -113,6 +133,8 @@ def _step(network: TopolocNet, samples: list[Sample]) -> tuple[Tensor, ...]:
     theirs = torch.cat([taught, taught])
     first, second = ours.chunk(2)
     seen_twice = valid.chunk(2)[0] & valid.chunk(2)[1]
+    is_taught = torch.tensor([sample.is_taught for sample in samples])
+    valid = valid & torch.cat([is_taught, is_taught])[:, None]
     target, inside = both("scores").float()[:, None], both("inside")[:, None]
     return (
         likeness(ours, theirs, valid),
@@ -126,7 +148,9 @@ def _step(network: TopolocNet, samples: list[Sample]) -> tuple[Tensor, ...]:
 def _begin(config: TrainNet) -> tuple[TopolocNet, TopolocNet, torch.optim.Optimizer, int]:
     network = TopolocNet()
     optimizer = torch.optim.AdamW(network.parameters(), lr=config.rate, weight_decay=1e-4)
-    if config.start is not None:
+    if config.start is not None and config.start.suffix == ".onnx":
+        load_exported(network, config.start)
+    elif config.start is not None:
         _begin_with(network, torch.load(config.start, weights_only=True)["average"])
     average, step = copy.deepcopy(network), 0
     if (state := config.out / "state.pt").is_file():
@@ -159,13 +183,13 @@ def _follow(average: nn.Module, network: nn.Module, kept: float) -> None:
                 old.copy_(new)
 
 
-def _save(out: Path, network: nn.Module, average: TopolocNet, optimizer: torch.optim.Optimizer, step: int) -> None:
-    part = out / "state.part"
+def _save(config: TrainNet, network: nn.Module, average: TopolocNet, optimizer: torch.optim.Optimizer, step: int) -> None:
+    part = config.out / "state.part"
     state = {"network": network.state_dict(), "average": average.state_dict(), "optimizer": optimizer.state_dict(), "step": step}
     torch.save(state, part)
-    part.replace(out / "state.pt")
-    origin = {"topoloc_network": KIND, "licence": "Apache-2.0", "source": f"trained by topoloc_training.net.train, {step} steps"}
-    export(copy.deepcopy(average).eval(), out / f"{KIND}.onnx", origin)
+    part.replace(config.out / "state.pt")
+    origin = {"topoloc_network": config.name, "licence": "Apache-2.0", "source": f"trained by topoloc_training.net.train, {step} steps"}
+    export(copy.deepcopy(average).eval(), config.out / f"{config.name}.onnx", origin)
 
 
 def _log(out: Path, line: dict[str, int | float]) -> None:
@@ -178,16 +202,20 @@ def _picture_folders(names: str) -> tuple[str, str]:
     return f"{day}/image_2", f"{other}/images"
 
 
-def _cached_pairs(names: str, out: Path) -> list[Pair]:
+def _cached_pairs(names: str, out: Path, find: Callable[[str, str], list[Pair]]) -> list[Pair]:
     file = out / f"pairs-{names.replace('/', '_').replace(':', '-')}.npz"
     if not file.is_file():
         day, _, other = names.partition(":")
-        pairs = find_pairs(day, other)
+        pairs = find(day, other)
         arrays = {f"{i}{part}": getattr(p, part) for i, p in enumerate(pairs) for part in ("day", "other", "day_px", "other_px")}
         np.savez(file, **arrays)
     with np.load(file) as kept:
         count = len(kept.files) // 4
         return [Pair(str(kept[f"{i}day"]), str(kept[f"{i}other"]), kept[f"{i}day_px"], kept[f"{i}other_px"]) for i in range(count)]
+
+
+def _side_pairs(pictures: Path, out: str, back: str) -> list[Pair]:
+    return find_side_pairs(open_sequence(out), open_sequence(back), pictures)
 
 
 def _cut(pair: Pair) -> Pair:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.random import Generator
 
 from topoloc_training.net.light import changed
 from topoloc_training.net.pairs import Pair
+from topoloc_training.net.slants import slanted
 from topoloc_training.net.teacher import HEIGHT, WIDTH, Lessons
 
 VIEW_WIDTH, VIEW_HEIGHT = 320, 256
@@ -23,7 +24,8 @@ _CLEAN = 0.3  # share of first views in unchanged light
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Two views (2, h, w) in [0, 1], the teacher's scores seen the same way and where they are to be learned.
+    """Two views (2, h, w) in [0, 1], the teacher's scores seen the same way and where they are to be learned. Of a sample that is not
+    taught the teacher says nothing: its points are learned of each other alone.
 
     Points (2, n, 2), the teacher's descriptors of them (n, 64), whether a point lies in each view (2, n), and which points are so
     near each other that they are no rivals (n, n).
@@ -36,38 +38,75 @@ class Sample:
     taught: np.ndarray
     valid: np.ndarray
     near: np.ndarray
+    is_taught: bool = True
 
 
-def draw_sample(lessons: Lessons, pairs: list[tuple[int, int, Pair]], share: float, generator: Generator) -> Sample:
-    """A picture and its copy in another light, or, in `share` of the cases, a pair of the list (its numbers are rows of `lessons`)."""
-    if pairs and generator.random() < share:
-        first, second, pair = pairs[int(generator.integers(len(pairs)))]
-        return _of_pair(lessons, first, second, pair, generator)
+KnownPair = tuple[int, int, Pair]
+"""A pair, and the rows of its pictures in the lessons."""
+
+
+@dataclass(frozen=True)
+class Shares:
+    """Of samples: those that are pairs in different light, pairs of views to the sides of walls that were walked along both ways, and, of
+    the other ones, those that show a picture as if it hung on such a wall."""
+
+    pairs: float
+    walls: float
+    slants: float
+
+
+def draw_sample(lessons: Lessons, pairs: list[KnownPair], walls: list[KnownPair], shares: Shares, generator: Generator) -> Sample:
+    """A picture and its copy in another light, or seen from the two ends of a wall; or a pair."""
+    drawn = generator.random()
+    if pairs and drawn < shares.pairs:
+        return _of_pair(lessons, pairs, (0.2, 0.2), generator)
+    if walls and shares.pairs <= drawn < shares.pairs + shares.walls:
+        of_wall = _of_pair(lessons, walls, (0.3, 0.3), generator, is_wall=True)
+        of_wall.inside[:] = False
+        return replace(of_wall, is_taught=False)
     index = int(generator.integers(len(lessons.paths)))
     place = _crop(generator.uniform((0.25, 0.25), (0.75, 0.75)) * (WIDTH, HEIGHT))
     other = _nudged(place @ _random_homography(generator, np.array([VIEW_WIDTH, VIEW_HEIGHT]) / 2, 0.8), generator)
+    is_wall = generator.random() < shares.slants
     strengths = (0.0 if generator.random() < _CLEAN else generator.random(), 0.3 + 0.7 * generator.random())
-    views, scores, inside = _seen(lessons, [index, index], [place, other], strengths, generator)
+    if is_wall:
+        strengths = (0.4 * strengths[0], 0.4 * strengths[1])
+    views, scores, inside = _seen(lessons, [index, index], [place, other], strengths, generator, is_wall)
     inside[1] = False
     points = _chosen_points(scores[0], generator)
     source = _mapped(points, place)
     return _sample(lessons, index, source, [points, _mapped(source, np.linalg.inv(other))], views, scores, inside)
 
 
-def _of_pair(lessons: Lessons, first: int, second: int, pair: Pair, generator: Generator) -> Sample:
-    places, here, there, both = _looks(pair, generator)
+def _of_pair(
+    lessons: Lessons, known: list[KnownPair], strengths: tuple[float, float], generator: Generator, is_wall: bool = False
+) -> Sample:
+    """Of walls, most of which are bare, points are drawn where the teacher sees key points; of other pairs anywhere."""
+    first, second, pair = known[int(generator.integers(len(known)))]
+    weights = (
+        _told(lessons.scores[first], pair.day_px) + _told(lessons.scores[second], pair.other_px) if is_wall else np.ones(len(pair.day_px))
+    )
+    places, here, there, both = _looks(pair, weights, generator)
     for _ in range(_TRIES):
         if len(both) >= NUM_POINTS:
             break
-        places, here, there, both = _looks(pair, generator)
-    chosen = generator.choice(both if len(both) else len(here), NUM_POINTS, replace=len(both) < NUM_POINTS)
-    views, scores, inside = _seen(lessons, [first, second], places, (0.2, 0.2), generator)
+        places, here, there, both = _looks(pair, weights, generator)
+    candidates = both if len(both) else np.arange(len(here))
+    shares = weights[candidates] / weights[candidates].sum()
+    chosen = generator.choice(candidates, NUM_POINTS, replace=len(candidates) < NUM_POINTS, p=shares)
+    views, scores, inside = _seen(lessons, [first, second], places, strengths, generator)
     return _sample(lessons, first, pair.day_px[chosen], [here[chosen], there[chosen]], views, scores, inside)
 
 
-def _looks(pair: Pair, generator: Generator) -> tuple[list[np.ndarray], np.ndarray, np.ndarray, np.ndarray]:
+def _told(scores: np.ndarray, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
+    """How much of a key point the teacher sees at most within two pixels of each; a little anywhere."""
+    x, y = np.rint(pixels).astype(int).T
+    return cv2.dilate(np.asarray(scores), np.ones((5, 5), np.uint8))[y, x] / 255.0 + 0.02
+
+
+def _looks(pair: Pair, weights: np.ndarray, generator: Generator) -> tuple[list[np.ndarray], np.ndarray, np.ndarray, np.ndarray]:
     """Two views around the same point: their homographies, the pair's points in each, and the numbers of those that both see."""
-    middle = int(generator.integers(len(pair.day_px)))
+    middle = int(generator.choice(len(weights), p=weights / weights.sum()))
     places = [_crop(pair.day_px[middle]), _crop(pair.other_px[middle])]
     here, there = (_mapped(px, np.linalg.inv(place)) for px, place in zip((pair.day_px, pair.other_px), places, strict=True))
     return places, here, there, np.flatnonzero(_within(here) & _within(there))
@@ -86,14 +125,22 @@ def _sample(
 
 
 def _seen(
-    lessons: Lessons, indices: list[int], places: list[np.ndarray], strengths: tuple[float, float], generator: Generator
+    lessons: Lessons,
+    indices: list[int],
+    places: list[np.ndarray],
+    strengths: tuple[float, float],
+    generator: Generator,
+    is_wall: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    size = (VIEW_WIDTH, VIEW_HEIGHT)
+    size, is_ahead_right = (VIEW_WIDTH, VIEW_HEIGHT), generator.random() < 0.5 if is_wall else False
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     views, scores, inside = [], [], []
     for index, place, strength in zip(indices, places, strengths, strict=True):
         picture = cv2.warpPerspective(lessons.pictures[index], place, size, flags=flags, borderMode=cv2.BORDER_REFLECT_101)
-        views.append(changed(picture.astype(np.float32) / 255, strength, generator))
+        shown = picture.astype(np.float32) / 255
+        if is_wall:
+            shown, is_ahead_right = slanted(shown, is_ahead_right, generator), not is_ahead_right
+        views.append(changed(shown, strength, generator))
         scores.append(cv2.warpPerspective(lessons.scores[index], place, size, flags=flags).astype(np.float32) / 255)
         inside.append(cv2.warpPerspective(np.ones((HEIGHT, WIDTH), np.uint8), place, size, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP))
     return np.array(views), np.array(scores), np.array(inside, bool)
