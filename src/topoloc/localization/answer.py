@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.geometry.clustered_errors import coherence
 from topoloc.geometry.rigid import covariance_of_inverse
 from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.belief import MIN_LEAD, Hypothesis, lead
@@ -96,7 +97,8 @@ def _is_unclear_beside(search: Search, best: Hypothesis, other: Hypothesis) -> b
     return bool(is_elsewhere) and best.log_odds <= search.weights.evidence.clear_log_odds
 
 
-def _answered(search: Search, best: Hypothesis, probability: float) -> Answered:
+def _answered(search: Search, hypothesis: Hypothesis, probability: float) -> Answered:
+    best = _widened(search, hypothesis)
     assert best.fit.pose is not None
     is_rough = isinstance(best.fit.lens, RoughCamera)
     localization = Localization(
@@ -115,6 +117,18 @@ def _answered(search: Search, best: Hypothesis, probability: float) -> Answered:
         provenance=_provenance(search),
     )
     return localization, best.fit.seen_points(search.query.scale)
+
+
+def _widened(search: Search, best: Hypothesis) -> Hypothesis:
+    """With a covariance that also counts what the inliers are wrong by together in parts of the picture. What they have in common all over
+    it and what they have there add up: n rho + coherence^2, times that of independent errors. Walls have an inflation of their own."""
+    if best.is_from_walls or best.fit.pose is None:
+        return best
+    seen = best.fit.seen_points(1.0)
+    parts = seen.points_img.astype(np.float64), seen.points_world, seen.covariances
+    squared = coherence(*parts, best.fit.camera, best.fit.pose.cam_from_world, search.config.pose) ** 2
+    wider = 1.0 + (squared - 1.0) * best.noise_share
+    return replace(best, covariance=wider * best.covariance, noise_share=best.noise_share / wider)
 
 
 def _ambiguity(search: Search, ranked: list[Hypothesis], leads: list[float], others: float) -> Verdict:

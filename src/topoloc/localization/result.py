@@ -28,7 +28,8 @@ class Localization:
 
     `covariance` (6, 6) is that of the left perturbation xi of world_from_cam, ``true_world_from_cam = exp(xi) @ world_from_cam``:
     order (translation, rotation), metres and radians, axes of the world. It counts the noise of the image, the uncertainty of each map
-    point, and what the map's points are wrong by together (`correlated_errors.py`). Its translation part is that of the world's origin,
+    point, what the map's points are wrong by together (`correlated_errors.py`), and what they are in parts of the picture, such as where
+    things were moved (`geometry/clustered_errors.py`). Its translation part is that of the world's origin,
     as it is moved by xi; `camera_covariance` is that of the camera itself. `noise_share` of it differs from picture to picture; the rest
     is the map's, and a picture taken close by shares it.
 
