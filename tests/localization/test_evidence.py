@@ -150,6 +150,12 @@ def test_more_evidence_of_walls_means_better_odds(evidence: Evidence):
     assert log_odds_of(evidence, WEIGHTS) > log_odds_of(OF_WALLS, WEIGHTS) + 0.1
 
 
+def test_both_walls_say_more_than_one_of_them():
+    weights = weights_of("topoloc-net-sides")
+    by_both, by_one = (log_odds_of(replace(OF_WALLS, num_lesser_side=num), weights) for num in (30, 1))
+    assert by_both > by_one + 1.0
+
+
 def test_no_evidence_of_walls_at_all_is_odds_all_the_same():
     nothing = Evidence(0, 0, 0, 0, 0, spread=0.0, doubt=50.0, even_share=0.0, num_distinct=0)
     assert log_odds_of(nothing, WEIGHTS) < -5.0

@@ -52,7 +52,7 @@ def _list() -> None:
             where = str(find_network(network.name))
         except WeightsError:
             where = "not here"
-        print(f"{network.name:15} {network.licence:10}  {network.origin:22}  {where}")
+        print(f"{network.name:17} {network.licence:10}  {network.origin:22}  {where}")
 
 
 def keep_network(path: Path) -> tuple[KnownNetwork, Path]:

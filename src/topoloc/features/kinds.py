@@ -70,7 +70,8 @@ class FeatureKind:
     sigma_px: standard deviation (pixels) of a matched key point along x and along y.
     ratio: a match must be nearer than this times its nearest rival; wall_ratio, of walls seen from the side, which repeat themselves.
     position_weight: how much a feature's place in the picture counts beside its descriptor where pictures are ranked (`places/vlad.py`).
-    network: what gives the features, if a network does (`network_files.py`).
+    network: what gives the features, if a network does (`network_files.py`). sides: the kind that describes views to the sides
+    (`side_views.py`) of a map of this one, if that is another.
     guided: thresholds for key points near their projection; distant: far from it, where the pose is only that of a node nearby.
     """
 
@@ -88,6 +89,12 @@ class FeatureKind:
     wall_ratio: float = 0.9
     position_weight: float = 0.9
     network: str | None = None
+    sides: str | None = None
+
+    @property
+    def kind_of_sides(self) -> str:
+        """The kind by which views to the sides are described in maps of this one."""
+        return self.sides or self.name
 
 
 def _extract_surf(image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None) -> Features:
@@ -99,7 +106,7 @@ def _extract_sift(image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_th
     return extract_sift(image, SiftConfig(max_features=config.max_features, contrast_threshold=config.contrast_threshold))
 
 
-def _learned_kind(network: str, descriptor_size: int, min_score: float) -> FeatureKind:
+def _learned_kind(network: str, descriptor_size: int, min_score: float, sides: str | None = None) -> FeatureKind:
     """A kind whose features a network gives: no size, no angle, and the picture as it is."""
 
     def extract(image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None) -> Features:
@@ -117,6 +124,7 @@ def _learned_kind(network: str, descriptor_size: int, min_score: float) -> Featu
         ratio=0.92,
         position_weight=1.5,
         network=network,
+        sides=sides,
     )
 
 
@@ -130,7 +138,7 @@ SURF = FeatureKind(
 SIFT = FeatureKind("sift", _extract_sift, 128, guided=SURF.guided, distant=SURF.distant)
 
 LEARNED = (
-    _learned_kind("topoloc-net", 64, min_score=0.0067),
+    _learned_kind("topoloc-net", 64, min_score=0.0067, sides="topoloc-net-sides"),
     _learned_kind("edgepoint2-s64", 64, min_score=0.0067),
     _learned_kind("edgepoint2-t32", 32, min_score=0.0067),
     _learned_kind("edgepoint2-e64", 64, min_score=0.0067),
@@ -138,15 +146,20 @@ LEARNED = (
 )
 """The first one is what is meant by learned features where none are named."""
 
+OF_SIDES = _learned_kind("topoloc-net-sides", 64, min_score=0.0067)
+"""The same network, taught further on walls that are seen at a slant from their two ends. No kind to make a map of."""
+
 KINDS: dict[str, FeatureKind] = {kind.name: kind for kind in (SURF, SIFT, *LEARNED)}
 
 
 def find_kind(name: str) -> FeatureKind:
-    """The kind of this name.
+    """The kind of this name, also one of side views.
 
     Raises:
         FeatureKindError: there is none.
     """
+    if name == OF_SIDES.name:
+        return OF_SIDES
     if name not in KINDS:
         raise FeatureKindError(f"no features of kind {name!r}; there are {', '.join(KINDS)}")
     return KINDS[name]

@@ -68,6 +68,7 @@ NETWORKS = {
     network.name: network
     for network in (
         KnownNetwork("topoloc-net", "Apache-2.0", "shipped with topoloc"),
+        KnownNetwork("topoloc-net-sides", "Apache-2.0", "shipped with topoloc"),
         _XFEAT,
         *(
             KnownNetwork(f"edgepoint2-{size.lower()}", "MIT", "HITCSC/EdgePoint2", f"{size}.pth", digest, f"{_EDGEPOINT2_URL}{size}.pth")

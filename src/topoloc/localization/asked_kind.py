@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from topoloc.errors import MissingExtraError, WeightsError
 from topoloc.features.kinds import check_available
@@ -30,9 +30,17 @@ class AskedKind:
     ) -> AskedKind:
         """Of a map's first kind; `weights` instead of those that ship for it. Raises as `OpenMap`."""
         opened = OpenMap(topomap, coarse or config.coarse)
-        c, weights = config.for_kind(opened.kind), weights or weights_of(opened.kind.name)
+        c, weights = config.for_kind(opened.kind), weights or _weights_of(opened)
         rho = correlated_errors_of(topomap, c.guided, c.pose, c.correlated_errors, weights.shared_errors)
         return AskedKind(opened, c, weights, rho)
+
+
+def _weights_of(opened: OpenMap) -> FittedWeights:
+    """Those that ship; of the walls those of the kind that describes them."""
+    weights, sides = weights_of(opened.kind.name), opened.topomap.sides
+    if sides is None or not sides.is_asked_by(opened.kind.name):
+        return weights
+    return replace(weights, walls=weights_of(sides.kind).walls)
 
 
 def kinds_to_ask(topomap: TopoMetricMap, wanted: tuple[str, ...] | None) -> tuple[list[str], dict[str, str]]:

@@ -11,7 +11,8 @@ The weights are those of a logistic regression on poses tried, right and wrong o
 (`fitted_weights.py`). That of the doubt is set by hand: wrong places in a corridor of many doors come with precise
 poses, and a free weight would follow them to zero. Walls that are seen from the other side (`walls/`) repeat themselves more than a
 room does, and less of them is recognised at a slant: the same evidence has weights of its own there, and it also counts how many
-of the key points found look more like the map's point here than like any elsewhere.
+of the key points found look more like the map's point here than like any elsewhere, and whether both walls agree: one alone may be
+a twin's.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class Evidence:
     share of the picture's cells that hold one of them, `even_share` the share found of what must be in view, every part of the view
     asked on its own (`even_share_of`), `doubt` the pose's standard deviation in its worst direction over what
     is tolerated: 1 where the two are equal. Of walls only, `num_distinct` of the points found look more like the map's point here than
-    like any elsewhere.
+    like any elsewhere, and `num_lesser_side` are those of the wall, of the two, of which fewer were found.
     """
 
     num_matches: int
@@ -51,6 +52,7 @@ class Evidence:
     doubt: float
     even_share: float
     num_distinct: int | None = None
+    num_lesser_side: int | None = None
 
     @property
     def is_from_walls(self) -> bool:
@@ -156,6 +158,7 @@ def wall_score_features(evidence: Evidence) -> tuple[float, ...]:
         math.log((e.num_inliers + 1) / (e.num_matches + 10)),
         math.log(e.spread + 0.02),
         math.log(e.num_distinct + 1),
+        math.log((e.num_lesser_side or 0) + 2),
         math.log(e.even_share + 0.002),
         math.log(max(e.doubt, 0.01)),
     )

@@ -74,6 +74,7 @@ class WallWeights:
     spread: float
     doubt: float
     distinct: float
+    lesser_side: float
     even_share: float
     bias: float
     sigma_px: float
@@ -82,7 +83,8 @@ class WallWeights:
     @property
     def in_order(self) -> tuple[float, ...]:
         """In the order of `wall_score_features`; without the bias."""
-        return (self.found, self.chance, self.inliers, self.inlier_share, self.spread, self.distinct, self.even_share, self.doubt)
+        shares = (self.found, self.chance, self.inliers, self.inlier_share, self.spread)
+        return (*shares, self.distinct, self.lesser_side, self.even_share, self.doubt)
 
 
 @dataclass(frozen=True)

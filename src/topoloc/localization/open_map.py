@@ -70,7 +70,7 @@ class OpenMap:
     def walls(self) -> WallIndex | None:
         """The map's side nodes; None where it has none, or by features of another kind."""
         sides = self.topomap.sides
-        return WallIndex(self.topomap, sides) if sides is not None and sides.kind == self.kind.name else None
+        return WallIndex(self.topomap, sides) if sides is not None and sides.is_asked_by(self.kind.name) else None
 
     def with_ids(self, candidates: list[NodeScore]) -> list[NodeScore]:
         """Candidates as they are reported: until then a candidate's `node_id` is the row of its node."""

@@ -245,7 +245,7 @@ def _evidence_of(value: Any) -> Evidence:
     data = checked.mapping(value, "evidence")
     values: dict[str, Any] = {}
     for one in fields(Evidence):
-        is_missing = one.name == "num_distinct" and data.get(one.name) is None
+        is_missing = one.name in ("num_distinct", "num_lesser_side") and data.get(one.name) is None
         read = checked.whole if one.name.startswith("num_") else checked.number
         values[one.name] = None if is_missing else read(checked.wanted(data, one.name), f"evidence.{one.name}")
     return Evidence(**values)

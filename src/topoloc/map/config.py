@@ -56,8 +56,9 @@ class MapConfig:
 
     @property
     def kind_of_sides(self) -> str:
-        """The kind of features that side nodes are described with: one that a network gives, where the map has one."""
-        return next((kind for kind in self.kinds if find_kind(kind).network is not None), self.features.kind)
+        """The kind of features that side nodes are described with: that of a kind that a network gives, where the map has one."""
+        kinds = [find_kind(kind) for kind in self.kinds]
+        return next((kind for kind in kinds if kind.network is not None), kinds[0]).kind_of_sides
 
     def features_of(self, kind: str) -> FeatureConfig:
         """The settings of the features of this kind: those of `features`, but for the picture's normalization, which suits the kind."""

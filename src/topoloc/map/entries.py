@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int8
 
 from topoloc.features.features import Features
+from topoloc.features.kinds import find_kind
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.map.sums import LandmarkSums
@@ -87,6 +88,10 @@ class SideNodes:
     nodes: Sequence[TopoNode]
     coarse_models: Mapping[str, CoarseModel]
     kind: str
+
+    def is_asked_by(self, kind: str) -> bool:
+        """Are they asked together with the nodes' points of this kind of features?"""
+        return self.kind in (kind, find_kind(kind).kind_of_sides)
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,7 @@ def _contents_of(file: MapFile) -> MapContents:
     sides = None
     if file.count(f"{SIDE}nodes") > 0:
         kind = value_from(str, json_of(facts["kind_of_sides"]), "kind_of_sides") if "kind_of_sides" in facts else config.features.kind
-        if kind not in kinds:
+        if kind not in {*kinds, *(find_kind(one).kind_of_sides for one in kinds)}:
             raise Damage(f"kind_of_sides: the map has no features {kind!r}")
         models = _Keyed(file, f"{SIDE}coarse_models", _model_of)
         sides = SideNodes(_stored_summaries(file, SIDE), _stored_nodes(file, kind, SIDE), models, kind)

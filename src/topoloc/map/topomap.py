@@ -75,7 +75,7 @@ class TopoMetricMap(MapContents):
             nodes=self.other_kinds[kind],
             config=replace(self.config, features=self.config.features_of(kind), other_kinds=()),
             shared_errors=self.other_shared_errors.get(kind),
-            sides=self.sides if self.sides is not None and self.sides.kind == kind else None,
+            sides=self.sides if self.sides is not None and self.sides.is_asked_by(kind) else None,
             other_kinds={},
             other_shared_errors={},
         )

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from built_corridor import WIDE, back, built_corridor, corridor, corridor_of_two_kinds, seen_ahead, seen_on_the_way_back
+from built_corridor import WIDE, WalkAhead, back, built_corridor, corridor, corridor_of_two_kinds, seen_ahead, seen_on_the_way_back
 from tiny_world import path_pose, render, room
 from topoloc.errors import MapError
-from topoloc.features.kinds import SURF
+from topoloc.features.kinds import KINDS, SURF, FeatureConfig, find_kind, learned_kind
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
@@ -22,6 +22,7 @@ from topoloc.localization.belief import Hypothesis
 from topoloc.localization.config import WallsConfig
 from topoloc.localization.fitted_weights import weights_of
 from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.map_facts.building import build_map
 from topoloc.localization.open_map import OpenMap
 from topoloc.localization.query import Picture, Query
 from topoloc.localization.refine import hypothesis_of
@@ -29,6 +30,7 @@ from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Search
 from topoloc.localization.walls import propose_walls as propose_walls_module
 from topoloc.localization.walls.propose_walls import propose_walls
+from topoloc.map.build import BuildConfig
 from topoloc.map.topomap import SideNodes, TopoMetricMap
 
 NO_WALLS = LocalizerConfig(walls=WallsConfig(num_places=0))
@@ -226,7 +228,7 @@ def test_learned_features_know_the_walls_where_the_map_has_them(tmp_path: Path):
     corridor_of_two_kinds().save(path)
     loaded = TopoMetricMap.load(path)
     assert loaded.sides is not None
-    assert loaded.sides.kind == loaded.kinds[1]
+    assert loaded.sides.kind == find_kind(loaded.kinds[1]).kind_of_sides != loaded.kinds[1]
     assert loaded.by_kind(loaded.kinds[1]).sides is loaded.sides
     localizer, learned = Localizer(loaded), Localizer(loaded, LocalizerConfig(kinds=(loaded.kinds[1],)))
     for picture, truth in seen_on_the_way_back()[::2]:
@@ -242,6 +244,21 @@ def test_learned_features_know_the_walls_where_the_map_has_them(tmp_path: Path):
         database.commit()
     with pytest.raises(MapError, match="kind_of_sides"):
         TopoMetricMap.load(path)
+
+
+def test_walls_that_the_nodes_own_kind_describes_are_asked_still(monkeypatch: pytest.MonkeyPatch):
+    network = learned_kind()
+    with monkeypatch.context() as patch:  # as maps were, before walls had a network of their own
+        patch.setitem(KINDS, network, replace(KINDS[network], sides=None))
+        topomap = build_map(WalkAhead(0), BuildConfig(features=FeatureConfig(kind=network), other_kinds=()))
+    assert topomap.sides is not None
+    assert topomap.sides.kind == network
+    localizer = Localizer(topomap)
+    assert localizer.weights.walls == weights_of(network).walls
+    for picture, truth in seen_on_the_way_back()[::2]:
+        result = localizer.localize(picture, WIDE)
+        assert _is_by_walls(result)
+        assert _is_right(result, truth)
 
 
 def test_from_a_file_the_same_is_answered(tmp_path: Path):

@@ -165,7 +165,7 @@ def _on_walls(num: int, weights: FittedWeights, seed: int = 0) -> list[TriedPose
     """Poses that walls let expect, right with the probability that these weights give them."""
     rng, poses = np.random.default_rng(seed), []
     for k in range(num):
-        evidence = replace(_evidence(rng), num_distinct=int(rng.integers(0, 60)))
+        evidence = replace(_evidence(rng), num_distinct=int(rng.integers(0, 60)), num_lesser_side=int(rng.integers(0, 40)))
         is_right = rng.random() < 1.0 / (1.0 + math.exp(-log_odds_of(evidence, weights)))
         poses.append(_pose(RIGHT if is_right else WRONG, evidence, k))
     return poses
@@ -173,7 +173,7 @@ def _on_walls(num: int, weights: FittedWeights, seed: int = 0) -> list[TriedPose
 
 def test_the_weights_of_walls_are_found_again_and_left_alone_where_poses_are_few():
     before = weights_of("surf")
-    true = replace(before, walls=replace(before.walls, spread=2.0, bias=before.walls.bias - 2.0))
+    true = replace(before, walls=replace(before.walls, spread=2.0, lesser_side=0.7, bias=before.walls.bias - 3.5))
     fitted, num = fit_walls(_on_walls(4000, true), before.walls)
     assert num == 4000
     told = _on_walls(500, true, seed=1)

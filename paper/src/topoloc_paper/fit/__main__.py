@@ -127,8 +127,8 @@ def fit(kind: str, poses: list[TriedPose], step: int, by_recording: bool) -> Fit
 
 
 def fit_walls_alone(kind: str, poses: list[TriedPose]) -> FittedWeights:
-    """The weights in use with those of the walls fitted anew."""
-    before = weights_of(kind)
+    """The weights in use with those of the walls fitted anew, for the kind by which the walls are described."""
+    before = weights_of(find_kind(kind).kind_of_sides)
     walls, num = fit_walls(poses, before.walls)
     told = told_by_walls(poses)
     for name, weights in (("in use", before.walls), ("fitted", walls)):

@@ -47,9 +47,9 @@ def fit_walls(poses: list[TriedPose], before: WallWeights) -> tuple[WallWeights,
         return float(np.sum(np.logaddexp(0.0, -signs * (x @ weights + given))) + _STRENGTH * np.sum((weights - start) ** 2))
 
     bounds = [(0.0, None)] * (len(start) - 1) + [(None, None)]
-    found, chance, inliers, share, spread, distinct, even, bias = (
+    found, chance, inliers, share, spread, distinct, lesser_side, even, bias = (
         float(weight) for weight in np.round(minimize(loss, start, bounds=bounds, method="L-BFGS-B").x, 3)
     )
+    by_sides = {"distinct": distinct, "lesser_side": lesser_side}
     shares = {"inlier_share": share, "even_share": even}
-    fitted = replace(before, found=found, chance=chance, inliers=inliers, spread=spread, distinct=distinct, bias=bias, **shares)
-    return fitted, len(told)
+    return replace(before, found=found, chance=chance, inliers=inliers, spread=spread, bias=bias, **by_sides, **shares), len(told)

@@ -19,6 +19,7 @@ from jaxtyping import UInt8
 
 from topoloc.features.extraction import extract_normalized, normalize_image
 from topoloc.features.features import Features
+from topoloc.features.kinds import FeatureConfig
 from topoloc.features.matching import MatchingConfig, match_features, match_pooled
 from topoloc.features.side_views import SideView, side_views
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig
@@ -31,7 +32,6 @@ from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.map_facts.correlated_errors import inflation
 from topoloc.localization.pose_fit import PoseFit
-from topoloc.localization.query import Query
 from topoloc.localization.search import Proposal, Search
 from topoloc.localization.walls.wall_index import WallIndex
 from topoloc.localization.walls.wall_matching import SeenSide, SideMatches, count_sides, estimate_pose, match_sides, nearest_sides, together
@@ -65,7 +65,8 @@ class SeenWalls:
         assert isinstance(query.lens, Camera)
         for view in side_views(query.lens, index.view_config):
             picture = view.picture(query.grey)
-            features = query.shared.once(query, (view.name, index.view_config), partial(_features_of, query, view, picture))
+            seen_by = (view.name, index.view_config, index.feature_config)
+            features = query.shared.once(query, seen_by, partial(_features_of, index.feature_config, view, picture))
             seen.append(SeenSide(view, features, view.in_picture(features, query.lens)))
             named.append(NamedPlaces.of(view, index, index.likeness(picture, features)))
         apart = search.config.walls.apart * search.map.d_thresh
@@ -86,9 +87,9 @@ class SeenWalls:
         return LocalMap.pooled([self.index.local_map(row) for row in rows])
 
 
-def _features_of(query: Query, view: SideView, picture: UInt8[np.ndarray, "a b"]) -> Features:
+def _features_of(config: FeatureConfig, view: SideView, picture: UInt8[np.ndarray, "a b"]) -> Features:
     """Those of what a view shows."""
-    return view.within(extract_normalized(normalize_image(picture, query.feature_config), query.feature_config))
+    return view.within(extract_normalized(normalize_image(picture, config), config))
 
 
 def propose_walls(search: Search) -> Iterator[Proposal]:
@@ -165,6 +166,7 @@ def weigh_wall(proposal: WallProposal, final: PoseFit) -> Hypothesis | None:
     covariance = inflated * pose.covariance
     depths = pose.cam_from_world.apply(final.local_map.points_world[final.matches.train_idx[pose.inliers]])[:, 2]
     points_img = final.features.points_img[final.matches.query_idx[pose.inliers]].astype(np.float64)
+    num_left = int(np.count_nonzero(points_img[:, 0] < camera.cx))
     agreeing_img = points_img if counts.agreeing_img is None else counts.agreeing_img
     evidence = Evidence(
         num_matches=len(proposal.fit.matches),
@@ -176,6 +178,7 @@ def weigh_wall(proposal: WallProposal, final: PoseFit) -> Hypothesis | None:
         doubt=doubt_of(covariance, float(np.median(depths)), search.config.evidence),
         even_share=even_share_of(agreeing_img, counts.visible_img, camera.width, camera.height),
         num_distinct=_num_distinct(walls, final),
+        num_lesser_side=min(num_left, len(points_img) - num_left),
     )
     return Hypothesis("walls", final, evidence, covariance, 1.0 / inflated, log_odds_of(evidence, search.weights))
 

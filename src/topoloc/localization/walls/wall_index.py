@@ -30,7 +30,7 @@ class WallIndex:
         self.rotations = np.array([summary.world_from_cam.rotation for summary in sides.summaries])
         self.positions = np.array([summary.world_from_cam.translation for summary in sides.summaries])
         self.middles = np.einsum("nji,nj->ni", self.rotations, self.centres - self.positions)
-        self.view_config = topomap.config.sides.views
+        self.view_config, self.feature_config = topomap.config.sides.views, topomap.config.features_of(sides.kind)
         self.local_map = RememberedNodes(lambda row: _read(sides, row))
 
     @property
