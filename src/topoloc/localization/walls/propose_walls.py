@@ -107,7 +107,7 @@ def propose_walls(search: Search) -> Iterator[Proposal]:
     with search.query.clock.stage("walls"):
         walls = SeenWalls.of(search, index)
         found = [proposal for place in walls.places if (proposal := _compared(walls, place)) is not None]
-        chosen = _best(found)
+        chosen = _best([_looked_again(proposal) for proposal in _best(found)])
     yield from chosen
 
 
@@ -121,6 +121,12 @@ def _best(found: list[WallProposal]) -> list[WallProposal]:
         if not any(_are_near(search, proposal.cam_from_world, other.cam_from_world) for other in kept):
             kept.append(proposal)
     return kept
+
+
+def _looked_again(proposal: WallProposal) -> WallProposal:
+    """Compared with what must be seen from the pose itself, where more agrees then: the place that named it was only near."""
+    again = _compared(proposal.walls, proposal.cam_from_world.inverse())
+    return again if again is not None and again.num_agreeing > proposal.num_agreeing else proposal
 
 
 def _compared(walls: SeenWalls, place: Rigid3) -> WallProposal | None:
