@@ -29,7 +29,7 @@ from topoloc.localization.refine import hypothesis_of
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Search
 from topoloc.localization.walls import propose_walls as propose_walls_module
-from topoloc.localization.walls.propose_walls import propose_walls
+from topoloc.localization.walls.propose_walls import SeenWalls, propose_walls
 from topoloc.map.build import BuildConfig
 from topoloc.map.topomap import SideNodes, TopoMetricMap
 
@@ -191,14 +191,34 @@ def test_walls_that_stand_in_two_places_are_no_answer():
 
 def _by_the_walls(topomap: TopoMetricMap, picture: np.ndarray, config: WallsConfig | None = None) -> list[Hypothesis]:
     """What the walls let expect, whatever the nodes say; the likeliest first."""
-    open_map, weights = OpenMap(topomap), weights_of("surf")
-    resolved = LocalizerConfig(walls=config or WallsConfig()).for_kind(SURF)
-    search = Search(Query(picture, WIDE, 1.0, open_map.feature_config), open_map, resolved, weights, rho=0.1)
+    search = _search(topomap, picture, config)
     for proposal in propose_walls(search):
         hypothesis = hypothesis_of(search, proposal)
         if hypothesis is not None:
-            search.belief = search.belief.given(hypothesis, resolved.evidence, weights.rivals)
-    return search.belief.ranked(weights.rivals)
+            search.belief = search.belief.given(hypothesis, search.config.evidence, search.weights.rivals)
+    return search.belief.ranked(search.weights.rivals)
+
+
+def _search(topomap: TopoMetricMap, picture: np.ndarray, config: WallsConfig | None = None) -> Search:
+    open_map = OpenMap(topomap)
+    resolved = LocalizerConfig(walls=config or WallsConfig()).for_kind(SURF)
+    return Search(Query(picture, WIDE, 1.0, open_map.feature_config), open_map, resolved, weights_of("surf"), rho=0.1)
+
+
+def test_a_place_that_is_only_near_is_looked_at_again_from_the_pose_that_it_led_to():
+    picture, truth = seen_on_the_way_back()[2]
+    search = _search(built_corridor(), picture)
+    assert search.map.walls is not None
+    walls = SeenWalls.of(search, search.map.walls)
+    away = Rigid3(truth.rotation, truth.translation + np.array([0.0, 2.0, 0.0]))
+    from_there = propose_walls_module._compared(walls, away)
+    from_here = propose_walls_module._compared(walls, truth)
+    assert from_there is not None
+    assert from_here is not None
+    again = propose_walls_module._looked_again(from_there)
+    assert from_there.num_agreeing < again.num_agreeing
+    assert again.num_agreeing > 0.7 * from_here.num_agreeing
+    assert propose_walls_module._looked_again(again).num_agreeing >= again.num_agreeing
 
 
 def test_poses_where_nodes_look_the_same_way_are_left_to_the_nodes():
