@@ -1,6 +1,6 @@
 """Local features side by side where light changes: pairs of pictures of rendered places (exact truth) and of a path by day and by night.
 
-    python benchmarks/learned_features.py --kinds surf xfeat topoloc-net --pairs DAY,OTHER [--shared ../shared]
+    python benchmarks/learned_features.py --kinds surf xfeat topoloc-net --pairs DAY,OTHER [--features N] [--shared ../shared]
 
 DAY is a stereo recording, OTHER any other, both with truth; parts of one (`street1@0::2,street1@1::2`) do as well. Each picture of OTHER is
 matched to the nearest one of DAY that looks the same way (mutual nearest neighbours, no ratio), the day's points get their depth by block

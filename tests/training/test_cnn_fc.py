@@ -37,7 +37,7 @@ def train(room_set: TrainingSet, how: CnnFcConfig, checkpoint: Path | None = Non
 
 
 def test_from_nothing_it_learns_the_room(room_set: TrainingSet):
-    model = train(room_set, config(60, learning_rate=3e-3))
+    model = train(room_set, config(110, learning_rate=3e-3))
     localizer = open_coarse(model)
     assert isinstance(localizer, CnnFc)
     pictures = [decode_picture(jpeg) for jpeg in room_set.jpegs]
