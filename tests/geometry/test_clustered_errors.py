@@ -52,10 +52,10 @@ def test_what_was_moved_shows_and_widens_as_much_as_it_is_off():
     assert np.mean(off[:, 1] / off[:, 0] ** 2 < 12.592) > 0.9
 
 
-@pytest.mark.parametrize("count", [0, 1, 4, 7])
+@pytest.mark.parametrize("count", [0, 1, 4, 5])
 def test_of_few_matches_nothing_is_said(count: int):
-    points_img, points = seen(0, 0.0, max(count, 1))
+    points_img, points = seen(0, 0.05, max(count, 1))
     arguments = points_img[:count], points[:count], NO_COVARIANCES[:count]
-    assert coherence(*arguments, CAMERA, Rigid3.identity(), CONFIG) == pytest.approx(1.0, abs=20.0)
+    assert coherence(*arguments, CAMERA, Rigid3.identity(), CONFIG) == 1.0
     crowded = np.full((9, 2), 100.0) + np.arange(9)[:, None]
     assert coherence(crowded, np.ones((9, 3)), NO_COVARIANCES[:9], CAMERA, Rigid3.identity(), CONFIG) == 1.0

@@ -146,10 +146,10 @@ LEARNED = (
 )
 """The first one is what is meant by learned features where none are named."""
 
-OF_SIDES = _learned_kind("topoloc-net-sides", 64, min_score=0.0067)
-"""The same network, taught further on walls that are seen at a slant from their two ends. No kind to make a map of."""
-
 KINDS: dict[str, FeatureKind] = {kind.name: kind for kind in (SURF, SIFT, *LEARNED)}
+
+_OF_SIDES = {"topoloc-net-sides": _learned_kind("topoloc-net-sides", 64, min_score=0.0067)}
+"""Those of side views alone, which no map is made of: `topoloc-net`, taught further on walls that are seen from their two ends."""
 
 
 def find_kind(name: str) -> FeatureKind:
@@ -158,11 +158,10 @@ def find_kind(name: str) -> FeatureKind:
     Raises:
         FeatureKindError: there is none.
     """
-    if name == OF_SIDES.name:
-        return OF_SIDES
-    if name not in KINDS:
+    kind = KINDS.get(name) or _OF_SIDES.get(name)
+    if kind is None:
         raise FeatureKindError(f"no features of kind {name!r}; there are {', '.join(KINDS)}")
-    return KINDS[name]
+    return kind
 
 
 def learned_kind() -> str:

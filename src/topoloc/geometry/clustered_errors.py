@@ -12,13 +12,12 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.absolute_pose import CAUCHY_SCALE, AbsolutePoseConfig, Matches
+from topoloc.geometry.absolute_pose_kernels import squared_pulls
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.clustered_errors_kernels import squared_pulls
 from topoloc.geometry.rigid import Rigid3
 
 _COLUMNS, _ROWS = 8, 6
-_MIN_CELLS = 6
-"""With matches in fewer cells of the picture nothing is said."""
+_MIN_CELLS = 6  # with matches in fewer of them nothing is said
 
 
 def coherence(
