@@ -1,10 +1,12 @@
-"""Robust PnP: time and success of topoloc against plain OpenCV, over the number of matches and the share of outliers.
+"""Robust PnP: time and success of topoloc against plain OpenCV, over the number of matches and the
+share of outliers.
 
     python benchmarks/absolute_pose.py [--num-scenes 20] [--json FILE]
 
-Scenes are simulated: 752x480 pinhole, points 2 to 12 m away, 1 px of key point noise, stereo points with an uncertain depth.
-A scene is solved where the position is within 0.25 m and the rotation within 2 degrees. Times are the median over the scenes of the
-fastest of three calls, one thread, everything included from the matches to the pose (for topoloc: to its covariance, too).
+Scenes are simulated: 752x480 pinhole, points 2 to 12 m away, 1 px of key point noise, stereo points
+with an uncertain depth. A scene is solved where the position is within 0.25 m and the rotation
+within 2 degrees. Times are the median over the scenes of the fastest of three calls, one thread,
+everything included from the matches to the pose (for topoloc: to its covariance, too).
 """
 
 from __future__ import annotations
@@ -44,7 +46,8 @@ def make_scene(rng: np.random.Generator, n: int, outliers: float) -> Scene:
     pixels = rng.uniform([0, 0], [CAMERA.width - 1, CAMERA.height - 1], (n, 2))
     points_cam = CAMERA.rays_from_img(pixels) * rng.uniform(2.0, 12.0, (n, 1))
     points_world = cam_from_world.inverse().apply(points_cam)
-    # The mapping camera stood half a metre beside and a metre behind; its depth error is that of a 12 cm baseline.
+    # The mapping camera stood half a metre beside and a metre behind; its depth error is that of a
+    # 12 cm baseline.
     rays = points_world - cam_from_world.inverse().apply(np.array([0.5, 0.0, -1.0]))
     distances = np.linalg.norm(rays, axis=1, keepdims=True)
     rays /= distances
@@ -53,13 +56,17 @@ def make_scene(rng: np.random.Generator, n: int, outliers: float) -> Scene:
     covariances = sigmas[:, :, None] ** 2 * rays[:, :, None] * rays[:, None, :] + 1e-6 * np.eye(3)
     pixels = pixels + rng.normal(size=(n, 2))
     is_outlier = rng.permutation(n) < round(outliers * n)
-    pixels[is_outlier] = rng.uniform([0, 0], [CAMERA.width - 1, CAMERA.height - 1], (np.count_nonzero(is_outlier), 2))
+    pixels[is_outlier] = rng.uniform(
+        [0, 0], [CAMERA.width - 1, CAMERA.height - 1], (np.count_nonzero(is_outlier), 2)
+    )
     # As a ratio test would tell: right matches mostly, not always, before wrong ones.
     priorities = rng.normal(size=n) + np.where(is_outlier, 0.0, 1.5)
     return Scene(pixels, points_world, covariances, priorities, cam_from_world)
 
 
-def with_topoloc(scene: Scene, config: AbsolutePoseConfig, covariances: bool, priorities: bool) -> Rigid3 | None:
+def with_topoloc(
+    scene: Scene, config: AbsolutePoseConfig, covariances: bool, priorities: bool
+) -> Rigid3 | None:
     pose = estimate_absolute_pose(
         scene.points_img,
         scene.points_world,
@@ -72,15 +79,21 @@ def with_topoloc(scene: Scene, config: AbsolutePoseConfig, covariances: bool, pr
 
 
 def with_opencv(scene: Scene, **settings: Any) -> Rigid3 | None:
-    found, rotation, translation, _ = cv2.solvePnPRansac(scene.points_world, scene.points_img, CAMERA.matrix(), None, **settings)
+    found, rotation, translation, _ = cv2.solvePnPRansac(
+        scene.points_world, scene.points_img, CAMERA.matrix(), None, **settings
+    )
     return Rigid3(cv2.Rodrigues(rotation)[0], translation[:, 0]) if found else None
 
 
 SOLVERS: dict[str, Callable[[Scene], Rigid3 | None]] = {
     "topoloc": lambda scene: with_topoloc(scene, AbsolutePoseConfig(), True, False),
     "topoloc, priorities": lambda scene: with_topoloc(scene, AbsolutePoseConfig(), True, True),
-    "topoloc, points taken as exact": lambda scene: with_topoloc(scene, AbsolutePoseConfig(), False, False),
-    "topoloc, method opencv": lambda scene: with_topoloc(scene, AbsolutePoseConfig(method="opencv"), True, False),
+    "topoloc, points taken as exact": lambda scene: with_topoloc(
+        scene, AbsolutePoseConfig(), False, False
+    ),
+    "topoloc, method opencv": lambda scene: with_topoloc(
+        scene, AbsolutePoseConfig(method="opencv"), True, False
+    ),
     "OpenCV, its defaults": with_opencv,
     "OpenCV, USAC_MAGSAC": lambda scene: with_opencv(
         scene, flags=cv2.USAC_MAGSAC, reprojectionError=4.0, iterationsCount=5000, confidence=0.9999
@@ -125,13 +138,25 @@ def main(num_scenes: int = 20, json_file: Path | None = None) -> None:
         for outliers in (0.1, 0.5, 0.7, 0.9):
             rng = np.random.default_rng(n)
             scenes = [make_scene(rng, n, outliers) for _ in range(num_scenes)]
-            rows += [{"num_matches": n, "outliers": outliers, "solver": name} | measure(solve, scenes) for name, solve in SOLVERS.items()]
-    table = Table("matches", "outliers", "solver", "median ms", "max ms", "solved", "wrong", "cm", "deg")
+            rows += [
+                {"num_matches": n, "outliers": outliers, "solver": name} | measure(solve, scenes)
+                for name, solve in SOLVERS.items()
+            ]
+    table = Table(
+        "matches", "outliers", "solver", "median ms", "max ms", "solved", "wrong", "cm", "deg"
+    )
     for row in rows:
         times = [f"{row[key]:.2f}" for key in ("median_ms", "max_ms")]
         shares = [f"{row[key]:.0%}" for key in ("solved", "wrong")]
         errors = [f"{100 * row['median_translation_m']:.2f}", f"{row['median_rotation_deg']:.3f}"]
-        table.add_row(str(row["num_matches"]), f"{row['outliers']:.0%}", row["solver"], *times, *shares, *errors)
+        table.add_row(
+            str(row["num_matches"]),
+            f"{row['outliers']:.0%}",
+            row["solver"],
+            *times,
+            *shares,
+            *errors,
+        )
     Console().print(table)
     if json_file is not None:
         json_file.write_text(json.dumps(rows, indent=1))

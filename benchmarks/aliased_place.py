@@ -1,13 +1,16 @@
-"""An aliased place: a wall of equal panels, asked by single pictures and by a stream. What is asked beside what is measured.
+"""An aliased place: a wall of equal panels, asked by single pictures and by a stream. What is asked
+beside what is measured.
 
     python benchmarks/aliased_place.py MAP_SEQ QUERY_SEQ [--seed N] [--json FILE]
 
-Recordings of the world `hospital` of one seed, as by `topoloc simulate hospital hospital_map --spacing 0.3` and
-`topoloc simulate hospital hospital_ask --spacing 0.45 --lateral 0.15 --take 1 --mono`; with `--look -80` in both the camera sees
-little but the wall. Right is within 0.25 m and 5 degrees, a panel off is wrong along the way by whole metres to within a quarter. A
-picture cannot be told apart where every column of it shows panels, by the plan of the place: no door, no corner. Such a one should be
-refused as ambiguous, with a right pose among its alternatives. The same pictures are then one stream: its poses are those that were
-localized or followed, from the first right one on.
+Recordings of the world `hospital` of one seed, as by `topoloc simulate hospital hospital_map
+--spacing 0.3` and `topoloc simulate hospital hospital_ask --spacing 0.45 --lateral 0.15 --take 1
+--mono`; with `--look -80` in both the camera sees little but the wall. Right is within 0.25 m and 5
+degrees, a panel off is wrong along the way by whole metres to within a quarter. A picture cannot be
+told apart where every column of it shows panels, by the plan of the place: no door, no corner. Such
+a one should be refused as ambiguous, with a right pose among its alternatives. The same pictures
+are then one stream: its poses are those that were localized or followed, from the first right one
+on.
 """
 
 from __future__ import annotations
@@ -64,7 +67,9 @@ class Streamed:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("mapped")
     parser.add_argument("asked")
     parser.add_argument("--seed", type=int, default=0, help="the hospital's")
@@ -72,11 +77,19 @@ def main() -> None:
     args = parser.parse_args()
     localizer = Localizer(build_map(open_sequence(args.mapped)))
     sequence = single_pictures(open_sequence(args.asked))
-    frames = [frame for frame in (sequence[i] for i in range(len(sequence))) if frame.world_from_cam is not None]
+    frames = [
+        frame
+        for frame in (sequence[i] for i in range(len(sequence)))
+        if frame.world_from_cam is not None
+    ]
     alone, streamed = asked_alone(localizer, frames, args.seed), asked_as_stream(localizer, frames)
     report(len(localizer.topomap.nodes), alone, streamed)
     if args.json:
-        figures = {"nodes": len(localizer.topomap.nodes), "alone": asdict(alone), "stream": asdict(streamed)}
+        figures = {
+            "nodes": len(localizer.topomap.nodes),
+            "alone": asdict(alone),
+            "stream": asdict(streamed),
+        }
         args.json.write_text(json.dumps(figures, indent=1))
 
 
@@ -92,7 +105,11 @@ def asked_alone(localizer: Localizer, frames: list[StereoFrame], seed: int) -> A
         else:
             refused[result.reason] += 1
             with_truth = any(is_right(pose, frame.world_from_cam) for pose in alternatives(result))
-            kind = "ambiguous with truth" if result.reason == "ambiguous" and with_truth else result.reason
+            kind = (
+                "ambiguous with truth"
+                if result.reason == "ambiguous" and with_truth
+                else result.reason
+            )
         kinds[kind] += 1
         if shows_panels_only(frame, seed):
             alike_kinds[kind] += 1
@@ -127,20 +144,34 @@ def asked_as_stream(localizer: Localizer, frames: list[StereoFrame]) -> Streamed
         if first_right is not None:
             states[answer.state] += 1
             kinds[kind] += 1
-    return Streamed(kinds.total(), kinds["right"], kinds["panel off"] + kinds["wrong"], kinds["panel off"], first_right, dict(states))
+    return Streamed(
+        kinds.total(),
+        kinds["right"],
+        kinds["panel off"] + kinds["wrong"],
+        kinds["panel off"],
+        first_right,
+        dict(states),
+    )
 
 
 def alternatives(result: NotLocalized) -> list[Rigid3]:
-    """The poses that an ambiguous picture may have been taken at; none from a localizer that does not tell them."""
+    """The poses that an ambiguous picture may have been taken at; none from a localizer that does
+    not tell them."""
     return [alternative.world_from_cam for alternative in getattr(result, "alternatives", ())]
 
 
 def shows_panels_only(frame: StereoFrame, seed: int) -> bool:
-    """Whether every column of the picture looks at panels: rays on the plan, at the height of the camera."""
+    """Whether every column of the picture looks at panels: rays on the plan, at the height of the
+    camera."""
     assert frame.camera is not None
     assert frame.world_from_cam is not None
-    columns = np.column_stack([np.linspace(0.0, frame.camera.width - 1.0, 65), np.full(65, frame.camera.cy)])
-    rays = np.column_stack([frame.camera.normalized_from_img(columns), np.ones(65)]) @ frame.world_from_cam.rotation.T
+    columns = np.column_stack(
+        [np.linspace(0.0, frame.camera.width - 1.0, 65), np.full(65, frame.camera.cy)]
+    )
+    rays = (
+        np.column_stack([frame.camera.normalized_from_img(columns), np.ones(65)])
+        @ frame.world_from_cam.rotation.T
+    )
     nearest, panelled = np.full(65, np.inf), np.zeros(65, np.bool_)
     for side in walls_of(seed).values():
         along = np.array([np.cos(side.wall.yaw), np.sin(side.wall.yaw)])
@@ -151,7 +182,10 @@ def shows_panels_only(frame: StereoFrame, seed: int) -> bool:
         x = (reach[:, None] * rays[:, :2] - to_wall) @ along
         hit = (reach > 0.0) & (reach < nearest) & (x >= 0.0) & (x <= side.wall.length)
         nearest[hit] = reach[hit]
-        panelled[hit] = np.any([(x[hit] > left) & (x[hit] < left + BAY * bays) for left, bays in side.panelled()], axis=0)
+        panelled[hit] = np.any(
+            [(x[hit] > left) & (x[hit] < left + BAY * bays) for left, bays in side.panelled()],
+            axis=0,
+        )
     return bool(panelled.all())
 
 
@@ -160,12 +194,19 @@ def verdict(world_from_cam: Rigid3, truth: Rigid3) -> str:
     if is_right(world_from_cam, truth):
         return "right"
     metres = translation_error(world_from_cam, truth)
-    off = round(metres / BAY) > 0 and abs(metres - BAY * round(metres / BAY)) < BAY / 4 and _degrees(world_from_cam, truth) < MAX_DEGREES
+    off = (
+        round(metres / BAY) > 0
+        and abs(metres - BAY * round(metres / BAY)) < BAY / 4
+        and _degrees(world_from_cam, truth) < MAX_DEGREES
+    )
     return "panel off" if off else "wrong"
 
 
 def is_right(world_from_cam: Rigid3, truth: Rigid3) -> bool:
-    return translation_error(world_from_cam, truth) < MAX_METRES and _degrees(world_from_cam, truth) < MAX_DEGREES
+    return (
+        translation_error(world_from_cam, truth) < MAX_METRES
+        and _degrees(world_from_cam, truth) < MAX_DEGREES
+    )
 
 
 def _degrees(a: Rigid3, b: Rigid3) -> float:
@@ -174,7 +215,10 @@ def _degrees(a: Rigid3, b: Rigid3) -> float:
 
 def report(num_nodes: int, alone: Alone, streamed: Streamed) -> None:
     print(f"{num_nodes} nodes, {alone.pictures} pictures")
-    print(f"alone: {alone.right} right, refused {alone.refused}, {alone.ambiguous_with_truth} of the ambiguous with the true pose")
+    print(
+        f"alone: {alone.right} right, refused {alone.refused}, {alone.ambiguous_with_truth} of the"
+        " ambiguous with the true pose"
+    )
     print(f"{alone.alike} show panels only: {alone.alike_kinds}")
     share = f"{100 * alone.alike_with_truth / alone.alike:.0f} %" if alone.alike else "none"
     row("of those, ambiguous with the true pose among the alternatives", ">= 95 %", share)
@@ -183,9 +227,16 @@ def report(num_nodes: int, alone: Alone, streamed: Streamed) -> None:
     if streamed.first_right is None:
         row("stream", "", "nothing right was ever seen")
         return
-    print(f"stream, from picture {streamed.first_right} on: {streamed.frames} frames, {streamed.states}")
+    print(
+        f"stream, from picture {streamed.first_right} on: {streamed.frames} frames,"
+        f" {streamed.states}"
+    )
     row("right", ">= 98 %", f"{100 * streamed.right / streamed.frames:.1f} %")
-    row("wrong without saying", "0", f"{streamed.wrong}, {streamed.one_panel_off} of them whole panels")
+    row(
+        "wrong without saying",
+        "0",
+        f"{streamed.wrong}, {streamed.one_panel_off} of them whole panels",
+    )
 
 
 def row(what: str, asked: str, measured: str) -> None:

@@ -1,10 +1,13 @@
-"""An atlas beside the maps that it is made of: what each tile alone localizes, and what the atlas makes of the same pictures.
+"""An atlas beside the maps that it is made of: what each tile alone localizes, and what the atlas
+makes of the same pictures.
 
-    python benchmarks/atlas.py ATLAS TILE=RECORDING ... [--elsewhere RECORDING ...] [--alike c1,c2] [--memory-mb 256] [--json FILE]
+    python benchmarks/atlas.py ATLAS TILE=RECORDING ... [--elsewhere RECORDING ...] [--alike c1,c2]
+    [--memory-mb 256] [--json FILE]
 
-Each picture is asked of its own tile's map alone and of the atlas, in turns, in one process. `--alike` names tiles of places that share
-things (two fittings of one building): an answer in another of them is counted apart, and held against the recording's truth. A picture of
-`--elsewhere` is asked of each tile's map alone, and of the atlas: its time is compared with the mean of theirs.
+Each picture is asked of its own tile's map alone and of the atlas, in turns, in one process.
+`--alike` names tiles of places that share things (two fittings of one building): an answer in
+another of them is counted apart, and held against the recording's truth. A picture of `--elsewhere`
+is asked of each tile's map alone, and of the atlas: its time is compared with the mean of theirs.
 """
 
 from __future__ import annotations
@@ -37,7 +40,9 @@ from topoloc.tracking.warm_up import warm_up
 RIGHT_METRES = 0.5
 
 
-def asked(localizer: AtlasLocalizer, alone: Localizer, tile_id: str, frame: StereoFrame, alike: set[str]) -> dict[str, Any]:
+def asked(
+    localizer: AtlasLocalizer, alone: Localizer, tile_id: str, frame: StereoFrame, alike: set[str]
+) -> dict[str, Any]:
     """One picture asked of the map alone and of the atlas."""
     assert frame.camera is not None
     start = time.process_time()
@@ -47,17 +52,36 @@ def asked(localizer: AtlasLocalizer, alone: Localizer, tile_id: str, frame: Ster
     end = time.process_time()
     ranking = [name for name, _ in localizer.rank(Picture(frame.image, frame.camera))]
     answer = by_atlas.provenance.tile if isinstance(by_atlas, Localization) else None
-    outcome = "right" if answer == tile_id else "none" if answer is None else "alike" if {answer, tile_id} <= alike else "false"
-    row: dict[str, Any] = {"alone": by_map.localized, "outcome": outcome, "answer": answer, "rank": ranking.index(tile_id) + 1}
+    outcome = (
+        "right"
+        if answer == tile_id
+        else "none"
+        if answer is None
+        else "alike"
+        if {answer, tile_id} <= alike
+        else "false"
+    )
+    row: dict[str, Any] = {
+        "alone": by_map.localized,
+        "outcome": outcome,
+        "answer": answer,
+        "rank": ranking.index(tile_id) + 1,
+    }
     if isinstance(by_atlas, NotLocalized):
         row["reason"] = by_atlas.reason
         row["tiles"] = [one.tile for one in by_atlas.alternatives]
     elif outcome == "alike" and frame.world_from_cam is not None:
         row["metres_off"] = translation_error(by_atlas.world_from_cam, frame.world_from_cam)
-    return row | {"name": frame.name, "ms_alone": 1e3 * (middle - start), "ms_atlas": 1e3 * (end - middle)}
+    return row | {
+        "name": frame.name,
+        "ms_alone": 1e3 * (middle - start),
+        "ms_atlas": 1e3 * (end - middle),
+    }
 
 
-def asked_elsewhere(localizer: AtlasLocalizer, alone: dict[str, Localizer], frame: StereoFrame) -> dict[str, Any]:
+def asked_elsewhere(
+    localizer: AtlasLocalizer, alone: dict[str, Localizer], frame: StereoFrame
+) -> dict[str, Any]:
     """One picture of no tile asked of each map alone and of the atlas."""
     assert frame.camera is not None
     ms_alone, poses = [], 0
@@ -69,34 +93,50 @@ def asked_elsewhere(localizer: AtlasLocalizer, alone: dict[str, Localizer], fram
     result = localizer.localize(frame.image, frame.camera)
     ms_atlas = 1e3 * (time.process_time() - start)
     answer = result.provenance.tile if isinstance(result, Localization) else None
-    return {"name": frame.name, "answer": answer, "poses_alone": poses, "ms_alone": float(np.mean(ms_alone)), "ms_atlas": ms_atlas}
+    return {
+        "name": frame.name,
+        "answer": answer,
+        "poses_alone": poses,
+        "ms_alone": float(np.mean(ms_alone)),
+        "ms_atlas": ms_atlas,
+    }
 
 
 def elsewhere_line(name: str, rows: list[dict[str, Any]]) -> str:
     """The figures of a recording of elsewhere, or of all."""
     ratios = [row["ms_atlas"] / row["ms_alone"] for row in rows]
-    by_atlas, by_maps = sum(row["answer"] is not None for row in rows), sum(row["poses_alone"] for row in rows)
+    by_atlas, by_maps = (
+        sum(row["answer"] is not None for row in rows),
+        sum(row["poses_alone"] for row in rows),
+    )
     return (
-        f"{name:24} {len(rows):4} pictures of elsewhere: poses by the atlas {by_atlas}, by single maps {by_maps}; "
-        f"time {np.median(ratios):.2f} of a single map's in the median, {np.min(ratios):.2f} to "
-        f"{np.max(ratios):.2f}"
+        f"{name:24} {len(rows):4} pictures of elsewhere: poses by the atlas {by_atlas}, by single"
+        f" maps {by_maps}; time {np.median(ratios):.2f} of a single map's in the median,"
+        f" {np.min(ratios):.2f} to {np.max(ratios):.2f}"
     )
 
 
 def line(name: str, rows: list[dict[str, Any]]) -> str:
     """The figures of a recording, or of all."""
-    outcomes, of_alone = Counter(row["outcome"] for row in rows), [row for row in rows if row["alone"]]
+    outcomes, of_alone = (
+        Counter(row["outcome"] for row in rows),
+        [row for row in rows if row["alone"]],
+    )
     kept = sum(row["outcome"] in ("right", "alike") for row in of_alone)
     alike = [row["metres_off"] for row in rows if "metres_off" in row]
-    ratio = np.median([row["ms_atlas"] for row in rows]) / np.median([row["ms_alone"] for row in rows])
+    ratio = np.median([row["ms_atlas"] for row in rows]) / np.median(
+        [row["ms_alone"] for row in rows]
+    )
     each = np.median([row["ms_atlas"] / row["ms_alone"] for row in rows])
     first = np.mean([row["rank"] == 1 for row in rows])
     return (
-        f"{name:24} {len(rows):4} pictures; alone {len(of_alone)}, of these {kept} ({100 * kept / max(len(of_alone), 1):.1f} %); "
-        f"right {outcomes['right']}, alike {outcomes['alike']} ({sum(off < RIGHT_METRES for off in alike)} right by truth), "
-        f"false {outcomes['false']}, none {outcomes['none']} ({sum(row.get('reason') == 'ambiguous' for row in rows)} ambiguous); "
-        f"time {ratio:.2f} of the medians, {each:.2f} median; right tile first {100 * first:.0f} %, "
-        f"rank at most {max(row['rank'] for row in rows)}"
+        f"{name:24} {len(rows):4} pictures; alone {len(of_alone)}, of these {kept}"
+        f" ({100 * kept / max(len(of_alone), 1):.1f} %); right {outcomes['right']}, alike"
+        f" {outcomes['alike']} ({sum(off < RIGHT_METRES for off in alike)} right by truth), false"
+        f" {outcomes['false']}, none {outcomes['none']}"
+        f" ({sum(row.get('reason') == 'ambiguous' for row in rows)} ambiguous); time {ratio:.2f} of"
+        f" the medians, {each:.2f} median; right tile first {100 * first:.0f} %, rank at most"
+        f" {max(row['rank'] for row in rows)}"
     )
 
 
@@ -104,18 +144,25 @@ def ask_elsewhere(localizer: AtlasLocalizer, paths: list[str]) -> dict[str, list
     """The rows of each recording, which are printed."""
     atlas, rows = localizer.atlas, dict[str, list[dict[str, Any]]]()
     with ExitStack() as opened:
-        maps = {tile.tile_id: opened.enter_context(TopoMetricMap.load(atlas.map_path(tile))) for tile in atlas.manifest.tiles}
+        maps = {
+            tile.tile_id: opened.enter_context(TopoMetricMap.load(atlas.map_path(tile)))
+            for tile in atlas.manifest.tiles
+        }
         alone = {tile_id: Localizer(topomap) for tile_id, topomap in maps.items()}
         for path in paths:
             sequence = single_pictures(open_sequence(path))
-            rows[path] = [asked_elsewhere(localizer, alone, sequence[k]) for k in range(len(sequence))]
+            rows[path] = [
+                asked_elsewhere(localizer, alone, sequence[k]) for k in range(len(sequence))
+            ]
             print(elsewhere_line(Path(path).name, rows[path]), flush=True)
     print(elsewhere_line("all", [row for of_one in rows.values() for row in of_one]))
     return rows
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("atlas")
     parser.add_argument("recordings", nargs="+", metavar="TILE=RECORDING")
     parser.add_argument("--elsewhere", nargs="+", default=[], metavar="RECORDING")
@@ -132,7 +179,10 @@ def main() -> None:
         tile_id, path = pair.split("=", 1)
         with TopoMetricMap.load(atlas.map_path(atlas.tile(tile_id))) as topomap:
             sequence, alone = single_pictures(open_sequence(path)), Localizer(topomap)
-            of_one = [asked(localizer, alone, tile_id, sequence[k], set(args.alike.split(","))) for k in range(len(sequence))]
+            of_one = [
+                asked(localizer, alone, tile_id, sequence[k], set(args.alike.split(",")))
+                for k in range(len(sequence))
+            ]
         rows[pair] = of_one
         print(line(f"{tile_id} {Path(path).name}", of_one), flush=True)
     print(line("all", [row for of_one in rows.values() for row in of_one]))

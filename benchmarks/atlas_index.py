@@ -1,10 +1,13 @@
-"""The coarse search of an atlas over more and more places: time, recall of exact search, memory, bytes, look-alikes; drawn.
+"""The coarse search of an atlas over more and more places: time, recall of exact search, memory,
+bytes, look-alikes; drawn.
 
-    python benchmarks/atlas_index.py ATLAS [--sizes 1000 10000 100000 1000000] [--likeness 0.6 0.7 0.8] [--figure FILE.png] [--json FILE]
+    python benchmarks/atlas_index.py ATLAS [--sizes 1000 10000 100000 1000000] [--likeness 0.6 0.7
+    0.8] [--figure FILE.png] [--json FILE]
 
-Places are made up with the statistics of true ones: each is a mix of two place vectors of the atlas with noise of their spread, brought
-to unit length; queries are places of it, turned away by as much as pictures of the same place are (`--likeness`, a cosine). The index is
-made by the atlas's own code, in a process of its own; another one opens it and asks, with one thread.
+Places are made up with the statistics of true ones: each is a mix of two place vectors of the atlas
+with noise of their spread, brought to unit length; queries are places of it, turned away by as much
+as pictures of the same place are (`--likeness`, a cosine). The index is made by the atlas's own
+code, in a process of its own; another one opens it and asks, with one thread.
 """
 
 from __future__ import annotations
@@ -34,21 +37,33 @@ from topoloc.places.shared_vocabulary import shared_vocabulary
 NUM_NEIGHBOURS, PLACES_A_TILE, CHUNK = 20, 250, 100_000
 
 
-def made_up(true: Float32[np.ndarray, "n d"], count: int, rng: np.random.Generator) -> Float32[np.ndarray, "m d"]:
+def made_up(
+    true: Float32[np.ndarray, "n d"], count: int, rng: np.random.Generator
+) -> Float32[np.ndarray, "m d"]:
     """Unit vectors like the true ones."""
     out = np.empty((count, true.shape[1]), np.float32)
     spread = true.std(axis=0)
     for start in range(0, count, CHUNK):
         size = min(CHUNK, count - start)
-        one, other = true[rng.integers(len(true), size=size)], true[rng.integers(len(true), size=size)]
+        one, other = (
+            true[rng.integers(len(true), size=size)],
+            true[rng.integers(len(true), size=size)],
+        )
         mixed = one + rng.uniform(0, 1, (size, 1)).astype(np.float32) * other
         mixed += spread * rng.standard_normal(mixed.shape, np.float32)
         out[start : start + size] = mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
     return out
 
 
-def prepared(folder: Path, true: Float32[np.ndarray, "n d"], size: int, num_queries: int, likenesses: list[float]) -> float:
-    """Writes places and queries with their true neighbours; milliseconds of comparing one query with all places, the median."""
+def prepared(
+    folder: Path,
+    true: Float32[np.ndarray, "n d"],
+    size: int,
+    num_queries: int,
+    likenesses: list[float],
+) -> float:
+    """Writes places and queries with their true neighbours; milliseconds of comparing one query
+    with all places, the median."""
     rng = np.random.default_rng(0)
     places = made_up(true, size, rng).astype(np.float16)
     places.tofile(folder / "places")
@@ -59,12 +74,18 @@ def prepared(folder: Path, true: Float32[np.ndarray, "n d"], size: int, num_quer
         away = made_up(true, num_queries, rng)
         away -= np.sum(away * asked, axis=1, keepdims=True) * asked
         away /= np.linalg.norm(away, axis=1, keepdims=True)
-        queries[str(likeness)] = asked = np.ascontiguousarray(likeness * asked + np.sqrt(1 - likeness**2) * away, np.float32)
+        queries[str(likeness)] = asked = np.ascontiguousarray(
+            likeness * asked + np.sqrt(1 - likeness**2) * away, np.float32
+        )
         rows = nearest(places, asked)
         similar = np.einsum("qkd,qd->qk", places[rows].astype(np.float32), asked)
         exact[f"nearest {likeness}"] = rows
         exact[f"rival {likeness}"] = np.where(rows == own[:, None], -1.0, similar).max(axis=1)
-        exact[f"rank {likeness}"] = np.where((rows == own[:, None]).any(axis=1), np.argmax(rows == own[:, None], axis=1), NUM_NEIGHBOURS)
+        exact[f"rank {likeness}"] = np.where(
+            (rows == own[:, None]).any(axis=1),
+            np.argmax(rows == own[:, None], axis=1),
+            NUM_NEIGHBOURS,
+        )
     np.savez(folder / "queries.npz", **queries, **exact)  # pyright: ignore[reportArgumentType]
     compared, times, similarities = places.astype(np.float32), [], np.empty(size, np.float32)
     for query in queries[str(likenesses[0])][:20]:
@@ -76,16 +97,24 @@ def prepared(folder: Path, true: Float32[np.ndarray, "n d"], size: int, num_quer
 
 def nearest(places: Float16[np.ndarray, "n d"], asked: Float32[np.ndarray, "q d"]) -> np.ndarray:
     """The numbers of the most similar places of each query."""
-    best, numbers = np.full((len(asked), NUM_NEIGHBOURS), -2.0, np.float32), np.zeros((len(asked), NUM_NEIGHBOURS), np.int64)
+    best, numbers = (
+        np.full((len(asked), NUM_NEIGHBOURS), -2.0, np.float32),
+        np.zeros((len(asked), NUM_NEIGHBOURS), np.int64),
+    )
     for start in range(0, len(places), CHUNK):
         similar = asked @ places[start : start + CHUNK].astype(np.float32).T
-        both, rows = np.hstack([best, similar]), np.hstack([numbers, np.tile(np.arange(similar.shape[1]) + start, (len(asked), 1))])
+        both, rows = (
+            np.hstack([best, similar]),
+            np.hstack([numbers, np.tile(np.arange(similar.shape[1]) + start, (len(asked), 1))]),
+        )
         order = np.argsort(-both, axis=1)[:, :NUM_NEIGHBOURS]
         best, numbers = np.take_along_axis(both, order, 1), np.take_along_axis(rows, order, 1)
     return numbers
 
 
-def tiles_of(folder: Path, kind: str, dimension: int) -> tuple[list[Tile], Callable[[Tile], PlaceVectors]]:
+def tiles_of(
+    folder: Path, kind: str, dimension: int
+) -> tuple[list[Tile], Callable[[Tile], PlaceVectors]]:
     """Tiles of places that follow each other in the file, and what reads them."""
     row, vocabulary = 2 * dimension, shared_vocabulary(kind)
     assert vocabulary is not None
@@ -96,11 +125,28 @@ def tiles_of(folder: Path, kind: str, dimension: int) -> tuple[list[Tile], Calla
     for number in range(count):
         stored = StoredFile(f"tiles/{number:07d}.places", f"{number:064x}", 1)
         versions = {kind: vocabulary.version}
-        tiles.append(Tile(f"{number:07d}", stored, stored, versions, "0" * 16, 1, (kind,), PLACES_A_TILE, (), 300.0, box, "w"))
+        tiles.append(
+            Tile(
+                f"{number:07d}",
+                stored,
+                stored,
+                versions,
+                "0" * 16,
+                1,
+                (kind,),
+                PLACES_A_TILE,
+                (),
+                300.0,
+                box,
+                "w",
+            )
+        )
 
     def read(tile: Tile) -> PlaceVectors:
         least, most = bounds[int(tile.tile_id)], bounds[int(tile.tile_id) + 1]
-        rows = np.fromfile(folder / "places", np.float16, (most - least) * dimension, offset=int(least) * row)
+        rows = np.fromfile(
+            folder / "places", np.float16, (most - least) * dimension, offset=int(least) * row
+        )
         return {kind: rows.reshape(-1, dimension).astype(np.float32)}
 
     return tiles, read
@@ -109,7 +155,10 @@ def tiles_of(folder: Path, kind: str, dimension: int) -> tuple[list[Tile], Calla
 def memory_mb() -> dict[str, float]:
     """Of this process: at most, and now its own and of files."""
     status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
-    return {name: int(status[name].split()[0]) / 1024 for name in ("VmHWM", "VmRSS", "RssAnon", "RssFile")}
+    return {
+        name: int(status[name].split()[0]) / 1024
+        for name in ("VmHWM", "VmRSS", "RssAnon", "RssFile")
+    }
 
 
 def opened(folder: Path, kind: str, dimension: int) -> tuple[AtlasIndex, dict[str, float]]:
@@ -129,12 +178,25 @@ def made(folder: Path, kind: str, dimension: int) -> dict[str, float]:
 def asked(folder: Path, kind: str, dimension: int) -> dict[str, Any]:
     """What asking it takes, and what it finds."""
     tiles, _ = tiles_of(folder, kind, dimension)
-    multiply_rows(np.zeros((1, dimension), np.float32), np.zeros(dimension, np.float32), np.empty(1, np.float32))  # compiled code is loaded
+    multiply_rows(
+        np.zeros((1, dimension), np.float32),
+        np.zeros(dimension, np.float32),
+        np.empty(1, np.float32),
+    )  # compiled code is loaded
     before = memory_mb()
     index, facts = opened(folder, kind, dimension)
     with np.load(folder / "queries.npz") as stored:
         queries = {name: stored[name] for name in stored.files}
-    bounds = np.cumsum([0, *np.diff(np.linspace(0, (folder / "places").stat().st_size // (2 * dimension), len(tiles) + 1).astype(int))])
+    bounds = np.cumsum(
+        [
+            0,
+            *np.diff(
+                np.linspace(
+                    0, (folder / "places").stat().st_size // (2 * dimension), len(tiles) + 1
+                ).astype(int)
+            ),
+        ]
+    )
     rows = {}
     for likeness in (name for name in queries if " " not in name):
         times, hits, firsts = [], 0.0, 0
@@ -142,8 +204,14 @@ def asked(folder: Path, kind: str, dimension: int) -> dict[str, Any]:
             start = time.perf_counter()
             ranked = index.rank({kind: query}, NUM_NEIGHBOURS)
             times.append(1e3 * (time.perf_counter() - start))
-            of_right = list(dict.fromkeys(f"{np.searchsorted(bounds, place, 'right') - 1:07d}" for place in right))
-            hits += len({name for name, _ in ranked[: len(of_right)]} & set(of_right)) / len(of_right)
+            of_right = list(
+                dict.fromkeys(
+                    f"{np.searchsorted(bounds, place, 'right') - 1:07d}" for place in right
+                )
+            )
+            hits += len({name for name, _ in ranked[: len(of_right)]} & set(of_right)) / len(
+                of_right
+            )
             firsts += ranked[0][0] == of_right[0]
         count = len(queries[likeness])
         rows[likeness] = {"ms": float(np.median(times)), "p90_ms": float(np.percentile(times, 90))}
@@ -153,31 +221,49 @@ def asked(folder: Path, kind: str, dimension: int) -> dict[str, Any]:
             "rival": float(np.median(queries[f"rival {likeness}"])),
         }
         rows[likeness]["own_first"] = float(np.mean(queries[f"rank {likeness}"] == 0))
-        rows[likeness]["own_among_nearest"] = float(np.mean(queries[f"rank {likeness}"] < NUM_NEIGHBOURS))
+        rows[likeness]["own_among_nearest"] = float(
+            np.mean(queries[f"rank {likeness}"] < NUM_NEIGHBOURS)
+        )
     after = memory_mb()
     for likeness, row in rows.items():
         row["recall"] = recall_of_places(folder, queries, likeness)
-    grown = {name: after[name] - before[name] for name in ("RssAnon", "RssFile")} | {"most": after["VmHWM"] - before["VmRSS"]}
+    grown = {name: after[name] - before[name] for name in ("RssAnon", "RssFile")} | {
+        "most": after["VmHWM"] - before["VmRSS"]
+    }
     num_bytes = sum(path.stat().st_size for path in (folder / "index").glob("*.index"))
-    return {"opened_s": facts["s"], "grown_mb": grown, "index_bytes": num_bytes, "by_likeness": rows}
+    return {
+        "opened_s": facts["s"],
+        "grown_mb": grown,
+        "index_bytes": num_bytes,
+        "by_likeness": rows,
+    }
 
 
 def recall_of_places(folder: Path, queries: dict[str, np.ndarray], likeness: str) -> float:
-    """The part of the true neighbours that is among as many that the shards name; all where there are none."""
-    shards = sorted((PlaceShard.open(path) for path in (folder / "index").glob("*.index")), key=lambda shard: shard.tiles[0].tile_id)
+    """The part of the true neighbours that is among as many that the shards name; all where there
+    are none."""
+    shards = sorted(
+        (PlaceShard.open(path) for path in (folder / "index").glob("*.index")),
+        key=lambda shard: shard.tiles[0].tile_id,
+    )
     if not shards:
         return 1.0
     firsts, hits = np.cumsum([0, *(len(shard.vectors) for shard in shards)]), 0
     for query, right in zip(queries[likeness], queries[f"nearest {likeness}"], strict=True):
         found = [shard.nearest(query, 1024, np.ones(len(shard.tiles), bool)) for shard in shards]
-        rows = np.concatenate([rows + first for (rows, _), first in zip(found, firsts, strict=False)])
-        best = np.argsort(-np.concatenate([similar for _, similar in found]), kind="stable")[:NUM_NEIGHBOURS]
+        rows = np.concatenate(
+            [rows + first for (rows, _), first in zip(found, firsts, strict=False)]
+        )
+        best = np.argsort(-np.concatenate([similar for _, similar in found]), kind="stable")[
+            :NUM_NEIGHBOURS
+        ]
         hits += len(set(rows[best]) & set(right))
     return hits / (NUM_NEIGHBOURS * len(queries[likeness]))
 
 
 def drawn(rows: dict[int, dict[str, Any]], path: Path) -> None:
-    """Time, memory, the time of making, and look-alikes over the number of places, which is on a logarithmic axis."""
+    """Time, memory, the time of making, and look-alikes over the number of places, which is on a
+    logarithmic axis."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -186,19 +272,41 @@ def drawn(rows: dict[int, dict[str, Any]], path: Path) -> None:
     sizes = sorted(rows)
     figure, (left, right, alike) = plt.subplots(1, 3, figsize=(14, 4), layout="constrained")
     for likeness in rows[sizes[0]]["by_likeness"]:
-        left.loglog(sizes, [rows[size]["by_likeness"][likeness]["ms"] for size in sizes], "o-", label=f"index, likeness {likeness}")
-    left.loglog(sizes, [rows[size]["exact_ms"] for size in sizes], "s--", color="grey", label="comparing all")
+        left.loglog(
+            sizes,
+            [rows[size]["by_likeness"][likeness]["ms"] for size in sizes],
+            "o-",
+            label=f"index, likeness {likeness}",
+        )
+    left.loglog(
+        sizes,
+        [rows[size]["exact_ms"] for size in sizes],
+        "s--",
+        color="grey",
+        label="comparing all",
+    )
     left.set(xlabel="places", ylabel="milliseconds a query, median, one thread")
-    right.loglog(sizes, [rows[size]["grown_mb"]["most"] for size in sizes], "o-", label="memory, opened and asked (MB)")
+    right.loglog(
+        sizes,
+        [rows[size]["grown_mb"]["most"] for size in sizes],
+        "o-",
+        label="memory, opened and asked (MB)",
+    )
     of_files = [size for size in sizes if rows[size]["index_bytes"]]
-    right.loglog(of_files, [rows[size]["index_bytes"] / 1e6 for size in of_files], "^-", label="files (MB)")
+    right.loglog(
+        of_files, [rows[size]["index_bytes"] / 1e6 for size in of_files], "^-", label="files (MB)"
+    )
     right.loglog(sizes, [rows[size]["made"]["s"] for size in sizes], "s-", label="made once (s)")
     right.loglog(sizes, [rows[size]["opened_s"] for size in sizes], "d-", label="opened (s)")
     right.set(xlabel="places", ylabel="megabytes, seconds")
     for likeness in rows[sizes[0]]["by_likeness"]:
         shares = [rows[size]["by_likeness"][likeness]["own_among_nearest"] for size in sizes]
-        alike.semilogx(sizes, shares, "o-", label=f"own place among {NUM_NEIGHBOURS}, likeness {likeness}")
-    rivals = [np.mean([row["rival"] for row in rows[size]["by_likeness"].values()]) for size in sizes]
+        alike.semilogx(
+            sizes, shares, "o-", label=f"own place among {NUM_NEIGHBOURS}, likeness {likeness}"
+        )
+    rivals = [
+        np.mean([row["rival"] for row in rows[size]["by_likeness"].values()]) for size in sizes
+    ]
     alike.semilogx(sizes, rivals, "s--", color="grey", label="likeness of the best look-alike")
     alike.set(xlabel="places", ylabel="share; likeness", ylim=(0, 1.05))
     for axes in (left, right, alike):
@@ -211,22 +319,27 @@ def printed(size: int, row: dict[str, Any]) -> None:
     grown = row["grown_mb"]
     for likeness, of_one in row["by_likeness"].items():
         print(
-            f"{size:>9} places, likeness {likeness}: {of_one['ms']:.2f} ms (p90 {of_one['p90_ms']:.2f}; all {row['exact_ms']:.2f}); "
-            f"recall@{NUM_NEIGHBOURS} of places {100 * of_one['recall']:.1f} %, tiles {100 * of_one['recall_of_tiles']:.1f} %, nearest one "
-            f"first {100 * of_one['first']:.1f} %; best look-alike {of_one['rival']:.3f}, own place first "
-            f"{100 * of_one['own_first']:.0f} %, among {NUM_NEIGHBOURS} {100 * of_one['own_among_nearest']:.0f} %",
+            f"{size:>9} places, likeness {likeness}: {of_one['ms']:.2f} ms (p90"
+            f" {of_one['p90_ms']:.2f}; all {row['exact_ms']:.2f}); recall@{NUM_NEIGHBOURS} of"
+            f" places {100 * of_one['recall']:.1f} %, tiles {100 * of_one['recall_of_tiles']:.1f}"
+            f" %, nearest one first {100 * of_one['first']:.1f} %; best look-alike"
+            f" {of_one['rival']:.3f}, own place first {100 * of_one['own_first']:.0f} %, among"
+            f" {NUM_NEIGHBOURS} {100 * of_one['own_among_nearest']:.0f} %",
             flush=True,
         )
     print(
-        f"{size:>9} places: made in {row['made']['s']:.1f} s with {row['made']['mb']:.0f} MB, {row['index_bytes'] / 1e6:.0f} MB on disk; "
-        f"opened in {row['opened_s']:.2f} s, memory grown by {grown['most']:.0f} MB at most ({grown['RssAnon']:.0f} own, "
-        f"{grown['RssFile']:.0f} pages of files)",
+        f"{size:>9} places: made in {row['made']['s']:.1f} s with {row['made']['mb']:.0f} MB,"
+        f" {row['index_bytes'] / 1e6:.0f} MB on disk; opened in {row['opened_s']:.2f} s, memory"
+        f" grown by {grown['most']:.0f} MB at most ({grown['RssAnon']:.0f} own,"
+        f" {grown['RssFile']:.0f} pages of files)",
         flush=True,
     )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("atlas")
     parser.add_argument("--sizes", type=int, nargs="+", default=[1_000, 10_000, 100_000, 1_000_000])
     parser.add_argument("--queries", type=int, default=200)
@@ -236,12 +349,22 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     atlas = Atlas.open(args.atlas)
-    of_tiles = [read_vectors(atlas.store.local(tile.places.name, tile.places.sha256), tile.vocabularies) for tile in atlas.manifest.tiles]
-    true, rows = np.concatenate([vectors[args.kind] for vectors in of_tiles if args.kind in vectors]), {}
+    of_tiles = [
+        read_vectors(atlas.store.local(tile.places.name, tile.places.sha256), tile.vocabularies)
+        for tile in atlas.manifest.tiles
+    ]
+    true, rows = (
+        np.concatenate([vectors[args.kind] for vectors in of_tiles if args.kind in vectors]),
+        {},
+    )
     for size in args.sizes:
         with tempfile.TemporaryDirectory() as name:
             of_places = (args.kind, true.shape[1])
-            steps = [(prepared, (true, size, args.queries, args.likeness)), (made, of_places), (asked, of_places)]
+            steps = [
+                (prepared, (true, size, args.queries, args.likeness)),
+                (made, of_places),
+                (asked, of_places),
+            ]
             results = []
             for step, arguments in steps:  # each in a process of its own
                 with get_context("spawn").Pool(1) as pool:

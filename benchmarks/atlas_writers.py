@@ -1,9 +1,11 @@
-"""Writers of one atlas at once, each a process of its own: is every tile there afterwards, and the manifest whole?
+"""Writers of one atlas at once, each a process of its own: is every tile there afterwards, and the
+manifest whole?
 
     python benchmarks/atlas_writers.py MAP [--writers 2] [--times 50] [--s3]
 
-Each writer adds so many tiles, one at a time, with the command's own code; the map is the same for all, under ids of their own. The atlas
-is a folder; with `--s3` a prefix of moto's server, which speaks the API of Amazon S3 on this machine (s3fs, 'moto[s3]', flask, flask-cors).
+Each writer adds so many tiles, one at a time, with the command's own code; the map is the same for
+all, under ids of their own. The atlas is a folder; with `--s3` a prefix of moto's server, which
+speaks the API of Amazon S3 on this machine (s3fs, 'moto[s3]', flask, flask-cors).
 """
 
 from __future__ import annotations
@@ -39,7 +41,12 @@ def place(folder: str, is_s3: bool) -> Iterator[str]:
     server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     server.start()
     address = "http://{}:{}".format(*server.get_host_and_port())
-    os.environ.update(AWS_ENDPOINT_URL=address, AWS_DEFAULT_REGION="us-east-1", AWS_ACCESS_KEY_ID="x", AWS_SECRET_ACCESS_KEY="x")
+    os.environ.update(
+        AWS_ENDPOINT_URL=address,
+        AWS_DEFAULT_REGION="us-east-1",
+        AWS_ACCESS_KEY_ID="x",
+        AWS_SECRET_ACCESS_KEY="x",
+    )
     os.environ["TOPOLOC_CACHE"] = folder
     s3fs.S3FileSystem().mkdir("bucket")
     yield "s3://bucket/atlas"
@@ -47,7 +54,9 @@ def place(folder: str, is_s3: bool) -> Iterator[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("map")
     parser.add_argument("--writers", type=int, default=2)
     parser.add_argument("--times", type=int, default=50)
@@ -57,15 +66,22 @@ def main() -> None:
         create_atlas(where, [])
         start = time.perf_counter()
         with ProcessPoolExecutor(args.writers, get_context("spawn")) as pool:
-            for done in [pool.submit(write, where, args.map, writer, args.times) for writer in range(args.writers)]:
+            for done in [
+                pool.submit(write, where, args.map, writer, args.times)
+                for writer in range(args.writers)
+            ]:
                 done.result()
         atlas = Atlas.open(where)
-        expected = {f"w{writer}-{number}" for writer in range(args.writers) for number in range(args.times)}
+        expected = {
+            f"w{writer}-{number}" for writer in range(args.writers) for number in range(args.times)
+        }
         missing = expected - {tile.tile_id for tile in atlas.manifest.tiles}
-        damaged = [problem for tile in atlas.manifest.tiles if (problem := tile_problem(atlas, tile))]
+        damaged = [
+            problem for tile in atlas.manifest.tiles if (problem := tile_problem(atlas, tile))
+        ]
         print(
-            f"{args.writers} writers, {args.times} tiles each, {time.perf_counter() - start:.0f} s: {len(missing)} missing, "
-            f"{len(damaged)} damaged, serial {atlas.manifest.serial}"
+            f"{args.writers} writers, {args.times} tiles each, {time.perf_counter() - start:.0f} s:"
+            f" {len(missing)} missing, {len(damaged)} damaged, serial {atlas.manifest.serial}"
         )
 
 

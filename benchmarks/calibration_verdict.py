@@ -1,4 +1,5 @@
-"""Of wrong calibrations (5 % of focal length or width), how many do N pictures in a row name; how often is a right one accused?
+"""Of wrong calibrations (5 % of focal length or width), how many do N pictures in a row name; how
+often is a right one accused?
 
 python benchmarks/calibration_verdict.py kitchen.topo kitchen@60-99/100 --every 3
 """
@@ -17,7 +18,14 @@ from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import open_sequence
 
 RIGHT = (1.0, 0.0, 0.0)
-WRONG = ((0.95, 0.0, 0.0), (1.05, 0.0, 0.0), (1.0, 0.05, 0.0), (1.0, -0.05, 0.0), (1.0, 0.0, 0.05), (1.0, 0.0, -0.05))
+WRONG = (
+    (0.95, 0.0, 0.0),
+    (1.05, 0.0, 0.0),
+    (1.0, 0.05, 0.0),
+    (1.0, -0.05, 0.0),
+    (1.0, 0.0, 0.05),
+    (1.0, 0.0, -0.05),
+)
 NUM_PICTURES = (5, 10, 15, 20)
 
 
@@ -36,12 +44,17 @@ def seen_with(
     first = sequence[0].camera
     assert first is not None, "a recording with a calibration is needed"
     camera = changed(first, *case)
-    results = [localizer.localize(sequence[index].image, camera) for index in range(0, len(sequence), every)]
+    results = [
+        localizer.localize(sequence[index].image, camera)
+        for index in range(0, len(sequence), every)
+    ]
     return [result.seen_camera for result in results if result.seen_camera is not None], camera
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("map")
     parser.add_argument("recording", help="of one camera, rightly calibrated")
     parser.add_argument("--every", type=int, default=1, help="ask every Nth frame")
@@ -51,14 +64,24 @@ def main() -> None:
     for case in (RIGHT, *WRONG):
         seen, camera = seen_with(localizer, sequence, args.every, case)
         for num in NUM_PICTURES:
-            verdicts = [verdict_of_pictures(seen[first : first + num], camera) for first in range(len(seen) - num + 1)]
-            said = [one.is_of_focal_length if case[0] != 1.0 else one.is_of_centre for one in verdicts if one is not None]
+            verdicts = [
+                verdict_of_pictures(seen[first : first + num], camera)
+                for first in range(len(seen) - num + 1)
+            ]
+            said = [
+                one.is_of_focal_length if case[0] != 1.0 else one.is_of_centre
+                for one in verdicts
+                if one is not None
+            ]
             accused = [one.contradicts for one in verdicts if one is not None]
             counts[num, case == RIGHT][0] += sum(accused if case == RIGHT else said)
             counts[num, case == RIGHT][1] += len(said)
     for num in NUM_PICTURES:
         (accused, of), (named, of_wrong) = counts[num, True], counts[num, False]
-        print(f"{num:3d} pictures: {named} of {of_wrong} wrong calibrations named, {accused} of {of} right ones accused")
+        print(
+            f"{num:3d} pictures: {named} of {of_wrong} wrong calibrations named, {accused} of {of}"
+            " right ones accused"
+        )
 
 
 if __name__ == "__main__":

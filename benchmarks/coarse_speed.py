@@ -1,9 +1,11 @@
-"""Milliseconds of one picture through each coarse localizer, nearest neighbour included, on this machine's processor.
+"""Milliseconds of one picture through each coarse localizer, nearest neighbour included, on this
+machine's processor.
 
     python benchmarks/coarse_speed.py [--threads 2] [--networks ...] [--size 224x224]
 
-Random weights: the time is the same. `wall` is the least and the median of the runs; `core` the least time of all cores together,
-which another program on the same machine disturbs less. What the processor offers is printed first.
+Random weights: the time is the same. `wall` is the least and the median of the runs; `core` the
+least time of all cores together, which another program on the same machine disturbs less. What the
+processor offers is printed first.
 """
 
 from __future__ import annotations
@@ -42,17 +44,24 @@ NETWORKS: tuple[tuple[str, BackboneName], ...] = (
 
 def main() -> None:
     names = [f"{name}/{backbone}" for name, backbone in NETWORKS]
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--networks", nargs="+", default=names, choices=names)
     parser.add_argument("--size", default="224x224")
     parser.add_argument("--runs", type=int, default=15)
     arguments = parser.parse_args()
     set_num_threads(arguments.threads)
-    print(f"{torch.backends.cpu.get_cpu_capability()}, bfloat16 in hardware: {has_bfloat16()}, {arguments.threads} threads")
+    print(
+        f"{torch.backends.cpu.get_cpu_capability()}, bfloat16 in hardware: {has_bfloat16()},"
+        f" {arguments.threads} threads"
+    )
     width, height = map(int, arguments.size.split("x"))
     image = np.random.default_rng(0).integers(0, 255, (480, 640, 3), np.uint8)
-    no_features = Features(*(np.zeros(shape, np.float32) for shape in ((0, 2), (0,), (0,), (0,), (0, 64))))
+    no_features = Features(
+        *(np.zeros(shape, np.float32) for shape in ((0, 2), (0,), (0,), (0,), (0, 64)))
+    )
     for name in arguments.networks:
         method, _, backbone = name.partition("/")
         localizer = made(method, backbone, PictureConfig(width, height))
@@ -63,7 +72,11 @@ def main() -> None:
             localizer.rank(image, no_features, 4)
             walls.append((time.perf_counter() - wall) * 1e3)
             cores.append((time.process_time() - core) * 1e3)
-        print(f"{name:<24}{arguments.size:>9}  wall {min(walls):7.1f} {np.median(walls):7.1f}  core {min(cores):7.1f} ms", flush=True)
+        print(
+            f"{name:<24}{arguments.size:>9}  wall {min(walls):7.1f} {np.median(walls):7.1f}  core"
+            f" {min(cores):7.1f} ms",
+            flush=True,
+        )
 
 
 def made(method: str, backbone: BackboneName, picture: PictureConfig) -> CoarseLocalizer:
@@ -73,20 +86,34 @@ def made(method: str, backbone: BackboneName, picture: PictureConfig) -> CoarseL
     if method == "cnn-fc":
         config = {"picture": {"width_px": picture.width_px, "height_px": picture.height_px}}
         settings |= {"config": config, "num_nodes": NUM_NODES, "temperature": 1.0}
-        return CnnFc(CoarseModel("cnn-fc", settings, to_arrays(NodeClassifier(backbone, NUM_NODES))))
+        return CnnFc(
+            CoarseModel("cnn-fc", settings, to_arrays(NodeClassifier(backbone, NUM_NODES)))
+        )
     if method == "cnn-nn":
         c = CnnNnConfig()
-        network: torch.nn.Module = PooledFeatures(backbone, CNN_DEPTHS[backbone], c.grid_rows, c.grid_columns, c.power)
-        num_raw = Backbone(backbone, None, CNN_DEPTHS[backbone]).num_channels * c.grid_rows * c.grid_columns
+        network: torch.nn.Module = PooledFeatures(
+            backbone, CNN_DEPTHS[backbone], c.grid_rows, c.grid_columns, c.power
+        )
+        num_raw = (
+            Backbone(backbone, None, CNN_DEPTHS[backbone]).num_channels
+            * c.grid_rows
+            * c.grid_columns
+        )
     else:
         num_clusters = VladNnConfig().num_clusters
         network = VladNetwork(backbone, VLAD_DEPTHS[backbone], num_clusters)
         num_raw = Backbone(backbone, None, VLAD_DEPTHS[backbone]).num_channels * num_clusters
     settings["config"] = {"picture": {"width_px": picture.width_px, "height_px": picture.height_px}}
     vectors = rng.standard_normal((NUM_IMAGES, DIMENSION)).astype(np.float16)
-    arrays = {"vectors": vectors, "node_ids": np.arange(NUM_IMAGES) // 20, "mean": np.zeros(num_raw, np.float32)}
+    arrays = {
+        "vectors": vectors,
+        "node_ids": np.arange(NUM_IMAGES) // 20,
+        "mean": np.zeros(num_raw, np.float32),
+    }
     arrays["projection"] = rng.standard_normal((DIMENSION, num_raw)).astype(np.float16)
-    return VectorSearch(CoarseModel(method, settings, to_arrays(network) | arrays), network, picture)
+    return VectorSearch(
+        CoarseModel(method, settings, to_arrays(network) | arrays), network, picture
+    )
 
 
 if __name__ == "__main__":

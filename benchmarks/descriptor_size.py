@@ -1,18 +1,21 @@
 """What do smaller descriptors cost, beside fewer landmarks of the same bytes?
 
-    python benchmarks/descriptor_size.py MAP QUERIES [--step 1] [--landmarks 60 120 240 10000] [--forms bytes coarse8 pq16 ...]
+    python benchmarks/descriptor_size.py MAP QUERIES [--step 1] [--landmarks 60 120 240 10000]
+    [--forms bytes coarse8 pq16 ...]
 
-The map keeps so many landmarks a node, as `topoloc prune` would choose them; their descriptors are then quantised and restored in memory,
-and every `step`-th picture of QUERIES (with truth in the map's world) is asked. Forms:
+The map keeps so many landmarks a node, as `topoloc prune` would choose them; their descriptors are
+then quantised and restored in memory, and every `step`-th picture of QUERIES (with truth in the
+map's world) is asked. Forms:
 
 - `bytes`: signed bytes, 1/200 a step, as map files have them;
 - `coarseN`: the same with steps N times as large, packed as map files pack them;
-- `pqN`: product quantisation to N bytes (Jegou et al. 2011), 256 words for each of N parts, learned from the map's own descriptors; the
-  words are counted, too (256 descriptors in signed bytes a kind);
+- `pqN`: product quantisation to N bytes (Jegou et al. 2011), 256 words for each of N parts, learned
+  from the map's own descriptors; the words are counted, too (256 descriptors in signed bytes a
+  kind);
 - `binary`: signs of the numbers less their median over the map, one bit each.
 
-Printed for each: bytes of the map's file as it would be, of them descriptors, pictures localized and wrong (off by more than 0.5 m or 5
-degrees), median errors and inliers.
+Printed for each: bytes of the map's file as it would be, of them descriptors, pictures localized
+and wrong (off by more than 0.5 m or 5 degrees), median errors and inliers.
 """
 
 from __future__ import annotations
@@ -51,7 +54,16 @@ class Args:
     queries: tyro.conf.Positional[str]
     step: int = 1
     landmarks: tuple[int, ...] = (60, 120, 240, 10_000)
-    forms: tuple[str, ...] = ("bytes", "coarse8", "coarse16", "coarse32", "pq8", "pq16", "pq32", "binary")
+    forms: tuple[str, ...] = (
+        "bytes",
+        "coarse8",
+        "coarse16",
+        "coarse32",
+        "pq8",
+        "pq16",
+        "pq32",
+        "binary",
+    )
 
 
 def coarse(times: int, scale: float) -> Form:
@@ -67,7 +79,10 @@ def product_quantised(learned_from: Descriptors, num_bytes: int) -> Form:
     ends = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 15, 1e-4)
     cv2.setRNGSeed(0)
     labels = np.zeros((len(learned_from), 1), np.int32)
-    words = [cv2.kmeans(learned_from[:, p].copy(), _WORDS, labels, ends, 1, cv2.KMEANS_PP_CENTERS)[2] for p in parts]
+    words = [
+        cv2.kmeans(learned_from[:, p].copy(), _WORDS, labels, ends, 1, cv2.KMEANS_PP_CENTERS)[2]
+        for p in parts
+    ]
 
     def form(descriptors: Descriptors) -> tuple[Descriptors, float]:
         restored = np.empty_like(descriptors)
@@ -85,11 +100,16 @@ def binary(learned_from: Descriptors) -> Form:
         np.array([c[over].mean() for c, over in zip(learned_from.T, o.T, strict=True)])
         for o in (learned_from > middle, learned_from <= middle)
     )
-    return lambda descriptors: (_unit(np.where(descriptors > middle, high, low).astype(np.float32)), descriptors.size / 8)
+    return lambda descriptors: (
+        _unit(np.where(descriptors > middle, high, low).astype(np.float32)),
+        descriptors.size / 8,
+    )
 
 
 def _unit(descriptors: np.ndarray) -> Descriptors:
-    return (descriptors / np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-6)).astype(np.float32)
+    return (
+        descriptors / np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-6)
+    ).astype(np.float32)
 
 
 def form_of(name: str, kind: str, topomap: TopoMetricMap) -> tuple[Form, int]:
@@ -101,11 +121,17 @@ def form_of(name: str, kind: str, topomap: TopoMetricMap) -> tuple[Form, int]:
     learned_from = learned_from[:: max(len(learned_from) // _LEARNED_FROM, 1)]
     if name == "binary":
         return binary(learned_from), 3 * learned_from.shape[1] * 4
-    return product_quantised(learned_from, int(name.removeprefix("pq"))), _WORDS * learned_from.shape[1]
+    return (
+        product_quantised(learned_from, int(name.removeprefix("pq"))),
+        _WORDS * learned_from.shape[1],
+    )
 
 
-def with_descriptors(topomap: TopoMetricMap, name: str, whole: TopoMetricMap) -> tuple[TopoMetricMap, float]:
-    """The map with its descriptors restored from this form (learned from those of the whole map), and their bytes."""
+def with_descriptors(
+    topomap: TopoMetricMap, name: str, whole: TopoMetricMap
+) -> tuple[TopoMetricMap, float]:
+    """The map with its descriptors restored from this form (learned from those of the whole map),
+    and their bytes."""
     num_bytes, nodes = 0.0, dict[str, list[TopoNode]]()
     for kind in topomap.kinds:
         form, once = form_of(name, kind, whole)
@@ -113,7 +139,13 @@ def with_descriptors(topomap: TopoMetricMap, name: str, whole: TopoMetricMap) ->
         for node in topomap.nodes_of(kind):
             restored, of_node = form(node.features.descriptors)
             num_bytes += of_node
-            nodes[kind].append(replace(node, features=replace(node.features, descriptors=restored), stored_descriptors=None))
+            nodes[kind].append(
+                replace(
+                    node,
+                    features=replace(node.features, descriptors=restored),
+                    stored_descriptors=None,
+                )
+            )
     return replace(topomap, nodes=nodes.pop(topomap.kind), other_kinds=nodes), num_bytes
 
 
@@ -123,7 +155,9 @@ def written(topomap: TopoMetricMap) -> tuple[int, int]:
         path = Path(folder) / "written.topo"
         write_map(topomap, path)
         with closing(sqlite3.connect(path)) as database:
-            of_descriptors = database.execute("SELECT total(length(descriptors)) FROM node_points").fetchone()[0]
+            of_descriptors = database.execute(
+                "SELECT total(length(descriptors)) FROM node_points"
+            ).fetchone()[0]
         return path.stat().st_size, int(of_descriptors)
 
 
@@ -136,23 +170,38 @@ def asked(topomap: TopoMetricMap, queries: str, step: int) -> str:
         num += 1
         if isinstance(result, Localization) and frame.world_from_cam is not None:
             metres.append(translation_error(frame.world_from_cam, result.world_from_cam))
-            degrees.append(float(np.degrees(rotation_error(frame.world_from_cam, result.world_from_cam))))
+            degrees.append(
+                float(np.degrees(rotation_error(frame.world_from_cam, result.world_from_cam)))
+            )
             inliers.append(result.num_inliers)
     wrong = sum(m > _WRONG_M or d > _WRONG_DEG for m, d in zip(metres, degrees, strict=True))
     medians = [np.median(values or [np.nan]) for values in (metres, degrees, inliers)]
-    return f"{len(metres)} of {num}, {wrong} wrong, {100 * medians[0]:.2f} cm, {medians[1]:.2f} deg, {medians[2]:.0f} inliers"
+    return (
+        f"{len(metres)} of {num}, {wrong} wrong, {100 * medians[0]:.2f} cm, {medians[1]:.2f} deg,"
+        f" {medians[2]:.0f} inliers"
+    )
 
 
 def main(args: Args) -> None:
     with TopoMetricMap.load(args.map) as whole:
-        nothing = {kind: [np.zeros(len(node.features), bool) for node in whole.nodes_of(kind)] for kind in whole.kinds}
+        nothing = {
+            kind: [np.zeros(len(node.features), bool) for node in whole.nodes_of(kind)]
+            for kind in whole.kinds
+        }
         for most in args.landmarks:
             fewer = _with_fewer(whole, nothing, most, PruneConfig()).topomap
             size, of_descriptors = written(fewer)
             for name in args.forms:
                 quantised, num_bytes = with_descriptors(fewer, name, whole)
-                mb, said = (size - of_descriptors + num_bytes) / 1e6, asked(quantised, args.queries, args.step)
-                print(f"{most:6d} {name:9s} {mb:6.2f} MB ({num_bytes / 1e6:.2f} of descriptors): {said}", flush=True)
+                mb, said = (
+                    (size - of_descriptors + num_bytes) / 1e6,
+                    asked(quantised, args.queries, args.step),
+                )
+                print(
+                    f"{most:6d} {name:9s} {mb:6.2f} MB ({num_bytes / 1e6:.2f} of descriptors):"
+                    f" {said}",
+                    flush=True,
+                )
 
 
 if __name__ == "__main__":

@@ -22,7 +22,11 @@ from topoloc.features.patch_normalization import PatchNormalizationConfig, patch
 from topoloc.sequences.open import open_sequence
 from topoloc.sequences.pictures import grey_image
 
-RECORDINGS = {"kitchen": "seven_scenes/kitchen/seq-01", "zed": "zed_lab/session1", "kitti": "kitti/sequences/street1"}
+RECORDINGS = {
+    "kitchen": "seven_scenes/kitchen/seq-01",
+    "zed": "zed_lab/session1",
+    "kitti": "kitti/sequences/street1",
+}
 
 
 @dataclass(frozen=True)
@@ -48,26 +52,50 @@ def time_extraction(image: np.ndarray, repeats: int) -> None:
             ("65 square", PatchNormalizationConfig(65, 24.0)),
         ):
             report(
-                f"patch normalisation {name}, {num_threads} threads", lambda c=config, n=num_threads: patch_normalize(image, c, n), repeats
+                f"patch normalisation {name}, {num_threads} threads",
+                lambda c=config, n=num_threads: patch_normalize(image, c, n),
+                repeats,
             )
-        for config in (FeatureConfig(), FeatureConfig(normalization="none"), FeatureConfig(kind="sift")):
+        for config in (
+            FeatureConfig(),
+            FeatureConfig(normalization="none"),
+            FeatureConfig(kind="sift"),
+        ):
             normalized = normalize_image(image, config, num_threads)
             name = f"{config.kind} on {config.normalization}, {num_threads} threads"
-            report(name, lambda c=config, i=normalized, n=num_threads: extract_normalized(i, c, n), repeats)
+            report(
+                name,
+                lambda c=config, i=normalized, n=num_threads: extract_normalized(i, c, n),
+                repeats,
+            )
 
 
-def time_matching(repeats: int, num_query: int = 850, num_train: int = 4000, size: int = 64) -> None:
+def time_matching(
+    repeats: int, num_query: int = 850, num_train: int = 4000, size: int = 64
+) -> None:
     random = np.random.default_rng(0)
     train = random.normal(size=(num_train, size))
     query = random.normal(size=(num_query, size))
-    query[: num_query // 2] = train[: num_query // 2] + 0.3 * random.normal(size=(num_query // 2, size))
-    train, query = ((d / np.linalg.norm(d, axis=1, keepdims=True)).astype(np.float32) for d in (train, query))
+    query[: num_query // 2] = train[: num_query // 2] + 0.3 * random.normal(
+        size=(num_query // 2, size)
+    )
+    train, query = (
+        (d / np.linalg.norm(d, axis=1, keepdims=True)).astype(np.float32) for d in (train, query)
+    )
     points, radii = random.uniform(-5, 5, (num_train, 3)), np.full(num_train, 0.05)
     config = MatchingConfig()
     report("exact", lambda: match_features(query, train, config), repeats)
-    report("exact, no mutual check", lambda: match_features(query, train, MatchingConfig(mutual=False)), repeats)
+    report(
+        "exact, no mutual check",
+        lambda: match_features(query, train, MatchingConfig(mutual=False)),
+        repeats,
+    )
     report("exact, pooled", lambda: match_pooled(query, train, points, radii, config), repeats)
-    report("FLANN", lambda: match_features(query, train, MatchingConfig(method="flann")), max(repeats // 10, 3))
+    report(
+        "FLANN",
+        lambda: match_features(query, train, MatchingConfig(method="flann")),
+        max(repeats // 10, 3),
+    )
     report("the bare matrix product", lambda: query @ train.T, repeats)
 
 

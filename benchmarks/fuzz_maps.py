@@ -1,9 +1,11 @@
-"""Open maps that were made to deceive, in child processes: how many crash, hang, show a traceback, or take much memory?
+"""Open maps that were made to deceive, in child processes: how many crash, hang, show a traceback,
+or take much memory?
 
     python benchmarks/fuzz_maps.py MAP PICTURE CAMERA.json --mutations 100000 --first-seed 0
 
-A child opens 50 mutations in a row (`tests/map/mutations.py`, `tests/map/opening.py`): it asks each about the picture and looks at all its
-bytes. Every finding is printed with its seed; exit status 1 where there is any.
+A child opens 50 mutations in a row (`tests/map/mutations.py`, `tests/map/opening.py`): it asks each
+about the picture and looks at all its bytes. Every finding is printed with its seed; exit status 1
+where there is any.
 """
 
 from __future__ import annotations
@@ -28,7 +30,9 @@ BATCH, MAX_SECONDS, MAX_RSS_KB = 50, 5.0, 1_000_000
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("map", type=Path)
     parser.add_argument("picture", type=Path)
     parser.add_argument("camera", type=Path)
@@ -43,14 +47,18 @@ def main() -> int:
         for start in range(0, len(seeds), BATCH):
             batch = seeds[start : start + BATCH]
             maps = [Path(folder) / f"{seed}.topo" for seed in batch]
-            done = [mutate(arguments.map, path, seed) for seed, path in zip(batch, maps, strict=True)]
+            done = [
+                mutate(arguments.map, path, seed) for seed, path in zip(batch, maps, strict=True)
+            ]
             while maps:
                 told, why = _open(picture, arguments.camera, maps)
                 for row in told:
                     outcomes[" | ".join(text.split(":")[0][:40] for text in row["outcome"])] += 1
                     slowest, largest = max(slowest, row["seconds"]), max(largest, row["rss_kb"])
                     if row["seconds"] > MAX_SECONDS or row["rss_kb"] > MAX_RSS_KB:
-                        findings.append(f"{Path(row['map']).stem}: {row['seconds']:.1f} s, {row['rss_kb']} kB")
+                        findings.append(
+                            f"{Path(row['map']).stem}: {row['seconds']:.1f} s, {row['rss_kb']} kB"
+                        )
                 if len(told) < len(maps):
                     seed = int(maps[len(told)].stem)
                     findings.append(f"{seed} ({done[batch.index(seed)]}): {why}")
@@ -60,20 +68,36 @@ def main() -> int:
                 (Path(folder) / f"{seed}.topo").unlink()
     for outcome, count in outcomes.most_common():
         print(f"{count:7d}  {outcome}")
-    print(f"{sum(outcomes.values())} mutations, {len(findings)} findings, slowest {slowest:.1f} s, largest {largest / 1e3:.0f} MB")
+    print(
+        f"{sum(outcomes.values())} mutations, {len(findings)} findings, slowest {slowest:.1f} s,"
+        f" largest {largest / 1e3:.0f} MB"
+    )
     print("\n".join(findings))
     return 1 if findings else 0
 
 
 def _open(picture: Path, camera: Path, maps: list[Path]) -> tuple[list[dict], str]:
     """What a child said of each map until it ended, and why it ended."""
-    command = [sys.executable, str(TESTS / "opening.py"), str(picture), str(camera), *map(str, maps)]
+    command = [
+        sys.executable,
+        str(TESTS / "opening.py"),
+        str(picture),
+        str(camera),
+        *map(str, maps),
+    ]
     try:
-        run = subprocess.run(command, capture_output=True, text=True, timeout=60.0 + 10.0 * len(maps), check=False)
+        run = subprocess.run(
+            command, capture_output=True, text=True, timeout=60.0 + 10.0 * len(maps), check=False
+        )
     except subprocess.TimeoutExpired as error:
         output = error.stdout or b""
-        return [json.loads(line) for line in (output.decode() if isinstance(output, bytes) else output).splitlines()], "hangs"
-    return [json.loads(line) for line in run.stdout.splitlines()], f"exit {run.returncode}: {run.stderr.strip()[-400:]}"
+        return [
+            json.loads(line)
+            for line in (output.decode() if isinstance(output, bytes) else output).splitlines()
+        ], "hangs"
+    return [
+        json.loads(line) for line in run.stdout.splitlines()
+    ], f"exit {run.returncode}: {run.stderr.strip()[-400:]}"
 
 
 if __name__ == "__main__":

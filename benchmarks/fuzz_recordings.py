@@ -1,12 +1,13 @@
-"""Read pictures and recordings that were made to deceive, in child processes: how many crash, hang, raise what they should not, or take
-much memory?
+"""Read pictures and recordings that were made to deceive, in child processes: how many crash, hang,
+raise what they should not, or take much memory?
 
     python benchmarks/fuzz_recordings.py --mutations 100000 --first-seed 0
 
-Whole ones are made first, and read: pictures of every type, and a small recording of every format that is text and pictures. Each seed
-damages one file of one of them (bytes changed, cut off, repeated, or a hostile word in place of a number). A child takes 200 seeds in
-a row: it reads each picture, or opens the recording and reads its frames. Every finding is printed with its seed; exit status 1 where
-there is any.
+Whole ones are made first, and read: pictures of every type, and a small recording of every format
+that is text and pictures. Each seed damages one file of one of them (bytes changed, cut off,
+repeated, or a hostile word in place of a number). A child takes 200 seeds in a row: it reads each
+picture, or opens the recording and reads its frames. Every finding is printed with its seed; exit
+status 1 where there is any.
 """
 
 from __future__ import annotations
@@ -45,7 +46,9 @@ WORDS = (
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--mutations", type=int, default=2000)
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--child", nargs=2, type=int, help=argparse.SUPPRESS)
@@ -65,8 +68,15 @@ def main() -> int:
             for row in rows:
                 outcomes[f"{row['of']}: {row['outcome'].split(':')[0]}"] += 1
                 slowest, largest = max(slowest, row["seconds"]), max(largest, row["rss_kb"])
-                if row["seconds"] > MAX_SECONDS or row["rss_kb"] > MAX_RSS_KB or row["outcome"].startswith("!"):
-                    findings.append(f"{row['seed']} ({row['of']}): {row['outcome']}, {row['seconds']:.1f} s, {row['rss_kb']} kB")
+                if (
+                    row["seconds"] > MAX_SECONDS
+                    or row["rss_kb"] > MAX_RSS_KB
+                    or row["outcome"].startswith("!")
+                ):
+                    findings.append(
+                        f"{row['seed']} ({row['of']}): {row['outcome']}, {row['seconds']:.1f} s,"
+                        f" {row['rss_kb']} kB"
+                    )
             at += len(rows)
             if why:
                 findings.append(f"{at}: {why}")
@@ -76,7 +86,10 @@ def main() -> int:
             num_told = len(findings)
     for outcome, count in sorted(outcomes.items()):
         print(f"{count:7d}  {outcome}")
-    print(f"{sum(outcomes.values())} mutations, {len(findings)} findings, slowest {slowest:.1f} s, largest {largest / 1e3:.0f} MB")
+    print(
+        f"{sum(outcomes.values())} mutations, {len(findings)} findings, slowest {slowest:.1f} s,"
+        f" largest {largest / 1e3:.0f} MB"
+    )
     return 1 if findings else 0
 
 
@@ -87,7 +100,14 @@ def _child(whole: Path, first: int, end: int) -> tuple[list[dict], str]:
         run = subprocess.run(command, capture_output=True, text=True, timeout=120.0, check=False)
         output, why = run.stdout, f"exit {run.returncode}: {run.stderr.strip()[-300:]}"
     except subprocess.TimeoutExpired as error:
-        output, why = (error.stdout or b"").decode() if isinstance(error.stdout, bytes) else error.stdout or "", "hangs"
+        output, why = (
+            (
+                (error.stdout or b"").decode()
+                if isinstance(error.stdout, bytes)
+                else error.stdout or ""
+            ),
+            "hangs",
+        )
     rows = [json.loads(line) for line in output.splitlines() if line.endswith("}")]
     return rows, "" if len(rows) == end - first else why
 
@@ -99,7 +119,10 @@ def make_whole(whole: Path) -> None:
     deep = rng.integers(0, 65536, (24, 32), dtype=np.uint16)
     (whole / "pictures").mkdir(parents=True)
     for suffix in ("png", "jpg", "bmp", "ppm", "pgm", "tiff", "webp"):
-        cv2.imwrite(str(whole / "pictures" / f"colour.{suffix}"), colour if suffix != "pgm" else colour[:, :, 0])
+        cv2.imwrite(
+            str(whole / "pictures" / f"colour.{suffix}"),
+            colour if suffix != "pgm" else colour[:, :, 0],
+        )
     for suffix in ("png", "tiff", "pgm"):
         cv2.imwrite(str(whole / "pictures" / f"deep.{suffix}"), deep)
     cv2.imwrite(str(whole / "pictures" / "alpha.png"), np.dstack([colour, colour[:, :, 0]]))
@@ -117,9 +140,21 @@ def check_whole(whole: Path) -> None:
 
 def _recordings(whole: Path, colour: np.ndarray, deep: np.ndarray) -> None:
     stamps = [f"{k}.5" for k in range(NUM_FRAMES)]
-    tum = "\n".join(f"{stamp} {pose[0, 3]} 0 {pose[2, 3]} 0 0 0 1" for stamp, pose in zip(stamps, POSES, strict=True))
+    tum = "\n".join(
+        f"{stamp} {pose[0, 3]} 0 {pose[2, 3]} 0 0 0 1"
+        for stamp, pose in zip(stamps, POSES, strict=True)
+    )
     kitti = "\n".join(" ".join(map(str, pose.ravel())) for pose in POSES)
-    camera = {"model": "PINHOLE", "width": 32, "height": 24, "fx": 40.0, "fy": 40.0, "cx": 16.0, "cy": 12.0, "baseline": 0.1}
+    camera = {
+        "model": "PINHOLE",
+        "width": 32,
+        "height": 24,
+        "fx": 40.0,
+        "fy": 40.0,
+        "cx": 16.0,
+        "cy": 12.0,
+        "baseline": 0.1,
+    }
     texts = {
         "folder/camera.json": json.dumps(camera),
         "folder/times.txt": "\n".join(stamps),
@@ -130,25 +165,49 @@ def _recordings(whole: Path, colour: np.ndarray, deep: np.ndarray) -> None:
         "tum/rgb.txt": "\n".join(f"{stamp} rgb/{k}.png" for k, stamp in enumerate(stamps)),
         "tum/depth.txt": "\n".join(f"{stamp} depth/{k}.png" for k, stamp in enumerate(stamps)),
         "tum/groundtruth.txt": tum,
-        "tum/camera.json": json.dumps({key: camera[key] for key in camera if key != "baseline"} | {"depth_factor": 5000.0}),
+        "tum/camera.json": json.dumps(
+            {key: camera[key] for key in camera if key != "baseline"} | {"depth_factor": 5000.0}
+        ),
         "nerfstudio/transforms.json": json.dumps(
             {"fl_x": 40.0, "fl_y": 40.0, "cx": 16.0, "cy": 12.0, "w": 32, "h": 24, "k1": 0.1}
-            | {"frames": [{"file_path": f"images/{k}.png", "transform_matrix": [*p.tolist(), [0, 0, 0, 1]]} for k, p in enumerate(POSES)]}
+            | {
+                "frames": [
+                    {
+                        "file_path": f"images/{k}.png",
+                        "transform_matrix": [*p.tolist(), [0, 0, 0, 1]],
+                    }
+                    for k, p in enumerate(POSES)
+                ]
+            }
         ),
         "colmap/sparse/0/cameras.txt": "1 OPENCV 32 24 40 40 16 12 0.1 0 0 0",
-        "colmap/sparse/0/images.txt": "\n".join(f"{k + 1} 1 0 0 0 {0.1 * k} 0 0 1 {k}.png\n" for k in range(NUM_FRAMES)),
+        "colmap/sparse/0/images.txt": "\n".join(
+            f"{k + 1} 1 0 0 0 {0.1 * k} 0 0 1 {k}.png\n" for k in range(NUM_FRAMES)
+        ),
         "colmap/sparse/0/points3D.txt": "1 0 0 5 1 2 3 0.5",
     }
     for k in range(NUM_FRAMES):
         pose = np.vstack([POSES[k], [0, 0, 0, 1]])
-        texts[f"seven_scenes/frame-{k:06d}.pose.txt"] = "\n".join(" ".join(map(str, row)) for row in pose)
-        for name in ("folder/left/{}.png", "folder/right/{}.png", "kitti/image_0/{:06d}.png", "kitti/image_1/{:06d}.png", "tum/rgb/{}.png"):
+        texts[f"seven_scenes/frame-{k:06d}.pose.txt"] = "\n".join(
+            " ".join(map(str, row)) for row in pose
+        )
+        for name in (
+            "folder/left/{}.png",
+            "folder/right/{}.png",
+            "kitti/image_0/{:06d}.png",
+            "kitti/image_1/{:06d}.png",
+            "tum/rgb/{}.png",
+        ):
             _write(whole / name.format(k), colour)
         for name in ("nerfstudio/images/{}.png", "colmap/images/{}.png"):
             _write(whole / name.format(k), colour)
         _write(whole / f"tum/depth/{k}.png", deep)
-        _write(whole / f"seven_scenes/frame-{k:06d}.color.png", np.zeros((480, 640, 3), np.uint8))  # its camera is built in
-        _write(whole / f"seven_scenes/frame-{k:06d}.depth.png", np.full((480, 640), 1000, np.uint16))
+        _write(
+            whole / f"seven_scenes/frame-{k:06d}.color.png", np.zeros((480, 640, 3), np.uint8)
+        )  # its camera is built in
+        _write(
+            whole / f"seven_scenes/frame-{k:06d}.depth.png", np.full((480, 640), 1000, np.uint16)
+        )
     for name, text in texts.items():
         (whole / name).parent.mkdir(parents=True, exist_ok=True)
         (whole / name).write_text(text)
@@ -178,10 +237,20 @@ def read_all(whole: Path, seeds: range) -> None:
             try:
                 outcome = _read_picture(damaged) if of == "pictures" else _read_recording(copy)
             except TopolocError as error:
-                outcome = type(error).__name__ if "\n" not in str(error) else f"! an error of several lines: {error!r}"
+                outcome = (
+                    type(error).__name__
+                    if "\n" not in str(error)
+                    else f"! an error of several lines: {error!r}"
+                )
             except Exception as error:  # what nobody expects is what is sought
                 outcome = f"! {type(error).__name__}: {str(error)[:200]}"
-            row = {"seed": seed, "of": of, "outcome": outcome, "seconds": time.process_time() - start, "rss_kb": _peak_kb()}
+            row = {
+                "seed": seed,
+                "of": of,
+                "outcome": outcome,
+                "seconds": time.process_time() - start,
+                "rss_kb": _peak_kb(),
+            }
             print(json.dumps(row), flush=True)
             shutil.rmtree(copy)
 

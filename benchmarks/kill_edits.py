@@ -1,16 +1,18 @@
-"""Edits of a map that are killed at random moments: is the map ever broken, is anything left lying about?
+"""Edits of a map that are killed at random moments: is the map ever broken, is anything left lying
+about?
 
     python benchmarks/kill_edits.py MAP [--kills 200] [--within 2]
     python benchmarks/kill_edits.py MAP --command-lines SEQ OTHER_MAP [--kills 60]
 
-A child edits a copy of MAP without end, every third time taking the edit back. After each kill the map is looked at from end to end, all
-that can be undone is undone, and one more edit is made; then no file but the map and its undo file may be there. Exit status 1 where
-anything was wrong.
+A child edits a copy of MAP without end, every third time taking the edit back. After each kill the
+map is looked at from end to end, all that can be undone is undone, and one more edit is made; then
+no file but the map and its undo file may be there. Exit status 1 where anything was wrong.
 
-With `--command-lines` whole processes are killed instead, in turns: `topoloc update MAP SEQ`, `prune --max-mb` to 90 % of the file, `undo`
-of an update, `merge MAP OTHER_MAP OUT` over a file that is there. Each is let run to its end once, and killed at a moment of the time that
-this took. The map, and OUT, must be the one before or the one after, to the byte, and nothing else may be there after one more edit; what
-processes leave in the folder for temporary files counts, too.
+With `--command-lines` whole processes are killed instead, in turns: `topoloc update MAP SEQ`,
+`prune --max-mb` to 90 % of the file, `undo` of an update, `merge MAP OTHER_MAP OUT` over a file
+that is there. Each is let run to its end once, and killed at a moment of the time that this took.
+The map, and OUT, must be the one before or the one after, to the byte, and nothing else may be
+there after one more edit; what processes leave in the folder for temporary files counts, too.
 """
 
 from __future__ import annotations
@@ -47,7 +49,9 @@ def kill_transactions(path: Path, kills: int, within_s: float) -> Counter[str]:
     """Kills of a process that edits the map at `path`."""
     rng, counts = np.random.default_rng(0), Counter[str]()
     for _ in range(kills):
-        with subprocess.Popen([sys.executable, __file__, str(path), "--edit-without-end"], stdout=subprocess.PIPE) as child:
+        with subprocess.Popen(
+            [sys.executable, __file__, str(path), "--edit-without-end"], stdout=subprocess.PIPE
+        ) as child:
             assert child.stdout is not None
             child.stdout.readline()
             time.sleep(rng.uniform(0.0, within_s))
@@ -58,14 +62,18 @@ def kill_transactions(path: Path, kills: int, within_s: float) -> Counter[str]:
             counts["undone"] += 1
         counts["broken"] += bool(damages(path))
         _one_more_edit(path)
-        counts["left"] += sorted(one.name for one in path.parent.iterdir()) not in ([path.name], [path.name, f"{path.name}.undo"])
+        counts["left"] += sorted(one.name for one in path.parent.iterdir()) not in (
+            [path.name],
+            [path.name, f"{path.name}.undo"],
+        )
     print(f"{kills} kills, {counts['undone']} edits undone afterwards: {_said(counts)}")
     return counts
 
 
 @dataclass(frozen=True)
 class KilledCommand:
-    """A command line with the files that it begins with, by their names; `target` is the one that it writes."""
+    """A command line with the files that it begins with, by their names; `target` is the one that
+    it writes."""
 
     words: list[str]
     files: dict[str, bytes]
@@ -82,8 +90,13 @@ class KilledCommand:
 
     def start(self, folder: Path) -> subprocess.Popen[bytes]:
         words = [sys.executable, "-m", "topoloc", *self.words]
-        environment = os.environ | {"TMPDIR": str(folder / "temporary"), "SOURCE_DATE_EPOCH": "1700000000"}
-        return subprocess.Popen(words, cwd=folder, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        environment = os.environ | {
+            "TMPDIR": str(folder / "temporary"),
+            "SOURCE_DATE_EPOCH": "1700000000",
+        }
+        return subprocess.Popen(
+            words, cwd=folder, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
 
     def finished(self, folder: Path) -> KilledCommand:
         """With what it leaves, and how long it takes, when nobody kills it."""
@@ -92,10 +105,14 @@ class KilledCommand:
         if self.start(folder).wait() != 0:
             raise SystemExit(f"topoloc {' '.join(self.words)} does not work")
         after = {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
-        return KilledCommand(self.words, self.files, self.target, after, time.perf_counter() - start)
+        return KilledCommand(
+            self.words, self.files, self.target, after, time.perf_counter() - start
+        )
 
 
-def kill_command_lines(given: Path, sequence: str, other: Path, kills: int, folder: Path) -> Counter[str]:
+def kill_command_lines(
+    given: Path, sequence: str, other: Path, kills: int, folder: Path
+) -> Counter[str]:
     """Kills of `update`, `prune`, `undo` and `merge` in turns."""
     built = {"map.topo": given.read_bytes()}
     size = 0.9 * len(built["map.topo"]) / 1e6
@@ -103,13 +120,19 @@ def kill_command_lines(given: Path, sequence: str, other: Path, kills: int, fold
     prune = KilledCommand(["prune", "map.topo", "--max-mb", f"{size:.4f}"], built).finished(folder)
     undo = KilledCommand(["undo", "map.topo"], update.after).finished(folder)
     pair = built | {"other.topo": other.read_bytes(), "out.topo": prune.after["map.topo"]}
-    merge = KilledCommand(["merge", "map.topo", "other.topo", "out.topo"], pair, "out.topo").finished(folder)
+    merge = KilledCommand(
+        ["merge", "map.topo", "other.topo", "out.topo"], pair, "out.topo"
+    ).finished(folder)
     rng, total = np.random.default_rng(0), Counter[str]()
     for command in (update, prune, undo, merge):
         counts = Counter[str]()
         for _ in range(kills // 4):
             _kill_once(command, folder, rng.uniform(0.0, 1.1 * command.seconds), counts)
-        print(f"{command.words[0]:7} {command.seconds:.1f} s, {kills // 4} kills: {counts['before']} times the one before, ", end="")
+        print(
+            f"{command.words[0]:7} {command.seconds:.1f} s, {kills // 4} kills: {counts['before']}"
+            " times the one before, ",
+            end="",
+        )
         print(f"{counts['after']} times the one after, {_said(counts)}", flush=True)
         total += counts
     return total
@@ -145,10 +168,17 @@ def _said(counts: Counter[str]) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("map", type=Path)
     parser.add_argument("--kills", type=int, default=200)
-    parser.add_argument("--within", type=float, default=2.0, help="seconds after which a process that edits is killed at the latest")
+    parser.add_argument(
+        "--within",
+        type=float,
+        default=2.0,
+        help="seconds after which a process that edits is killed at the latest",
+    )
     parser.add_argument("--command-lines", nargs=2, metavar=("SEQ", "OTHER_MAP"))
     parser.add_argument("--edit-without-end", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -158,9 +188,13 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         if args.command_lines:
             sequence, other = args.command_lines
-            counts = kill_command_lines(args.map, os.path.abspath(sequence), Path(other), args.kills, Path(folder) / "place")
+            counts = kill_command_lines(
+                args.map, os.path.abspath(sequence), Path(other), args.kills, Path(folder) / "place"
+            )
         else:
-            counts = kill_transactions(Path(shutil.copy(args.map, Path(folder) / "map.topo")), args.kills, args.within)
+            counts = kill_transactions(
+                Path(shutil.copy(args.map, Path(folder) / "map.topo")), args.kills, args.within
+            )
     return int(counts["broken"] + counts["left"] > 0)
 
 

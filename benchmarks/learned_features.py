@@ -1,11 +1,14 @@
-"""Local features side by side where light changes: pairs of pictures of rendered places (exact truth) and of a path by day and by night.
+"""Local features side by side where light changes: pairs of pictures of rendered places (exact
+truth) and of a path by day and by night.
 
-    python benchmarks/learned_features.py --kinds surf xfeat topoloc-net --pairs DAY,OTHER [--features N] [--shared ../shared]
+    python benchmarks/learned_features.py --kinds surf xfeat topoloc-net --pairs DAY,OTHER
+    [--features N] [--shared ../shared]
 
-DAY is a stereo recording, OTHER any other, both with truth; parts of one (`street1@0::2,street1@1::2`) do as well. Each picture of OTHER is
-matched to the nearest one of DAY that looks the same way (mutual nearest neighbours, no ratio), the day's points get their depth by block
-matching, one PnP follows. Real pictures: frame i of the night walk of `gardenspoint` against the day's frame i and against those from
-elsewhere, inliers of a fundamental matrix.
+DAY is a stereo recording, OTHER any other, both with truth; parts of one
+(`street1@0::2,street1@1::2`) do as well. Each picture of OTHER is matched to the nearest one of DAY
+that looks the same way (mutual nearest neighbours, no ratio), the day's points get their depth by
+block matching, one PnP follows. Real pictures: frame i of the night walk of `gardenspoint` against
+the day's frame i and against those from elsewhere, inliers of a fundamental matrix.
 """
 
 from __future__ import annotations
@@ -35,7 +38,14 @@ _SIZES = {"edgepoint2-t32": 32, "edgepoint2-s32": 32}
 
 @dataclass(frozen=True)
 class Args:
-    kinds: tuple[str, ...] = ("surf", "xfeat", "edgepoint2-t32", "edgepoint2-s64", "edgepoint2-e64", "topoloc-net")
+    kinds: tuple[str, ...] = (
+        "surf",
+        "xfeat",
+        "edgepoint2-t32",
+        "edgepoint2-s64",
+        "edgepoint2-e64",
+        "topoloc-net",
+    )
     pairs: tuple[str, ...] = ()
     shared: Path = Path(os.environ.get("TOPOLOC_SHARED", Path(__file__).parents[2] / "shared"))
     reach: float = 2.0
@@ -62,14 +72,28 @@ def match(first: Features, second: Features) -> tuple[np.ndarray, np.ndarray]:
 
 def disparity_map(frame: StereoFrame) -> np.ndarray:
     """Of the left picture, pixels; below 1 where block matching finds none."""
-    matcher = cv2.StereoSGBM.create(0, 64, 5, 200, 800, disp12MaxDiff=1, uniquenessRatio=10, speckleWindowSize=80, speckleRange=2)
+    matcher = cv2.StereoSGBM.create(
+        0,
+        64,
+        5,
+        200,
+        800,
+        disp12MaxDiff=1,
+        uniquenessRatio=10,
+        speckleWindowSize=80,
+        speckleRange=2,
+    )
     return matcher.compute(grey_image(frame.image), grey_image(frame.right)).astype(np.float64) / 16
 
 
 def day_points(frame: StereoFrame, disparity: np.ndarray, points_img: np.ndarray) -> np.ndarray:
     """Points in the left camera, metres; NaN where there is no depth."""
     x, y = np.round(points_img).astype(int).T
-    z = np.where(disparity[y, x] > 1, frame.camera.fx * frame.rig.baseline / np.maximum(disparity[y, x], 1e-6), np.nan)
+    z = np.where(
+        disparity[y, x] > 1,
+        frame.camera.fx * frame.rig.baseline / np.maximum(disparity[y, x], 1e-6),
+        np.nan,
+    )
     return np.column_stack([frame.camera.normalized_from_img(points_img) * z[:, None], z])
 
 
@@ -100,12 +124,20 @@ def rendered(names: str, args: Args) -> None:
         matches, right, metres, degrees = np.array(rows).T
         solved = np.mean((metres <= _SOLVED[0]) & (degrees <= _SOLVED[1]))
         share = right.sum() / max(1, matches.sum())
-        print(f"  {kind:16} solved {solved:6.1%}  median {100 * np.median(metres):6.2f} cm {np.median(degrees):5.2f} deg  ", end="")
+        print(
+            f"  {kind:16} solved {solved:6.1%}  median {100 * np.median(metres):6.2f} cm"
+            f" {np.median(degrees):5.2f} deg  ",
+            end="",
+        )
         print(f"right matches {np.median(right):4.0f} of {np.median(matches):4.0f} ({share:.0%})")
 
 
 def ask(
-    day: StereoFrame, disparity: np.ndarray, other: StereoFrame, other_from_day: np.ndarray, sets: list[Features]
+    day: StereoFrame,
+    disparity: np.ndarray,
+    other: StereoFrame,
+    other_from_day: np.ndarray,
+    sets: list[Features],
 ) -> tuple[int, int, float, float]:
     """Matches with depth, those of them that are right, and the errors of one PnP (m, deg)."""
     here, there = sets
@@ -116,13 +148,23 @@ def ask(
     local = points @ other_from_day[:3, :3].T + other_from_day[:3, 3]
     expected = other.camera.img_from_cam(local)
     right = int((np.linalg.norm(expected - pixels, axis=1) < _RIGHT_PX).sum())
-    camera = {"model": "PINHOLE", "width": other.camera.width, "height": other.camera.height, "params": list(other.camera.params)}
+    camera = {
+        "model": "PINHOLE",
+        "width": other.camera.width,
+        "height": other.camera.height,
+        "params": list(other.camera.params),
+    }
     if len(points) < 4:
         return len(points), right, np.inf, np.inf
     pose, _ = poselib.estimate_absolute_pose(pixels, points, camera, {"max_reproj_error": 3.0}, {})
     rotation = pose.R @ other_from_day[:3, :3].T
     metres = np.linalg.norm(pose.R.T @ pose.t - other_from_day[:3, :3].T @ other_from_day[:3, 3])
-    return len(points), right, float(metres), float(np.rad2deg(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))))
+    return (
+        len(points),
+        right,
+        float(metres),
+        float(np.rad2deg(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1)))),
+    )
 
 
 def walked(folder: Path, args: Args) -> None:
@@ -131,16 +173,27 @@ def walked(folder: Path, args: Args) -> None:
     apart = np.abs(np.subtract.outer(frames, frames)) >= _APART
     for kind in args.kinds:
         sets = {
-            walk: [extract(grey_image(read_image(folder / walk / f"Image{i:03}.jpg")), kind, args.features) for i in frames]
+            walk: [
+                extract(
+                    grey_image(read_image(folder / walk / f"Image{i:03}.jpg")), kind, args.features
+                )
+                for i in frames
+            ]
             for walk in ("day_right", "day_left", "night_right")
         }
         for walk in ("day_right", "day_left"):
-            counts = np.array([[inliers(day, night) for night in sets["night_right"]] for day in sets[walk]])
+            counts = np.array(
+                [[inliers(day, night) for night in sets["night_right"]] for day in sets[walk]]
+            )
             best_other, same = np.where(apart, counts, 0).max(0), np.diag(counts)
             told = int((same > best_other).sum())
-            middles = f"inliers same place {np.median(same):4.0f}, best other {np.median(best_other):4.0f}"
+            middles = (
+                f"inliers same place {np.median(same):4.0f}, best other"
+                f" {np.median(best_other):4.0f}"
+            )
             print(
-                f"{walk} against night_right: {kind:16} told apart (more inliers than any other place) {told:2} of {len(frames)}  {middles}"
+                f"{walk} against night_right: {kind:16} told apart (more inliers than any other"
+                f" place) {told:2} of {len(frames)}  {middles}"
             )
 
 
@@ -148,7 +201,9 @@ def inliers(day: Features, night: Features) -> int:
     rows, columns = match(day, night)
     if len(rows) < 8:
         return 0
-    _, mask = cv2.findFundamentalMat(day.points_img[rows], night.points_img[columns], cv2.USAC_MAGSAC, 2.0, 0.999, 2000)
+    _, mask = cv2.findFundamentalMat(
+        day.points_img[rows], night.points_img[columns], cv2.USAC_MAGSAC, 2.0, 0.999, 2000
+    )
     return 0 if mask is None else int(mask.sum())
 
 

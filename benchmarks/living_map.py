@@ -1,19 +1,23 @@
-"""A map that takes recordings of a changing place in, by the commands that a user has, beside maps that do not.
+"""A map that takes recordings of a changing place in, by the commands that a user has, beside maps
+that do not.
 
     python benchmarks/living_map.py MAP_SEQ [WALK ...] --ask NAME=SEQ [NAME=SEQ ...] [--step 1]
-        [--trajectory slam] [--prune] [--budget 1.5] [--unlimited] [--alone] [--ask-each] [--features surf,topoloc-net]
-        [--settings FILE.toml]
+        [--trajectory slam] [--prune] [--budget 1.5] [--unlimited] [--alone] [--ask-each]
+        [--features surf,topoloc-net] [--settings FILE.toml]
 
-`topoloc build` maps MAP_SEQ by its own poses; each WALK then joins by `topoloc update`: of stereo or RGB-D by `--trajectory` (slam, as a
-user has it who carries a camera and nothing else), of a single camera by the map's answers. WALK=LIGHT names the light. With `--prune` the
-map is pruned after each, with `--budget F` to F times the bytes of the map as it was built. Beside it stand the map never updated and,
-with `--unlimited`, the same map that is never pruned. `--settings` are those of `update` and `prune`: with `min_inliers = 10000` in the
-table `[update]` every picture of a session becomes a node, so that a budget binds.
+`topoloc build` maps MAP_SEQ by its own poses; each WALK then joins by `topoloc update`: of stereo
+or RGB-D by `--trajectory` (slam, as a user has it who carries a camera and nothing else), of a
+single camera by the map's answers. WALK=LIGHT names the light. With `--prune` the map is pruned
+after each, with `--budget F` to F times the bytes of the map as it was built. Beside it stand the
+map never updated and, with `--unlimited`, the same map that is never pruned. `--settings` are those
+of `update` and `prune`: with `min_inliers = 10000` in the table `[update]` every picture of a
+session becomes a node, so that a budget binds.
 
-Printed for each walk: bytes, nodes, processor time and the memory at most of `update` and of `prune`; with `--alone` what building the
-walk alone takes. At the end (with `--ask-each` after each walk, too) every `step`-th picture of each NAME is asked as a single picture:
-localized, wrong (off by more than 0.5 m or 5 degrees), median errors. The folder `--keep` keeps maps and what was printed, and maps that
-are there go on from where they stand.
+Printed for each walk: bytes, nodes, processor time and the memory at most of `update` and of
+`prune`; with `--alone` what building the walk alone takes. At the end (with `--ask-each` after each
+walk, too) every `step`-th picture of each NAME is asked as a single picture: localized, wrong (off
+by more than 0.5 m or 5 degrees), median errors. The folder `--keep` keeps maps and what was
+printed, and maps that are there go on from where they stand.
 """
 
 from __future__ import annotations
@@ -48,7 +52,11 @@ class Cost:
 
 def run(*words: str | Path) -> Cost:
     """A command of topoloc's in a process of its own. Ends the benchmark where it fails."""
-    process = subprocess.Popen([sys.executable, "-m", "topoloc", *map(str, words)], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "topoloc", *map(str, words)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+    )
     assert process.stderr is not None
     said = process.stderr.read().decode()
     _, status, used = os.wait4(process.pid, 0)
@@ -70,19 +78,29 @@ def asked(path: Path, pictures: Path, step: int) -> str:
             num += 1
             if isinstance(result, Localization) and frame.world_from_cam is not None:
                 metres.append(translation_error(frame.world_from_cam, result.world_from_cam))
-                degrees.append(float(np.degrees(rotation_error(frame.world_from_cam, result.world_from_cam))))
+                degrees.append(
+                    float(np.degrees(rotation_error(frame.world_from_cam, result.world_from_cam)))
+                )
     wrong = sum(m > _WRONG_M or d > _WRONG_DEG for m, d in zip(metres, degrees, strict=True))
-    medians = f"{100 * np.median(metres or [np.nan]):.2f} cm, {np.median(degrees or [np.nan]):.3f} deg"
+    medians = (
+        f"{100 * np.median(metres or [np.nan]):.2f} cm, {np.median(degrees or [np.nan]):.3f} deg"
+    )
     return f"{len(metres)} of {num}, {wrong} wrong, {medians}"
 
 
 def size(path: Path) -> str:
     with TopoMetricMap.load(path) as topomap:
         nodes, kilometres = topomap.summaries, topomap.length_m / 1e3
-        of_session = [sum(node.session_id == session.session_id for node in nodes) for session in topomap.sessions]
+        of_session = [
+            sum(node.session_id == session.session_id for node in nodes)
+            for session in topomap.sessions
+        ]
         num_points = sum(node.num_points for node in nodes) / len(nodes)
     at = f"{len(nodes)} nodes {of_session}, {num_points:.0f} landmarks a node"
-    return f"{path.stat().st_size / 1e6:.2f} MB ({path.stat().st_size / 1e6 / kilometres:.0f} MB a km walked), {at}"
+    return (
+        f"{path.stat().st_size / 1e6:.2f} MB ({path.stat().st_size / 1e6 / kilometres:.0f} MB a km"
+        f" walked), {at}"
+    )
 
 
 class LivingMap:
@@ -90,12 +108,18 @@ class LivingMap:
 
     def __init__(self, args: argparse.Namespace, folder: Path) -> None:
         self.args, self.folder = args, folder
-        self.never, self.living, self.unlimited = (folder / f"{name}.topo" for name in ("never", "living", "unlimited"))
+        self.never, self.living, self.unlimited = (
+            folder / f"{name}.topo" for name in ("never", "living", "unlimited")
+        )
         self.features = ["--features", args.features] if args.features else []
         self.settings = ["--config", args.settings] if args.settings else []
         self.updated = [self.living, self.unlimited] if args.unlimited else [self.living]
         if not self.never.exists():
-            self.say(f"build {args.map_sequence}: {run('build', args.map_sequence, self.never, *self.features)}; {size(self.never)}")
+            self.say(
+                f"build {args.map_sequence}:"
+                f" {run('build', args.map_sequence, self.never, *self.features)};"
+                f" {size(self.never)}"
+            )
         for path in self.updated:
             if not path.exists():
                 path.write_bytes(self.never.read_bytes())
@@ -116,12 +140,22 @@ class LivingMap:
             costs.append(run("update", topo, path, *words))
             self.say(f"{topo.stem} + {path} by {trajectory}: {costs[-1]}; {size(topo)}")
         if self.args.alone and trajectory != "map":
-            alone = run("build", path, self.folder / "alone.topo", "--trajectory", trajectory, *self.features)
+            alone = run(
+                "build",
+                path,
+                self.folder / "alone.topo",
+                "--trajectory",
+                trajectory,
+                *self.features,
+            )
             self.say(f"  alone: {alone}; update / build {costs[0].seconds / alone.seconds:.2f}")
         if self.args.prune or self.budget is not None:
             words = [] if self.budget is None else ["--max-mb", f"{self.budget:.3f}"]
             cost = run("prune", self.living, *words, *self.settings)
-            self.say(f"  pruned {' '.join(words)}: {cost}; {size(self.living)}, {self.share():.2f} of the first map's bytes")
+            self.say(
+                f"  pruned {' '.join(words)}: {cost}; {size(self.living)}, {self.share():.2f} of"
+                " the first map's bytes"
+            )
 
     def share(self) -> float:
         return self.living.stat().st_size / self.never.stat().st_size
@@ -133,7 +167,9 @@ class LivingMap:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("map_sequence")
     parser.add_argument("walks", nargs="*", metavar="WALK[=LIGHT]")
     parser.add_argument("--ask", nargs="+", default=[], metavar="NAME=SEQ")

@@ -1,12 +1,15 @@
-"""How hard is the night of a rendered world? Queries localized by day and by night against a map made by day.
+"""How hard is the night of a rendered world? Queries localized by day and by night against a map
+made by day.
 
-    topoloc simulate lab /tmp/map                                     # and so on, or the recordings of `topoloc demo`
-    python benchmarks/night_difficulty.py --map /tmp/map --day /tmp/day --night /tmp/night
+    topoloc simulate lab /tmp/map                                     # and so on, or the recordings
+    of `topoloc demo` python benchmarks/night_difficulty.py --map /tmp/map --day /tmp/day --night
+    /tmp/night
 
-Plain SIFT (no normalisation, OpenCV's own contrast threshold, five candidate nodes pooled, no guided step, every pose with a
-dozen inliers taken) shows what the light costs a common method; it should lose about half of what it localizes by day. Beside it
-the paper's scheme (its normalisation, one node) and this project's defaults. A query counts where its pose is right within both
-bounds; a pose that is wrong by more than 0.5 m or 10 degrees is a false accept.
+Plain SIFT (no normalisation, OpenCV's own contrast threshold, five candidate nodes pooled, no
+guided step, every pose with a dozen inliers taken) shows what the light costs a common method; it
+should lose about half of what it localizes by day. Beside it the paper's scheme (its normalisation,
+one node) and this project's defaults. A query counts where its pose is right within both bounds; a
+pose that is wrong by more than 0.5 m or 10 degrees is a false accept.
 """
 
 from __future__ import annotations
@@ -42,34 +45,56 @@ METHODS = (
     Method(
         "plain SIFT, five nodes",
         FeatureConfig(kind="sift", normalization="none", contrast_threshold=0.04),
-        LocalizerConfig(num_candidates=5, guided=UNGUIDED, evidence=ANY_POSE, num_first_features=1_000_000),
+        LocalizerConfig(
+            num_candidates=5, guided=UNGUIDED, evidence=ANY_POSE, num_first_features=1_000_000
+        ),
     ),
     Method(
         "the paper's scheme",
         FeatureConfig(kind="surf", normalization="paper"),
-        LocalizerConfig(num_candidates=1, guided=UNGUIDED, evidence=ANY_POSE, num_first_features=1_000_000),
+        LocalizerConfig(
+            num_candidates=1, guided=UNGUIDED, evidence=ANY_POSE, num_first_features=1_000_000
+        ),
     ),
     Method("defaults", FeatureConfig(), LocalizerConfig()),
 )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--map", nargs="+", required=True, help="recordings by day with depth or stereo")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--map", nargs="+", required=True, help="recordings by day with depth or stereo"
+    )
     parser.add_argument("--day", required=True)
     parser.add_argument("--night", required=True)
     arguments = parser.parse_args()
     mapping = [open_sequence(path) for path in arguments.map]
     queries = {"day": open_sequence(arguments.day), "night": open_sequence(arguments.night)}
-    print(f"| method | light | within {' | within '.join(bound.replace('_', ' ') for bound in BOUNDS)} | false accepts | median |")
+    print(
+        "| method | light | within"
+        f" {' | within '.join(bound.replace('_', ' ') for bound in BOUNDS)} | false accepts |"
+        " median |"
+    )
     print("|---|---|---|---|---|---|")
     for method in METHODS:
-        localizer = Localizer(build_map(mapping, BuildConfig(features=method.features)), method.localizer)
+        localizer = Localizer(
+            build_map(mapping, BuildConfig(features=method.features)), method.localizer
+        )
         for light, sequence in queries.items():
             e = summarize(answer_queries(localizer, sequence))
             shares = " | ".join(f"{100 * e['recall'][bound]:.0f} %" for bound in BOUNDS)
-            median = f"{100 * e['median_translation_m']:.1f} cm, {e['median_rotation_deg']:.2f} deg" if e["num_localized"] else "-"
-            print(f"| {method.name} | {light} | {shares} | {e['false_accepts']} of {e['num_queries']} | {median} |", flush=True)
+            median = (
+                f"{100 * e['median_translation_m']:.1f} cm, {e['median_rotation_deg']:.2f} deg"
+                if e["num_localized"]
+                else "-"
+            )
+            print(
+                f"| {method.name} | {light} | {shares} | {e['false_accepts']} of {e['num_queries']}"
+                f" | {median} |",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

@@ -1,9 +1,12 @@
-"""A stereo recording written as what other programs write, mapped from that, and asked with another recording beside the stereo map.
+"""A stereo recording written as what other programs write, mapped from that, and asked with another
+recording beside the stereo map.
 
-    python benchmarks/other_formats.py RECORDING QUERIES [--map-from-truth FILE] [--formats nerfstudio colmap] [--out DIR]
+    python benchmarks/other_formats.py RECORDING QUERIES [--map-from-truth FILE] [--formats
+    nerfstudio colmap] [--out DIR]
 
-`nerfstudio`: transforms.json with depth of 16 bits by semi-global matching of the pairs. `colmap`: a model whose cameras and poses are
-those of the recording, whose points are triangulated by pycolmap from its own SIFT features; no depth, no right picture.
+`nerfstudio`: transforms.json with depth of 16 bits by semi-global matching of the pairs. `colmap`:
+a model whose cameras and poses are those of the recording, whose points are triangulated by
+pycolmap from its own SIFT features; no depth, no right picture.
 """
 
 from __future__ import annotations
@@ -38,29 +41,51 @@ def write_nerfstudio(sequence: StereoSequence, folder: Path) -> Path:
         _write(folder / name, jpeg_of(frame.image, 95))
         _write(folder / depth_name, cv2.imencode(".png", _depth_mm(frame))[1].tobytes())
         matrix = (frame.world_from_cam.matrix() @ GL_FROM_CV).tolist()
-        frames.append({"file_path": name, "depth_file_path": depth_name, "transform_matrix": matrix})
+        frames.append(
+            {"file_path": name, "depth_file_path": depth_name, "transform_matrix": matrix}
+        )
     camera = sequence[0].camera
     assert camera is not None
     _, w, h, (fx, fy, cx, cy) = camera.to_colmap()
-    lens = {"camera_model": "OPENCV", "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": w, "h": h, "k1": 0, "k2": 0, "p1": 0, "p2": 0}
-    (folder / "transforms.json").write_text(json.dumps(lens | {"depth_unit_scale_factor": 0.001, "frames": frames}))
+    lens = {
+        "camera_model": "OPENCV",
+        "fl_x": fx,
+        "fl_y": fy,
+        "cx": cx,
+        "cy": cy,
+        "w": w,
+        "h": h,
+        "k1": 0,
+        "k2": 0,
+        "p1": 0,
+        "p2": 0,
+    }
+    (folder / "transforms.json").write_text(
+        json.dumps(lens | {"depth_unit_scale_factor": 0.001, "frames": frames})
+    )
     return folder
 
 
 def _depth_mm(frame: StereoFrame) -> np.ndarray:
-    """Depth of the left picture by semi-global matching (Hirschmueller 2008, as OpenCV has it), 0 where unknown."""
+    """Depth of the left picture by semi-global matching (Hirschmueller 2008, as OpenCV has it), 0
+    where unknown."""
     view = frame_view(frame)
     assert view.rig is not None
     assert view.right_grey is not None
-    matcher = cv2.StereoSGBM.create(0, 128, 5, 8 * 25, 32 * 25, 1, 63, 10, 100, 2, cv2.STEREO_SGBM_MODE_HH)
+    matcher = cv2.StereoSGBM.create(
+        0, 128, 5, 8 * 25, 32 * 25, 1, 63, 10, 100, 2, cv2.STEREO_SGBM_MODE_HH
+    )
     disparity = matcher.compute(view.grey, view.right_grey).astype(np.float64) / 16.0
     with np.errstate(divide="ignore"):
         millimetres = 1000.0 * view.rig.left.fx * view.rig.baseline / disparity
-    return np.where((disparity > 1.0) & (millimetres < 65000), np.rint(millimetres), 0).astype(np.uint16)
+    return np.where((disparity > 1.0) & (millimetres < 65000), np.rint(millimetres), 0).astype(
+        np.uint16
+    )
 
 
 def write_colmap(sequence: StereoSequence, folder: Path) -> Path:
-    """A model of the left pictures under the recording's poses, in its own unit, which is not the metre; the pictures lie in images/."""
+    """A model of the left pictures under the recording's poses, in its own unit, which is not the
+    metre; the pictures lie in images/."""
     import pycolmap  # pyright: ignore[reportMissingImports]
 
     pycolmap.logging.minloglevel = 2
@@ -76,8 +101,19 @@ def write_colmap(sequence: StereoSequence, folder: Path) -> Path:
     reader.camera_model, reader.camera_params = model, ",".join(map(repr, params))
     database_path, device, names = folder / "database.db", pycolmap.Device.cpu, sorted(index_of)
     single = pycolmap.CameraMode.SINGLE
-    pycolmap.extract_features(database_path, folder / "images", names, camera_mode=single, reader_options=reader, device=device)
-    pairs = [(names[a], names[a + step]) for step in (1, 2, 3, 5, 8, 12) for a in range(len(names) - step)]
+    pycolmap.extract_features(
+        database_path,
+        folder / "images",
+        names,
+        camera_mode=single,
+        reader_options=reader,
+        device=device,
+    )
+    pairs = [
+        (names[a], names[a + step])
+        for step in (1, 2, 3, 5, 8, 12)
+        for a in range(len(names) - step)
+    ]
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = str(folder / "pairs.txt")
     (folder / "pairs.txt").write_text("".join(f"{a} {b}\n" for a, b in pairs))
@@ -130,7 +166,9 @@ def main() -> None:
             more = ["--images", str(options.out / name / "images"), "--scale", str(COLMAP_UNIT)]
         target = str(options.out / f"{name}.topo")
         _topoloc("build", source, target, "--features", "surf", *more)
-        _topoloc("evaluate", target, options.queries, "--json", str(options.out / f"{name}.json"), *world)
+        _topoloc(
+            "evaluate", target, options.queries, "--json", str(options.out / f"{name}.json"), *world
+        )
 
 
 if __name__ == "__main__":

@@ -1,12 +1,14 @@
-"""The other way round: a way mapped in one direction, walked in the other. What is asked beside what is measured.
+"""The other way round: a way mapped in one direction, walked in the other. What is asked beside
+what is measured.
 
     python benchmarks/other_way.py MAP_SEQ QUERY_SEQ [--json FILE]
 
 Recordings as by `topoloc simulate corridor corridor_map --laps 1` and
-`topoloc simulate corridor corridor_reverse --reverse --mono --take 6` (of a map of two laps take the first: `corridor_map@0:269`), with
-exact truth. A query sees something twice where at least 50 map points that were seen from the other side lie in one of its views to the
-sides, as truth has it. Right is within 0.5 m and 5 degrees, far off beyond 0.5 m or 10 degrees. The same queries are asked without side
-nodes (`walls.num_places=0`) for comparison.
+`topoloc simulate corridor corridor_reverse --reverse --mono --take 6` (of a map of two laps take
+the first: `corridor_map@0:269`), with exact truth. A query sees something twice where at least 50
+map points that were seen from the other side lie in one of its views to the sides, as truth has it.
+Right is within 0.5 m and 5 degrees, far off beyond 0.5 m or 10 degrees. The same queries are asked
+without side nodes (`walls.num_places=0`) for comparison.
 """
 
 from __future__ import annotations
@@ -35,7 +37,9 @@ MIN_POINTS, MAX_METRES = 50, 60.0
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("mapped")
     parser.add_argument("asked")
     parser.add_argument("--json", type=Path)
@@ -45,22 +49,30 @@ def main() -> None:
         raise MapError(f"{arguments.mapped}: a lens too narrow for side nodes")
     sequence = open_sequence(arguments.asked)
     frames = [sequence[i] for i in range(len(sequence))]
-    shown = [(node.summary.world_from_cam, points_world(node.summary.world_from_cam, node.points_cam)) for node in topomap.sides.nodes]
+    shown = [
+        (node.summary.world_from_cam, points_world(node.summary.world_from_cam, node.points_cam))
+        for node in topomap.sides.nodes
+    ]
     seen_twice = [frame for frame in frames if num_seen_twice(frame, shown) >= MIN_POINTS]
     print(
-        f"{len(topomap.nodes)} nodes, {len(topomap.sides.nodes)} side nodes; {len(frames)} queries, {len(seen_twice)} see something twice"
+        f"{len(topomap.nodes)} nodes, {len(topomap.sides.nodes)} side nodes; {len(frames)} queries,"
+        f" {len(seen_twice)} see something twice"
     )
     figures = {"with side nodes": asked(Localizer(topomap), frames)}
     without = LocalizerConfig(walls=WallsConfig(num_places=0))
     figures["without"] = asked(Localizer(topomap, without), frames)
     for name, f in figures.items():
         print(
-            f"{name}: {f['right']} right ({100 * f['right'] / max(len(seen_twice), 1):.0f} % of what is seen twice, asked >= 40 %),"
-            f" {f['far_off']} far off (asked 0), {f['answered']} answered, median {100 * f['median_m']:.1f} cm,"
-            f" {100 * f['inside']:.0f} % inside the 95 % ellipsoid, {f['ms']:.0f} ms; refused {f['reasons']}"
+            f"{name}: {f['right']} right ({100 * f['right'] / max(len(seen_twice), 1):.0f} % of"
+            f" what is seen twice, asked >= 40 %), {f['far_off']} far off (asked 0),"
+            f" {f['answered']} answered, median {100 * f['median_m']:.1f} cm,"
+            f" {100 * f['inside']:.0f} % inside the 95 % ellipsoid, {f['ms']:.0f} ms; refused"
+            f" {f['reasons']}"
         )
     if arguments.json:
-        arguments.json.write_text(json.dumps({"queries": len(frames), "seen_twice": len(seen_twice), **figures}, indent=1))
+        arguments.json.write_text(
+            json.dumps({"queries": len(frames), "seen_twice": len(seen_twice), **figures}, indent=1)
+        )
 
 
 def points_world(world_from_cam: Rigid3, points_cam: np.ndarray) -> np.ndarray:
@@ -71,17 +83,31 @@ def num_seen_twice(frame: StereoFrame, shown: list[tuple[Rigid3, np.ndarray]]) -
     """Most points of one side node that lie in one of the frame's side views."""
     assert frame.camera is not None
     assert frame.world_from_cam is not None
-    return max((num_in_view(frame.camera, frame.world_from_cam, *node) for node in shown), default=0)
+    return max(
+        (num_in_view(frame.camera, frame.world_from_cam, *node) for node in shown), default=0
+    )
 
 
-def num_in_view(camera: Camera, world_from_cam: Rigid3, world_from_node: Rigid3, points: np.ndarray) -> int:
+def num_in_view(
+    camera: Camera, world_from_cam: Rigid3, world_from_node: Rigid3, points: np.ndarray
+) -> int:
     best = 0
     for view in side_views(camera, SideViewConfig()):
         world_from_side = world_from_cam @ view.cam_from_side
-        is_near = np.linalg.norm(world_from_node.translation - world_from_side.translation) < MAX_METRES
+        is_near = (
+            np.linalg.norm(world_from_node.translation - world_from_side.translation) < MAX_METRES
+        )
         if is_near and world_from_node.rotation[:, 2] @ world_from_side.rotation[:, 2] > 0.8:
-            pixels = np.rint(np.nan_to_num(view.camera.img_from_cam(world_from_side.inverse().apply(points)), nan=-1.0)).astype(int)
-            inside = (pixels >= 0).all(axis=1) & (pixels[:, 0] < view.camera.width) & (pixels[:, 1] < view.camera.height)
+            pixels = np.rint(
+                np.nan_to_num(
+                    view.camera.img_from_cam(world_from_side.inverse().apply(points)), nan=-1.0
+                )
+            ).astype(int)
+            inside = (
+                (pixels >= 0).all(axis=1)
+                & (pixels[:, 0] < view.camera.width)
+                & (pixels[:, 1] < view.camera.height)
+            )
             best = max(best, int(view.inside[pixels[inside, 1], pixels[inside, 0]].sum()))
     return best
 
@@ -108,7 +134,9 @@ def asked(localizer: Localizer, frames: list[StereoFrame]) -> dict:
         "right": len(right),
         "far_off": sum(metres > 0.5 or degrees > 10.0 for metres, degrees in errors),
         "median_m": float(np.median(right)) if right else float("nan"),
-        "inside": float(np.mean(np.array(squares) < CHI_SQUARE_6_AT_95)) if squares else float("nan"),
+        "inside": (
+            float(np.mean(np.array(squares) < CHI_SQUARE_6_AT_95)) if squares else float("nan")
+        ),
         "ms": float(np.median(milliseconds)),
         "reasons": dict(reasons),
     }

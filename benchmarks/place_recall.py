@@ -1,11 +1,15 @@
-"""Is the right place among the first? Recall of the coarse search of a kind of features, where the light is another one.
+"""Is the right place among the first? Recall of the coarse search of a kind of features, where the
+light is another one.
 
-    python benchmarks/place_recall.py --kinds surf topoloc-net --pairs MAPPED,ASKED --reach 1 [--walks day_right,night_right]
+    python benchmarks/place_recall.py --kinds surf topoloc-net --pairs MAPPED,ASKED --reach 1
+    [--walks day_right,night_right]
 
-MAPPED and ASKED are recordings with truth (parts of one, `street1@0::2`, do as well): surf-vlad by each kind is learnt from all pictures of
-MAPPED, each being a node, and each picture of ASKED is put to it, also without the network's cells (`VLAD alone`). A hit is a mapped
-picture within `--reach` metres and 20 degrees; pictures of ASKED without one are left out. Walks are folders of `gardenspoint`, where
-pictures of equal numbers show the same place, but for a frame or two: a hit is the very frame, and, counted apart, one within two.
+MAPPED and ASKED are recordings with truth (parts of one, `street1@0::2`, do as well): surf-vlad by
+each kind is learnt from all pictures of MAPPED, each being a node, and each picture of ASKED is put
+to it, also without the network's cells (`VLAD alone`). A hit is a mapped picture within `--reach`
+metres and 20 degrees; pictures of ASKED without one are left out. Walks are folders of
+`gardenspoint`, where pictures of equal numbers show the same place, but for a frame or two: a hit
+is the very frame, and, counted apart, one within two.
 """
 
 from __future__ import annotations
@@ -50,22 +54,34 @@ Described = list[tuple[Features, np.ndarray]]
 
 
 def described(images: Iterator[np.ndarray], kind: str) -> Described:
-    return [(extract_features(image, FeatureConfig(kind=kind)), np.empty_like(image)) for image in images]
+    return [
+        (extract_features(image, FeatureConfig(kind=kind)), np.empty_like(image))
+        for image in images
+    ]
 
 
 def learnt(mapped: Described, kind: str) -> SurfVlad:
-    """As `topoloc build` does, but for the words, which it learns from features with a 3-D position alone."""
+    """As `topoloc build` does, but for the words, which it learns from features with a 3-D position
+    alone."""
     config = MapConfig().vlad_of(kind)
     found = [placed(features, image.shape[1], image.shape[0], config) for features, image in mapped]
     words = learn_words(np.concatenate(found), config)
     vlads = np.stack([vlad(descriptors, words) for descriptors in found])
-    return SurfVlad.fit(words, vlads, np.arange(len(mapped)), config, [features.cells for features, _ in mapped])
+    return SurfVlad.fit(
+        words, vlads, np.arange(len(mapped)), config, [features.cells for features, _ in mapped]
+    )
 
 
-def judge(mapped: Described, asked: Described, kind: str, hits: list[tuple[str, np.ndarray]]) -> None:
+def judge(
+    mapped: Described, asked: Described, kind: str, hits: list[tuple[str, np.ndarray]]
+) -> None:
     """`hits` (asked, mapped): which answers are right, by name."""
     coarse = learnt(mapped, kind)
-    ways = {"VLAD alone": [(features.select(np.arange(len(features))), image) for features, image in asked]}
+    ways = {
+        "VLAD alone": [
+            (features.select(np.arange(len(features))), image) for features, image in asked
+        ]
+    }
     if asked[0][0].cells is not None:
         ways["and cells"] = asked
     for way, queries in ways.items():
@@ -77,14 +93,21 @@ def judge(mapped: Described, asked: Described, kind: str, hits: list[tuple[str, 
         for what, right in hits:
             found = np.array([right[k, row] for k, row in enumerate(ranked)])
             shares = "  ".join(f"@{n} {found[:, :n].any(axis=1).mean():.2f}" for n in _FIRST)
-            print(f"  {kind:14} {way:10}  {what:12} {shares}  {np.median(times):.1f} ms", flush=True)
+            print(
+                f"  {kind:14} {way:10}  {what:12} {shares}  {np.median(times):.1f} ms", flush=True
+            )
 
 
 def recorded(names: str, args: Args) -> None:
     mapped, asked = (open_sequence(name) for name in names.split(","))
-    here, there = (np.array([pose.matrix() for pose in sequence.poses if pose is not None]) for sequence in (mapped, asked))
+    here, there = (
+        np.array([pose.matrix() for pose in sequence.poses if pose is not None])
+        for sequence in (mapped, asked)
+    )
     away = np.linalg.norm(there[:, None, :3, 3] - here[None, :, :3, 3], axis=2)
-    right = (away <= args.reach) & (there[:, :3, 2] @ here[:, :3, 2].T >= np.cos(np.deg2rad(_TURN_DEG)))
+    right = (away <= args.reach) & (
+        there[:, :3, 2] @ here[:, :3, 2].T >= np.cos(np.deg2rad(_TURN_DEG))
+    )
     rows = np.flatnonzero(right.any(axis=1))[:: args.every]
     print(f"{names}: {len(rows)} asked")
     for kind in args.kinds:
@@ -100,13 +123,19 @@ def walked(names: str, args: Args) -> None:
     print(f"{names}: {_NUM_FRAMES} asked")
     for kind in args.kinds:
         folders = [args.shared / "data" / "gardenspoint" / walk for walk in names.split(",")]
-        sets = [described((reduced(folder, k) for k in range(_NUM_FRAMES)), kind) for folder in folders]
+        sets = [
+            described((reduced(folder, k) for k in range(_NUM_FRAMES)), kind) for folder in folders
+        ]
         judge(sets[0], sets[1], kind, [("the frame", apart == 0), ("within two", apart <= 2)])
 
 
 def reduced(folder: Path, k: int) -> np.ndarray:
     grey = grey_image(read_image(folder / f"Image{k:03}.jpg"))
-    return cv2.resize(grey, (_WIDTH_PX, round(grey.shape[0] * _WIDTH_PX / grey.shape[1])), interpolation=cv2.INTER_AREA)
+    return cv2.resize(
+        grey,
+        (_WIDTH_PX, round(grey.shape[0] * _WIDTH_PX / grey.shape[1])),
+        interpolation=cv2.INTER_AREA,
+    )
 
 
 def main(args: Args) -> None:

@@ -1,10 +1,12 @@
-"""The ratio test where several map nodes show the same point: three rules compared on the kitchen of 7-Scenes.
+"""The ratio test where several map nodes show the same point: three rules compared on the kitchen
+of 7-Scenes.
 
     python benchmarks/pooled_matching.py [--shared ../shared]
 
-Nodes are every tenth frame; a query is matched with the five nearest nodes but the two next to it. Right is a match whose
-map point falls within 4 pixels of the key point, under the pose that the matches of all rules together give. Printed are
-right matches, each key point of the query counted once (geometric mean), and precision.
+Nodes are every tenth frame; a query is matched with the five nearest nodes but the two next to it.
+Right is a match whose map point falls within 4 pixels of the key point, under the pose that the
+matches of all rules together give. Printed are right matches, each key point of the query counted
+once (geometric mean), and precision.
 """
 
 from __future__ import annotations
@@ -42,7 +44,10 @@ class Pool:
     @staticmethod
     def concatenate(parts: list[Pool]) -> Pool:
         return Pool(
-            *(np.concatenate([getattr(part, name) for part in parts]) for name in ("descriptors", "points_world", "sigmas", "node_ids"))
+            *(
+                np.concatenate([getattr(part, name) for part in parts])
+                for name in ("descriptors", "points_world", "sigmas", "node_ids")
+            )
         )
 
 
@@ -57,7 +62,9 @@ def best_of_the_nodes(query: np.ndarray, pool: Pool, ratio: float) -> tuple[np.n
         rows = np.flatnonzero(pool.node_ids == node_id)
         matches = match_features(query, pool.descriptors[rows], MatchingConfig(ratio=ratio))
         found.append((matches.query_idx, rows[matches.train_idx], matches.distances))
-    query_idx, train_idx, distances = (np.concatenate(column) for column in zip(*found, strict=True))
+    query_idx, train_idx, distances = (
+        np.concatenate(column) for column in zip(*found, strict=True)
+    )
     order = np.argsort(distances, kind="stable")
     _, first = np.unique(query_idx[order], return_index=True)
     return query_idx[order][first], train_idx[order][first]
@@ -66,7 +73,9 @@ def best_of_the_nodes(query: np.ndarray, pool: Pool, ratio: float) -> tuple[np.n
 def twins_within(num_sigmas: float) -> Rule:
     def rule(query: np.ndarray, pool: Pool, ratio: float) -> tuple[np.ndarray, np.ndarray]:
         radii = 0.01 + num_sigmas * pool.sigmas
-        matches = match_pooled(query, pool.descriptors, pool.points_world, radii, MatchingConfig(ratio=ratio))
+        matches = match_pooled(
+            query, pool.descriptors, pool.points_world, radii, MatchingConfig(ratio=ratio)
+        )
         return matches.query_idx, matches.train_idx
 
     return rule
@@ -92,24 +101,39 @@ def main(args: Args) -> None:
         rows = np.flatnonzero(located.valid)
         sigmas = np.sqrt(np.trace(located.covariances[rows], axis1=1, axis2=2))
         points_world = view.world_from_cam.apply(located.points_cam[rows])
-        nodes.append(Pool(features.descriptors[rows], points_world, sigmas, np.full(len(rows), node_id)))
+        nodes.append(
+            Pool(features.descriptors[rows], points_world, sigmas, np.full(len(rows), node_id))
+        )
     tallies: dict[tuple[str, float], list[tuple[int, int, int]]] = {}
     for query_idx in range(5, len(sequence), 20):
         view = frame_view(sequence[query_idx], with_depth=False)
         nearest = sorted(range(len(nodes)), key=lambda k, at=query_idx: abs(10 * k - at))[2:7]
         pool = Pool.concatenate([nodes[k] for k in nearest])
         features = extract_features(view.grey, config)
-        found = {(name, ratio): rule(features.descriptors, pool, ratio) for name, rule in RULES.items() for ratio in (0.7, 0.8, 0.85)}
+        found = {
+            (name, ratio): rule(features.descriptors, pool, ratio)
+            for name, rule in RULES.items()
+            for ratio in (0.7, 0.8, 0.85)
+        }
         rows, train_rows = (np.concatenate(column) for column in zip(*found.values(), strict=True))
-        pose = estimate_absolute_pose(features.points_img[rows].astype(np.float64), pool.points_world[train_rows], view.camera)
+        pose = estimate_absolute_pose(
+            features.points_img[rows].astype(np.float64), pool.points_world[train_rows], view.camera
+        )
         assert pose is not None
         for key, (rows, train_rows) in found.items():
-            seen = view.camera.img_from_cam(pose.cam_from_world.apply(pool.points_world[train_rows]))
+            seen = view.camera.img_from_cam(
+                pose.cam_from_world.apply(pool.points_world[train_rows])
+            )
             right = np.linalg.norm(seen - features.points_img[rows], axis=1) < 4.0
-            tallies.setdefault(key, []).append((len(np.unique(rows[right])), int(right.sum()), len(rows)))
+            tallies.setdefault(key, []).append(
+                (len(np.unique(rows[right])), int(right.sum()), len(rows))
+            )
     for (name, ratio), tally in sorted(tallies.items()):
         once, right, total = np.array(tally).T
-        print(f"{name:34s} ratio {ratio:.2f}  right {np.expm1(np.log1p(once).mean()):6.1f}  precision {right.sum() / total.sum():.2f}")
+        print(
+            f"{name:34s} ratio {ratio:.2f}  right {np.expm1(np.log1p(once).mean()):6.1f}  precision"
+            f" {right.sum() / total.sum():.2f}"
+        )
 
 
 if __name__ == "__main__":

@@ -1,9 +1,12 @@
-"""PoseNet against the deep-geometric localizer: median pose errors on the same images, and how many times smaller ours are.
+"""PoseNet against the deep-geometric localizer: median pose errors on the same images, and how many
+times smaller ours are.
 
-    python benchmarks/posenet_baseline.py MAP --queries SEQ [SEQ ...] [--weights FILE] [--epochs 80] [--losses ...] [--rates ...]
+    python benchmarks/posenet_baseline.py MAP --queries SEQ [SEQ ...] [--weights FILE] [--epochs 80]
+    [--losses ...] [--rates ...]
 
-PoseNet is tuned as carefully as our own: every loss and learning rate below is trained on the map's images, and the one with the
-least mean D_total on the held-out images is asked. It answers every query; ours is judged by what it localizes, and its share is printed.
+PoseNet is tuned as carefully as our own: every loss and learning rate below is trained on the map's
+images, and the one with the least mean D_total on the held-out images is asked. It answers every
+query; ours is judged by what it localizes, and its share is printed.
 """
 
 from __future__ import annotations
@@ -31,7 +34,9 @@ LEARNING_RATES = (3e-4, 1e-3)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("map")
     parser.add_argument("--queries", nargs="+", required=True)
     parser.add_argument("--weights", help="SqueezeNet 1.1 trained on ImageNet")
@@ -48,18 +53,35 @@ def main() -> None:
     for path in arguments.queries:
         sequence = open_sequence(path)
         frames = [sequence[i] for i, pose in enumerate(sequence.poses) if pose is not None]
-        pairs = list(zip(posenet.localize([f.image for f in frames]), [f.world_from_cam for f in frames], strict=True))
+        pairs = list(
+            zip(
+                posenet.localize([f.image for f in frames]),
+                [f.world_from_cam for f in frames],
+                strict=True,
+            )
+        )
         theirs = [float(np.median([translation_error(a, b) for a, b in pairs if b is not None]))]
-        theirs.append(float(np.rad2deg(np.median([rotation_error(a, b) for a, b in pairs if b is not None]))))
+        theirs.append(
+            float(np.rad2deg(np.median([rotation_error(a, b) for a, b in pairs if b is not None])))
+        )
         ours = summarize(answer_queries(localizer, sequence))
-        row = {"queries": path, "posenet_m": theirs[0], "posenet_deg": theirs[1], "ours_m": ours["median_translation_m"]}
-        row |= {"ours_deg": ours["median_rotation_deg"], "localized": ours["num_localized"] / max(ours["num_queries"], 1)}
+        row = {
+            "queries": path,
+            "posenet_m": theirs[0],
+            "posenet_deg": theirs[1],
+            "ours_m": ours["median_translation_m"],
+        }
+        row |= {
+            "ours_deg": ours["median_rotation_deg"],
+            "localized": ours["num_localized"] / max(ours["num_queries"], 1),
+        }
         rows.append(row)
         if row["ours_m"]:
             print(
-                f"{path[-30:]:<32}PoseNet {theirs[0]:.3f} m, {theirs[1]:.2f} deg; ours {row['ours_m']:.4f} m, {row['ours_deg']:.3f} deg"
-                f" ({100 * row['localized']:.0f} % localized),"
-                f" {theirs[0] / row['ours_m']:.1f} and {theirs[1] / row['ours_deg']:.1f} times smaller",
+                f"{path[-30:]:<32}PoseNet {theirs[0]:.3f} m, {theirs[1]:.2f} deg; ours"
+                f" {row['ours_m']:.4f} m, {row['ours_deg']:.3f} deg ({100 * row['localized']:.0f} %"
+                f" localized), {theirs[0] / row['ours_m']:.1f} and"
+                f" {theirs[1] / row['ours_deg']:.1f} times smaller",
                 flush=True,
             )
     if arguments.json:
@@ -71,9 +93,20 @@ def tuned(topomap: TopoMetricMap, arguments: argparse.Namespace) -> PoseNet:
     found = find_weights("squeezenet1_1", arguments.weights)
     best: PoseNet | None = None
     for loss, rate in itertools.product(arguments.losses, arguments.rates):
-        training = TrainingConfig(max_epochs=arguments.epochs, patience=arguments.epochs // 3, learning_rate=rate)
-        posenet = train_posenet(topomap, "squeezenet1_1", found, PoseNetConfig(loss, picture=PictureConfig(112, 84), training=training))
-        print(f"PoseNet, {loss} loss, learning rate {rate:g}: D_total {posenet.held_out_m:.3f} m on held-out images", flush=True)
+        training = TrainingConfig(
+            max_epochs=arguments.epochs, patience=arguments.epochs // 3, learning_rate=rate
+        )
+        posenet = train_posenet(
+            topomap,
+            "squeezenet1_1",
+            found,
+            PoseNetConfig(loss, picture=PictureConfig(112, 84), training=training),
+        )
+        print(
+            f"PoseNet, {loss} loss, learning rate {rate:g}: D_total {posenet.held_out_m:.3f} m on"
+            " held-out images",
+            flush=True,
+        )
         if best is None or posenet.held_out_m < best.held_out_m:
             best = posenet
     assert best is not None

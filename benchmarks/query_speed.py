@@ -2,8 +2,9 @@
 
     python benchmarks/query_speed.py [--shared ../shared] [--num-queries 60]
 
-The peer is what a wheel of OpenCV gives of the paper as written: SIFT (no wheel has SURF), one node, FLANN with the ratio
-test, RANSAC and LM by OpenCV; D_thresh 2. Both take turns, picture by picture, so that a machine's changing speed meets both.
+The peer is what a wheel of OpenCV gives of the paper as written: SIFT (no wheel has SURF), one
+node, FLANN with the ratio test, RANSAC and LM by OpenCV; D_thresh 2. Both take turns, picture by
+picture, so that a machine's changing speed meets both.
 """
 
 from __future__ import annotations
@@ -36,15 +37,24 @@ AS_WRITTEN = LocalizerConfig(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--shared", type=Path, default=Path(os.environ.get("TOPOLOC_SHARED", "../shared")))
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--shared", type=Path, default=Path(os.environ.get("TOPOLOC_SHARED", "../shared"))
+    )
     parser.add_argument("--num-queries", type=int, default=60)
     arguments = parser.parse_args()
     kitchen = arguments.shared / "data" / "seven_scenes" / "kitchen"
     mapping, queries = open_sequence(f"{kitchen}@0-59/100"), open_sequence(f"{kitchen}@60-99/100")
     ours = Localizer(build_map(mapping, BuildConfig(nodes=NodeConfig(d_thresh=0.5))))
     sift = FeatureConfig(kind="sift", normalization="none")
-    peer = Localizer(build_map(mapping, BuildConfig(nodes=NodeConfig(d_thresh=2.0, lambda_rot=2.0), features=sift)), AS_WRITTEN)
+    peer = Localizer(
+        build_map(
+            mapping, BuildConfig(nodes=NodeConfig(d_thresh=2.0, lambda_rot=2.0), features=sift)
+        ),
+        AS_WRITTEN,
+    )
     times: dict[str, list[float]] = {}
     for i in range(-5, arguments.num_queries):
         frame = queries[i % len(queries)]
@@ -55,9 +65,15 @@ def main() -> None:
             for stage, ms in {PEER: peer_ms, **our_ms}.items():
                 times.setdefault(stage, []).append(ms)
     for stage, ms in times.items():
-        print(f"{stage:28s} median {np.median(ms):7.2f} ms  quartiles {np.percentile(ms, 25):.2f} to {np.percentile(ms, 75):.2f}")
+        print(
+            f"{stage:28s} median {np.median(ms):7.2f} ms  quartiles {np.percentile(ms, 25):.2f} to"
+            f" {np.percentile(ms, 75):.2f}"
+        )
     print(f"ratio, ours to the peer's: {np.median(times['total']) / np.median(times[PEER]):.2f}")
-    print(f"peak memory of this process, map building included: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
+    print(
+        "peak memory of this process, map building included:"
+        f" {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB"
+    )
 
 
 if __name__ == "__main__":

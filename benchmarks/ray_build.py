@@ -1,10 +1,13 @@
-"""Recordings built on a cluster of two nodes beside the same ones built one by one: the same bytes? how much time is lost?
+"""Recordings built on a cluster of two nodes beside the same ones built one by one: the same bytes?
+how much time is lost?
 
     python benchmarks/ray_build.py SEQ [SEQ ...] [--nodes 2]
 
-Both nodes are this machine, with one processor each. One by one is `topoloc build SEQ MAP`, a process each, with one thread. What is lost
-is the time on the clock over the processor time of the work divided by the processors, once of the commands one by one and once of the
-tasks. On a busy machine the clock counts others' work, too; so what processors idled and what Ray itself took stand beside it.
+Both nodes are this machine, with one processor each. One by one is `topoloc build SEQ MAP`, a
+process each, with one thread. What is lost is the time on the clock over the processor time of the
+work divided by the processors, once of the commands one by one and once of the tasks. On a busy
+machine the clock counts others' work, too; so what processors idled and what Ray itself took stand
+beside it.
 """
 
 from __future__ import annotations
@@ -33,7 +36,8 @@ TICKS = os.sysconf("SC_CLK_TCK")
 
 
 class Watch:
-    """Processor seconds of all processes below this one, also of those that end meanwhile, and seconds that processors idled."""
+    """Processor seconds of all processes below this one, also of those that end meanwhile, and
+    seconds that processors idled."""
 
     def __init__(self) -> None:
         self._cpu: dict[int, float] = {}
@@ -83,15 +87,32 @@ def one_by_one(recordings: list[str], names: list[str], folder: Path) -> tuple[f
     """Seconds on the clock and on a processor."""
     before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     for recording, name in zip(recordings, names, strict=True):
-        command = [sys.executable, "-m", "topoloc", "build", recording, str(folder / f"{name}.topo")]
+        command = [
+            sys.executable,
+            "-m",
+            "topoloc",
+            "build",
+            recording,
+            str(folder / f"{name}.topo"),
+        ]
         subprocess.run(command, check=True, env=os.environ | ONE_THREAD, stdout=subprocess.DEVNULL)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return time.perf_counter() - start, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return (
+        time.perf_counter() - start,
+        after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
+    )
 
 
-def on_cluster(recordings: list[str], names: list[str], atlas: str, num_nodes: int) -> tuple[list[Outcome], tuple[float, float, float]]:
+def on_cluster(
+    recordings: list[str], names: list[str], atlas: str, num_nodes: int
+) -> tuple[list[Outcome], tuple[float, float, float]]:
     jobs = [
-        TileJob(recording, name, name, MapMaking((recording,), PosesAsked(), BuildConfig(), SlamConfig()))
+        TileJob(
+            recording,
+            name,
+            name,
+            MapMaking((recording,), PosesAsked(), BuildConfig(), SlamConfig()),
+        )
         for recording, name in zip(recordings, names, strict=True)
     ]
     node = {"num_cpus": 1, "include_dashboard": False, "object_store_memory": 100_000_000}
@@ -109,7 +130,9 @@ def on_cluster(recordings: list[str], names: list[str], atlas: str, num_nodes: i
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("recordings", nargs="+")
     parser.add_argument("--nodes", type=int, default=2)
     args = parser.parse_args()
@@ -119,18 +142,29 @@ def main() -> None:
         where = str(Path(folder) / "atlas")
         outcomes, (wall_s, cpu_s, idle) = on_cluster(args.recordings, names, where, args.nodes)
         atlas = Atlas.open(where)
-        same = [atlas.map_path(atlas.tile(name)).read_bytes() == (Path(folder) / f"{name}.topo").read_bytes() for name in names]
+        same = [
+            atlas.map_path(atlas.tile(name)).read_bytes()
+            == (Path(folder) / f"{name}.topo").read_bytes()
+            for name in names
+        ]
     tasks_s = sum(outcome.cpu_seconds for outcome in outcomes)
     for one in outcomes:
-        print(f"  {one.recording}: {one.state} {one.reason or ''} {one.seconds:.1f} s, of a processor {one.cpu_seconds:.1f} s")
+        print(
+            f"  {one.recording}: {one.state} {one.reason or ''} {one.seconds:.1f} s, of a processor"
+            f" {one.cpu_seconds:.1f} s"
+        )
     print(f"one by one: {alone_s:.1f} s on the clock, {work_s:.1f} s of a processor")
     print(
-        f"{args.nodes} nodes: {wall_s:.1f} s on the clock; of a processor {tasks_s:.1f} s the tasks, {cpu_s - tasks_s:.1f} s Ray and starts"
+        f"{args.nodes} nodes: {wall_s:.1f} s on the clock; of a processor {tasks_s:.1f} s the"
+        f" tasks, {cpu_s - tasks_s:.1f} s Ray and starts"
     )
     for name, seconds in (("one by one", work_s), ("the tasks", tasks_s)):
         print(f"clock over work of {name} / {args.nodes}: {wall_s / (seconds / args.nodes):.3f}")
     others = 1 - (cpu_s + idle) / (wall_s * (os.cpu_count() or 1))
-    print(f"others took {100 * others:.0f} % of the processors; our time and idle time over work one by one: {(cpu_s + idle) / work_s:.3f}")
+    print(
+        f"others took {100 * others:.0f} % of the processors; our time and idle time over work one"
+        f" by one: {(cpu_s + idle) / work_s:.3f}"
+    )
     print(f"same bytes: {sum(same)} of {len(same)}")
 
 

@@ -1,4 +1,5 @@
-"""How long opening a recording and reading a frame of it take: minima over several runs, in milliseconds.
+"""How long opening a recording and reading a frame of it take: minima over several runs, in
+milliseconds.
 
 python benchmarks/read_recordings.py PATH [PATH ...]
 """

@@ -1,11 +1,12 @@
-"""The spine's figures on real recordings: accuracy, darkened queries, images from elsewhere, milliseconds, bytes.
+"""The spine's figures on real recordings: accuracy, darkened queries, images from elsewhere,
+milliseconds, bytes.
 
     python benchmarks/real_recordings.py [--shared ../shared] [--json FILE]
 
-Each map is built with the default settings but for D_thresh = 0.5 m indoors. `d` in the table is the share localized of
-the same queries darkened to a third, with a gradient across the picture, gamma 0.6 and sensor noise of 4 grey levels
-(`d2`: gamma 1 / 0.6, far darker). Images from elsewhere: the queries of the other places, and noise, lettering, shapes,
-repeated patterns.
+Each map is built with the default settings but for D_thresh = 0.5 m indoors. `d` in the table is
+the share localized of the same queries darkened to a third, with a gradient across the picture,
+gamma 0.6 and sensor noise of 4 grey levels (`d2`: gamma 1 / 0.6, far darker). Images from
+elsewhere: the queries of the other places, and noise, lettering, shapes, repeated patterns.
 """
 
 from __future__ import annotations
@@ -46,17 +47,41 @@ class Place:
 
 
 PLACES = (
-    Place("kitchen, 60 of 100 frames map", "seven_scenes/kitchen@0-59/100", "seven_scenes/kitchen@60-99/100", 0.5),
-    Place("kitchen, 30 of 50 frames map", "seven_scenes/kitchen@0-29/50", "seven_scenes/kitchen@30-49/50", 0.5),
-    Place("ZED lab, session 1 / 2", "zed_lab/session1", "zed_lab/session2@0:99", 0.5, "zed_lab/session1_from_session2.json"),
-    Place("KITTI street 1, even / odd", "kitti/sequences/street1@0::2", "kitti/sequences/street1@1::2"),
-    Place("KITTI street 2, even / odd", "kitti/sequences/street2@0::2", "kitti/sequences/street2@1::2"),
+    Place(
+        "kitchen, 60 of 100 frames map",
+        "seven_scenes/kitchen@0-59/100",
+        "seven_scenes/kitchen@60-99/100",
+        0.5,
+    ),
+    Place(
+        "kitchen, 30 of 50 frames map",
+        "seven_scenes/kitchen@0-29/50",
+        "seven_scenes/kitchen@30-49/50",
+        0.5,
+    ),
+    Place(
+        "ZED lab, session 1 / 2",
+        "zed_lab/session1",
+        "zed_lab/session2@0:99",
+        0.5,
+        "zed_lab/session1_from_session2.json",
+    ),
+    Place(
+        "KITTI street 1, even / odd", "kitti/sequences/street1@0::2", "kitti/sequences/street1@1::2"
+    ),
+    Place(
+        "KITTI street 2, even / odd", "kitti/sequences/street2@0::2", "kitti/sequences/street2@1::2"
+    ),
 )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--shared", type=Path, default=Path(os.environ.get("TOPOLOC_SHARED", "../shared")))
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--shared", type=Path, default=Path(os.environ.get("TOPOLOC_SHARED", "../shared"))
+    )
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     data = arguments.shared / "data"
@@ -68,19 +93,29 @@ def main() -> None:
         rows.append(row)
         print(json.dumps(row), flush=True)
     print("\n" + table(rows))
-    print(f"peak memory of this process: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB (it holds all queries)")
+    print(
+        "peak memory of this process:"
+        f" {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB (it holds all"
+        " queries)"
+    )
     if arguments.json:
         arguments.json.write_text(json.dumps(rows, indent=1))
 
 
-def measure(place: Place, data: Path, queries: dict[str, list[StereoFrame]], drawn: list[np.ndarray]) -> dict[str, Any]:
-    topomap = build_map(open_sequence(data / place.mapping), BuildConfig(nodes=NodeConfig(d_thresh=place.d_thresh)))
+def measure(
+    place: Place, data: Path, queries: dict[str, list[StereoFrame]], drawn: list[np.ndarray]
+) -> dict[str, Any]:
+    topomap = build_map(
+        open_sequence(data / place.mapping), BuildConfig(nodes=NodeConfig(d_thresh=place.d_thresh))
+    )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "place.topo"
         topomap.save(path)
         num_bytes = path.stat().st_size
         localizer = Localizer(TopoMetricMap.load(path))
-        world_from_truth = read_rigid(data / place.map_from_truth) if place.map_from_truth else Rigid3.identity()
+        world_from_truth = (
+            read_rigid(data / place.map_from_truth) if place.map_from_truth else Rigid3.identity()
+        )
         frames = queries[place.name]
         for frame in frames[:5]:  # warm-up
             ask(localizer, frame)
@@ -91,12 +126,24 @@ def measure(place: Place, data: Path, queries: dict[str, list[StereoFrame]], dra
             if result.localized and frame.world_from_cam is not None
         ]
         dark = {
-            gamma: np.mean([ask(localizer, frame, darkened(frame.image, gamma, i)).localized for i, frame in enumerate(frames)])
+            gamma: np.mean(
+                [
+                    ask(localizer, frame, darkened(frame.image, gamma, i)).localized
+                    for i, frame in enumerate(frames)
+                ]
+            )
             for gamma in (0.6, 1 / 0.6)
         }
-        others = [frame for name, other in queries.items() if name[:5] != place.name[:5] for frame in other]
+        others = [
+            frame
+            for name, other in queries.items()
+            if name[:5] != place.name[:5]
+            for frame in other
+        ]
         camera = Camera.pinhole(640, 480, 525.0, 525.0, 319.5, 239.5)
-        elsewhere = [ask(localizer, frame).localized for frame in others] + [localizer.localize(image, camera).localized for image in drawn]
+        elsewhere = [ask(localizer, frame).localized for frame in others] + [
+            localizer.localize(image, camera).localized for image in drawn
+        ]
     stages = results[0].times_ms if results else {}
     return {
         "place": place.name,
@@ -104,13 +151,18 @@ def measure(place: Place, data: Path, queries: dict[str, list[StereoFrame]], dra
         "kB_per_node": round(num_bytes / len(topomap.summaries) / 1e3, 1),
         "queries": len(frames),
         "localized_percent": round(100 * float(np.mean([r.localized for r in results])), 1),
-        "median_cm": round(100 * float(np.median([np.linalg.norm(e.translation) for e in errors])), 2),
+        "median_cm": round(
+            100 * float(np.median([np.linalg.norm(e.translation) for e in errors])), 2
+        ),
         "median_deg": round(float(np.rad2deg(np.median([e.angle() for e in errors]))), 3),
         "dark_percent": round(100 * float(dark[0.6]), 1),
         "darker_percent": round(100 * float(dark[1 / 0.6]), 1),
         "elsewhere": len(elsewhere),
         "accepted": int(np.sum(elsewhere)),
-        "median_ms": {stage: round(float(np.median([r.times_ms.get(stage, 0.0) for r in results])), 2) for stage in stages},
+        "median_ms": {
+            stage: round(float(np.median([r.times_ms.get(stage, 0.0) for r in results])), 2)
+            for stage in stages
+        },
     }
 
 
@@ -121,14 +173,18 @@ def ask(localizer: Localizer, frame: StereoFrame, image: np.ndarray | None = Non
 
 def table(rows: list[dict[str, Any]]) -> str:
     lines = [
-        "| recording | nodes | kB a node | localized | median error | darkened: localized | from elsewhere: accepted | ms a query |",
+        (
+            "| recording | nodes | kB a node | localized | median error | darkened: localized |"
+            " from elsewhere: accepted | ms a query |"
+        ),
         "|---|---|---|---|---|---|---|---|",
     ]
     for r in rows:
         lines.append(
-            f"| {r['place']} | {r['nodes']} | {r['kB_per_node']:.0f} | {r['localized_percent']:g} % of {r['queries']} |"
-            f" {r['median_cm']:.2f} cm, {r['median_deg']:.3f} deg | {r['dark_percent']:g} % ({r['darker_percent']:g} %) |"
-            f" {r['accepted']} of {r['elsewhere']} | {r['median_ms']['total']:.0f} |"
+            f"| {r['place']} | {r['nodes']} | {r['kB_per_node']:.0f} | {r['localized_percent']:g} %"
+            f" of {r['queries']} | {r['median_cm']:.2f} cm, {r['median_deg']:.3f} deg |"
+            f" {r['dark_percent']:g} % ({r['darker_percent']:g} %) | {r['accepted']} of"
+            f" {r['elsewhere']} | {r['median_ms']['total']:.0f} |"
         )
     return "\n".join(lines)
 

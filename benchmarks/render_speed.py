@@ -1,7 +1,9 @@
-"""Seconds a picture of every world, and seconds until its light is known: python benchmarks/render_speed.py [--worlds lab] [--fresh]
+"""Seconds a picture of every world, and seconds until its light is known: python
+benchmarks/render_speed.py [--worlds lab] [--fresh]
 
-Light is traced once for a world, a condition and a quality, and kept in the cache; with --fresh it is traced here, into a cache of its
-own. Without LLVM nothing is known beforehand, and each picture traces its own light: --variants scalar_rgb shows what that costs.
+Light is traced once for a world, a condition and a quality, and kept in the cache; with --fresh it
+is traced here, into a cache of its own. Without LLVM nothing is known beforehand, and each picture
+traces its own light: --variants scalar_rgb shows what that costs.
 """
 
 from __future__ import annotations
@@ -25,7 +27,9 @@ QUALITIES = {"default": RenderConfig(), "draft": RenderConfig.draft()}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--worlds", nargs="*", default=list(WORLDS))
     parser.add_argument("--conditions", nargs="*", default=["day"])
     parser.add_argument("--qualities", nargs="*", default=list(QUALITIES), choices=QUALITIES)
@@ -35,8 +39,13 @@ def main() -> None:
     parser.add_argument("--fresh", action="store_true")
     args = parser.parse_args()
     width, height = args.size
-    camera = Camera.pinhole(width, height, 0.59 * width, 0.59 * width, (width - 1) / 2, (height - 1) / 2)
-    print(f"{width}x{height}, {os.cpu_count()} cores; medians of {args.frames} pictures, by the clock and by the processor")
+    camera = Camera.pinhole(
+        width, height, 0.59 * width, 0.59 * width, (width - 1) / 2, (height - 1) / 2
+    )
+    print(
+        f"{width}x{height}, {os.cpu_count()} cores; medians of {args.frames} pictures, by the clock"
+        " and by the processor"
+    )
     with tempfile.TemporaryDirectory() as folder:
         if args.fresh:
             os.environ["XDG_CACHE_HOME"] = folder
@@ -48,19 +57,29 @@ def main() -> None:
                         measure(world, condition, quality, camera, variant, args.frames)
 
 
-def measure(world: World, condition: str, quality: str, camera: Camera, variant: str, num_frames: int) -> None:
+def measure(
+    world: World, condition: str, quality: str, camera: Camera, variant: str, num_frames: int
+) -> None:
     started = time.perf_counter()
     scene = world.build(0, find_condition(condition))
     renderer = Renderer(scene, QUALITIES[quality], world.viewpoints())
     ready = time.perf_counter() - started
     wall, processor = [], []
-    for number, world_from_cam in enumerate(along_the_way(world, num_frames + 1)):  # the first compiles
+    for number, world_from_cam in enumerate(
+        along_the_way(world, num_frames + 1)
+    ):  # the first compiles
         clock, cpu = time.perf_counter(), time.process_time()
         renderer.render(camera, world_from_cam, number)
         wall.append(time.perf_counter() - clock)
         processor.append(time.process_time() - cpu)
-    seconds = f"{statistics.median(wall[1:]):6.2f} s  {statistics.median(processor[1:]):6.2f} s of a core"
-    print(f"{variant:12s} {world.name:9s} {condition:8s} {quality:8s} {seconds}  ready after {ready:6.1f} s", flush=True)
+    seconds = (
+        f"{statistics.median(wall[1:]):6.2f} s  {statistics.median(processor[1:]):6.2f} s of a core"
+    )
+    print(
+        f"{variant:12s} {world.name:9s} {condition:8s} {quality:8s} {seconds}  ready after"
+        f" {ready:6.1f} s",
+        flush=True,
+    )
 
 
 def along_the_way(world: World, num: int) -> list[Rigid3]:

@@ -1,10 +1,12 @@
-"""`topoloc serve` under load, beside the same localizer called in this process, on the same pictures in the same run.
+"""`topoloc serve` under load, beside the same localizer called in this process, on the same
+pictures in the same run.
 
     python benchmarks/service.py MAP QUERIES [--requests 2000] [--clients 4] [--maps 20]
 
-Prints one line a question: pictures a second by one thread and by as many threads as there are processors here, then by the service;
-times of answers at 80 % of that; with 30 % pictures of elsewhere; memory and statuses over many requests of which a tenth is garbage;
-memory with many maps under a budget, and whether their answers are those of this process to the byte.
+Prints one line a question: pictures a second by one thread and by as many threads as there are
+processors here, then by the service; times of answers at 80 % of that; with 30 % pictures of
+elsewhere; memory and statuses over many requests of which a tenth is garbage; memory with many maps
+under a budget, and whether their answers are those of this process to the byte.
 """
 
 from __future__ import annotations
@@ -55,7 +57,9 @@ def service(*args: object) -> Iterator[Service]:
     command = [sys.executable, "-m", "topoloc", "serve", *map(str, args), "--port", "0"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
-        url = next(found[1] for line in process.stderr if (found := re.search(r"serves on (\S+)", line)))
+        url = next(
+            found[1] for line in process.stderr if (found := re.search(r"serves on (\S+)", line))
+        )
         threading.Thread(target=process.stderr.read, daemon=True).start()
         address = urlsplit(url)
         try:
@@ -68,18 +72,32 @@ class Client:
     """One connection that is kept."""
 
     def __init__(self, of: Service, camera: Camera) -> None:
-        self._http, self._camera = http.client.HTTPConnection(of.host, of.port, timeout=120), quote(json.dumps(camera.to_json()))
+        self._http, self._camera = (
+            http.client.HTTPConnection(of.host, of.port, timeout=120),
+            quote(json.dumps(camera.to_json())),
+        )
 
     def ask(self, name: str, jpeg: bytes) -> tuple[int, bytes]:
-        self._http.request("POST", f"/v1/maps/{name}/localize?camera={self._camera}&name=q", jpeg, {"Content-Type": "image/jpeg"})
+        self._http.request(
+            "POST",
+            f"/v1/maps/{name}/localize?camera={self._camera}&name=q",
+            jpeg,
+            {"Content-Type": "image/jpeg"},
+        )
         response = self._http.getresponse()
         return response.status, response.read()
 
 
 def load(
-    of: Service, name: str, camera: Camera, pictures: Sequence[bytes], num_clients: int, rate: float | None = None
+    of: Service,
+    name: str,
+    camera: Camera,
+    pictures: Sequence[bytes],
+    num_clients: int,
+    rate: float | None = None,
 ) -> tuple[float, list[float], Counter]:
-    """Pictures a second, seconds of each answer, and how often each status came; with a rate (1/s) requests come as the clock says."""
+    """Pictures a second, seconds of each answer, and how often each status came; with a rate (1/s)
+    requests come as the clock says."""
     seconds, statuses, lock, start = list[float](), Counter(), threading.Lock(), time.perf_counter()
     waiting = iter(enumerate(pictures))
 
@@ -103,7 +121,9 @@ def load(
     return len(pictures) / (time.perf_counter() - start), seconds, statuses
 
 
-def in_process(localizer: Localizer, camera: Camera, pictures: Sequence[bytes], num_threads: int) -> float:
+def in_process(
+    localizer: Localizer, camera: Camera, pictures: Sequence[bytes], num_threads: int
+) -> float:
     """Pictures a second, decoded and localized by threads of this process."""
 
     def ask(jpeg: bytes) -> None:
@@ -129,7 +149,9 @@ def garbage(rng: random.Random, picture: bytes) -> bytes:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("map", type=Path)
     parser.add_argument("queries")
     parser.add_argument("--requests", type=int, default=2000)
@@ -147,7 +169,9 @@ def main() -> None:
         many_maps(args, Localizer(topomap), camera, clear)
 
 
-def speed(args: argparse.Namespace, localizer: Localizer, camera: Camera, clear: list[bytes]) -> None:
+def speed(
+    args: argparse.Namespace, localizer: Localizer, camera: Camera, clear: list[bytes]
+) -> None:
     name, num = args.map.stem, max(len(clear), args.requests // 10)
     many = [clear[i % len(clear)] for i in range(num)]
     in_process(localizer, camera, clear, 1)
@@ -160,9 +184,17 @@ def speed(args: argparse.Namespace, localizer: Localizer, camera: Camera, clear:
         print(f"service: {rate:.1f}/s, {args.clients} clients")
         _, seconds, statuses = load(of, name, camera, many, 16, 0.8 * rate)
         median, p99 = 1e3 * np.percentile(seconds, [50, 99])
-        print(f"at 80 %: median {median:.0f} ms, p99 {p99:.0f} ms = {p99 / median:.1f} x; {dict(statuses)}")
+        print(
+            f"at 80 %: median {median:.0f} ms, p99 {p99:.0f} ms = {p99 / median:.1f} x;"
+            f" {dict(statuses)}"
+        )
         elsewhere = jpeg_of(
-            cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (camera.height, camera.width), np.uint8), (0, 0), 2.5), 90
+            cv2.GaussianBlur(
+                np.random.default_rng(0).integers(0, 255, (camera.height, camera.width), np.uint8),
+                (0, 0),
+                2.5,
+            ),
+            90,
         )
         mixed = [elsewhere if i % 10 < 3 else picture for i, picture in enumerate(many)]
         print(f"30 % of elsewhere: {load(of, name, camera, mixed, args.clients)[0]:.1f}/s")
@@ -171,16 +203,31 @@ def speed(args: argparse.Namespace, localizer: Localizer, camera: Camera, clear:
 
 def under_garbage(args: argparse.Namespace, camera: Camera, clear: list[bytes]) -> None:
     rng, name = random.Random(0), args.map.stem
-    requests = [garbage(rng, clear[0]) if i % 10 == 3 else clear[i % len(clear)] for i in range(args.requests)]
+    requests = [
+        garbage(rng, clear[0]) if i % 10 == 3 else clear[i % len(clear)]
+        for i in range(args.requests)
+    ]
     with service(args.map) as of:
-        _, _, before = load(of, name, camera, requests[: min(1000, args.requests // 2)], args.clients)
+        _, _, before = load(
+            of, name, camera, requests[: min(1000, args.requests // 2)], args.clients
+        )
         early = of.rss_mb()
-        _, _, after = load(of, name, camera, requests[min(1000, args.requests // 2) :], args.clients)
-        print(f"{args.requests} requests, a tenth garbage: {dict(before + after)}; {early:.0f} MB, then {of.rss_mb():.0f} MB")
+        _, _, after = load(
+            of, name, camera, requests[min(1000, args.requests // 2) :], args.clients
+        )
+        print(
+            f"{args.requests} requests, a tenth garbage: {dict(before + after)}; {early:.0f} MB,"
+            f" then {of.rss_mb():.0f} MB"
+        )
 
 
-def many_maps(args: argparse.Namespace, localizer: Localizer, camera: Camera, clear: list[bytes]) -> None:
-    own = [localizer.localize(read_image(PictureBytes("q", jpeg)), camera).to_json("q") for jpeg in clear[:6]]
+def many_maps(
+    args: argparse.Namespace, localizer: Localizer, camera: Camera, clear: list[bytes]
+) -> None:
+    own = [
+        localizer.localize(read_image(PictureBytes("q", jpeg)), camera).to_json("q")
+        for jpeg in clear[:6]
+    ]
     with tempfile.TemporaryDirectory() as folder:
         for number in range(args.maps):
             shutil.copy(args.map, Path(folder) / f"m{number}.topo")
@@ -189,9 +236,12 @@ def many_maps(args: argparse.Namespace, localizer: Localizer, camera: Camera, cl
             for _ in range(2):
                 for number in range(args.maps):
                     answers = [json.loads(client.ask(f"m{number}", jpeg)[1]) for jpeg in clear[:6]]
-                    same += sum(_timeless(a) == _timeless(b) for a, b in zip(answers, own, strict=True))
+                    same += sum(
+                        _timeless(a) == _timeless(b) for a, b in zip(answers, own, strict=True)
+                    )
             print(
-                f"{args.maps} maps under 512 MB: {of.rss_mb('VmHWM'):.0f} MB at most; {same} of {12 * args.maps} answers are the same bytes"
+                f"{args.maps} maps under 512 MB: {of.rss_mb('VmHWM'):.0f} MB at most; {same} of"
+                f" {12 * args.maps} answers are the same bytes"
             )
 
 

@@ -1,11 +1,14 @@
-"""Does it help to make little of what sets the place vectors of several lights apart? Recall of the coarse search before and after.
+"""Does it help to make little of what sets the place vectors of several lights apart? Recall of the
+coarse search before and after.
 
     python benchmarks/session_light.py [--kinds surf topoloc-net]
 
-As maps grow: vocabulary and whitening are learnt from the first walk, the second one joins. Of `gardenspoint` (one path by day, beside it
-by day, and by night; pictures of equal numbers show the same place, a hit is within two) a night that covers the whole path, a quarter of
-it, or one half, where the other half is asked. Of the demo's lab (rendered) a day's lap and half of a night's pictures, the rest asked; a
-hit is within 30 cm and 20 degrees. Walks by one light are left as they are.
+As maps grow: vocabulary and whitening are learnt from the first walk, the second one joins. Of
+`gardenspoint` (one path by day, beside it by day, and by night; pictures of equal numbers show the
+same place, a hit is within two) a night that covers the whole path, a quarter of it, or one half,
+where the other half is asked. Of the demo's lab (rendered) a day's lap and half of a night's
+pictures, the rest asked; a hit is within 30 cm and 20 degrees. Walks by one light are left as they
+are.
 """
 
 from __future__ import annotations
@@ -39,7 +42,8 @@ _FIRST = (1, 4, 16)
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A picture as the coarse search sees it, with what says where it was taken: its number, or a pose."""
+    """A picture as the coarse search sees it, with what says where it was taken: its number, or a
+    pose."""
 
     features: Features
     size: tuple[int, int]
@@ -57,9 +61,14 @@ def walk(name: str, kind: str) -> list[View]:
     """Of a folder of the shared recordings, or of the demo's lab."""
     if name.startswith("lab/"):
         sequence = open_sequence(LAB / name.removeprefix("lab/"))
-        pictures = [(sequence[k].image, pose) for k, pose in enumerate(sequence.poses) if pose is not None]
+        pictures = [
+            (sequence[k].image, pose) for k, pose in enumerate(sequence.poses) if pose is not None
+        ]
     else:
-        pictures = [(read_image(path), k) for k, path in enumerate(sorted((SHARED / "data" / name).glob("*.jpg")))]
+        pictures = [
+            (read_image(path), k)
+            for k, path in enumerate(sorted((SHARED / "data" / name).glob("*.jpg")))
+        ]
     return [_view(picture, place, kind) for picture, place in pictures]
 
 
@@ -74,8 +83,14 @@ def _view(picture: np.ndarray, place: int | Rigid3, kind: str) -> View:
 def is_hit(a: View, b: View) -> bool:
     if isinstance(a.place, Rigid3) and isinstance(b.place, Rigid3):
         apart = a.place.inverse() @ b.place
-        return bool(np.linalg.norm(apart.translation) <= _NEAR_M and np.degrees(apart.angle()) <= _NEAR_DEG)
-    return isinstance(a.place, int) and isinstance(b.place, int) and abs(a.place - b.place) <= _NEAR_FRAMES
+        return bool(
+            np.linalg.norm(apart.translation) <= _NEAR_M and np.degrees(apart.angle()) <= _NEAR_DEG
+        )
+    return (
+        isinstance(a.place, int)
+        and isinstance(b.place, int)
+        and abs(a.place - b.place) <= _NEAR_FRAMES
+    )
 
 
 def judge(title: str, sessions: Sequence[Sequence[View]], asked: Sequence[View], kind: str) -> None:
@@ -83,14 +98,25 @@ def judge(title: str, sessions: Sequence[Sequence[View]], asked: Sequence[View],
     found = [placed(view.features, *view.size, config) for view in first]
     words = learn_words(np.concatenate(found), config)
     vlads = np.stack([vlad(descriptors, words) for descriptors in found])
-    model = SurfVlad.fit(words, vlads, np.arange(len(first)), config, [view.features.cells for view in first])
+    model = SurfVlad.fit(
+        words, vlads, np.arange(len(first)), config, [view.features.cells for view in first]
+    )
     views = [view for session in sessions for view in session]
     added = views[len(first) :]
-    model = model.with_images([(view.features, *view.size) for view in added], np.arange(len(first), len(views)))
+    model = model.with_images(
+        [(view.features, *view.size) for view in added], np.arange(len(first), len(views))
+    )
     lights = [mean_light([view.light for view in session]) for session in sessions]
-    of = light_groups([Session(k, str(k), light=light) for k, light in enumerate(lights)], {k: len(s) for k, s in enumerate(sessions)})
+    of = light_groups(
+        [Session(k, str(k), light=light) for k, light in enumerate(lights)],
+        {k: len(s) for k, s in enumerate(sessions)},
+    )
     groups = np.concatenate([np.full(len(session), of[k]) for k, session in enumerate(sessions)])
-    apart = max(light_distance(lights[0], light) for light in lights[1:] if lights[0] is not None and light is not None)
+    apart = max(
+        light_distance(lights[0], light)
+        for light in lights[1:]
+        if lights[0] is not None and light is not None
+    )
     right = np.array([[is_hit(view, other) for other in views] for view in asked])
     rows = np.flatnonzero(right.any(axis=1))
     changed = model.with_less_between(groups) if groups.any() else model
@@ -103,7 +129,9 @@ def _recall(model: SurfVlad, asked: Sequence[View], right: np.ndarray, rows: np.
     for k in rows:
         view = asked[k]
         blank = np.zeros((view.size[1], view.size[0]), np.uint8)
-        ranked.append([right[k, score.node_id] for score in model.rank(blank, view.features, max(_FIRST))])
+        ranked.append(
+            [right[k, score.node_id] for score in model.rank(blank, view.features, max(_FIRST))]
+        )
     hits = np.array(ranked)
     return "  ".join(f"@{n} {int(hits[:, :n].any(axis=1).sum()):3d}" for n in _FIRST)
 
@@ -111,7 +139,9 @@ def _recall(model: SurfVlad, asked: Sequence[View], right: np.ndarray, rows: np.
 def main() -> None:
     args = tyro.cli(Args, description=__doc__)
     for kind in args.kinds:
-        left, right, night = (walk(f"gardenspoint/{name}", kind) for name in ("day_left", "day_right", "night_right"))
+        left, right, night = (
+            walk(f"gardenspoint/{name}", kind) for name in ("day_left", "day_right", "night_right")
+        )
         judge("day and night, day asked", [left, night], right, kind)
         judge("day and a quarter night, day asked", [left, night[::4]], right, kind)
         judge("day and a quarter night, night asked", [left, night[::4]], night[2::4], kind)

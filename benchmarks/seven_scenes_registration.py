@@ -1,8 +1,10 @@
-"""Which transform between the Kinect's cameras fits 7-Scenes: how strong are the colour edges where depth edges fall?
+"""Which transform between the Kinect's cameras fits 7-Scenes: how strong are the colour edges where
+depth edges fall?
 
     python benchmarks/seven_scenes_registration.py PATH_OF_A_RUN
 
-A row is the mean gradient of the colour picture, over that of the whole picture, at the near side of every depth jump.
+A row is the mean gradient of the colour picture, over that of the whole picture, at the near side
+of every depth jump.
 """
 
 from __future__ import annotations
@@ -23,7 +25,8 @@ BORDER_PX = 4
 
 
 def edges(frame: StereoFrame) -> tuple[np.ndarray, np.ndarray]:
-    """Gradient strength of the colour picture, and the points (depth camera, metres) on the near side of depth jumps."""
+    """Gradient strength of the colour picture, and the points (depth camera, metres) on the near
+    side of depth jumps."""
     grey = cv2.GaussianBlur(grey_image(frame.image), (0, 0), 1.0)
     strength = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
     depth = frame.depth.depth
@@ -34,15 +37,31 @@ def edges(frame: StereoFrame) -> tuple[np.ndarray, np.ndarray]:
     inner[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX] = True
     v, u = np.nonzero(near & inner)
     rays = DEPTH_CAMERA.normalized_from_img(np.column_stack([u, v]).astype(np.float64))
-    return strength / strength.mean(), np.column_stack([rays, np.ones(len(rays))]) * depth[v, u, None].astype(np.float64)
+    return strength / strength.mean(), np.column_stack([rays, np.ones(len(rays))]) * depth[
+        v, u, None
+    ].astype(np.float64)
 
 
-def score(found: list[tuple[np.ndarray, np.ndarray]], cam_from_depth: Rigid3, focal: float, cx: float, cy: float) -> float:
+def score(
+    found: list[tuple[np.ndarray, np.ndarray]],
+    cam_from_depth: Rigid3,
+    focal: float,
+    cx: float,
+    cy: float,
+) -> float:
     values = []
     for strength, points_depth in found:
         points_cam = cam_from_depth.apply(points_depth)
         pixels = (points_cam[:, :2] / points_cam[:, 2:] * focal + [cx, cy]).astype(np.float32)
-        values.append(cv2.remap(strength, pixels[None, :, 0], pixels[None, :, 1], cv2.INTER_LINEAR, borderValue=np.nan)[0])
+        values.append(
+            cv2.remap(
+                strength,
+                pixels[None, :, 0],
+                pixels[None, :, 1],
+                cv2.INTER_LINEAR,
+                borderValue=np.nan,
+            )[0]
+        )
     return float(np.nanmean(np.concatenate(values)))
 
 
@@ -58,7 +77,10 @@ def main(path: str) -> None:
         ("its rotation alone", Rigid3(COLOUR_FROM_DEPTH.rotation, np.zeros(3)), focal, cx, cy),
         ("none, f of colour", Rigid3.identity(), focal, cx, cy),
         ("none, f of depth (as registered)", Rigid3.identity(), DEPTH_CAMERA.fx, cx, cy),
-        *((f"as used, f {other:g}", COLOUR_FROM_DEPTH, other, cx, cy) for other in (515.0, 520.0, 530.0, 535.0)),
+        *(
+            (f"as used, f {other:g}", COLOUR_FROM_DEPTH, other, cx, cy)
+            for other in (515.0, 520.0, 530.0, 535.0)
+        ),
         ("as used, centre +4, +4", COLOUR_FROM_DEPTH, focal, cx + 4.0, cy + 4.0),
         ("as used, centre -4, -4", COLOUR_FROM_DEPTH, focal, cx - 4.0, cy - 4.0),
     ]

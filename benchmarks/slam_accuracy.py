@@ -1,11 +1,14 @@
-"""SLAM on recordings with truth: error, drift, loops, frames a second; what is asked beside what is measured.
+"""SLAM on recordings with truth: error, drift, loops, frames a second; what is asked beside what is
+measured.
 
-    python benchmarks/slam_accuracy.py [--shared ../shared] [--corridor PATH] [--street PATH] [--gaps] [--json FILE]
+    python benchmarks/slam_accuracy.py [--shared ../shared] [--corridor PATH] [--street PATH]
+    [--gaps] [--json FILE]
 
-The rendered recordings are made by ``topoloc simulate corridor PATH --laps 2`` and ``topoloc simulate street PATH``; what is
-missing is skipped. With ``--gaps`` recordings follow from which frames were taken out; their ATE is to be compared with that of the
-whole. Frames a second are of the whole (reading, loops, optimisation) on the clock, and of the processor time with two cores at work,
-which other programs on the machine disturb less.
+The rendered recordings are made by ``topoloc simulate corridor PATH --laps 2`` and ``topoloc
+simulate street PATH``; what is missing is skipped. With ``--gaps`` recordings follow from which
+frames were taken out; their ATE is to be compared with that of the whole. Frames a second are of
+the whole (reading, loops, optimisation) on the clock, and of the processor time with two cores at
+work, which other programs on the machine disturb less.
 """
 
 from __future__ import annotations
@@ -21,7 +24,11 @@ from typing import Any
 import numpy as np
 
 from topoloc.errors import RecordingError
-from topoloc.geometry.alignment import absolute_trajectory_errors, align_trajectories, relative_drift
+from topoloc.geometry.alignment import (
+    absolute_trajectory_errors,
+    align_trajectories,
+    relative_drift,
+)
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.open import open_sequence
 from topoloc.slam.slam import run_slam
@@ -37,8 +44,16 @@ class Recording:
 
 
 RECORDINGS = (
-    Recording("KITTI street 1", "kitti/sequences/street1", "drift 0.8 %, 0.004 deg/m; ATE 0.35 m; 12 frames/s"),
-    Recording("KITTI street 2", "kitti/sequences/street2", "drift 0.8 %, 0.004 deg/m; ATE 0.35 m; 12 frames/s"),
+    Recording(
+        "KITTI street 1",
+        "kitti/sequences/street1",
+        "drift 0.8 %, 0.004 deg/m; ATE 0.35 m; 12 frames/s",
+    ),
+    Recording(
+        "KITTI street 2",
+        "kitti/sequences/street2",
+        "drift 0.8 %, 0.004 deg/m; ATE 0.35 m; 12 frames/s",
+    ),
     Recording("ZED session 1", "zed_lab/session1", "ATE 1.5 cm; 20 frames/s"),
     Recording("ZED session 2", "zed_lab/session2@0:99", "ATE 1.5 cm; 20 frames/s"),
     Recording("EuRoC part", "euroc/v1_01_part", "all 50 pairs; right residual 0.7 px"),
@@ -55,28 +70,55 @@ GAPS = (
 
 def with_gaps(name: str, path: str, num_out: int, period: int) -> Recording:
     """The recording without the last `num_out` of every `period` frames."""
-    kept = ",".join(f"{start}:{start + period - num_out}" for start in range(0, len(open_sequence(path)), period))
-    return Recording(f"{name}, {num_out} of every {period} frames out", f"{path}@{kept}", "95 % of the frames; ATE 1.3 x the whole")
+    kept = ",".join(
+        f"{start}:{start + period - num_out}"
+        for start in range(0, len(open_sequence(path)), period)
+    )
+    return Recording(
+        f"{name}, {num_out} of every {period} frames out",
+        f"{path}@{kept}",
+        "95 % of the frames; ATE 1.3 x the whole",
+    )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--shared", type=Path, default=Path(os.environ.get("TOPOLOC_SHARED", "../shared")))
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--shared", type=Path, default=Path(os.environ.get("TOPOLOC_SHARED", "../shared"))
+    )
     parser.add_argument("--corridor", help="rendered, two laps")
     parser.add_argument("--street", help="rendered, one lap")
-    parser.add_argument("--gaps", action="store_true", help="also recordings from which frames were taken out")
+    parser.add_argument(
+        "--gaps", action="store_true", help="also recordings from which frames were taken out"
+    )
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
-    recordings = [Recording(r.name, str(arguments.shared / "data" / r.path), r.asked) for r in RECORDINGS]
+    recordings = [
+        Recording(r.name, str(arguments.shared / "data" / r.path), r.asked) for r in RECORDINGS
+    ]
     if arguments.corridor:
-        recordings.append(Recording("rendered corridor", arguments.corridor, "ATE 5 cm, between the laps 3 cm; 20 frames/s"))
+        recordings.append(
+            Recording(
+                "rendered corridor",
+                arguments.corridor,
+                "ATE 5 cm, between the laps 3 cm; 20 frames/s",
+            )
+        )
     if arguments.street:
         recordings.append(Recording("rendered street", arguments.street, "ATE 1.5 m, drift 0.7 %"))
     if arguments.gaps:
-        recordings += [with_gaps(name, str(arguments.shared / "data" / path), *out) for name, path, *out in GAPS]
+        recordings += [
+            with_gaps(name, str(arguments.shared / "data" / path), *out)
+            for name, path, *out in GAPS
+        ]
     run_slam(open_sequence(f"{recordings[0].path}@0:6"))  # compiles
     rows = []
-    print("| recording | asked | tracked | key frames | loops | ATE | between laps | drift | right residual | frames/s |")
+    print(
+        "| recording | asked | tracked | key frames | loops | ATE | between laps | drift | right"
+        " residual | frames/s |"
+    )
     print("|---|---|---|---|---|---|---|---|---|---|")
     for recording in recordings:
         try:
@@ -107,19 +149,27 @@ def measure(recording: Recording) -> dict[str, Any]:
     }
     if len(result.right_residuals_px):
         row["right_residual_px"] = float(np.nanmedian(result.right_residuals_px))
-    both = [(t, p) for t, p in zip(sequence.poses, result.poses[0], strict=True) if t is not None and p is not None]
+    both = [
+        (t, p)
+        for t, p in zip(sequence.poses, result.poses[0], strict=True)
+        if t is not None and p is not None
+    ]
     if both:
         truth, found = [t for t, _ in both], [p for _, p in both]
         row["ate_m"] = float(np.sqrt(np.mean(absolute_trajectory_errors(truth, found) ** 2)))
         row["between_laps_m"] = gap_between_laps(truth, found)
         drift = relative_drift(truth, found)
         if drift:
-            row["drift_percent"], row["drift_deg_per_m"] = 100 * drift.translation, float(np.rad2deg(drift.rotation))
+            row["drift_percent"], row["drift_deg_per_m"] = (
+                100 * drift.translation,
+                float(np.rad2deg(drift.rotation)),
+            )
     return row
 
 
 def gap_between_laps(truth: list[Rigid3], found: list[Rigid3]) -> float | None:
-    """Median over frames of a second lap: error of where they are relative to the nearest frame of the first (metres)."""
+    """Median over frames of a second lap: error of where they are relative to the nearest frame of
+    the first (metres)."""
     positions = np.array([pose.translation for pose in truth])
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
     aligned = align_trajectories(truth, found)
@@ -139,11 +189,15 @@ def table_line(row: dict[str, Any]) -> str:
         value = row.get(key)
         return "" if value is None else f"{scale * value:.{digits}f} {unit}"
 
-    drift = ", ".join(filter(None, [shown("drift_percent", 1, "%"), shown("drift_deg_per_m", 1, "deg/m", 4)]))
+    drift = ", ".join(
+        filter(None, [shown("drift_percent", 1, "%"), shown("drift_deg_per_m", 1, "deg/m", 4)])
+    )
     speed = f"{row['frames_per_second']:.0f} ({row['frames_per_second_of_processor']:.0f})"
     return (
-        f"| {row['recording']} | {row['asked']} | {row['tracked']} of {row['frames']} | {row['keyframes']} | {row['loops']} |"
-        f" {shown('ate_m', 100, 'cm')} | {shown('between_laps_m', 100, 'cm')} | {drift} | {shown('right_residual_px', 1, 'px')} | {speed} |"
+        f"| {row['recording']} | {row['asked']} | {row['tracked']} of {row['frames']} |"
+        f" {row['keyframes']} | {row['loops']} | {shown('ate_m', 100, 'cm')} |"
+        f" {shown('between_laps_m', 100, 'cm')} | {drift} | {shown('right_residual_px', 1, 'px')} |"
+        f" {speed} |"
     )
 
 

@@ -2,23 +2,27 @@
 
     python benchmarks/streams.py [--shared ../shared] [--stream NAME MAP_SEQ STREAM_SEQ ...]
 
-Maps one recording (or part of one) and streams another: 7-Scenes' kitchen, one frame in four mapped and the others streamed; the
-ZED camera's second session in a map of its first; the demo's lab by day, pictures half a second apart. Further pairs are
-named by `--stream`.
-Errors are those of the smoothed pose against the recording's truth, "inside" counts those within the 95 % ellipsoid of its covariance.
-Jitter is the root mean square of the error of the step from frame to frame, for the stream and for the same pictures localized one by one.
-Milliseconds are processor time of one process, which a busy machine does not change.
+Maps one recording (or part of one) and streams another: 7-Scenes' kitchen, one frame in four mapped
+and the others streamed; the ZED camera's second session in a map of its first; the demo's lab by
+day, pictures half a second apart. Further pairs are named by `--stream`. Errors are those of the
+smoothed pose against the recording's truth, "inside" counts those within the 95 % ellipsoid of its
+covariance. Jitter is the root mean square of the error of the step from frame to frame, for the
+stream and for the same pictures localized one by one. Milliseconds are processor time of one
+process, which a busy machine does not change.
 
-Where the truth trembles itself (7-Scenes, ZED), a jitter measured against it is the truth's as well. So where the streamed
-recording has a second view or depth, which the tracker does not get, SLAM says what the steps were, from corners and depths of its own:
+Where the truth trembles itself (7-Scenes, ZED), a jitter measured against it is the truth's as
+well. So where the streamed recording has a second view or depth, which the tracker does not get,
+SLAM says what the steps were, from corners and depths of its own:
 
-- the same share of jitters is given against SLAM's steps, and beside it what the truth's steps would get: nothing is subtracted
-  here, but SLAM's own errors are in both jitters, and it sees the noise of the same pictures;
-- three witnesses of the same steps whose errors are independent tell how large each one's are (the three-cornered hat: Gray and
-  Allan, *A method for estimating the frequency stability of an individual oscillator*, 1974). With the truth, SLAM and the single
-  pictures that gives the trembling of the truth, which is then taken out of both jitters. What pictures and SLAM are wrong by
-  together counts as the truth's. The numbers after +- are standard errors (jackknife, ten pieces of the stream): where they are
-  large, the witnesses cannot tell.
+- the same share of jitters is given against SLAM's steps, and beside it what the truth's steps
+  would get: nothing is subtracted here, but SLAM's own errors are in both jitters, and it sees the
+  noise of the same pictures;
+- three witnesses of the same steps whose errors are independent tell how large each one's are (the
+  three-cornered hat: Gray and Allan, *A method for estimating the frequency stability of an
+  individual oscillator*, 1974). With the truth, SLAM and the single pictures that gives the
+  trembling of the truth, which is then taken out of both jitters. What pictures and SLAM are wrong
+  by together counts as the truth's. The numbers after +- are standard errors (jackknife, ten pieces
+  of the stream): where they are large, the witnesses cannot tell.
 """
 
 from __future__ import annotations
@@ -53,7 +57,8 @@ DEMO = Path(__file__).parents[1] / "src" / "topoloc" / "demo" / "lab"
 
 @dataclass(frozen=True)
 class Pair:
-    """A map's recordings and the stream; `map_from_truth` takes the world of the stream's truth into the map's."""
+    """A map's recordings and the stream; `map_from_truth` takes the world of the stream's truth
+    into the map's."""
 
     name: str
     mapped: tuple[str, ...]
@@ -62,13 +67,25 @@ class Pair:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--shared", type=Path, default=Path(os.environ.get("TOPOLOC_SHARED", "../shared")))
-    parser.add_argument("--stream", nargs=3, action="append", default=[], metavar=("NAME", "MAP_SEQ", "STREAM_SEQ"))
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--shared", type=Path, default=Path(os.environ.get("TOPOLOC_SHARED", "../shared"))
+    )
+    parser.add_argument(
+        "--stream", nargs=3, action="append", default=[], metavar=("NAME", "MAP_SEQ", "STREAM_SEQ")
+    )
     parser.add_argument("--only", help="the name of one stream")
     args = parser.parse_args()
     cv2.setNumThreads(2)
-    pairs = [*known_pairs(args.shared), *(Pair(name, (mapped,), streamed, Rigid3.identity()) for name, mapped, streamed in args.stream)]
+    pairs = [
+        *known_pairs(args.shared),
+        *(
+            Pair(name, (mapped,), streamed, Rigid3.identity())
+            for name, mapped, streamed in args.stream
+        ),
+    ]
     for pair in pairs:
         if args.only in (None, pair.name):
             judge(pair)
@@ -81,38 +98,86 @@ def known_pairs(shared: Path) -> list[Pair]:
     return [
         Pair("kitchen", (f"{kitchen}@0::4",), f"{kitchen}@1-3/4", Rigid3.identity()),
         # From frame 99 on the tracker that is the truth here jumps by 2.7 degrees.
-        Pair("zed_lab", (str(lab / "session1"),), f"{lab / 'session2'}@0:99", Rigid3.from_matrix(np.array(matrix))),
-        Pair("demo", (str(DEMO / "map_lap1"), str(DEMO / "map_lap2")), str(DEMO / "day"), Rigid3.identity()),
+        Pair(
+            "zed_lab",
+            (str(lab / "session1"),),
+            f"{lab / 'session2'}@0:99",
+            Rigid3.from_matrix(np.array(matrix)),
+        ),
+        Pair(
+            "demo",
+            (str(DEMO / "map_lap1"), str(DEMO / "map_lap2")),
+            str(DEMO / "day"),
+            Rigid3.identity(),
+        ),
     ]
 
 
 def judge(pair: Pair) -> None:
     localizer = Localizer(build_map([open_sequence(path) for path in pair.mapped]))
     sequence = single_pictures(open_sequence(pair.streamed))
-    frames = [frame for frame in (sequence[index] for index in range(len(sequence))) if frame.world_from_cam is not None]
-    truths = [pair.map_from_truth @ frame.world_from_cam for frame in frames if frame.world_from_cam is not None]
+    frames = [
+        frame
+        for frame in (sequence[index] for index in range(len(sequence)))
+        if frame.world_from_cam is not None
+    ]
+    truths = [
+        pair.map_from_truth @ frame.world_from_cam
+        for frame in frames
+        if frame.world_from_cam is not None
+    ]
     warm_up(localizer, frames)
     singles = [localizer.localize(frame.image, _camera(frame)) for frame in frames]
     print(f"{pair.name}: {len(frames)} frames, a map of {len(localizer.topomap.nodes)} nodes")
-    alone = [single.world_from_cam if isinstance(single, Localization) else None for single in singles]
+    alone = [
+        single.world_from_cam if isinstance(single, Localization) else None for single in singles
+    ]
     report_poses("one by one", alone, truths)
-    for name, config in (("the paper's rule", TrackerConfig(mode="paper")), ("tracker", TrackerConfig())):
+    for name, config in (
+        ("the paper's rule", TrackerConfig(mode="paper")),
+        ("tracker", TrackerConfig()),
+    ):
         answers, cpu_ms, seconds = stream(localizer, frames, config)
-        report_poses(f"{name}, raw", [a.result.world_from_cam if isinstance(a.result, Localization) else None for a in answers], truths)
+        report_poses(
+            f"{name}, raw",
+            [
+                a.result.world_from_cam if isinstance(a.result, Localization) else None
+                for a in answers
+            ],
+            truths,
+        )
         smoothed = [a.smoothed for a in answers]
         report_poses(f"{name}, smoothed", smoothed, truths)
     states = Counter(answer.state for answer in answers)
-    print("  states: " + ", ".join(f"{states[state]} {state}" for state in ("localized", "tracked", "predicted", "ambiguous", "lost")))
+    print(
+        "  states: "
+        + ", ".join(
+            f"{states[state]} {state}"
+            for state in ("localized", "tracked", "predicted", "ambiguous", "lost")
+        )
+    )
     measured = [answer.state in ("localized", "tracked") for answer in answers]
     tracked = [ms for ms, answer in zip(cpu_ms, answers, strict=True) if answer.state == "tracked"]
-    errors = [translation_error(pose, truth) for pose, truth in zip(smoothed, truths, strict=True) if pose is not None]
+    errors = [
+        translation_error(pose, truth)
+        for pose, truth in zip(smoothed, truths, strict=True)
+        if pose is not None
+    ]
     ratio = jitter_mm(smoothed, truths) / jitter_mm(alone, truths)
     row("share of frames with a measured pose", ">= 99 %", f"{100 * np.mean(measured):.1f} %")
     row("largest error", "<= 0.5 m", f"{max(errors):.3f} m")
-    row("smoothed poses inside their 95 % ellipsoid", "88-99 %", f"{100 * share_inside(answers, truths):.1f} %")
+    row(
+        "smoothed poses inside their 95 % ellipsoid",
+        "88-99 %",
+        f"{100 * share_inside(answers, truths):.1f} %",
+    )
     row("jitter, share of that of single pictures", "<= 0.5", f"{ratio:.2f}")
     report_trembling(smoothed, alone, truths, motion_of_camera(pair))
-    row("processor time of a tracked frame, median", "<= 12 ms", f"{np.median(tracked):.1f} ms" if tracked else "none tracked")
+    row(
+        "processor time of a tracked frame, median",
+        "<= 12 ms",
+        f"{np.median(tracked):.1f} ms" if tracked else "none tracked",
+    )
     row("processor time of all frames, mean", "", f"{np.mean(cpu_ms):.1f} ms")
     row("frames a second, pictures in memory", "", f"{len(frames) / seconds:.1f}")
 
@@ -129,8 +194,11 @@ def warm_up(localizer: Localizer, frames: list[StereoFrame]) -> None:
         tracker.process(frame.image, _camera(frame), frame.t_ns)
 
 
-def stream(localizer: Localizer, frames: list[StereoFrame], config: TrackerConfig) -> tuple[list[StreamedPose], list[float], float]:
-    """The answers, the processor time of each in milliseconds, and the seconds of all on the clock."""
+def stream(
+    localizer: Localizer, frames: list[StereoFrame], config: TrackerConfig
+) -> tuple[list[StreamedPose], list[float], float]:
+    """The answers, the processor time of each in milliseconds, and the seconds of all on the
+    clock."""
     tracker = Tracker(localizer, config)
     answers, cpu_ms = [], []
     start = time.perf_counter()
@@ -142,11 +210,17 @@ def stream(localizer: Localizer, frames: list[StereoFrame], config: TrackerConfi
 
 
 def step_errors(poses: Sequence[Rigid3 | None], truths: Sequence[Rigid3 | None]) -> np.ndarray:
-    """Distance (metres) between the steps of both, of each frame from the one before; NaN where one of the four poses is missing."""
+    """Distance (metres) between the steps of both, of each frame from the one before; NaN where one
+    of the four poses is missing."""
     errors = np.full(len(poses) - 1, np.nan)
     for k in range(1, len(poses)):
         before, after, truth_before, truth_after = poses[k - 1], poses[k], truths[k - 1], truths[k]
-        if before is not None and after is not None and truth_before is not None and truth_after is not None:
+        if (
+            before is not None
+            and after is not None
+            and truth_before is not None
+            and truth_after is not None
+        ):
             step, truth = before.inverse() @ after, truth_before.inverse() @ truth_after
             errors[k - 1] = np.linalg.norm((truth.inverse() @ step).translation)
     return errors
@@ -168,7 +242,8 @@ def share_inside(answers: list[StreamedPose], truths: list[Rigid3]) -> float:
 
 
 def motion_of_camera(pair: Pair) -> list[Rigid3 | None] | None:
-    """SLAM's pose of each streamed frame that has a truth, in a world of its own; None where there are single pictures only."""
+    """SLAM's pose of each streamed frame that has a truth, in a world of its own; None where there
+    are single pictures only."""
     sequence = open_sequence(pair.streamed)
     first = sequence[0]
     if first.right is None and first.depth is None:
@@ -178,40 +253,75 @@ def motion_of_camera(pair: Pair) -> list[Rigid3 | None] | None:
 
 
 def report_trembling(
-    smoothed: list[Rigid3 | None], alone: list[Rigid3 | None], truths: list[Rigid3], camera: list[Rigid3 | None] | None
+    smoothed: list[Rigid3 | None],
+    alone: list[Rigid3 | None],
+    truths: list[Rigid3],
+    camera: list[Rigid3 | None] | None,
 ) -> None:
     """Jitter where the truth is not what limits it; see above."""
     if camera is None:
-        row("the same without the trembling of the truth", "<= 0.5", "single pictures only: not known")
+        row(
+            "the same without the trembling of the truth",
+            "<= 0.5",
+            "single pictures only: not known",
+        )
         return
-    pairs = [(smoothed, truths), (alone, truths), (alone, camera), (truths, camera), (smoothed, camera)]
+    pairs = [
+        (smoothed, truths),
+        (alone, truths),
+        (alone, camera),
+        (truths, camera),
+        (smoothed, camera),
+    ]
     squares = np.array([np.square(1e3 * step_errors(*pair)) for pair in pairs])
     squares = squares[:, np.all(np.isfinite(squares), axis=0)]
     _, _, by_slam, of_truth, of_stream = np.sqrt(squares.mean(axis=1))
-    row("the same against SLAM's steps", "<= 0.5", f"{of_stream / by_slam:.2f} (the truth's own: {of_truth / by_slam:.2f})")
+    row(
+        "the same against SLAM's steps",
+        "<= 0.5",
+        f"{of_stream / by_slam:.2f} (the truth's own: {of_truth / by_slam:.2f})",
+    )
     pieces = np.array_split(np.arange(squares.shape[1]), 10)
-    errors = np.sqrt((len(pieces) - 1) * np.var([_hat(np.delete(squares, piece, axis=1)) for piece in pieces], axis=0))
-    shown = [f"{value:.1f} +- {error:.1f} mm^2" for value, error in zip(_hat(squares), errors, strict=True)]
+    errors = np.sqrt(
+        (len(pieces) - 1)
+        * np.var([_hat(np.delete(squares, piece, axis=1)) for piece in pieces], axis=0)
+    )
+    shown = [
+        f"{value:.1f} +- {error:.1f} mm^2"
+        for value, error in zip(_hat(squares), errors, strict=True)
+    ]
     row("trembling of the truth, squared", "", shown[0])
     row("squared jitter without it, stream", "", shown[1])
     row("squared jitter without it, single pictures", "", shown[2])
-    row("the same without the trembling of the truth", "<= 0.5", f"{_hat(squares)[3]:.2f} +- {errors[3]:.2f}")
+    row(
+        "the same without the trembling of the truth",
+        "<= 0.5",
+        f"{_hat(squares)[3]:.2f} +- {errors[3]:.2f}",
+    )
 
 
 def _hat(squares: np.ndarray) -> np.ndarray:
-    """Mean squared errors (mm^2) of truth, stream and single pictures from the squared differences of `report_trembling`, and
-    the share of the stream's jitter."""
+    """Mean squared errors (mm^2) of truth, stream and single pictures from the squared differences
+    of `report_trembling`, and the share of the stream's jitter."""
     stream_truth, alone_truth, alone_camera, truth_camera, _ = squares.mean(axis=1)
     truth = (alone_truth + truth_camera - alone_camera) / 2.0
     stream, alone = stream_truth - truth, alone_truth - truth
-    return np.array([truth, stream, alone, np.sqrt(max(stream, 0.0) / alone) if alone > 0 else np.nan])
+    return np.array(
+        [truth, stream, alone, np.sqrt(max(stream, 0.0) / alone) if alone > 0 else np.nan]
+    )
 
 
 def report_poses(name: str, poses: list[Rigid3 | None], truths: list[Rigid3]) -> None:
-    errors = np.array([translation_error(pose, truth) for pose, truth in zip(poses, truths, strict=True) if pose is not None])
+    errors = np.array(
+        [
+            translation_error(pose, truth)
+            for pose, truth in zip(poses, truths, strict=True)
+            if pose is not None
+        ]
+    )
     print(
-        f"  {name:<26} {len(errors):4d} poses  median {1e3 * np.median(errors):6.1f} mm  largest {1e3 * errors.max():7.1f} mm"
-        f"  jitter {jitter_mm(poses, truths):6.2f} mm"
+        f"  {name:<26} {len(errors):4d} poses  median {1e3 * np.median(errors):6.1f} mm  largest"
+        f" {1e3 * errors.max():7.1f} mm  jitter {jitter_mm(poses, truths):6.2f} mm"
     )
 
 

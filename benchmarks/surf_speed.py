@@ -2,9 +2,10 @@
 
     python benchmarks/surf_speed.py [--shared ../shared] [--repeats 100]
 
-Prints milliseconds for key points with descriptors, image in memory, after warm-up: median, minimum and the range between the
-quartiles; and how many times as long as SURF on two threads the others take. All run interleaved, so that a busy machine
-slows them alike. OpenCV's are asked for as many features as SURF finds.
+Prints milliseconds for key points with descriptors, image in memory, after warm-up: median, minimum
+and the range between the quartiles; and how many times as long as SURF on two threads the others
+take. All run interleaved, so that a busy machine slows them alike. OpenCV's are asked for as many
+features as SURF finds.
 """
 
 from __future__ import annotations
@@ -30,7 +31,9 @@ class Args:
     repeats: int = 100
 
 
-def time_interleaved_ms(functions: dict[str, Callable[[], object]], repeats: int) -> dict[str, np.ndarray]:
+def time_interleaved_ms(
+    functions: dict[str, Callable[[], object]], repeats: int
+) -> dict[str, np.ndarray]:
     times = {name: np.zeros(repeats) for name in functions}
     for repeat in range(-3, repeats):
         for name, function in functions.items():
@@ -45,7 +48,10 @@ def main(args: Args) -> None:
     image = np.zeros((64, 64), np.uint8)
     start = time.perf_counter()
     extract_surf(image)
-    print(f"first call (compilation, or reading the compiled code): {time.perf_counter() - start:.1f} s")
+    print(
+        "first call (compilation, or reading the compiled code):"
+        f" {time.perf_counter() - start:.1f} s"
+    )
     cv2.setNumThreads(2)
     for name, size in SIZES.items():
         image = np.load(args.shared / "reference" / "surf" / f"{name}.npz")["image"]
@@ -55,15 +61,22 @@ def main(args: Args) -> None:
         sift, orb = cv2.SIFT_create(count), cv2.ORB_create(count)
         times = time_interleaved_ms(
             {
-                "SURF 2 threads": lambda image=image: extract_surf(image, SurfConfig(num_threads=2)),
+                "SURF 2 threads": lambda image=image: extract_surf(
+                    image, SurfConfig(num_threads=2)
+                ),
                 "SURF 1 thread": lambda image=image: extract_surf(image, SurfConfig(num_threads=1)),
-                "upright 2 threads": lambda image=image: extract_surf(image, SurfConfig(num_threads=2, upright=True)),
+                "upright 2 threads": lambda image=image: extract_surf(
+                    image, SurfConfig(num_threads=2, upright=True)
+                ),
                 "OpenCV SIFT": lambda image=image, sift=sift: sift.detectAndCompute(image, None),
                 "OpenCV ORB": lambda image=image, orb=orb: orb.detectAndCompute(image, None),
             },
             args.repeats,
         )
-        print(f"\n{name} {size[0]}x{size[1]}, {count} key points        median     min     IQR   x SURF")
+        print(
+            f"\n{name} {size[0]}x{size[1]}, {count} key points        median     min     IQR   x"
+            " SURF"
+        )
         for label, values in times.items():
             low, median, high = np.percentile(values, [25, 50, 75])
             ratio = median / np.median(times["SURF 2 threads"])

@@ -1,4 +1,5 @@
-"""Sphinx: `make docs` builds these pages into docs/_build. The pages themselves are Markdown and read well without it."""
+"""Sphinx: `make docs` builds these pages into docs/_build. The pages themselves are Markdown and
+read well without it."""
 
 from __future__ import annotations
 
@@ -16,7 +17,14 @@ release = version = version_of("topoloc")
 
 logging.getLogger("faiss.loader").setLevel(logging.WARNING)  # else it tells what it did not find
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode", "from_program", "source_pages"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+    "from_program",
+    "source_pages",
+]
 exclude_patterns = ["_build", "_ext"]
 myst_heading_anchors = 3
 

@@ -1,9 +1,11 @@
-"""A stream of pictures: each is tracked from the one before where that is possible, and what the motion does not allow for is refused.
+"""A stream of pictures: each is tracked from the one before where that is possible, and what the
+motion does not allow for is refused.
 
     python examples/follow_stream.py [MAP SEQ]
 
-Without arguments the built-in lab is asked with a walk by day, a few of whose pictures are covered by a hand, and one of which
-is from another end of the room. `topoloc localize MAP SEQ --stream` does the same.
+Without arguments the built-in lab is asked with a walk by day, a few of whose pictures are covered
+by a hand, and one of which is from another end of the room. `topoloc localize MAP SEQ --stream`
+does the same.
 """
 
 import argparse
@@ -23,12 +25,17 @@ COVERED, MISPLACED = range(8, 10), 20
 
 def main(map_file: Path | None, recording: str | None) -> None:
     if map_file is None:
-        topomap = topoloc.build_map([topoloc.open_sequence(SHIPPED / name) for name in ("map_lap1", "map_lap2")])
+        topomap = topoloc.build_map(
+            [topoloc.open_sequence(SHIPPED / name) for name in ("map_lap1", "map_lap2")]
+        )
     else:
         topomap = topoloc.TopoMetricMap.load(map_file)
     walk = topoloc.open_sequence(recording or SHIPPED / "day")
-    # A cart at walking pace, two pictures a second: what a hand could do within half a second, it cannot.
-    slow = HypothesesConfig(motion=MotionConfig(sigma_acceleration=0.5, sigma_angular_acceleration=1.5))
+    # A cart at walking pace, two pictures a second: what a hand could do within half a second, it
+    # cannot.
+    slow = HypothesesConfig(
+        motion=MotionConfig(sigma_acceleration=0.5, sigma_angular_acceleration=1.5)
+    )
     tracker = topoloc.Tracker(topoloc.Localizer(topomap), topoloc.TrackerConfig(hypotheses=slow))
     states: Counter[str] = Counter()
     errors_cm = []

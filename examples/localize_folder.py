@@ -2,8 +2,9 @@
 
     python examples/localize_folder.py [MAP FOLDER] [--out DIR]
 
-FOLDER holds pictures and a camera.json. A picture that cannot be read is an answer like the others, and the run goes on. Without
-arguments a map of the built-in demo is made, and asked by night. `topoloc localize MAP FOLDER --json FILE` does the same.
+FOLDER holds pictures and a camera.json. A picture that cannot be read is an answer like the others,
+and the run goes on. Without arguments a map of the built-in demo is made, and asked by night.
+`topoloc localize MAP FOLDER --json FILE` does the same.
 """
 
 import argparse
@@ -21,7 +22,9 @@ def main(map_file: Path | None, folder: str, out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     if map_file is None:
         map_file = out / "lab.topo"
-        topoloc.build_map([topoloc.open_sequence(SHIPPED / name) for name in ("map_lap1", "map_lap2")]).save(map_file)
+        topoloc.build_map(
+            [topoloc.open_sequence(SHIPPED / name) for name in ("map_lap1", "map_lap2")]
+        ).save(map_file)
     localizer = topoloc.Localizer(topoloc.TopoMetricMap.load(map_file))
     photos = topoloc.open_sequence(folder)
 
@@ -43,13 +46,19 @@ def main(map_file: Path | None, folder: str, out: Path) -> None:
     (out / "poses.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
     write_tum(out / "poses.tum", Trajectory(poses, times))
     refused = ", ".join(f"{count} {reason}" for reason, count in reasons.items()) or "none"
-    print(f"{len(poses)} of {len(lines)} photos localized, not localized: {refused}; written to {out}")
+    print(
+        f"{len(poses)} of {len(lines)} photos localized, not localized: {refused}; written to {out}"
+    )
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("map", nargs="?", type=Path, help="a map file")
-    parser.add_argument("folder", nargs="?", default=str(SHIPPED / "night"), help="photos with a camera.json")
-    parser.add_argument("--out", type=Path, default=Path("localized"), help="the folder to write to")
+    parser.add_argument(
+        "folder", nargs="?", default=str(SHIPPED / "night"), help="photos with a camera.json"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("localized"), help="the folder to write to"
+    )
     args = parser.parse_args()
     main(args.map, args.folder, args.out)

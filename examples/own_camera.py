@@ -1,9 +1,11 @@
-"""A camera of one's own, with a distorted lens: how it is described, and what happens if its distortion is left out.
+"""A camera of one's own, with a distorted lens: how it is described, and what happens if its
+distortion is left out.
 
     python examples/own_camera.py [--out DIR]
 
-The pictures are those of the built-in demo, bent as a wide lens bends them. They are written to a folder with a `camera.json`, under
-COLMAP's model names, as `topoloc localize MAP DIR` reads it, and localized twice: with that calibration, and as if by a pinhole.
+The pictures are those of the built-in demo, bent as a wide lens bends them. They are written to a
+folder with a `camera.json`, under COLMAP's model names, as `topoloc localize MAP DIR` reads it, and
+localized twice: with that calibration, and as if by a pinhole.
 """
 
 import argparse
@@ -17,13 +19,16 @@ import topoloc
 from topoloc.demo.recordings import SHIPPED
 from topoloc.geometry.alignment import translation_error
 
-# A lens with barrel distortion: f, c in pixels, (k1, k2, p1, p2) as OpenCV's calibration gives them.
+# A lens with barrel distortion: f, c in pixels, (k1, k2, p1, p2) as OpenCV's calibration gives
+# them.
 LENS = topoloc.Camera("OPENCV", 640, 400, (380.0, 380.0, 319.5, 199.5, -0.28, 0.07, 0.001, -0.0005))
 
 
 def bend(picture: np.ndarray, taken_with: topoloc.Camera, lens: topoloc.Camera) -> np.ndarray:
     """The picture as `lens` would have taken it from the same place."""
-    columns, rows = np.meshgrid(np.arange(lens.width, dtype=float), np.arange(lens.height, dtype=float))
+    columns, rows = np.meshgrid(
+        np.arange(lens.width, dtype=float), np.arange(lens.height, dtype=float)
+    )
     rays = lens.rays_from_img(np.stack([columns.ravel(), rows.ravel()], axis=1))
     where = taken_with.img_from_cam(rays).astype(np.float32).reshape(lens.height, lens.width, 2)
     return cv2.remap(picture, where[..., 0], where[..., 1], cv2.INTER_LINEAR)
@@ -36,19 +41,37 @@ def main(out: Path) -> None:
     truth = []
     for i in range(len(straight)):
         frame = straight[i]
-        cv2.imwrite(str(out / f"{i:03d}.png"), cv2.cvtColor(bend(frame.image, frame.camera, LENS), cv2.COLOR_RGB2BGR))
+        cv2.imwrite(
+            str(out / f"{i:03d}.png"),
+            cv2.cvtColor(bend(frame.image, frame.camera, LENS), cv2.COLOR_RGB2BGR),
+        )
         truth.append(frame.world_from_cam)
 
     localizer = topoloc.Localizer(topoloc.build_map(topoloc.open_sequence(SHIPPED / "map_lap1")))
     photos = topoloc.open_sequence(out)
     for what, camera in (("its own calibration", LENS), ("a pinhole's", LENS.undistorted())):
         results = [localizer.localize(photos[i].image, camera) for i in range(len(photos))]
-        pairs = [(true, found.world_from_cam) for true, found in zip(truth, results, strict=True) if found.localized]
-        error_cm = 100.0 * np.median([translation_error(*pair) for pair in pairs]) if pairs else float("nan")
-        print(f"with {what}: {len(pairs)} of {len(results)} localized, median error {error_cm:.2f} cm")
+        pairs = [
+            (true, found.world_from_cam)
+            for true, found in zip(truth, results, strict=True)
+            if found.localized
+        ]
+        error_cm = (
+            100.0 * np.median([translation_error(*pair) for pair in pairs])
+            if pairs
+            else float("nan")
+        )
+        print(
+            f"with {what}: {len(pairs)} of {len(results)} localized, median error {error_cm:.2f} cm"
+        )
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("wide_lens"), help="the folder for the pictures; must hold no others")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("wide_lens"),
+        help="the folder for the pictures; must hold no others",
+    )
     main(parser.parse_args().out)

@@ -1,7 +1,9 @@
-"""A corridor walked in one direction, as a map, and pictures of its way back; each made once a test run.
+"""A corridor walked in one direction, as a map, and pictures of its way back; each made once a test
+run.
 
-Its walls run along the world's +y, 2.2 m apart, with the textures of `tiny_world`, above a plain floor: who comes back sees the same
-walls at the opposite slant, and nothing else that the map knows.
+Its walls run along the world's +y, 2.2 m apart, with the textures of `tiny_world`, above a plain
+floor: who comes back sees the same walls at the opposite slant, and nothing else that the map
+knows.
 """
 
 from __future__ import annotations
@@ -40,13 +42,20 @@ def corridor(seed: int = 0) -> list[Panel]:
         (np.array([0.0, -4.0, 0.0]), np.array([-1.0, 0.0, 0.0]), up_down, (1.1, 1.3)),
     ]
     return [
-        Panel(centre, right, down, half, floor if number == 2 else smooth_texture(1000 + 100 * seed + number, half))
+        Panel(
+            centre,
+            right,
+            down,
+            half,
+            floor if number == 2 else smooth_texture(1000 + 100 * seed + number, half),
+        )
         for number, (centre, right, down, half) in enumerate(shapes)
     ]
 
 
 def ahead(y: float, x: float = 0.0, yaw: float = 0.0) -> Rigid3:
-    """world_from_cam in the mapped direction, `y` metres along the corridor, turned to the left by `yaw` radians."""
+    """world_from_cam in the mapped direction, `y` metres along the corridor, turned to the left by
+    `yaw` radians."""
     return Rigid3(exp_so3(np.array([0.0, 0.0, yaw])) @ LEVEL_FROM_CAM, np.array([x, y, 0.0]))
 
 
@@ -61,9 +70,12 @@ def _walking(number: int) -> Rigid3:
 
 @cache
 def _seen_from(seed: int, number: int, side: int, camera: Camera) -> np.ndarray:
-    """What the left (0) or right (1) camera of a pair of the walk sees; a map is built from several passes over the recording."""
+    """What the left (0) or right (1) camera of a pair of the walk sees; a map is built from several
+    passes over the recording."""
     pose = _walking(number)
-    return render(corridor(seed), right_pose(pose) if side else pose, camera, noise_seed=2 * number + side)[0]
+    return render(
+        corridor(seed), right_pose(pose) if side else pose, camera, noise_seed=2 * number + side
+    )[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +106,15 @@ class WalkAhead:
         pose = _walking(index)
         left, right = (_seen_from(self.seed, index, side, self.camera).copy() for side in (0, 1))
         rig = StereoRig.rectified(self.camera, BASELINE)
-        return StereoFrame(self.names[index], self.t_ns[index], left, self.camera, right=right, rig=rig, world_from_cam=pose)
+        return StereoFrame(
+            self.names[index],
+            self.t_ns[index],
+            left,
+            self.camera,
+            right=right,
+            rig=rig,
+            world_from_cam=pose,
+        )
 
 
 @once_a_run
@@ -105,19 +125,28 @@ def built_corridor() -> TopoMetricMap:
 
 @once_a_run
 def corridor_of_two_kinds() -> TopoMetricMap:
-    """The same, of SURF and the learned features at hand, which describe the side nodes. Raises MissingExtraError without ONNX Runtime."""
+    """The same, of SURF and the learned features at hand, which describe the side nodes. Raises
+    MissingExtraError without ONNX Runtime."""
     return build_map(WalkAhead(0), BuildConfig(other_kinds=(learned_kind(),)))
 
 
 @cache
 def seen_on_the_way_back(seed: int = 0) -> list[tuple[np.ndarray, Rigid3]]:
     """Grey pictures of WIDE, with world_from_cam; another seed is another corridor."""
-    poses = [back(y, x=0.15 * np.sin(y), yaw=0.05 * np.cos(3.0 * y)) for y in np.arange(4.0, 7.1, 0.6)]
-    return [(render(corridor(seed), pose, WIDE, noise_seed=500 + k)[0], pose) for k, pose in enumerate(poses)]
+    poses = [
+        back(y, x=0.15 * np.sin(y), yaw=0.05 * np.cos(3.0 * y)) for y in np.arange(4.0, 7.1, 0.6)
+    ]
+    return [
+        (render(corridor(seed), pose, WIDE, noise_seed=500 + k)[0], pose)
+        for k, pose in enumerate(poses)
+    ]
 
 
 @cache
 def seen_ahead() -> list[tuple[np.ndarray, Rigid3]]:
     """Grey pictures of WIDE in the mapped direction, between the frames of the map."""
     poses = [ahead(y, x=0.1, yaw=-0.03) for y in (0.5, 2.0, 3.8)]
-    return [(render(corridor(), pose, WIDE, noise_seed=700 + k)[0], pose) for k, pose in enumerate(poses)]
+    return [
+        (render(corridor(), pose, WIDE, noise_seed=700 + k)[0], pose)
+        for k, pose in enumerate(poses)
+    ]

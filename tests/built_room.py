@@ -1,4 +1,5 @@
-"""The rendered room of `tiny_world` as a map, and pictures of it that the map has not seen; each made once a test run."""
+"""The rendered room of `tiny_world` as a map, and pictures of it that the map has not seen; each
+made once a test run."""
 
 from __future__ import annotations
 
@@ -38,10 +39,14 @@ def room_of_two_kinds(recording: Path) -> TopoMetricMap:
 
 @cache
 def unseen_views(seed: int = 0, step: float = 1.5) -> list[tuple[np.ndarray, Rigid3]]:
-    """Grey pictures of CAMERA taken between the frames of the recording, with world_from_cam; another seed is another world."""
+    """Grey pictures of CAMERA taken between the frames of the recording, with world_from_cam;
+    another seed is another world."""
     panels = room(seed)
     indices = np.arange(0.5, 13.0, step)
-    return [(render(panels, path_pose(index), noise_seed=900 + k)[0], path_pose(index)) for k, index in enumerate(indices)]
+    return [
+        (render(panels, path_pose(index), noise_seed=900 + k)[0], path_pose(index))
+        for k, index in enumerate(indices)
+    ]
 
 
 def write_pictures(folder: Path, views: list[tuple[np.ndarray, Rigid3]]) -> Path:
@@ -50,6 +55,10 @@ def write_pictures(folder: Path, views: list[tuple[np.ndarray, Rigid3]]) -> Path
     for number, (picture, _) in enumerate(views):
         assert cv2.imwrite(str(folder / f"view{number:02d}.png"), picture)
     (folder / "camera.json").write_text(json.dumps(CAMERA.to_json()))
-    (folder / "times.txt").write_text("".join(f"{number / 10:.9f}\n" for number in range(len(views))))
-    (folder / "truth.tum").write_text("".join(tum_line(number, pose) + "\n" for number, (_, pose) in enumerate(views)))
+    (folder / "times.txt").write_text(
+        "".join(f"{number / 10:.9f}\n" for number in range(len(views)))
+    )
+    (folder / "truth.tum").write_text(
+        "".join(tum_line(number, pose) + "\n" for number, (_, pose) in enumerate(views))
+    )
     return folder

@@ -1,8 +1,10 @@
-"""Shapes and types in the annotations, checked while tests run: what jaxtyping's import hook decorates, checked in a fifth of its time.
+"""Shapes and types in the annotations, checked while tests run: what jaxtyping's import hook
+decorates, checked in a fifth of its time.
 
-`jaxtyping.jaxtyped` binds the arguments of every call to the signature, checks them twice where there is a result, and decorates a function
-within a function anew each time that the outer one runs: 30 % of the suite's processor time. Here arguments and result are checked once,
-in one context, so that `n` is the same number in all of them; a function within a function is not checked.
+`jaxtyping.jaxtyped` binds the arguments of every call to the signature, checks them twice where
+there is a result, and decorates a function within a function anew each time that the outer one
+runs: 30 % of the suite's processor time. Here arguments and result are checked once, in one
+context, so that `n` is the same number in all of them; a function within a function is not checked.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ _jaxtyped = jaxtyping.jaxtyped
 
 
 def check(modules: list[str]) -> None:
-    """Functions, methods and dataclasses of these modules, which nobody has imported yet, are checked from now on."""
+    """Functions, methods and dataclasses of these modules, which nobody has imported yet, are
+    checked from now on."""
     jaxtyping.jaxtyped = _for_the_hook  # what the hook writes above each definition
     jaxtyping.install_import_hook(modules, "beartype.beartype")
 
@@ -34,7 +37,11 @@ def _checked(defined: Any) -> Any:
     if "<locals>" in defined.__qualname__:
         return defined
     if inspect.isclass(defined):
-        if is_dataclass(defined) and isinstance(defined.__init__, FunctionType) and not hasattr(defined.__init__, "__wrapped__"):
+        if (
+            is_dataclass(defined)
+            and isinstance(defined.__init__, FunctionType)
+            and not hasattr(defined.__init__, "__wrapped__")
+        ):
             defined.__init__ = _checked(defined.__init__)
         return defined
     readable = _with_annotations_read(defined)
@@ -54,10 +61,24 @@ def _checked(defined: Any) -> Any:
 
 
 def _with_annotations_read(function: FunctionType) -> FunctionType:
-    """A copy whose annotations are no strings; what is not defined yet, such as the class around a method, may be anything."""
-    copy = FunctionType(function.__code__, function.__globals__, function.__name__, function.__defaults__, function.__closure__)
-    copy.__kwdefaults__, copy.__module__, copy.__qualname__ = function.__kwdefaults__, function.__module__, function.__qualname__
-    copy.__annotations__ = {name: _read(annotation, function.__globals__) for name, annotation in function.__annotations__.items()}
+    """A copy whose annotations are no strings; what is not defined yet, such as the class around a
+    method, may be anything."""
+    copy = FunctionType(
+        function.__code__,
+        function.__globals__,
+        function.__name__,
+        function.__defaults__,
+        function.__closure__,
+    )
+    copy.__kwdefaults__, copy.__module__, copy.__qualname__ = (
+        function.__kwdefaults__,
+        function.__module__,
+        function.__qualname__,
+    )
+    copy.__annotations__ = {
+        name: _read(annotation, function.__globals__)
+        for name, annotation in function.__annotations__.items()
+    }
     return copy
 
 

@@ -1,4 +1,5 @@
-"""Shapes in the annotations are checked at run time in every test; the recordings beside the project are found here."""
+"""Shapes in the annotations are checked at run time in every test; the recordings beside the
+project are found here."""
 
 from __future__ import annotations
 
@@ -19,10 +20,19 @@ from made_once import share_in
 
 
 def _modules_with_checked_shapes() -> list[str]:
-    """All leaf modules but the Numba kernels, whose compiler cannot take a wrapped function, and messages whose types DDS reads itself."""
+    """All leaf modules but the Numba kernels, whose compiler cannot take a wrapped function, and
+    messages whose types DDS reads itself."""
     packages = (topoloc, topoloc_worlds, topoloc_training, topoloc_paper)
-    modules = [m for package in packages for m in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")]
-    return [m.name for m in modules if not m.ispkg and not m.name.endswith(("_kernels", ".ros_messages"))]
+    modules = [
+        m
+        for package in packages
+        for m in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
+    ]
+    return [
+        m.name
+        for m in modules
+        if not m.ispkg and not m.name.endswith(("_kernels", ".ros_messages"))
+    ]
 
 
 check(_modules_with_checked_shapes())
@@ -61,9 +71,11 @@ def of_all_workers(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def tiny_recording(of_all_workers: Path) -> Path:
-    """A small rendered room as a stereo recording (KITTI-like, 14 pairs of 320x240) with exact truth.tum and a camera.json.
+    """A small rendered room as a stereo recording (KITTI-like, 14 pairs of 320x240) with exact
+    truth.tum and a camera.json.
 
-    Not to be written to: all tests share it. `tiny_world` renders more of the same place, or others.
+    Not to be written to: all tests share it. `tiny_world` renders more of the same place, or
+    others.
     """
     from built_room import recorded_room  # after the hook above
 
@@ -90,7 +102,8 @@ def queries(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def complaint(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., str]:
-    """Runs a command that must fail: its one line on stderr. No file may appear, change size or go."""
+    """Runs a command that must fail: its one line on stderr. No file may appear, change size or
+    go."""
     from topoloc.cli import main  # after the hook above
 
     def run(*args: object, status: int = 1) -> str:

@@ -1,4 +1,5 @@
-"""A third kind of features in one file: FAST corners, described by the 64 grey levels of their neighbourhood.
+"""A third kind of features in one file: FAST corners, described by the 64 grey levels of their
+neighbourhood.
 
 It has neither scale nor angle, and finds corners to a pixel only, as many learned kinds do.
 """
@@ -15,11 +16,18 @@ from topoloc.features.kinds import FeatureConfig, FeatureKind, GuidedThresholds
 _PATCH_PX, _CELLS = 24, 8
 
 
-def extract_corner_patches(image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int) -> Features:
-    """Corners of a grey image, strongest first; the mean is taken off each patch, which then gets unit length."""
+def extract_corner_patches(
+    image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int
+) -> Features:
+    """Corners of a grey image, strongest first; the mean is taken off each patch, which then gets
+    unit length."""
     corners = cv2.FastFeatureDetector_create(threshold=8).detect(image)  # pyright: ignore[reportAttributeAccessIssue]
-    table = np.array([(*corner.pt, corner.response) for corner in corners], np.float32).reshape(-1, 3)
-    inside = (table[:, :2] >= _PATCH_PX // 2).all(axis=1) & (table[:, :2] < np.array(image.shape[::-1]) - _PATCH_PX // 2).all(axis=1)
+    table = np.array([(*corner.pt, corner.response) for corner in corners], np.float32).reshape(
+        -1, 3
+    )
+    inside = (table[:, :2] >= _PATCH_PX // 2).all(axis=1) & (
+        table[:, :2] < np.array(image.shape[::-1]) - _PATCH_PX // 2
+    ).all(axis=1)
     table = table[inside][np.argsort(-table[inside, 2], kind="stable")[: config.max_features]]
     if len(table) == 0:
         return Features.empty(_CELLS**2)

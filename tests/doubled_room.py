@@ -16,11 +16,17 @@ ELSEWHERE = Rigid3(exp_so3(np.array([0.0, 0.0, 1.0])), np.array([40.0, -15.0, 0.
 
 def _moved(node: TopoNode, node_id: int) -> TopoNode:
     summary = node.summary
-    return replace(node, summary=replace(summary, node_id=node_id, world_from_cam=ELSEWHERE @ summary.world_from_cam))
+    return replace(
+        node,
+        summary=replace(
+            summary, node_id=node_id, world_from_cam=ELSEWHERE @ summary.world_from_cam
+        ),
+    )
 
 
 def twice(topomap: TopoMetricMap, share_alike: float = 1.0) -> TopoMetricMap:
-    """A map that holds the room a second time, elsewhere; only this share of its points looks the same there."""
+    """A map that holds the room a second time, elsewhere; only this share of its points looks the
+    same there."""
     num_nodes, rng = len(topomap.nodes), np.random.default_rng(0)
     copies = []
     for node in topomap.nodes:
@@ -38,4 +44,10 @@ def twice(topomap: TopoMetricMap, share_alike: float = 1.0) -> TopoMetricMap:
         "node_ids": np.concatenate([ids, ids + num_nodes]).astype(ids.dtype),
     }
     coarse = {SurfVlad.name: replace(model, arrays=arrays)}
-    return replace(topomap, nodes=nodes, summaries=[node.summary for node in nodes], coarse_models=coarse, edges=[])
+    return replace(
+        topomap,
+        nodes=nodes,
+        summaries=[node.summary for node in nodes],
+        coarse_models=coarse,
+        edges=[],
+    )

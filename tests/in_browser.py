@@ -1,4 +1,5 @@
-"""Pages in a real browser without a window: Chromium, driven by Playwright. Tests skip with a reason where either is missing."""
+"""Pages in a real browser without a window: Chromium, driven by Playwright. Tests skip with a
+reason where either is missing."""
 
 from __future__ import annotations
 
@@ -11,7 +12,8 @@ import pytest
 
 WIDTHS = (1300, 400)
 _SOFTWARE_3D = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-# Ratio of luminances of every text that is seen to what lies behind it, the lowest first (WCAG 2.2, 1.4.3).
+# Ratio of luminances of every text that is seen to what lies behind it, the lowest first (WCAG 2.2,
+# 1.4.3).
 CONTRASTS = """() => {
   const numbers = (colour) => (colour.match(/[\\d.]+/g) ?? []).map(Number);
   const luminance = (rgb) => rgb.slice(0, 3).map((c) => c / 255).map((c) => (c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4))
@@ -31,35 +33,55 @@ CONTRASTS = """() => {
     found.push([(a + 0.05) / (b + 0.05), text.slice(0, 40)]);
   }
   return found.sort((x, y) => x[0] - y[0]);
-}"""
+}"""  # noqa: E501
 # What can be used by keyboard and has no name that a screen reader could say.
 UNNAMED = """() => [...document.querySelectorAll("button, input:not([hidden]), select, canvas[tabindex], textarea")].filter((element) => {
   const named = element.ariaLabel || element.title || element.textContent.trim() || element.labels?.[0]?.textContent.trim();
   return element.checkVisibility() && !named;
-}).map((element) => element.outerHTML)"""
+}).map((element) => element.outerHTML)"""  # noqa: E501
 
 
 @contextmanager
 def chromium() -> Iterator[Any]:
     """The browser, as Playwright's `Browser`."""
     api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    program = next((path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None)
+    program = next(
+        (
+            path
+            for name in ("chromium", "chromium-browser", "google-chrome")
+            if (path := shutil.which(name))
+        ),
+        None,
+    )
     if program is None:
         pytest.skip("no Chromium is installed")
     with api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox", *_SOFTWARE_3D])
+        browser = playwright.chromium.launch(
+            executable_path=program, args=["--no-sandbox", *_SOFTWARE_3D]
+        )
         yield browser
         browser.close()
 
 
 @contextmanager
 def opened(browser: Any, address: str, width: int, dark: bool = False) -> Iterator[Any]:
-    """The page at this address in a window so many pixels wide; whatever it says on its console as an error fails the test."""
-    page = browser.new_page(viewport={"width": width, "height": 800}, color_scheme="dark" if dark else "light")
+    """The page at this address in a window so many pixels wide; whatever it says on its console as
+    an error fails the test."""
+    page = browser.new_page(
+        viewport={"width": width, "height": 800}, color_scheme="dark" if dark else "light"
+    )
     errors = list[str]()
-    page.on("console", lambda message: errors.append(message.text) if message.type in ("error", "warning") else None)
+    page.on(
+        "console",
+        lambda message: (
+            errors.append(message.text) if message.type in ("error", "warning") else None
+        ),
+    )
     page.on("pageerror", lambda error: errors.append(str(error)))
-    page.on("request", lambda request: errors.append(request.url) if _is_elsewhere(request.url, address) else None)
+    page.on(
+        "request",
+        lambda request: errors.append(request.url) if _is_elsewhere(request.url, address) else None,
+    )
     page.goto(address)
     yield page
     assert [error for error in errors if "GPU stall" not in error] == []
@@ -67,4 +89,6 @@ def opened(browser: Any, address: str, width: int, dark: bool = False) -> Iterat
 
 
 def _is_elsewhere(url: str, address: str) -> bool:
-    return not url.startswith(("data:", "blob:", address.split("/", 3)[0] + "//" + address.split("/", 3)[2]))
+    return not url.startswith(
+        ("data:", "blob:", address.split("/", 3)[0] + "//" + address.split("/", 3)[2])
+    )

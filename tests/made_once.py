@@ -1,4 +1,5 @@
-"""What takes long to make and is only read: the first process of a test run that asks for it makes it, the others read its file."""
+"""What takes long to make and is only read: the first process of a test run that asks for it makes
+it, the others read its file."""
 
 from __future__ import annotations
 
@@ -20,18 +21,22 @@ _folder: list[Path] = []
 
 
 def share_in(folder: Path) -> None:
-    """From now on what `once_a_run` makes lies in this folder, which all processes of the run name."""
+    """From now on what `once_a_run` makes lies in this folder, which all processes of the run
+    name."""
     _folder[:] = [folder]
 
 
 def once_a_run(make: Callable[P, R]) -> Callable[P, R]:
-    """Decorates a function whose arguments print alike in all processes and whose result can be pickled; a process calls it once."""
+    """Decorates a function whose arguments print alike in all processes and whose result can be
+    pickled; a process calls it once."""
 
     @functools.cache
     def made(*args: P.args, **settings: P.kwargs) -> R:
         if fcntl is None or not _folder:
             return make(*args, **settings)
-        name = hashlib.sha256(repr((make.__module__, make.__qualname__, args, settings)).encode()).hexdigest()
+        name = hashlib.sha256(
+            repr((make.__module__, make.__qualname__, args, settings)).encode()
+        ).hexdigest()
         path = _folder[0] / name
         with path.with_suffix(".lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)

@@ -13,10 +13,15 @@ import numpy as np
 
 
 @contextmanager
-def mjpeg_camera(pictures: Sequence[np.ndarray], period_s: float, hangs: bool = False) -> Iterator[str]:
+def mjpeg_camera(
+    pictures: Sequence[np.ndarray], period_s: float, hangs: bool = False
+) -> Iterator[str]:
     """Its URL. Each picture (grey or BGR) comes once; then the stream ends, or `hangs`."""
     ended = threading.Event()
-    data = [cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 97])[1].tobytes() for picture in pictures]
+    data = [
+        cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 97])[1].tobytes()
+        for picture in pictures
+    ]
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
@@ -25,7 +30,10 @@ def mjpeg_camera(pictures: Sequence[np.ndarray], period_s: float, hangs: bool = 
             self.end_headers()
             try:
                 for jpeg in data:
-                    self.wfile.write(b"--picture\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%s\r\n" % (len(jpeg), jpeg))
+                    self.wfile.write(
+                        b"--picture\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%s\r\n"
+                        % (len(jpeg), jpeg)
+                    )
                     time.sleep(period_s)
             except OSError:  # who looked has gone
                 return

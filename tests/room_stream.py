@@ -1,4 +1,5 @@
-"""The rendered room of `tiny_world` as a stream: thirty pictures a second along its path, with exact truth."""
+"""The rendered room of `tiny_world` as a stream: thirty pictures a second along its path, with
+exact truth."""
 
 from __future__ import annotations
 
@@ -18,7 +19,10 @@ def room_stream() -> list[tuple[int, np.ndarray, Rigid3]]:
     """(t_ns, grey picture, world_from_cam) along the path, about two centimetres a picture."""
     panels = room()
     poses = [path_pose(2.0 + 0.15 * number) for number in range(NUM_PICTURES)]
-    return [(number * INTERVAL_NS, render(panels, pose, noise_seed=400 + number)[0], pose) for number, pose in enumerate(poses)]
+    return [
+        (number * INTERVAL_NS, render(panels, pose, noise_seed=400 + number)[0], pose)
+        for number, pose in enumerate(poses)
+    ]
 
 
 @cache
@@ -26,4 +30,7 @@ def far_away(num: int = 5) -> list[tuple[np.ndarray, Rigid3]]:
     """Pictures of the far end of the path, 0.8 m and more from where the stream begins."""
     panels = room()
     poses = [path_pose(10.5 + 0.1 * number) for number in range(num)]
-    return [(render(panels, pose, noise_seed=700 + number)[0], pose) for number, pose in enumerate(poses)]
+    return [
+        (render(panels, pose, noise_seed=700 + number)[0], pose)
+        for number, pose in enumerate(poses)
+    ]

@@ -1,4 +1,5 @@
-"""Bounds of settings: what they let through, what they say, and that every setting of topoloc has a meaning and bounds."""
+"""Bounds of settings: what they let through, what they say, and that every setting of topoloc has a
+meaning and bounds."""
 
 from __future__ import annotations
 
@@ -15,7 +16,16 @@ from hypothesis import strategies as st
 
 import topoloc
 from built_room import built_room
-from topoloc.bounds import Above, AtLeast, Between, annotations_of, bounds_of, check_bounds, complaint, settings_from
+from topoloc.bounds import (
+    Above,
+    AtLeast,
+    Between,
+    annotations_of,
+    bounds_of,
+    check_bounds,
+    complaint,
+    settings_from,
+)
 from topoloc.cli.settings_file import all_tables, config_class, meanings_of
 from topoloc.errors import ConfigError
 from topoloc.map.nodes import NodeConfig
@@ -39,7 +49,15 @@ class Outer:
     inner: Inner = field(default_factory=Inner)
 
 
-@pytest.mark.parametrize("change", [{"length": 3}, {"length": np.float32(0.1)}, {"number": np.int64(7)}, {"inner": Inner(1.0, ())}])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"length": 3},
+        {"length": np.float32(0.1)},
+        {"number": np.int64(7)},
+        {"inner": Inner(1.0, ())},
+    ],
+)
 def test_what_is_within_passes(change: dict[str, Any]):
     check_bounds(replace(Outer(), **change))
 
@@ -62,7 +80,10 @@ def test_what_is_within_passes(change: dict[str, Any]):
         ({"inner": {"share": 0.5}}, "Outer.inner: a Inner is expected, not {'share': 0.5}"),
         ({"inner": Inner(share=1.01)}, "Outer.inner.share: must be from 0 to 1, not 1.01"),
         ({"inner": Inner(pairs=((1.0, -2.0),))}, "Outer.inner.pairs: must be at least 0, not -2.0"),
-        ({"inner": Inner(pairs=((1.0, math.nan),))}, "Outer.inner.pairs: must be a finite number, not nan"),
+        (
+            {"inner": Inner(pairs=((1.0, math.nan),))},
+            "Outer.inner.pairs: must be a finite number, not nan",
+        ),
         ({"inner": Inner(pairs=((1.0,),))}, "Outer.inner.pairs: a list of values is expected"),  # type: ignore[arg-type]
     ],
 )
@@ -81,7 +102,8 @@ def test_no_number_that_is_not_one_passes(bound: Any, number: float):
 
 
 def _settings_of(kind: type, key: str) -> list[tuple[str, type, str, Any, Any]]:
-    """Key, class, name, annotation and default of every field, those of nested configurations too."""
+    """Key, class, name, annotation and default of every field, those of nested configurations
+    too."""
     config = kind()
     found: list[tuple[str, type, str, Any, Any]] = []
     for name, declared in annotations_of(kind).items():
@@ -103,7 +125,9 @@ def test_every_setting_has_a_meaning_and_every_number_bounds(table: str):
         if is_dataclass(default):
             about = type(default).__doc__ or ""
             assert about, key
-            assert not about.startswith(f"{type(default).__name__}("), f"{key}: what a dataclass without a docstring is given"
+            assert not about.startswith(f"{type(default).__name__}("), (
+                f"{key}: what a dataclass without a docstring is given"
+            )
         else:
             assert meanings_of(kind).get(name), f"{key} has no docstring that says what it means"
         if _is_of_numbers(declared):
@@ -118,12 +142,16 @@ def test_defaults_are_within_their_bounds(table: str):
 def test_callers_from_python_are_told_too(tiny_recording: Path):
     topomap = built_room(tiny_recording)
     nodes = NodeConfig(d_thresh=-1.0)
-    with pytest.raises(ConfigError, match=r"^MapConfig\.nodes\.d_thresh: must be above 0, not -1\.0$"):
+    with pytest.raises(
+        ConfigError, match=r"^MapConfig\.nodes\.d_thresh: must be above 0, not -1\.0$"
+    ):
         topoloc.build_map([], topoloc.BuildConfig(nodes=nodes))
     with pytest.raises(ConfigError, match=r"^LocalizerConfig\.num_candidates: must be from 1"):
         topoloc.Localizer(topomap, topoloc.LocalizerConfig(num_candidates=0))
     gating = HypothesesConfig(max_surprise=math.nan)
-    with pytest.raises(ConfigError, match=r"^TrackerConfig\.hypotheses\.max_surprise: must be a finite number"):
+    with pytest.raises(
+        ConfigError, match=r"^TrackerConfig\.hypotheses\.max_surprise: must be a finite number"
+    ):
         topoloc.Tracker(topoloc.Localizer(topomap), topoloc.TrackerConfig(hypotheses=gating))
     with pytest.raises(ConfigError, match=r"^SlamConfig\.odometry\.window: must be from 1"):
         run_slam([], SlamConfig(odometry=OdometryConfig(window=0)))
@@ -140,7 +168,9 @@ def test_plain_data_becomes_the_dataclass_again():
     data = json.loads(json.dumps(asdict(Stored("a", 10**18, Inner(1, ((0.0, 3.0),))))))
     assert settings_from(Stored, data, "a") == Stored("a", 10**18, Inner(1.0, ((0.0, 3.0),)))
     assert settings_from(Stored, {"name": "a", "inner": None}, "a") == Stored("a")
-    assert settings_from(Stored, {"name": "a", "later": {}, "inner": {"later": 1}}, "a", is_strict=False) == Stored("a", inner=Inner())
+    assert settings_from(
+        Stored, {"name": "a", "later": {}, "inner": {"later": 1}}, "a", is_strict=False
+    ) == Stored("a", inner=Inner())
 
 
 @pytest.mark.parametrize(
@@ -152,7 +182,10 @@ def test_plain_data_becomes_the_dataclass_again():
         ({"name": "b", "t_ns": 0.5}, "a.t_ns: a whole number is expected, not 0.5"),
         ({"name": "b", "inner": 1}, "a.inner: a table is expected, [a.inner]"),
         ({"name": "b", "inner": {"share": 2}}, "a.inner.share: must be from 0 to 1, not 2.0"),
-        ({"name": "b", "inner": {"chare": 1}}, "a.inner.chare: no such setting; did you mean a.inner.share?"),
+        (
+            {"name": "b", "inner": {"chare": 1}},
+            "a.inner.chare: no such setting; did you mean a.inner.share?",
+        ),
     ],
 )
 def test_plain_data_that_is_none_of_it_is_named_by_its_key(data: Any, said: str):

@@ -1,4 +1,5 @@
-"""Machine code is read from where it lies and kept where it can be; without a place for it functions run all the same."""
+"""Machine code is read from where it lies and kept where it can be; without a place for it
+functions run all the same."""
 
 from __future__ import annotations
 
@@ -22,7 +23,10 @@ def twice(x):
 def more(x):
     return twice(x) + 1.0
 """
-_CALL = "import own_kernels as k; print(k.more(3.0), sum(k.more.stats.cache_hits.values()), sum(k.more.stats.cache_misses.values()))"
+_CALL = (
+    "import own_kernels as k; print(k.more(3.0), sum(k.more.stats.cache_hits.values()),"
+    " sum(k.more.stats.cache_misses.values()))"
+)
 
 
 @pytest.fixture
@@ -35,8 +39,18 @@ def module(tmp_path: Path) -> Path:
 
 def _run(module: Path, code: str = _CALL, **environment: str) -> tuple[str, str]:
     path = os.pathsep.join([str(module), *sys.path])
-    environment = os.environ | {"PYTHONPATH": path, "XDG_CACHE_HOME": str(module.parent / "home"), "NUMBA_CACHE_DIR": ""} | environment
-    done = subprocess.run([sys.executable, "-B", "-c", code], env=environment, capture_output=True, text=True, check=False)
+    environment = (
+        os.environ
+        | {"PYTHONPATH": path, "XDG_CACHE_HOME": str(module.parent / "home"), "NUMBA_CACHE_DIR": ""}
+        | environment
+    )
+    done = subprocess.run(
+        [sys.executable, "-B", "-c", code],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout.strip(), done.stderr
 
@@ -55,7 +69,9 @@ def test_where_it_cannot_lie_beside_the_function_it_is_the_users(module: Path):
     (module / "__pycache__").write_text("no folder")
     assert _run(module) == ("7.0 0 1", "")
     assert _run(module) == ("7.0 1 0", "")
-    assert list((module.parent / "home" / "topoloc" / "kernels").glob("code_*/own_kernels.more-*.nbi"))
+    assert list(
+        (module.parent / "home" / "topoloc" / "kernels").glob("code_*/own_kernels.more-*.nbi")
+    )
 
 
 def test_without_any_place_it_is_compiled_each_time_and_said_once(module: Path):
@@ -88,7 +104,9 @@ def test_damaged_code_is_made_again(module: Path, kind: str):
 
 
 def test_whether_code_is_kept_can_be_asked(module: Path):
-    asks = "from topoloc.compiled import is_kept; import own_kernels; print(is_kept(own_kernels.more))"
+    asks = (
+        "from topoloc.compiled import is_kept; import own_kernels; print(is_kept(own_kernels.more))"
+    )
     assert _run(module, asks)[0].splitlines()[-1] == "False"
     _run(module)
     assert _run(module, asks)[0].splitlines()[-1] == "True"
@@ -104,13 +122,16 @@ def test_a_changed_kernel_beside_it_makes_it_another(module: Path):
 
 
 def test_no_kernel_uses_numbas_own_threads():
-    """Which several threads of Python must not use at once: Numba ends the process where they do."""
+    """Which several threads of Python must not use at once: Numba ends the process where they
+    do."""
     import topoloc.localization.localizer  # noqa: F401
 
     with pytest.raises(ValueError, match="parallel"):
         kernel(parallel=True)
     assert len(KERNELS) > 20
-    assert [k for k in KERNELS if k.targetoptions.get("parallel") or not k.targetoptions["nogil"]] == []
+    assert [
+        k for k in KERNELS if k.targetoptions.get("parallel") or not k.targetoptions["nogil"]
+    ] == []
 
 
 def test_a_number_of_threads_is_taken_and_changes_no_feature():
@@ -128,4 +149,8 @@ def test_a_number_of_threads_is_taken_and_changes_no_feature():
         "except ValueError as error: print(error)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.stdout.splitlines() == ["1 1", "3 3", "at least one thread is needed, not 0"], done.stderr
+    assert done.stdout.splitlines() == [
+        "1 1",
+        "3 3",
+        "at least one thread is needed, not 0",
+    ], done.stderr

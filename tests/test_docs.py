@@ -1,4 +1,5 @@
-"""Documentation that cannot rot: commands, settings, result keys, tables and public names are written down, and nothing else is."""
+"""Documentation that cannot rot: commands, settings, result keys, tables and public names are
+written down, and nothing else is."""
 
 from __future__ import annotations
 
@@ -27,7 +28,9 @@ MAP_FORMAT = (ROOT / "docs" / "map-format.md").read_text(encoding="utf-8")
 PLAN = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 
-LOCALIZED = Localization(Rigid3.identity(), np.eye(6), 1.0, 0, [NodeScore(0, 1.0)], 30, 20, {"total": 1.0})
+LOCALIZED = Localization(
+    Rigid3.identity(), np.eye(6), 1.0, 0, [NodeScore(0, 1.0)], 30, 20, {"total": 1.0}
+)
 UNREADABLE = NotLocalized("unreadable", detail="which file, and why")
 
 
@@ -61,7 +64,10 @@ def test_every_command_and_setting_is_in_the_docs(command: str, capsys: pytest.C
 def test_commands_in_code_blocks_exist(capsys: pytest.CaptureFixture[str]):
     settings = {command: _settings(command, capsys) for command in all_commands()}
     lines = [
-        line for page in PAGES for block in _code_blocks(page.read_text(encoding="utf-8"), "(?:sh|bash)") for line in block.splitlines()
+        line
+        for page in PAGES
+        for block in _code_blocks(page.read_text(encoding="utf-8"), "(?:sh|bash)")
+        for line in block.splitlines()
     ]
     calls = [line for line in lines if re.match(r"(?:\S*/)?topoloc ", line)]
     assert len(calls) >= len(all_commands())
@@ -74,7 +80,10 @@ def test_commands_in_code_blocks_exist(capsys: pytest.CaptureFixture[str]):
         assert used <= settings[command] | {"--help"}, call
 
 
-@pytest.mark.parametrize("reason", ["too_few_matches", "too_few_inliers", "ambiguous", "not_in_map", "jump", "unreadable"])
+@pytest.mark.parametrize(
+    "reason",
+    ["too_few_matches", "too_few_inliers", "ambiguous", "not_in_map", "jump", "unreadable"],
+)
 def test_every_reason_is_documented(reason: str):
     assert f"`{reason}`" in _section("localize")
 
@@ -92,9 +101,14 @@ def test_every_table_and_column_of_the_map_is_documented():
     with closing(sqlite3.connect(":memory:")) as database:
         for table in schema.TABLES:
             database.execute(schema.creation_of(table))
-        tables = [name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+        tables = [
+            name
+            for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
+        ]
         for table in tables:
-            (section,) = re.findall(rf"^### {table}$(.*?)(?=^##|\Z)", MAP_FORMAT, re.MULTILINE | re.DOTALL)
+            (section,) = re.findall(
+                rf"^### {table}$(.*?)(?=^##|\Z)", MAP_FORMAT, re.MULTILINE | re.DOTALL
+            )
             columns = [row[1] for row in database.execute(f"PRAGMA table_info({table})")]
             assert [column for column in columns if f"`{column}`" not in section] == []
     assert set(re.findall(r"^### (\w+)$", MAP_FORMAT, re.MULTILINE)) == set(tables)
@@ -106,28 +120,51 @@ def test_every_table_and_column_of_the_map_is_documented():
 def test_every_public_name_says_what_it_is(name: str):
     public = getattr(topoloc, name)
     assert public.__doc__
-    assert not public.__doc__.startswith(f"{name}("), "the words that a dataclass is given where it has none of its own"
+    assert not public.__doc__.startswith(f"{name}("), (
+        "the words that a dataclass is given where it has none of its own"
+    )
 
 
 def test_python_examples_compile_and_use_public_names():
-    blocks = [block for page in PAGES for block in _code_blocks(page.read_text(encoding="utf-8"), "python")]
+    blocks = [
+        block
+        for page in PAGES
+        for block in _code_blocks(page.read_text(encoding="utf-8"), "python")
+    ]
     assert blocks
     for block in blocks:
         compile(block, "example", "exec")
-        for module, names in re.findall(r"^from (topoloc\.[\w.]+) import ([\w, ]+)$", block, re.MULTILINE):
-            assert [name for name in names.split(", ") if not hasattr(importlib.import_module(module), name)] == []
+        for module, names in re.findall(
+            r"^from (topoloc\.[\w.]+) import ([\w, ]+)$", block, re.MULTILINE
+        ):
+            assert [
+                name
+                for name in names.split(", ")
+                if not hasattr(importlib.import_module(module), name)
+            ] == []
         assert set(re.findall(r"(?<!from )\btopoloc\.(\w+)", block)) <= set(topoloc.__all__)
 
 
 def test_the_plan_names_the_files_that_are_there():
-    for package in ("src/topoloc", "worlds/src/topoloc_worlds", "training/src/topoloc_training", "paper/src/topoloc_paper"):
+    for package in (
+        "src/topoloc",
+        "worlds/src/topoloc_worlds",
+        "training/src/topoloc_training",
+        "paper/src/topoloc_paper",
+    ):
         rooms = re.search(rf"^{package}/\n(.*?)^\w", PLAN, re.MULTILINE | re.DOTALL)
         assert rooms
         named = set(re.findall(r"\b(\w+\.py)\b", rooms.group(1)))
         there = {path.name for path in (ROOT / package).rglob("*.py") if path.stat().st_size > 0}
         assert named - there == set(), package
-        if missing := sorted(name for name in there - named if not name.endswith("_kernels.py") and not name.startswith("__")):
-            warnings.warn(f"docs/architecture.md, {package}: not named: " + ", ".join(missing), stacklevel=1)
+        if missing := sorted(
+            name
+            for name in there - named
+            if not name.endswith("_kernels.py") and not name.startswith("__")
+        ):
+            warnings.warn(
+                f"docs/architecture.md, {package}: not named: " + ", ".join(missing), stacklevel=1
+            )
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

@@ -71,7 +71,9 @@ def test_an_example_is_short_says_how_it_is_run_and_is_tested_here(path: Path):
     assert docstring
     assert f"    python examples/{path.name}" in docstring
     assert len(text.splitlines()) <= MAX_LINES
-    assert re.search(rf'run(_in)?\((folder, patch, )?"{path.stem}"', Path(__file__).read_text(encoding="utf-8"))
+    assert re.search(
+        rf'run(_in)?\((folder, patch, )?"{path.stem}"', Path(__file__).read_text(encoding="utf-8")
+    )
 
 
 def test_map_and_localize(mapped: tuple[Path, str]):
@@ -92,7 +94,9 @@ def test_localize_folder(run: Run, lab: Path, tmp_path: Path):
     (photos / "broken.jpg").write_bytes(b"no picture")
     printed = run("localize_folder", lab, photos, "--out", "answers")
     assert "2 of 4 photos localized" in printed
-    lines = [json.loads(line) for line in (tmp_path / "answers" / "poses.jsonl").read_text().splitlines()]
+    lines = [
+        json.loads(line) for line in (tmp_path / "answers" / "poses.jsonl").read_text().splitlines()
+    ]
     assert {line["query"]: line.get("reason") for line in lines} == {
         "000000.jpg": None,
         "000004.jpg": None,
@@ -105,17 +109,25 @@ def test_localize_folder(run: Run, lab: Path, tmp_path: Path):
 def test_own_camera(run: Run, lab: Path, monkeypatch: pytest.MonkeyPatch):
     """The map that it makes is that of the first example."""
     recordings: list[StereoSequence] = []
-    monkeypatch.setattr(topoloc, "build_map", lambda recording: recordings.append(recording) or TopoMetricMap.load(lab))
+    monkeypatch.setattr(
+        topoloc,
+        "build_map",
+        lambda recording: recordings.append(recording) or TopoMetricMap.load(lab),
+    )
     with_lens, as_pinhole = run("own_camera").splitlines()
     assert [recording.name for recording in recordings] == ["map_lap1"]
     assert "8 of 8 localized" in with_lens
-    (error,), (error_as_pinhole,) = (_centimetres(line, "median error") for line in (with_lens, as_pinhole))
+    (error,), (error_as_pinhole,) = (
+        _centimetres(line, "median error") for line in (with_lens, as_pinhole)
+    )
     assert error < 1.5
     assert error_as_pinhole > 3.0 * error
 
 
 def test_reject_elsewhere(run: Run, lab: Path):
-    printed = run("reject_elsewhere", lab, SHIPPED / "day@0::8", SHIPPED / "corridor", SHIPPED / "street@0::2")
+    printed = run(
+        "reject_elsewhere", lab, SHIPPED / "day@0::8", SHIPPED / "corridor", SHIPPED / "street@0::2"
+    )
     accepted = re.findall(r"^(\S+): (\d+) of (\d+) accepted", printed, re.MULTILINE)
     assert accepted == [("day@0::8", "4", "4"), ("corridor", "0", "8"), ("street@0::2", "0", "4")]
 
@@ -154,9 +166,15 @@ def test_train_classifier(run: Run, coarse: str, tmp_path: Path, request: pytest
     pytest.importorskip("torch")
     weights: tuple[object, ...] = ()
     if coarse == "cnn-nn":
-        weights = ("--weights", request.getfixturevalue("shared") / "weights/squeezenet1_1-imagenet-features.pth")
+        weights = (
+            "--weights",
+            request.getfixturevalue("shared") / "weights/squeezenet1_1-imagenet-features.pth",
+        )
     printed = run("train_classifier", "--epochs", 1, *weights)
-    assert set(TopoMetricMap.load(tmp_path / "lab_learned.topo").coarse_models) >= {"surf-vlad", coarse}
+    assert set(TopoMetricMap.load(tmp_path / "lab_learned.topo").coarse_models) >= {
+        "surf-vlad",
+        coarse,
+    }
     near = re.search(rf"^{coarse}: .* in (\d+) %$", printed, re.MULTILINE)
     assert near
     if coarse == "cnn-nn":  # one epoch from nothing promises little

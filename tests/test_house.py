@@ -22,7 +22,9 @@ PACKAGES = {
     ROOT / "training" / "src" / "topoloc_training": TESTS / "training",
     ROOT / "paper" / "src" / "topoloc_paper": TESTS / "paper",
 }
-MODULES = sorted(path for package in PACKAGES for path in package.rglob("*.py") if path.stat().st_size > 0)
+MODULES = sorted(
+    path for package in PACKAGES for path in package.rglob("*.py") if path.stat().st_size > 0
+)
 TEST_FILES = sorted(TESTS.rglob("*.py"))
 
 
@@ -48,7 +50,12 @@ def test_files_and_functions_stay_small():
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 assert node.end_lineno is not None
                 num_lines = node.end_lineno - node.lineno + 1
-                sizes.append((num_lines / MAX_FUNCTION_LINES, f"{_relative(path)}: {node.name} has {num_lines} lines"))
+                sizes.append(
+                    (
+                        num_lines / MAX_FUNCTION_LINES,
+                        f"{_relative(path)}: {node.name} has {num_lines} lines",
+                    )
+                )
     if long := [text for share, text in sizes if share > 1]:
         warnings.warn("a missing idea? " + "; ".join(long), stacklevel=1)
     assert [text for share, text in sizes if share > HARD_LIMIT] == []
@@ -60,13 +67,34 @@ def test_every_module_says_what_it_is():
 
 
 def test_every_module_is_tested():
-    """A module that neither has a test file nor serves one that has is named in a warning; a whole floor without is a failure."""
+    """A module that neither has a test file nor serves one that has is named in a warning; a whole
+    floor without is a failure."""
     of = {path: package for package in PACKAGES for path in package.rglob("*.py")}
-    mirrored = {path for path in MODULES if (PACKAGES[of[path]] / path.relative_to(of[path]).parent / f"test_{path.stem}.py").is_file()}
+    mirrored = {
+        path
+        for path in MODULES
+        if (
+            PACKAGES[of[path]] / path.relative_to(of[path]).parent / f"test_{path.stem}.py"
+        ).is_file()
+    }
     readers = "\n".join(path.read_text(encoding="utf-8") for path in (*TEST_FILES, *mirrored))
-    served = {path for path in MODULES if ".".join(path.relative_to(of[path].parent).with_suffix("").parts) in readers}
-    untested = [_relative(path) for path in MODULES if path not in mirrored | served and not path.stem.startswith("__")]
+    served = {
+        path
+        for path in MODULES
+        if ".".join(path.relative_to(of[path].parent).with_suffix("").parts) in readers
+    }
+    untested = [
+        _relative(path)
+        for path in MODULES
+        if path not in mirrored | served and not path.stem.startswith("__")
+    ]
     if untested:
-        warnings.warn("neither a test file nor used by what has one: " + ", ".join(untested), stacklevel=1)
-    floors = {path.relative_to(SRC).parts[0] for path in MODULES if path.is_relative_to(SRC) and path.parent != SRC}
+        warnings.warn(
+            "neither a test file nor used by what has one: " + ", ".join(untested), stacklevel=1
+        )
+    floors = {
+        path.relative_to(SRC).parts[0]
+        for path in MODULES
+        if path.is_relative_to(SRC) and path.parent != SRC
+    }
     assert {floor for floor in floors if not list((TESTS / floor).glob("test_*.py"))} == set()

@@ -1,4 +1,5 @@
-"""What a stranger installs: the wheel is whole, the command answers, and nothing heavy is loaded before it is needed."""
+"""What a stranger installs: the wheel is whole, the command answers, and nothing heavy is loaded
+before it is needed."""
 
 from __future__ import annotations
 
@@ -63,18 +64,27 @@ for name in names:
         assert error.name.split(".")[0] in ("torch", "matplotlib", "mcap", "cyclonedds", *SERVING), (name, error)
         learning.append(name)
 print(json.dumps([names, learning, sorted(Barred.asked)]))
-"""
+"""  # noqa: E501
 
 
 def _run(*command: str | Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([str(part) for part in command], capture_output=True, text=True, env=environment, timeout=120, check=False)
+    return subprocess.run(
+        [str(part) for part in command],
+        capture_output=True,
+        text=True,
+        env=environment,
+        timeout=120,
+        check=False,
+    )
 
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The wheel, made from the source distribution as an index would serve it."""
     folder = tmp_path_factory.mktemp("dist")
-    built = _run(sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, ROOT, **os.environ)
+    built = _run(
+        sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, ROOT, **os.environ
+    )
     assert built.returncode == 0, built.stdout + built.stderr
     (wheel,) = folder.glob("*.whl")
     return wheel
@@ -82,11 +92,23 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of programs of a virtual environment with the wheel and nothing else, not even its dependencies."""
+    """The folder of programs of a virtual environment with the wheel and nothing else, not even its
+    dependencies."""
     folder = tmp_path_factory.mktemp("venv")
     venv.create(folder, with_pip=False, symlinks=os.name != "nt")
     programs = folder / ("Scripts" if os.name == "nt" else "bin")
-    pip = (sys.executable, "-m", "pip", "--python", programs / "python", "install", "--quiet", "--no-index", "--no-deps", wheel)
+    pip = (
+        sys.executable,
+        "-m",
+        "pip",
+        "--python",
+        programs / "python",
+        "install",
+        "--quiet",
+        "--no-index",
+        "--no-deps",
+        wheel,
+    )
     done = _run(*pip, **os.environ)
     assert done.returncode == 0, done.stderr
     return programs
@@ -95,9 +117,16 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_wheel_holds_every_module_what_they_read_and_the_licence(wheel: Path):
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
-    files = {path for path in (ROOT / "src" / "topoloc").rglob("*") if path.is_file() and path.parent.name != "__pycache__"}
+    files = {
+        path
+        for path in (ROOT / "src" / "topoloc").rglob("*")
+        if path.is_file() and path.parent.name != "__pycache__"
+    }
     assert {path.relative_to(ROOT / "src").as_posix() for path in files} <= names
-    assert {name.split("/")[0] for name in names} == {"topoloc", f"topoloc-{topoloc.__version__}.dist-info"}
+    assert {name.split("/")[0] for name in names} == {
+        "topoloc",
+        f"topoloc-{topoloc.__version__}.dist-info",
+    }
     assert any(name.endswith("/LICENSE") for name in names)
 
 
@@ -131,10 +160,15 @@ def test_wrong_usage_exits_with_2(args: tuple[str, ...], complaint: str):
 
 
 @pytest.mark.parametrize(("command", "distribution"), BROUGHT.items())
-def test_commands_of_other_distributions_are_named_where_they_are_missing(installed: Path, command: str, distribution: str):
+def test_commands_of_other_distributions_are_named_where_they_are_missing(
+    installed: Path, command: str, distribution: str
+):
     answer = _run(installed / "topoloc", command, "lab", "out")
     assert (answer.returncode, answer.stdout) == (2, "")
-    assert answer.stderr == f"error: `topoloc {command}` comes with {distribution}, which is not installed\n"
+    assert (
+        answer.stderr
+        == f"error: `topoloc {command}` comes with {distribution}, which is not installed\n"
+    )
 
 
 @pytest.mark.parametrize("command", all_commands())
@@ -145,7 +179,9 @@ def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixtu
     assert f"usage: topoloc {command} " in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("statement", ["import topoloc", "from topoloc.cli import main; main(['--help'])"])
+@pytest.mark.parametrize(
+    "statement", ["import topoloc", "from topoloc.cli import main; main(['--help'])"]
+)
 def test_nothing_heavy_is_loaded_before_it_is_needed(statement: str):
     code = f"import sys; {statement}; print([name for name in {HEAVY} if name in sys.modules])"
     answer = _run(sys.executable, "-c", code, **os.environ)
@@ -153,18 +189,32 @@ def test_nothing_heavy_is_loaded_before_it_is_needed(statement: str):
 
 
 def test_every_module_loads_without_extras_but_learned_classifiers_and_figures():
-    answer = _run(sys.executable, "-c", f"FOREIGN, SERVING = {FOREIGN}, {SERVING}\n{_IMPORT_ALL}", **os.environ)
+    answer = _run(
+        sys.executable,
+        "-c",
+        f"FOREIGN, SERVING = {FOREIGN}, {SERVING}\n{_IMPORT_ALL}",
+        **os.environ,
+    )
     assert answer.returncode == 0, answer.stderr
     modules, learning, asked = json.loads(answer.stdout)
     assert "topoloc.localization.localizer" in modules
     assert "topoloc.places.cnn_fc" in learning
     assert "topoloc.places.network_config" not in learning
-    drawing = {f"topoloc.evaluation.{name}" for name in ("figures", "map_figure", "report", "weak_parts_figure", "weak_parts_page")}
-    others = [name for name in learning if not name.startswith(("topoloc.places.", "topoloc.service.")) and name not in drawing]
+    drawing = {
+        f"topoloc.evaluation.{name}"
+        for name in ("figures", "map_figure", "report", "weak_parts_figure", "weak_parts_page")
+    }
+    others = [
+        name
+        for name in learning
+        if not name.startswith(("topoloc.places.", "topoloc.service.")) and name not in drawing
+    ]
     assert others == ["topoloc.export.ros_messages", "topoloc.sequences.bags.mcap_file"]
-    assert not {"topoloc.service.client", "topoloc.service.config", "topoloc.atlas.open_maps"} & set(learning), (
-        "commands and clients need these"
-    )
+    assert not {
+        "topoloc.service.client",
+        "topoloc.service.config",
+        "topoloc.atlas.open_maps",
+    } & set(learning), "commands and clients need these"
     assert "torchvision" not in asked
 
 

@@ -1,4 +1,5 @@
-"""The pages of docs/: scripts, settings and names that they mention are there; the quickstart runs; Sphinx has nothing to warn of."""
+"""The pages of docs/: scripts, settings and names that they mention are there; the quickstart runs;
+Sphinx has nothing to warn of."""
 
 from __future__ import annotations
 
@@ -29,9 +30,17 @@ def _read(name: str) -> str:
 
 
 def _run(*command: str | Path, folder: Path) -> str:
-    """The output of a program that must end with status 0, run with this Python's programs first in PATH."""
+    """The output of a program that must end with status 0, run with this Python's programs first in
+    PATH."""
     path = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", "")))
-    done = subprocess.run(list(map(str, command)), cwd=folder, env=os.environ | {"PATH": path}, capture_output=True, text=True, timeout=600)
+    done = subprocess.run(
+        list(map(str, command)),
+        cwd=folder,
+        env=os.environ | {"PATH": path},
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -52,7 +61,9 @@ def test_every_benchmark_is_on_its_page_and_says_how_it_is_run(script: Path):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
 def test_benchmarks_and_options_that_a_page_names_are_there(page: Path):
-    for name, words in re.findall(r"\bbenchmarks/(\w+\.py)\b([^`\n|]*)", page.read_text(encoding="utf-8")):
+    for name, words in re.findall(
+        r"\bbenchmarks/(\w+\.py)\b([^`\n|]*)", page.read_text(encoding="utf-8")
+    ):
         script = ROOT / "benchmarks" / name
         assert script.is_file(), f"{page.name} names benchmarks/{name}"
         text = script.read_text(encoding="utf-8")
@@ -62,13 +73,22 @@ def test_benchmarks_and_options_that_a_page_names_are_there(page: Path):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
 def test_targets_of_make_that_a_page_names_are_there(page: Path):
-    targets = set(re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
-    assert set(re.findall(r"(?:^|`)make (\w+)", page.read_text(encoding="utf-8"), re.MULTILINE)) <= targets
+    targets = set(
+        re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    )
+    assert (
+        set(re.findall(r"(?:^|`)make (\w+)", page.read_text(encoding="utf-8"), re.MULTILINE))
+        <= targets
+    )
 
 
 @pytest.mark.parametrize("name", topoloc.__all__)
 def test_every_public_name_is_in_the_reference(name: str):
-    described = re.findall(r"^\.\. (?:autofunction|autoclass|autoexception|py:data):: (?:topoloc\.)?(\w+)$", _read("api.md"), re.MULTILINE)
+    described = re.findall(
+        r"^\.\. (?:autofunction|autoclass|autoexception|py:data):: (?:topoloc\.)?(\w+)$",
+        _read("api.md"),
+        re.MULTILINE,
+    )
     assert described.count(name) == 1
 
 
@@ -89,7 +109,8 @@ def test_settings_that_the_pipeline_names_are_there(capsys: pytest.CaptureFixtur
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
 def test_settings_of_files_that_a_page_names_are_there(page: Path, tmp_path: Path):
-    """Lines as `localize.num_candidates = 1`, keys as `train.vlad_nn.tuning.num_epochs`, and blocks of TOML."""
+    """Lines as `localize.num_candidates = 1`, keys as `train.vlad_nn.tuning.num_epochs`, and blocks
+    of TOML."""
     text, tables = page.read_text(encoding="utf-8"), "|".join(all_tables())
     blocks = re.findall(r"^```toml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     blocks += re.findall(rf"`((?:{tables})\.[\w.]+ = [^`]+)`", text)
@@ -106,7 +127,11 @@ def test_settings_of_files_that_a_page_names_are_there(page: Path, tmp_path: Pat
 
 def test_every_page_is_reached_from_the_index():
     index = _read("index.md")
-    listed = {line for block in re.findall(r"^```\{toctree\}\n(.*?)^```", index, re.MULTILINE | re.DOTALL) for line in block.split()}
+    listed = {
+        line
+        for block in re.findall(r"^```\{toctree\}\n(.*?)^```", index, re.MULTILINE | re.DOTALL)
+        for line in block.split()
+    }
     assert {page.stem for page in DOCS.glob("*.md")} - {"index"} <= listed
 
 
@@ -125,7 +150,22 @@ def test_the_pages_build_without_a_warning(tmp_path: Path):
     missing = [name for name in SPHINX_PACKAGES if importlib.util.find_spec(name) is None]
     if missing:
         pytest.skip(f"{', '.join(missing)} not installed (the extra docs)")
-    _run(sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-d", tmp_path / "trees", DOCS, tmp_path / "html", folder=ROOT)
-    reference, commands = ((tmp_path / "html" / f"{name}.html").read_text(encoding="utf-8") for name in ("api", "commands"))
+    _run(
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-q",
+        "-W",
+        "--keep-going",
+        "-d",
+        tmp_path / "trees",
+        DOCS,
+        tmp_path / "html",
+        folder=ROOT,
+    )
+    reference, commands = (
+        (tmp_path / "html" / f"{name}.html").read_text(encoding="utf-8")
+        for name in ("api", "commands")
+    )
     assert [name for name in topoloc.__all__ if f'id="topoloc.{name}"' not in reference] == []
     assert [name for name in all_commands() if f"usage: topoloc {name} " not in commands] == []

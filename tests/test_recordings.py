@@ -1,4 +1,5 @@
-"""The whole on real recordings: what must not be lost. The full figures come from benchmarks/real_recordings.py."""
+"""The whole on real recordings: what must not be lost. The full figures come from
+benchmarks/real_recordings.py."""
 
 from __future__ import annotations
 
@@ -20,11 +21,18 @@ from topoloc.sequences.recording import sequence_subset
 
 @pytest.fixture(scope="module")
 def lab(shared: Path) -> Localizer:
-    return Localizer(build_map(open_sequence(shared / "data/zed_lab/session1@0::2"), BuildConfig(nodes=NodeConfig(d_thresh=0.5))))
+    return Localizer(
+        build_map(
+            open_sequence(shared / "data/zed_lab/session1@0::2"),
+            BuildConfig(nodes=NodeConfig(d_thresh=0.5)),
+        )
+    )
 
 
 def test_another_session_in_the_lab(lab: Localizer, shared: Path):
-    matrix = json.loads((shared / "data/zed_lab/session1_from_session2.json").read_text())["session1_from_session2"]
+    matrix = json.loads((shared / "data/zed_lab/session1_from_session2.json").read_text())[
+        "session1_from_session2"
+    ]
     queries = open_sequence(shared / "data/zed_lab/session2@0:99:4")
     summary = summarize(answer_queries(lab, queries, Rigid3.from_matrix(np.array(matrix))))
     assert summary["num_localized"] == summary["num_queries"] == 25
@@ -40,7 +48,9 @@ def test_a_street_is_not_the_lab(lab: Localizer, shared: Path):
 
 def test_the_odd_frames_of_a_street_in_the_map_of_the_even_ones(shared: Path):
     localizer = Localizer(build_map(open_sequence(shared / "data/kitti/sequences/street1@0:30:2")))
-    summary = summarize(answer_queries(localizer, open_sequence(shared / "data/kitti/sequences/street1@1:29:2")))
+    summary = summarize(
+        answer_queries(localizer, open_sequence(shared / "data/kitti/sequences/street1@1:29:2"))
+    )
     assert summary["num_localized"] == summary["num_queries"] == 14
     assert summary["median_translation_m"] < 0.03
     assert summary["median_rotation_deg"] < 0.06
@@ -50,7 +60,9 @@ def test_a_kitchen_by_depth_camera(shared: Path):
     kitchen = open_sequence(shared / "data/seven_scenes/kitchen")
     mapping = sequence_subset(kitchen, [i for i in range(120) if i % 20 < 12])
     localizer = Localizer(build_map(mapping, BuildConfig(nodes=NodeConfig(d_thresh=0.5))))
-    summary = summarize(answer_queries(localizer, sequence_subset(kitchen, list(range(16, 120, 20)))))
+    summary = summarize(
+        answer_queries(localizer, sequence_subset(kitchen, list(range(16, 120, 20))))
+    )
     assert summary["num_localized"] == summary["num_queries"]
     assert summary["median_translation_m"] < 0.016
     assert summary["median_rotation_deg"] < 0.6

@@ -32,21 +32,31 @@ def entries(count: int, frames: list[Frame]) -> list[Entry]:
     return [Entry(frames[k], [np.full(100, k, np.float64)]) for k in range(count)]
 
 
-@given(st.lists(st.tuples(st.integers(0, 9), st.integers(0, 1000)), max_size=60), st.sampled_from([0, 900, 2500, 10**6]))
+@given(
+    st.lists(st.tuples(st.integers(0, 9), st.integers(0, 1000)), max_size=60),
+    st.sampled_from([0, 900, 2500, 10**6]),
+)
 def test_it_is_a_list_whatever_lies_on_disk(changes: list[tuple[int, int]], max_bytes: int):
-    there, plain = Shelf((np.full(100, k) for k in range(10)), max_bytes), [np.full(100, k) for k in range(10)]
+    there, plain = (
+        Shelf((np.full(100, k) for k in range(10)), max_bytes),
+        [np.full(100, k) for k in range(10)],
+    )
     for row, value in changes:
         np.testing.assert_array_equal(there[row], plain[row])
         there[row] = plain[row] = np.full(100, value)
     there.append(np.zeros(3))
-    np.testing.assert_array_equal(np.concatenate(list(there)), np.concatenate([*plain, np.zeros(3)]))
+    np.testing.assert_array_equal(
+        np.concatenate(list(there)), np.concatenate([*plain, np.zeros(3)])
+    )
     np.testing.assert_array_equal(np.stack(there[2:5]), np.stack(plain[2:5]))
     np.testing.assert_array_equal(there[-2], plain[-1])
     assert len(there) == 11
 
 
 def test_only_so_much_stays_in_memory():
-    frames = [Frame(str(k), np.zeros(5000)) for k in range(50)]  # what is referred to does not count
+    frames = [
+        Frame(str(k), np.zeros(5000)) for k in range(50)
+    ]  # what is referred to does not count
     there = Shelf(entries(50, frames), max_bytes=8_000, by_reference=frames)
     assert len(there._kept) == 10
     assert there[0].values[0][0] == 0.0

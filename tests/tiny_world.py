@@ -1,6 +1,8 @@
-"""A small textured room, rendered exactly: stereo pairs and depth pictures along a path, so that tests need no real recording.
+"""A small textured room, rendered exactly: stereo pairs and depth pictures along a path, so that
+tests need no real recording.
 
-The world has z up. Pictures are ray-cast plane by plane; the textures are smooth enough not to alias at the distances used.
+The world has z up. Pictures are ray-cast plane by plane; the textures are smooth enough not to
+alias at the distances used.
 """
 
 from __future__ import annotations
@@ -28,7 +30,8 @@ _TEXELS_PER_METRE = 90.0
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """A textured rectangle: its centre, its two unit axes (to the texture's right and down), half its sides, metres."""
+    """A textured rectangle: its centre, its two unit axes (to the texture's right and down), half
+    its sides, metres."""
 
     centre: np.ndarray
     right: np.ndarray
@@ -38,17 +41,29 @@ class Panel:
 
 
 def room(seed: int = 0) -> list[Panel]:
-    """A back wall, a side wall, a floor, and two boards standing in front; another seed is another place."""
+    """A back wall, a side wall, a floor, and two boards standing in front; another seed is another
+    place."""
     up_down = np.array([0.0, 0.0, -1.0])
     shapes = [
         (np.array([0.8, 4.0, 0.0]), np.array([1.0, 0.0, 0.0]), up_down, (3.5, 2.0)),
         (np.array([-1.6, 2.2, 0.0]), np.array([0.3, 0.954, 0.0]), up_down, (2.2, 2.0)),
-        (np.array([0.8, 2.2, -1.3]), np.array([1.0, 0.0, 0.0]), np.array([0.0, -1.0, 0.0]), (4.0, 2.2)),
+        (
+            np.array([0.8, 2.2, -1.3]),
+            np.array([1.0, 0.0, 0.0]),
+            np.array([0.0, -1.0, 0.0]),
+            (4.0, 2.2),
+        ),
         (np.array([0.1, 2.6, -0.4]), np.array([0.95, 0.312, 0.0]), up_down, (0.45, 0.9)),
         (np.array([1.7, 3.0, -0.2]), np.array([0.9, -0.436, 0.0]), up_down, (0.5, 0.7)),
     ]
     return [
-        Panel(centre, right / np.linalg.norm(right), down, half, smooth_texture(100 * seed + number, half))
+        Panel(
+            centre,
+            right / np.linalg.norm(right),
+            down,
+            half,
+            smooth_texture(100 * seed + number, half),
+        )
         for number, (centre, right, down, half) in enumerate(shapes)
     ]
 
@@ -66,28 +81,39 @@ def smooth_texture(seed: int, half: tuple[float, float]) -> np.ndarray:
 
 
 def path_pose(index: float) -> Rigid3:
-    """world_from_cam of the left camera along the path: 0.13 m a step to the side, swaying a little."""
+    """world_from_cam of the left camera along the path: 0.13 m a step to the side, swaying a
+    little."""
     yaw, pitch = 0.06 * np.sin(0.5 * index), 0.03 * np.cos(0.7 * index)
     sway = exp_so3(np.array([0.0, 0.0, yaw])) @ exp_so3(np.array([pitch, 0.0, 0.0]))
-    return Rigid3(sway @ LEVEL_FROM_CAM, np.array([0.13 * index, 0.05 * np.sin(index), 0.02 * np.cos(index)]))
+    return Rigid3(
+        sway @ LEVEL_FROM_CAM, np.array([0.13 * index, 0.05 * np.sin(index), 0.02 * np.cos(index)])
+    )
 
 
 @cache
 def _rays(camera: Camera) -> np.ndarray:
-    """The directions of the pixels in the camera's frame, row by row of the picture: 3 x N, the third is 1."""
-    columns, rows = np.meshgrid(np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64))
+    """The directions of the pixels in the camera's frame, row by row of the picture: 3 x N, the
+    third is 1."""
+    columns, rows = np.meshgrid(
+        np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64)
+    )
     normalized = camera.normalized_from_img(np.column_stack([columns.ravel(), rows.ravel()]))
     return np.vstack([normalized.T, np.ones(len(normalized))])
 
 
-def render(panels: list[Panel], world_from_cam: Rigid3, camera: Camera = CAMERA, noise_seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """The grey picture (uint8, with a grey level of noise) and its exact depth (float64, metres, NaN where nothing is)."""
+def render(
+    panels: list[Panel], world_from_cam: Rigid3, camera: Camera = CAMERA, noise_seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """The grey picture (uint8, with a grey level of noise) and its exact depth (float64, metres,
+    NaN where nothing is)."""
     rays = _rays(camera)
     depth = np.full(rays.shape[1], np.inf)
     grey = np.full(rays.shape[1], 127.5, np.float32)
     for panel in panels:
         axes_world = np.stack([np.cross(panel.right, panel.down), panel.right, panel.down])
-        towards, to_right, to_down = (axes_world @ world_from_cam.rotation) @ rays  # what a metre of depth adds along each axis
+        towards, to_right, to_down = (
+            axes_world @ world_from_cam.rotation
+        ) @ rays  # what a metre of depth adds along each axis
         begin = axes_world @ (world_from_cam.translation - panel.centre)
         with np.errstate(divide="ignore"):
             z = -begin[0] / towards
@@ -97,10 +123,14 @@ def render(panels: list[Panel], world_from_cam: Rigid3, camera: Camera = CAMERA,
         if not seen.any():
             continue
         texel_x, texel_y = (
-            np.clip((place + half) * _TEXELS_PER_METRE - 0.5, -1e3, 1e4).astype(np.float32).reshape(camera.height, camera.width)
+            np.clip((place + half) * _TEXELS_PER_METRE - 0.5, -1e3, 1e4)
+            .astype(np.float32)
+            .reshape(camera.height, camera.width)
             for place, half in zip((across, along), panel.half, strict=True)
         )
-        shade = cv2.remap(panel.texture, texel_x, texel_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        shade = cv2.remap(
+            panel.texture, texel_x, texel_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
         grey[seen], depth[seen] = shade.ravel()[seen], z[seen]
     noisy = grey + np.random.default_rng(noise_seed).normal(0.0, 1.0, len(grey))
     shape = (camera.height, camera.width)
@@ -115,11 +145,19 @@ def right_pose(world_from_left: Rigid3) -> Rigid3:
 
 def tum_line(index: float, world_from_cam: Rigid3) -> str:
     w, x, y, z = world_from_cam.quat_wxyz()
-    return " ".join(f"{value:.9f}" for value in (index / RATE_HZ, *world_from_cam.translation, x, y, z, w))
+    return " ".join(
+        f"{value:.9f}" for value in (index / RATE_HZ, *world_from_cam.translation, x, y, z, w)
+    )
 
 
-def write_stereo_recording(folder: Path, seed: int = 0, indices: list[float] | None = None, panels: list[Panel] | None = None) -> Path:
-    """A KITTI-like recording with truth.tum, and the camera.json that a query by its pictures needs; returns `folder`."""
+def write_stereo_recording(
+    folder: Path,
+    seed: int = 0,
+    indices: list[float] | None = None,
+    panels: list[Panel] | None = None,
+) -> Path:
+    """A KITTI-like recording with truth.tum, and the camera.json that a query by its pictures
+    needs; returns `folder`."""
     indices = indices if indices is not None else [float(index) for index in range(NUM_FRAMES)]
     panels = panels or room(seed)
     for side in ("image_0", "image_1"):
@@ -130,7 +168,10 @@ def write_stereo_recording(folder: Path, seed: int = 0, indices: list[float] | N
             picture, _ = render(panels, pose, noise_seed=2 * number + (side == "image_1"))
             assert cv2.imwrite(str(folder / side / f"{number:06d}.png"), picture)
     fx, fy, cx, cy = CAMERA.params
-    rows = [f"P{number}: {fx} 0 {cx} {-fx * BASELINE * number} 0 {fy} {cy} 0 0 0 1 0" for number in (0, 1)]
+    rows = [
+        f"P{number}: {fx} 0 {cx} {-fx * BASELINE * number} 0 {fy} {cy} 0 0 0 1 0"
+        for number in (0, 1)
+    ]
     (folder / "calib.txt").write_text("\n".join(rows) + "\n")
     _write_times_and_truth(folder, indices)
     (folder / "camera.json").write_text(json.dumps(CAMERA.to_json() | {"baseline": BASELINE}))
@@ -138,7 +179,8 @@ def write_stereo_recording(folder: Path, seed: int = 0, indices: list[float] | N
 
 
 def write_depth_recording(folder: Path, seed: int = 0, indices: list[float] | None = None) -> Path:
-    """The same path as a folder of pictures with registered depth, camera.json and truth.tum; returns `folder`."""
+    """The same path as a folder of pictures with registered depth, camera.json and truth.tum;
+    returns `folder`."""
     indices = indices if indices is not None else [float(index) for index in range(NUM_FRAMES)]
     panels = room(seed)
     for side in ("rgb", "depth"):
@@ -149,10 +191,14 @@ def write_depth_recording(folder: Path, seed: int = 0, indices: list[float] | No
         assert cv2.imwrite(str(folder / "rgb" / f"{number:06d}.png"), picture)
         assert cv2.imwrite(str(folder / "depth" / f"{number:06d}.png"), units)
     _write_times_and_truth(folder, indices)
-    (folder / "camera.json").write_text(json.dumps(CAMERA.to_json() | {"depth_factor": DEPTH_FACTOR}))
+    (folder / "camera.json").write_text(
+        json.dumps(CAMERA.to_json() | {"depth_factor": DEPTH_FACTOR})
+    )
     return folder
 
 
 def _write_times_and_truth(folder: Path, indices: list[float]) -> None:
     (folder / "times.txt").write_text("".join(f"{index / RATE_HZ:.9f}\n" for index in indices))
-    (folder / "truth.tum").write_text("".join(tum_line(index, path_pose(index)) + "\n" for index in indices))
+    (folder / "truth.tum").write_text(
+        "".join(tum_line(index, path_pose(index)) + "\n" for index in indices)
+    )

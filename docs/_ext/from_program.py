@@ -1,4 +1,5 @@
-"""What of these pages is generated from the program: the help of every command, and fields as their own words describe them."""
+"""What of these pages is generated from the program: the help of every command, and fields as their
+own words describe them."""
 
 from __future__ import annotations
 
@@ -38,16 +39,21 @@ def _printed(args: list[str]) -> str:
 
 
 class WordsOfFields:
-    """Keeps Napoleon off what is said of a field: there it takes the words before a colon for a type."""
+    """Keeps Napoleon off what is said of a field: there it takes the words before a colon for a
+    type."""
 
     def __init__(self) -> None:
         self.kept: list[str] = []
 
-    def hide(self, app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+    def hide(
+        self, app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]
+    ) -> None:
         if what == "attribute":
             self.kept, lines[:] = lines[:], ["hidden"]
 
-    def show(self, app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+    def show(
+        self, app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]
+    ) -> None:
         if what == "attribute":
             lines[:] = self.kept
 

@@ -34,7 +34,11 @@ def collect_pages(app: Sphinx) -> Iterator[tuple[str, dict[str, Any], str]]:
     for name in sorted(app.env.topoloc_files):
         text = (ROOT / name).read_text(encoding="utf-8")
         body = app.builder.highlighter.highlight_block(text, "python", linenos=False)
-        yield f"{FOLDER}/{name}", {"title": name, "body": f"<h1>{name}</h1>{body}", "parents": []}, "page.html"
+        yield (
+            f"{FOLDER}/{name}",
+            {"title": name, "body": f"<h1>{name}</h1>{body}", "parents": []},
+            "page.html",
+        )
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

@@ -1,6 +1,8 @@
-"""topoloc: a place mapped once with a stereo or RGB-D camera; afterwards any single image of it gets a metric 6-DoF pose.
+"""topoloc: a place mapped once with a stereo or RGB-D camera; afterwards any single image of it
+gets a metric 6-DoF pose.
 
-The public names; each loads its module when it is first asked for, so that `import topoloc` costs nothing.
+The public names; each loads its module when it is first asked for, so that `import topoloc` costs
+nothing.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Settings and their bounds, which are declared beside the field: `Annotated[float, Above(0)]`.
 
-`check_bounds` holds what was made in Python, `settings_from` what was read from a TOML file, a map or a stored model. Whatever its bounds,
-no number may be NaN or infinite, and no whole number that has bounds so large that it does not fit into 32 bits.
+`check_bounds` holds what was made in Python, `settings_from` what was read from a TOML file, a map
+or a stored model. Whatever its bounds, no number may be NaN or infinite, and no whole number that
+has bounds so large that it does not fit into 32 bits.
 """
 
 from __future__ import annotations
@@ -67,7 +68,8 @@ Bound = Above | AtLeast | Between
 
 
 def check_bounds(config: Any, name: str | None = None) -> None:
-    """Hold that every value of a configuration (a dataclass, and those in it) is of its type and within its bounds.
+    """Hold that every value of a configuration (a dataclass, and those in it) is of its type and
+    within its bounds.
 
     Args:
         name: what the configuration is called in the error; by default its class.
@@ -85,18 +87,26 @@ def check_bounds(config: Any, name: str | None = None) -> None:
 
 
 def settings_from(
-    of: type[T], data: Any, key: str, default: T | None = None, known: Collection[str] | None = None, is_strict: bool = True
+    of: type[T],
+    data: Any,
+    key: str,
+    default: T | None = None,
+    known: Collection[str] | None = None,
+    is_strict: bool = True,
 ) -> T:
-    """The dataclass `of` from the nested values of a TOML or JSON file, each of its type and within its bounds.
+    """The dataclass `of` from the nested values of a TOML or JSON file, each of its type and within
+    its bounds.
 
     Args:
         key: what `data` is called in errors.
         default: what keeps its value where `data` has none; by default that of the class.
-        known: the keys that are proposed instead of one that there is not; by default those of `of`.
+        known: the keys that are proposed instead of one that there is not; by default those of
+            `of`.
         is_strict: such a key is an error; else it is left out.
 
     Raises:
-        ConfigError: a key that there is not or that is missing, or a value that cannot be; names the key.
+        ConfigError: a key that there is not or that is missing, or a value that cannot be; names
+            the key.
     """
     if not isinstance(data, dict):
         raise ConfigError(f"{key}: a table is expected, [{key}]")
@@ -105,10 +115,16 @@ def settings_from(
     for name, value in data.items():
         its_key = f"{key}.{quoted(name)}"
         if name in kinds:
-            values[name] = value_from(kinds[name], value, its_key, values.get(name), known, is_strict)
+            values[name] = value_from(
+                kinds[name], value, its_key, values.get(name), known, is_strict
+            )
         elif is_strict:
             raise ConfigError(f"{its_key}: no such setting{did_you_mean(its_key, known)}")
-    required = (field.name for field in fields(of) if field.default is MISSING and field.default_factory is MISSING)  # pyright: ignore[reportArgumentType]
+    required = (
+        field.name
+        for field in fields(of)
+        if field.default is MISSING and field.default_factory is MISSING
+    )  # pyright: ignore[reportArgumentType]
     if missing := [name for name in required if name not in values]:
         raise ConfigError(f"{key}.{missing[0]}: is missing")
     try:
@@ -117,7 +133,14 @@ def settings_from(
         raise ConfigError(f"{key}: {error}") from None
 
 
-def value_from(kind: Any, value: Any, key: str, default: Any = None, known: Collection[str] | None = None, is_strict: bool = True) -> Any:
+def value_from(
+    kind: Any,
+    value: Any,
+    key: str,
+    default: Any = None,
+    known: Collection[str] | None = None,
+    is_strict: bool = True,
+) -> Any:
     """One value as its annotation says; arguments and errors as of `settings_from`."""
     plain, may_be_none = bare(kind)
     if is_dataclass(plain) and not (value is None and may_be_none):
@@ -144,7 +167,11 @@ def did_you_mean(name: str, names: Collection[str]) -> str:
 
 def quoted(name: Any) -> str:
     """A key as it can stand in a line."""
-    return name if re.fullmatch(r"[\w-]{1,60}", name) else json.dumps(name if len(name) <= 60 else name[:57] + "...")
+    return (
+        name
+        if re.fullmatch(r"[\w-]{1,60}", name)
+        else json.dumps(name if len(name) <= 60 else name[:57] + "...")
+    )
 
 
 @cache
@@ -156,7 +183,11 @@ def annotations_of(kind: type) -> dict[str, Any]:
 
 def bounds_of(kind: Any) -> list[Bound]:
     """What an annotation says beside the type."""
-    return [extra for extra in get_args(kind)[1:] if isinstance(extra, Bound)] if get_origin(kind) is Annotated else []
+    return (
+        [extra for extra in get_args(kind)[1:] if isinstance(extra, Bound)]
+        if get_origin(kind) is Annotated
+        else []
+    )
 
 
 def bare(kind: Any) -> tuple[Any, bool]:
@@ -170,7 +201,8 @@ def bare(kind: Any) -> tuple[Any, bool]:
 
 
 def complaint(value: Any, kind: Any) -> str | None:
-    """Why `value` cannot be that of a field declared as `kind`; None where it can. What is in a nested dataclass is not looked at."""
+    """Why `value` cannot be that of a field declared as `kind`; None where it can. What is in a
+    nested dataclass is not looked at."""
     plain, may_be_none = bare(kind)
     if value is None and may_be_none:
         return None
@@ -204,7 +236,9 @@ def in_words(plain: Any) -> str:
         items = get_args(plain)
         number = "" if items[-1] is ... else f"{len(items)} "
         return f"a list of {number}values"
-    return {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}.get(plain, f"a {_name(plain)}")
+    return {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}.get(
+        plain, f"a {_name(plain)}"
+    )
 
 
 def _name(plain: Any) -> str:

@@ -1,8 +1,9 @@
 """Functions compiled by Numba, where their machine code is kept, and how many threads run them.
 
-Numba itself refuses, as a module is imported, to compile for a folder that cannot be written, and reads no code from one. A container's
-image is often both: filled as it is built, read-only afterwards. Here code is read from wherever it lies and kept where it can be; where
-that is nowhere, it is compiled anew in every process, and one line on stderr says what to do.
+Numba itself refuses, as a module is imported, to compile for a folder that cannot be written, and
+reads no code from one. A container's image is often both: filled as it is built, read-only
+afterwards. Here code is read from wherever it lies and kept where it can be; where that is nowhere,
+it is compiled anew in every process, and one line on stderr says what to do.
 """
 
 from __future__ import annotations
@@ -33,8 +34,9 @@ _told: list[str] = []
 def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Decorates a function that Numba compiles; `options` are those of `numba.njit`.
 
-    It releases the GIL and its machine code is kept. It is never `parallel`: Numba's own threads may be used by one thread of Python alone,
-    while a `Localizer` is shared by several. `features/bands.py` shares rows out to threads instead.
+    It releases the GIL and its machine code is kept. It is never `parallel`: Numba's own threads
+    may be used by one thread of Python alone, while a `Localizer` is shared by several.
+    `features/bands.py` shares rows out to threads instead.
     """
     if "parallel" in options:
         raise ValueError("a kernel that several threads call cannot be parallel")
@@ -49,17 +51,20 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 def is_kept(compiled: Any) -> bool:
-    """Whether machine code of this kernel lies somewhere, so that its first call takes no time to speak of."""
+    """Whether machine code of this kernel lies somewhere, so that its first call takes no time to
+    speak of."""
     return compiled._cache.is_kept
 
 
 def set_num_threads(number: int) -> None:
-    """At most so many threads work on one query or one frame; while a map is made, each on a mapping image or a node of its own.
+    """At most so many threads work on one query or one frame; while a map is made, each on a
+    mapping image or a node of its own.
 
-    Unless it is said these are 2, and 1 for the networks of learned coarse localizers. The answers do not depend on it, but for the last
-    digits of such a network's scores. Holds for topoloc in this process and for the libraries that it calls: OpenCV, FAISS, and PyTorch
-    where it is loaded. Of several threads that share a `Localizer`, each uses as many. NumPy's own number is set before it is loaded
-    (`OPENBLAS_NUM_THREADS`; the command line sets 1 where it is not set).
+    Unless it is said these are 2, and 1 for the networks of learned coarse localizers. The answers
+    do not depend on it, but for the last digits of such a network's scores. Holds for topoloc in
+    this process and for the libraries that it calls: OpenCV, FAISS, and PyTorch where it is loaded.
+    Of several threads that share a `Localizer`, each uses as many. NumPy's own number is set before
+    it is loaded (`OPENBLAS_NUM_THREADS`; the command line sets 1 where it is not set).
 
     Raises:
         ValueError: `number` is below 1.
@@ -77,20 +82,26 @@ def set_num_threads(number: int) -> None:
 
 
 def num_threads(usual: int = _USUAL_THREADS) -> int:
-    """As `set_num_threads` said, `usual` where it was not called; 1 in a thread that is one of several already."""
+    """As `set_num_threads` said, `usual` where it was not called; 1 in a thread that is one of
+    several already."""
     return 1 if hasattr(_own, "is_one_of_several") else _chosen[0] if _chosen else usual
 
 
 def be_one_of_several() -> None:
-    """From now on this thread of Python starts no others: they are all at work on items of their own (`features/bands.py`)."""
+    """From now on this thread of Python starts no others: they are all at work on items of their
+    own (`features/bands.py`)."""
     _own.is_one_of_several = True
 
 
 class _KeptCode(NullCache):
-    """The machine code of one function, as Numba asks for it: read from the first folder that has it, kept in the first that takes it."""
+    """The machine code of one function, as Numba asks for it: read from the first folder that has
+    it, kept in the first that takes it."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        self._caches = [_FolderCache(function, folder) for folder in _folders(str(Path(function.__code__.co_filename).parent))]
+        self._caches = [
+            _FolderCache(function, folder)
+            for folder in _folders(str(Path(function.__code__.co_filename).parent))
+        ]
 
     @property
     def cache_path(self) -> Any:
@@ -130,7 +141,9 @@ class _FolderCache(FunctionCache):
     """Numba's cache in a folder of our choice."""
 
     def __init__(self, function: Callable[..., Any], folder: str) -> None:
-        self._impl_class = type("_Impl", (CompileResultCacheImpl,), {"_locator_classes": [_Place(function, folder)]})
+        self._impl_class = type(
+            "_Impl", (CompileResultCacheImpl,), {"_locator_classes": [_Place(function, folder)]}
+        )
         super().__init__(function)
 
     @property
@@ -167,13 +180,21 @@ class _Place:
 
 @cache
 def _folders(source: str) -> list[str]:
-    """Where code of functions from the folder `source` may lie: `NUMBA_CACHE_DIR` if that is set, else beside them or the user's own."""
+    """Where code of functions from the folder `source` may lie: `NUMBA_CACHE_DIR` if that is set,
+    else beside them or the user's own."""
     apart = f"{Path(source).name}_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
     if named := config.CACHE_DIR:  # pyright: ignore[reportAttributeAccessIssue]
         return [os.path.join(named, apart)]
     folders = [os.path.join(source, "__pycache__")]
     with contextlib.suppress(RuntimeError):  # nobody knows a home
-        folders.append(str(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "topoloc" / "kernels" / apart))
+        folders.append(
+            str(
+                Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+                / "topoloc"
+                / "kernels"
+                / apart
+            )
+        )
     return folders
 
 
@@ -190,7 +211,8 @@ def _tell(folders: str) -> None:
         return
     _told.append(folders)
     print(
-        f"topoloc compiles anew in every process, a minute in all: machine code cannot be kept ({folders}). While a container's image"
-        " is built, `python -c 'import topoloc; topoloc.warm_up()'` fills the first; or NUMBA_CACHE_DIR names one that can be written.",
+        "topoloc compiles anew in every process, a minute in all: machine code cannot be kept"
+        f" ({folders}). While a container's image is built, `python -c 'import topoloc;"
+        " topoloc.warm_up()'` fills the first; or NUMBA_CACHE_DIR names one that can be written.",
         file=sys.stderr,
     )

@@ -1,4 +1,5 @@
-"""Known failures, one line each on the command line; anything else is a bug and shows its traceback.
+"""Known failures, one line each on the command line; anything else is a bug and shows its
+traceback.
 
 TopolocError
 ├── RecordingError        a recording (or one file of it) that cannot be read or makes no sense
@@ -11,23 +12,24 @@ TopolocError
 │   ├── MapVersionError       written by a later topoloc, schema unknown here
 │   ├── EmptyMapError         no node could be built, or the map holds none
 │   ├── UnknownMapError       no map of this name where maps are asked for by name
-│   └── AtlasError            an atlas that cannot be opened, read or written, or two tiles of one id
-│       └── StoreError            an object store that does not answer, or not in time
-├── WeightsError          weights of a network that are missing, damaged or of another network
-├── TrainingError         a training that cannot begin or go on: nothing to learn from, a loss that is not finite
-├── ConfigError           a setting that is unknown, of the wrong type or out of its bounds; names the key
-├── QueryError            the call of a query is wrong (no camera, camera of another image size)
-├── ResultError           a result (a JSON line) that is none
-├── GeoreferenceError     no place on earth, or points that do not say where a map lies on it
-├── FeatureKindError      features of a kind that there is not, or whose fitted weights are damaged
-├── ClusterError          a cluster that does not answer, or is of another version
-├── ServiceError          a service that does not answer, or refuses
-└── MissingExtraError     an optional dependency is not installed; names the extra
+│   └── AtlasError            an atlas that cannot be opened, read or written, or two tiles of one
+id │       └── StoreError            an object store that does not answer, or not in time ├──
+WeightsError          weights of a network that are missing, damaged or of another network ├──
+TrainingError         a training that cannot begin or go on: nothing to learn from, a loss that is
+not finite ├── ConfigError           a setting that is unknown, of the wrong type or out of its
+bounds; names the key ├── QueryError            the call of a query is wrong (no camera, camera of
+another image size) ├── ResultError           a result (a JSON line) that is none ├──
+GeoreferenceError     no place on earth, or points that do not say where a map lies on it ├──
+FeatureKindError      features of a kind that there is not, or whose fitted weights are damaged ├──
+ClusterError          a cluster that does not answer, or is of another version ├── ServiceError
+a service that does not answer, or refuses └── MissingExtraError     an optional dependency is not
+installed; names the extra
 """
 
 
 class TopolocError(Exception):
-    """A failure that the user can understand and mend: its text is one line, saying what and where."""
+    """A failure that the user can understand and mend: its text is one line, saying what and
+    where."""
 
 
 class RecordingError(TopolocError):
@@ -75,7 +77,8 @@ class AtlasError(MapError):
 
 
 class StoreError(AtlasError):
-    """An object store that does not answer, or whose files cannot be kept here: nothing is said of what they hold, and later it may go."""
+    """An object store that does not answer, or whose files cannot be kept here: nothing is said of
+    what they hold, and later it may go."""
 
 
 class WeightsError(TopolocError):
@@ -103,11 +106,13 @@ class GeoreferenceError(TopolocError):
 
 
 class FeatureKindError(TopolocError):
-    """Features of an unknown kind, or fitted weights that cannot be read; the text names the kinds or the file."""
+    """Features of an unknown kind, or fitted weights that cannot be read; the text names the kinds
+    or the file."""
 
 
 class ServiceError(TopolocError):
-    """A service that does not answer, or refuses; `status` is its HTTP status, None where there was no answer."""
+    """A service that does not answer, or refuses; `status` is its HTTP status, None where there was
+    no answer."""
 
     def __init__(self, text: str, status: int | None = None) -> None:
         super().__init__(text)

@@ -1,4 +1,5 @@
-"""A long list in the making whose entries lie on disk, but for those used last: what a map of any length is built with."""
+"""A long list in the making whose entries lie on disk, but for those used last: what a map of any
+length is built with."""
 
 from __future__ import annotations
 
@@ -24,23 +25,40 @@ DEFAULT_BYTES = 64_000_000
 
 
 class Shelf(Sequence[T]):
-    """Entries that stay in memory up to a number of bytes; those used longest ago lie in a temporary file, which ends with this process.
+    """Entries that stay in memory up to a number of bytes; those used longest ago lie in a
+    temporary file, which ends with this process.
 
-    An entry that was changed has to be put back (``shelf[row] = entry``), or the change may be lost. Threads may share a shelf. It is
-    pickled as a list.
+    An entry that was changed has to be put back (``shelf[row] = entry``), or the change may be
+    lost. Threads may share a shelf. It is pickled as a list.
 
     Args:
-        by_reference: objects that stay in memory in any case; entries that refer to them refer to these same objects when they come back.
+        by_reference: objects that stay in memory in any case; entries that refer to them refer to
+            these same objects when they come back.
 
     Raises:
-        TopolocError: the folder of temporary files has no room left; from whatever adds entries or looks at them.
+        TopolocError: the folder of temporary files has no room left; from whatever adds entries or
+            looks at them.
     """
 
-    def __init__(self, entries: Iterable[T] = (), max_bytes: int | None = None, by_reference: Sequence[object] = ()) -> None:
+    def __init__(
+        self,
+        entries: Iterable[T] = (),
+        max_bytes: int | None = None,
+        by_reference: Sequence[object] = (),
+    ) -> None:
         self._lock = threading.RLock()
-        self._kept: OrderedDict[int, tuple[T, int, bool]] = OrderedDict()  # by row: entry, bytes, whether the file has it as it is
-        self._length, self._num_bytes, self._max_bytes = 0, 0, DEFAULT_BYTES if max_bytes is None else max_bytes
-        self._referred, self._numbers = by_reference, {id(one): number for number, one in enumerate(by_reference)}
+        self._kept: OrderedDict[int, tuple[T, int, bool]] = (
+            OrderedDict()
+        )  # by row: entry, bytes, whether the file has it as it is
+        self._length, self._num_bytes, self._max_bytes = (
+            0,
+            0,
+            DEFAULT_BYTES if max_bytes is None else max_bytes,
+        )
+        self._referred, self._numbers = (
+            by_reference,
+            {id(one): number for number, one in enumerate(by_reference)},
+        )
         self._database: sqlite3.Connection | None = None
         for entry in entries:
             self.append(entry)
@@ -85,7 +103,8 @@ class Shelf(Sequence[T]):
         return row
 
     def _keep(self, row: int, entry: T, is_written: bool) -> None:
-        """In memory, as the entry used last; others give way. An entry beyond the whole budget is written at once."""
+        """In memory, as the entry used last; others give way. An entry beyond the whole budget is
+        written at once."""
         if row in self._kept:
             self._num_bytes -= self._kept.pop(row)[1]
         size = bytes_of(entry, self._numbers)
@@ -104,15 +123,21 @@ class Shelf(Sequence[T]):
                 self._database = sqlite3.connect("", isolation_level=None, check_same_thread=False)
                 for pragma in ("journal_mode = OFF", "synchronous = OFF"):
                     self._database.execute(f"PRAGMA {pragma}")
-                self._database.execute("CREATE TABLE entries (row INTEGER PRIMARY KEY, entry BLOB NOT NULL)")
+                self._database.execute(
+                    "CREATE TABLE entries (row INTEGER PRIMARY KEY, entry BLOB NOT NULL)"
+                )
             buffer = io.BytesIO()
             _Pickler(buffer, self._numbers).dump(entry)
-            self._database.execute("INSERT OR REPLACE INTO entries VALUES (?, ?)", (row, buffer.getbuffer()))
+            self._database.execute(
+                "INSERT OR REPLACE INTO entries VALUES (?, ?)", (row, buffer.getbuffer())
+            )
 
     def _read(self, row: int) -> T:
         assert self._database is not None
         with self._told():
-            blob = self._database.execute("SELECT entry FROM entries WHERE row = ?", (row,)).fetchone()[0]
+            blob = self._database.execute(
+                "SELECT entry FROM entries WHERE row = ?", (row,)
+            ).fetchone()[0]
         return _Unpickler(io.BytesIO(blob), self._referred).load()
 
     @contextmanager
@@ -120,7 +145,10 @@ class Shelf(Sequence[T]):
         try:
             yield
         except sqlite3.OperationalError as error:
-            raise TopolocError(f"the folder of temporary files (TMPDIR) does not hold what is in the making: {error}") from error
+            raise TopolocError(
+                "the folder of temporary files (TMPDIR) does not hold what is in the making:"
+                f" {error}"
+            ) from error
 
 
 class _Pickler(pickle.Pickler):
@@ -142,9 +170,12 @@ class _Unpickler(pickle.Unpickler):
 
 
 def bytes_of(value: Any, apart: Container[int] = ()) -> int:
-    """Bytes of the arrays and byte strings in a value, its fields and items, those of mappings too; objects of these `id` do not count."""
+    """Bytes of the arrays and byte strings in a value, its fields and items, those of mappings too;
+    objects of these `id` do not count."""
     total, left = 0, [value]
-    while left:  # no recursion: a draft has hundreds of parts, and is counted whenever a picture has seen it
+    while (
+        left
+    ):  # no recursion: a draft has hundreds of parts, and is counted whenever a picture has seen it
         one = left.pop()
         if id(one) in apart:
             continue

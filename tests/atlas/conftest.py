@@ -22,7 +22,9 @@ def other_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     folder = tmp_path_factory.mktemp("other")
     recording = write_stereo_recording(folder / "other", seed=1, indices=[0.0, 2.0, 4.0, 6.0])
-    build_map(open_sequence(str(recording)), BuildConfig(other_kinds=())).save(folder / "other.topo")
+    build_map(open_sequence(str(recording)), BuildConfig(other_kinds=())).save(
+        folder / "other.topo"
+    )
     return folder / "other.topo"
 
 
@@ -44,7 +46,10 @@ def own_atlas(atlas: Path, tmp_path: Path) -> Path:
 def s3_server() -> Iterator[str]:
     """The address of moto's server, which speaks the API of Amazon S3, on this machine."""
     for needed in ("s3fs", "moto", "flask", "flask_cors"):
-        pytest.importorskip(needed, reason="an S3 server to test on needs: pip install s3fs 'moto[s3]' flask flask-cors")
+        pytest.importorskip(
+            needed,
+            reason="an S3 server to test on needs: pip install s3fs 'moto[s3]' flask flask-cors",
+        )
     from moto.server import ThreadedMotoServer  # pyright: ignore[reportMissingImports]
 
     server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
@@ -60,7 +65,11 @@ def s3_bucket(s3_server: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
     import s3fs  # pyright: ignore[reportMissingImports]
 
     said = {"AWS_ENDPOINT_URL": s3_server, "AWS_DEFAULT_REGION": "us-east-1"}
-    said |= {"AWS_ACCESS_KEY_ID": "tests", "AWS_SECRET_ACCESS_KEY": "tests", "TOPOLOC_CACHE": str(tmp_path / "cache")}
+    said |= {
+        "AWS_ACCESS_KEY_ID": "tests",
+        "AWS_SECRET_ACCESS_KEY": "tests",
+        "TOPOLOC_CACHE": str(tmp_path / "cache"),
+    }
     for name, value in said.items():
         monkeypatch.setenv(name, value)
     s3fs.S3FileSystem.clear_instance_cache()

@@ -33,22 +33,37 @@ def _json(capsys: pytest.CaptureFixture[str], *args: object) -> str:
     return capsys.readouterr().out
 
 
-def test_an_atlas_is_made_added_to_and_emptied(room_map: Path, other_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_an_atlas_is_made_added_to_and_emptied(
+    room_map: Path, other_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     where = tmp_path / "campus"
     made = json.loads(_json(capsys, "atlas", "create", where, room_map))
-    assert (made["serial"], made["num_tiles"], [tile["id"] for tile in made["tiles"]]) == (1, 1, ["room"])
-    added = json.loads(_json(capsys, "atlas", "add", where, other_map, "--id", "annex", "--world", "house"))
-    assert [(tile["id"], tile["world"]) for tile in added["tiles"]] == [("annex", "house"), ("room", "room")]
+    assert (made["serial"], made["num_tiles"], [tile["id"] for tile in made["tiles"]]) == (
+        1,
+        1,
+        ["room"],
+    )
+    added = json.loads(
+        _json(capsys, "atlas", "add", where, other_map, "--id", "annex", "--world", "house")
+    )
+    assert [(tile["id"], tile["world"]) for tile in added["tiles"]] == [
+        ("annex", "house"),
+        ("room", "room"),
+    ]
     assert added["num_nodes"] == sum(tile["num_nodes"] for tile in added["tiles"])
     assert main(["atlas", "remove", str(where), "room"]) == 0
     assert main(["atlas", "info", str(where), "--check"]) == 0
     printed = capsys.readouterr().out
     assert "annex" in printed
     assert "check  ok" in printed
-    assert json.loads(_json(capsys, "info", where)) == json.loads(_json(capsys, "atlas", "info", where))
+    assert json.loads(_json(capsys, "info", where)) == json.loads(
+        _json(capsys, "atlas", "info", where)
+    )
 
 
-def test_the_history_is_that_of_each_tile(own_atlas: Path, room_map: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_history_is_that_of_each_tile(
+    own_atlas: Path, room_map: Path, capsys: pytest.CaptureFixture[str]
+):
     told = json.loads(_json(capsys, "history", own_atlas))
     assert [tile["tile_id"] for tile in told["tiles"]] == ["other", "room"]
     alone = json.loads(_json(capsys, "history", room_map))["edits"]
@@ -61,7 +76,9 @@ def test_the_history_is_that_of_each_tile(own_atlas: Path, room_map: Path, capsy
     assert "tile room" in said.out
 
 
-def test_a_history_ends_where_the_store_is_silent(atlas: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+def test_a_history_ends_where_the_store_is_silent(
+    atlas: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
     asked = list[str]()
 
     def silent(self: Atlas, tile: Tile) -> Path:
@@ -80,7 +97,9 @@ def test_check_names_the_tile_that_is_damaged(own_atlas: Path, capsys: pytest.Ca
     assert "error: tile other: tiles/other-" in capsys.readouterr().err
 
 
-def test_pictures_are_localized_in_their_tiles(atlas: Path, of_both: Path, capsys: pytest.CaptureFixture[str]):
+def test_pictures_are_localized_in_their_tiles(
+    atlas: Path, of_both: Path, capsys: pytest.CaptureFixture[str]
+):
     lines = [json.loads(line) for line in _json(capsys, "localize", atlas, of_both).splitlines()]
     assert [line["tile"] for line in lines] == ["room", "room", "other"]
     for line in lines:
@@ -91,7 +110,11 @@ def test_pictures_are_localized_in_their_tiles(atlas: Path, of_both: Path, capsy
 
 
 def test_near_leaves_tiles_out_that_are_known_to_lie_elsewhere(
-    own_atlas: Path, room_map: Path, of_both: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    own_atlas: Path,
+    room_map: Path,
+    of_both: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ):
     shutil.copy(room_map, tmp_path / "room.topo")
     assert main(["georeference", str(tmp_path / "room.topo"), "--origin", "50.87,4.7,30,0"]) == 0
@@ -108,16 +131,34 @@ def test_near_leaves_tiles_out_that_are_known_to_lie_elsewhere(
 
 
 def test_truth_is_that_of_one_tile(atlas: Path, of_both: Path, capsys: pytest.CaptureFixture[str]):
-    """Of the third picture the truth is said to lie in the room, and the answer is in the other one: a false accept."""
+    """Of the third picture the truth is said to lie in the room, and the answer is in the other
+    one: a false accept."""
     evaluation = json.loads(_json(capsys, "evaluate", atlas, of_both, "--tile", "room"))
-    assert (evaluation["num_queries"], evaluation["num_localized"], evaluation["false_accepts"]) == (3, 2, 1)
+    assert (
+        evaluation["num_queries"],
+        evaluation["num_localized"],
+        evaluation["false_accepts"],
+    ) == (3, 2, 1)
     assert evaluation["median_translation_m"] < 0.05
-    of_first = json.loads(_json(capsys, "evaluate", atlas, f"{of_both}@0:2", "--tile", "room", "--elsewhere", f"{of_both}@2:3"))
+    of_first = json.loads(
+        _json(
+            capsys,
+            "evaluate",
+            atlas,
+            f"{of_both}@0:2",
+            "--tile",
+            "room",
+            "--elsewhere",
+            f"{of_both}@2:3",
+        )
+    )
     assert (of_first["num_localized"], of_first["false_accepts"]) == (2, 1)
     assert np.isclose(of_first["median_translation_m"], evaluation["median_translation_m"])
 
 
-def test_a_picture_is_explained_in_its_tile(atlas: Path, of_both: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_picture_is_explained_in_its_tile(
+    atlas: Path, of_both: Path, capsys: pytest.CaptureFixture[str]
+):
     facts = json.loads(_json(capsys, "explain", atlas, f"{of_both}@2"))
     assert facts["tiles"][0] == "atlas: in tile other"
     assert facts["tiles"][1].startswith("looks most like: other ")
@@ -136,7 +177,9 @@ def test_a_picture_is_explained_in_its_tile(atlas: Path, of_both: Path, capsys: 
         (["slam", "ATLAS", "out.tum"], "no known recording"),
     ],
 )
-def test_known_failures_are_one_line(args: list[str], said: str, own_atlas: Path, room_map: Path, of_both: Path, complaint: Complaint):
+def test_known_failures_are_one_line(
+    args: list[str], said: str, own_atlas: Path, room_map: Path, of_both: Path, complaint: Complaint
+):
     paths = {"ATLAS": own_atlas, "MAP": room_map, "PICTURES": of_both}
     assert said in complaint(*(paths.get(arg, arg) for arg in args))
 
@@ -159,6 +202,8 @@ def test_known_failures_are_one_line(args: list[str], said: str, own_atlas: Path
         (["evaluate", "MAP", "PICTURES", "--tile", "room"], "--tile is of an atlas"),
     ],
 )
-def test_wrong_usage_is_said(args: list[str], said: str, own_atlas: Path, room_map: Path, of_both: Path, complaint: Complaint):
+def test_wrong_usage_is_said(
+    args: list[str], said: str, own_atlas: Path, room_map: Path, of_both: Path, complaint: Complaint
+):
     paths = {"ATLAS": own_atlas, "MAP": room_map, "PICTURES": of_both}
     assert said in complaint(*(paths.get(arg, arg) for arg in args), status=2)

@@ -1,4 +1,5 @@
-"""Tiles added and removed: nobody's are lost, files stay as long as somebody may read them, and no longer."""
+"""Tiles added and removed: nobody's are lost, files stay as long as somebody may read them, and no
+longer."""
 
 from __future__ import annotations
 
@@ -68,14 +69,21 @@ def test_an_atlas_that_is_made_where_there_is_none(somewhere: str, room_map: Pat
     assert _tiles(somewhere) == ["other", "room"]
 
 
-def test_what_was_made_of_the_same_is_no_other_tile(somewhere: str, room_map: Path, other_map: Path):
+def test_what_was_made_of_the_same_is_no_other_tile(
+    somewhere: str, room_map: Path, other_map: Path
+):
     made = NewTile("room", room_map, "room", recipe="ab" * 32)
     add_tiles(somewhere, [made], creates=True)
     assert add_tiles(somewhere, [made]).by_id["room"].recipe == made.recipe
     for other in (replace(made, recipe="cd" * 32), replace(made, recipe=None)):
         with pytest.raises(AtlasError, match="has a tile room already"):
             add_tiles(somewhere, [replace(other, path=other_map)])
-    assert add_tiles(somewhere, new_tiles([str(other_map)], "room"), replaces=True).by_id["room"].recipe is None
+    assert (
+        add_tiles(somewhere, new_tiles([str(other_map)], "room"), replaces=True)
+        .by_id["room"]
+        .recipe
+        is None
+    )
 
 
 def test_what_a_killed_writer_left_half_goes(room_map: Path, other_map: Path, tmp_path: Path):
@@ -87,7 +95,9 @@ def test_what_a_killed_writer_left_half_goes(room_map: Path, other_map: Path, tm
     assert not left.exists()
 
 
-def test_whoever_has_opened_an_atlas_keeps_its_tiles(somewhere: str, room_map: Path, other_map: Path):
+def test_whoever_has_opened_an_atlas_keeps_its_tiles(
+    somewhere: str, room_map: Path, other_map: Path
+):
     create_atlas(somewhere, new_tiles([str(room_map)], "hall"))
     before = Atlas.open(somewhere)
     add_tiles(somewhere, new_tiles([str(other_map)], "hall"), replaces=True)
@@ -96,10 +106,15 @@ def test_whoever_has_opened_an_atlas_keeps_its_tiles(somewhere: str, room_map: P
     assert after.map_path(after.tile("hall")).read_bytes() == other_map.read_bytes()
 
 
-def test_files_that_nobody_names_go_after_their_time(room_map: Path, other_map: Path, tmp_path: Path):
+def test_files_that_nobody_names_go_after_their_time(
+    room_map: Path, other_map: Path, tmp_path: Path
+):
     where = tmp_path / "campus"
     create_atlas(str(where), new_tiles([str(room_map)], "hall"))
-    files = lambda: {path.suffix for path in (where / "tiles").iterdir() if path.name.startswith("hall")}  # noqa: E731
+
+    def files():
+        return {path.suffix for path in (where / "tiles").iterdir() if path.name.startswith("hall")}
+
     litter = where / "tiles" / "killed-0123.topo"
     litter.write_bytes(b"of a writer that was killed")
     remove_tiles(str(where), ["hall"])
@@ -130,7 +145,9 @@ def test_a_tile_that_comes_back_is_not_swept(room_map: Path, tmp_path: Path):
     assert [tile_problem(read, tile) for tile in read.manifest.tiles] == [None, None]
 
 
-def test_two_writers_at_once_lose_nothing(somewhere: str, room_map: Path, monkeypatch: pytest.MonkeyPatch):
+def test_two_writers_at_once_lose_nothing(
+    somewhere: str, room_map: Path, monkeypatch: pytest.MonkeyPatch
+):
     """Writes of two writers that begin together; what is slow about a tile is left out."""
     num_writes = NUM_WRITES[somewhere.partition("://")[0] if "://" in somewhere else "folder"]
     create_atlas(somewhere, new_tiles([str(room_map)]))
@@ -160,18 +177,23 @@ def test_two_writers_at_once_lose_nothing(somewhere: str, room_map: Path, monkey
         writer.join()
     manifest = Atlas.open(somewhere).manifest
     assert not failures
-    assert {tile.tile_id for tile in manifest.tiles} == {"room"} | {f"{name}{number}" for name in "ab" for number in range(num_writes)}
+    assert {tile.tile_id for tile in manifest.tiles} == {"room"} | {
+        f"{name}{number}" for name in "ab" for number in range(num_writes)
+    }
     assert manifest.serial == 1 + 2 * num_writes
 
 
 def _one_object_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """fsspec's store in memory looks first and writes then, and lists what goes meanwhile, unlike S3; here each is one step."""
+    """fsspec's store in memory looks first and writes then, and lists what goes meanwhile, unlike
+    S3; here each is one step."""
     from fsspec.implementations.memory import MemoryFileSystem
 
     lock, write = threading.RLock(), MemoryFileSystem.pipe_file
     listed, removed = MemoryFileSystem.ls, MemoryFileSystem._rm  # pyright: ignore[reportPrivateUsage]
 
-    def at_once(self: MemoryFileSystem, path: str, value: bytes, mode: str = "overwrite", **kwargs: object) -> None:
+    def at_once(
+        self: MemoryFileSystem, path: str, value: bytes, mode: str = "overwrite", **kwargs: object
+    ) -> None:
         with lock:
             if mode == "create" and self.exists(path):
                 raise FileExistsError(path)
@@ -190,8 +212,11 @@ def _one_object_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(MemoryFileSystem, "_rm", gone_at_once)
 
 
-def test_a_writer_that_comes_too_late_begins_anew(room_map: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Another writer commits between reading and committing: its tile is there afterwards, and a clash of ids with it is told."""
+def test_a_writer_that_comes_too_late_begins_anew(
+    room_map: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Another writer commits between reading and committing: its tile is there afterwards, and a
+    clash of ids with it is told."""
     where = str(tmp_path / "campus")
     create_atlas(where, [])
     made: Callable[[NewTile, Store], Tile] = editing.tile_of

@@ -1,4 +1,5 @@
-"""The index ranks tiles by their most similar place, also where these have vectors by different kinds of features."""
+"""The index ranks tiles by their most similar place, also where these have vectors by different
+kinds of features."""
 
 from __future__ import annotations
 
@@ -26,13 +27,22 @@ def test_tiles_are_ranked_by_their_most_similar_place():
     ranked = AtlasIndex(list(tiles), list(tiles.values())).rank({"surf": asked}, 3)
     best = {name: float((vectors["surf"] @ asked).max()) for name, vectors in tiles.items()}
     assert [name for name, _ in ranked] == sorted(best, key=lambda name: -best[name])[:3]
-    assert [likeness for _, likeness in ranked] == pytest.approx([best[name] for name, _ in ranked], abs=1e-5)
+    assert [likeness for _, likeness in ranked] == pytest.approx(
+        [best[name] for name, _ in ranked], abs=1e-5
+    )
 
 
 def test_the_last_kind_counts_and_tiles_without_it_stay_as_far_behind_as_they_were():
     along = np.eye(4, dtype=np.float32)
-    like = lambda cosine, axis: (cosine * along[0] + np.sqrt(1 - cosine**2) * along[axis])[None].astype(np.float32)  # noqa: E731
-    vectors = [{"surf": like(0.5, 1), "net": like(0.9, 2)}, {"surf": like(0.6, 1), "net": like(0.4, 2)}, {"surf": like(0.4, 1)}]
+
+    def like(cosine, axis):
+        return (cosine * along[0] + np.sqrt(1 - cosine**2) * along[axis])[None].astype(np.float32)
+
+    vectors = [
+        {"surf": like(0.5, 1), "net": like(0.9, 2)},
+        {"surf": like(0.6, 1), "net": like(0.4, 2)},
+        {"surf": like(0.4, 1)},
+    ]
     index = AtlasIndex(["right", "wrong", "without"], vectors)
     by_surf = index.rank({"surf": along[0]}, 9)
     assert [name for name, _ in by_surf] == ["wrong", "right", "without"]
@@ -41,7 +51,9 @@ def test_the_last_kind_counts_and_tiles_without_it_stay_as_far_behind_as_they_we
     assert [likeness for _, likeness in ranked] == pytest.approx([0.9, 0.7, 0.4], abs=1e-6)
 
 
-def test_vectors_of_a_map_are_kept_and_those_of_another_vocabulary_are_not_compared(room_map: Path, tmp_path: Path):
+def test_vectors_of_a_map_are_kept_and_those_of_another_vocabulary_are_not_compared(
+    room_map: Path, tmp_path: Path
+):
     with TopoMetricMap.load(room_map) as topomap:
         vectors = place_vectors(topomap)
         assert len(vectors["surf"]) == len(topomap.summaries)
@@ -51,7 +63,11 @@ def test_vectors_of_a_map_are_kept_and_those_of_another_vocabulary_are_not_compa
 
     vocabulary = shared_vocabulary("surf")
     assert vocabulary is not None
-    assert np.allclose(read_vectors(tmp_path / "places", {"surf": vocabulary.version})["surf"], vectors["surf"], atol=1e-3)
+    assert np.allclose(
+        read_vectors(tmp_path / "places", {"surf": vocabulary.version})["surf"],
+        vectors["surf"],
+        atol=1e-3,
+    )
     with pytest.raises(AtlasError, match="another version"):
         read_vectors(tmp_path / "places", {"surf": "0"})
 
@@ -74,7 +90,9 @@ def test_pictures_look_like_their_own_tile(atlas: Path):
     assert vocabulary is not None
     for seed, tile in ((0, "room"), (1, "other")):
         image, _ = unseen_views(seed)[1]
-        vector = vocabulary.vector(extract_features(image, FeatureConfig()), CAMERA.width, CAMERA.height)
+        vector = vocabulary.vector(
+            extract_features(image, FeatureConfig()), CAMERA.width, CAMERA.height
+        )
         (first, likeness), (_, second) = index.rank({"surf": vector}, 2)
         assert first == tile
         assert likeness > second + 0.1

@@ -1,4 +1,5 @@
-"""An atlas answers as the tile that knows the place, names it, and does not choose between two that know it as well."""
+"""An atlas answers as the tile that knows the place, names it, and does not choose between two that
+know it as well."""
 
 from __future__ import annotations
 
@@ -27,8 +28,18 @@ from topoloc.map.topomap import TopoMetricMap
 BUDGET = 100_000_000
 
 
-def _localizer(where: Path, config: AtlasConfig | None = None, warn: list[str] | None = None, budget: int = BUDGET) -> AtlasLocalizer:
-    return AtlasLocalizer(Atlas.open(str(where)), Maps([], Localizer, budget), config, (warn if warn is not None else []).append)
+def _localizer(
+    where: Path,
+    config: AtlasConfig | None = None,
+    warn: list[str] | None = None,
+    budget: int = BUDGET,
+) -> AtlasLocalizer:
+    return AtlasLocalizer(
+        Atlas.open(str(where)),
+        Maps([], Localizer, budget),
+        config,
+        (warn if warn is not None else []).append,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +57,9 @@ def test_the_right_tile_answers_as_it_does_alone(asked: AtlasLocalizer, room_map
             assert result.provenance.tile == "room"
             assert result.provenance.map_id == by_map.provenance.map_id
             assert np.array_equal(result.world_from_cam.matrix(), by_map.world_from_cam.matrix())
-            assert np.linalg.norm(result.world_from_cam.translation - world_from_cam.translation) < 0.1
+            assert (
+                np.linalg.norm(result.world_from_cam.translation - world_from_cam.translation) < 0.1
+            )
 
 
 def test_the_other_room_is_the_other_tile(asked: AtlasLocalizer):
@@ -80,7 +93,9 @@ def test_features_are_extracted_once_for_all_tiles(atlas: Path, monkeypatch: pyt
         return extract(normalized, config)
 
     monkeypatch.setattr(query, "extract_normalized", counted)
-    _localizer(atlas, AtlasConfig(settled_gap=2.0, hopeless_gap=2.0)).localize(unseen_views(seed=2)[0][0], CAMERA)
+    _localizer(atlas, AtlasConfig(settled_gap=2.0, hopeless_gap=2.0)).localize(
+        unseen_views(seed=2)[0][0], CAMERA
+    )
     assert kinds == ["surf"]
 
 
@@ -90,7 +105,9 @@ def test_where_no_tile_looks_like_the_picture_only_the_likeliest_is_asked_by_all
 ):
     asked = list[str]()
     by_all_means = Asking.by_all_means
-    monkeypatch.setattr(Asking, "by_all_means", lambda self: asked.append(self.features) or by_all_means(self))
+    monkeypatch.setattr(
+        Asking, "by_all_means", lambda self: asked.append(self.features) or by_all_means(self)
+    )
     config = AtlasConfig(settled_gap=2.0, hopeless_gap=2.0, least_likeness=least_likeness)
     result = _localizer(atlas, config).localize(unseen_views(seed=2)[0][0], CAMERA)
     assert isinstance(result, NotLocalized)
@@ -109,11 +126,15 @@ def test_two_tiles_that_know_the_place_as_well_are_both_named(own_atlas: Path, r
     assert result_from_json(result.to_json("view")).alternatives[0].tile in ("room", "twin")  # pyright: ignore
 
 
-def test_a_look_alike_that_cannot_come_near_is_left_at_that(atlas: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_look_alike_that_cannot_come_near_is_left_at_that(
+    atlas: Path, monkeypatch: pytest.MonkeyPatch
+):
     """Neither does it cost a glance, nor is it named."""
     asked = list[str]()
     glance = Asking.at_a_glance
-    monkeypatch.setattr(Asking, "at_a_glance", lambda self: asked.append(self.features) or glance(self))
+    monkeypatch.setattr(
+        Asking, "at_a_glance", lambda self: asked.append(self.features) or glance(self)
+    )
     wide = AtlasConfig(settled_gap=2.0, hopeless_gap=2.0, alike_gap=2.0, num_glanced=1)
     result = _localizer(atlas, wide).localize(unseen_views()[0][0], CAMERA)
     assert isinstance(result, Localization)
@@ -122,7 +143,9 @@ def test_a_look_alike_that_cannot_come_near_is_left_at_that(atlas: Path, monkeyp
 
 def test_a_twin_that_is_asked_last_is_heard(own_atlas: Path, room_map: Path):
     add_tiles(str(own_atlas), new_tiles([str(room_map)], "twin"))
-    result = _localizer(own_atlas, AtlasConfig(settled_gap=2.0, num_glanced=1)).localize(unseen_views()[0][0], CAMERA)
+    result = _localizer(own_atlas, AtlasConfig(settled_gap=2.0, num_glanced=1)).localize(
+        unseen_views()[0][0], CAMERA
+    )
     assert isinstance(result, NotLocalized)
     assert result.reason == "ambiguous"
 
@@ -134,12 +157,18 @@ def test_two_tiles_of_one_world_agree(own_atlas: Path, room_map: Path):
     assert isinstance(_localizer(own_atlas).localize(unseen_views()[0][0], CAMERA), Localization)
 
 
-def test_georeferenced_tiles_agree_and_say_where_in_the_atlas(own_atlas: Path, room_map: Path, tmp_path: Path):
+def test_georeferenced_tiles_agree_and_say_where_in_the_atlas(
+    own_atlas: Path, room_map: Path, tmp_path: Path
+):
     from dataclasses import replace
 
-    turned = Rigid3(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.array([2.0, 3.0, 0.0]))
+    turned = Rigid3(
+        np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.array([2.0, 3.0, 0.0])
+    )
     with TopoMetricMap.load(room_map) as topomap:
-        replace(topomap, georeference=Georeference(GeoPoint(50.87, 4.70, 30.0), turned, "origin")).save(tmp_path / "room.topo")
+        replace(
+            topomap, georeference=Georeference(GeoPoint(50.87, 4.70, 30.0), turned, "origin")
+        ).save(tmp_path / "room.topo")
     add_tiles(str(own_atlas), new_tiles([str(tmp_path / "room.topo")], "room"), replaces=True)
     add_tiles(str(own_atlas), new_tiles([str(tmp_path / "room.topo")], "twin"))
     result = _localizer(own_atlas).localize(unseen_views()[0][0], CAMERA)
@@ -166,7 +195,9 @@ def test_a_tile_that_cannot_be_read_leaves_the_rest(own_atlas: Path, harm: str):
     assert result.provenance.tile == "room"
     assert result.localized
     of_other = localizer.localize(unseen_views(seed=1)[1][0], CAMERA)
-    assert of_other.localized == harm.startswith("places")  # whose places cannot be ranked is asked after the others
+    assert of_other.localized == harm.startswith(
+        "places"
+    )  # whose places cannot be ranked is asked after the others
     assert len(said) == 1
     assert said[0].startswith("tile other ")
     assert str(path.name) in said[0]

@@ -1,4 +1,5 @@
-"""What `atlas.json` says comes back as it was written, and is refused in one line where it was not."""
+"""What `atlas.json` says comes back as it was written, and is refused in one line where it was
+not."""
 
 from __future__ import annotations
 
@@ -21,16 +22,34 @@ def _tile(name: str, georeference: Georeference | None = None) -> Tile:
     stored = StoredFile(f"tiles/{name}-0123.topo", "ab" * 32, 10)
     box = np.array([[0.0, 1.0, 2.0], [3.0, 4.0, 5.5]])
     places = replace(stored, name=f"tiles/{name}-0123.places")
-    return Tile(name, stored, places, {"surf": "12ab"}, "0" * 16, 1, ("surf",), 4, ("walk",), 300.0, box, name, georeference)
+    return Tile(
+        name,
+        stored,
+        places,
+        {"surf": "12ab"},
+        "0" * 16,
+        1,
+        ("surf",),
+        4,
+        ("walk",),
+        300.0,
+        box,
+        name,
+        georeference,
+    )
 
 
 def test_what_is_written_is_read():
     turn = Rigid3(exp_so3(np.array([0.0, 0.0, 0.3])), np.array([5.0, 6.0, 7.0]))
     placed = _tile("b", Georeference(GeoPoint(50.0, 4.0, 30.0), turn, "origin"))
-    written = Manifest().with_tiles({"a": replace(_tile("a"), recipe="cd" * 32), "b": placed}, now=5.0)
+    written = Manifest().with_tiles(
+        {"a": replace(_tile("a"), recipe="cd" * 32), "b": placed}, now=5.0
+    )
     read = Manifest.from_bytes(written.to_bytes(), "here")
     rows, read_rows = ([tile.to_json() for tile in one.tiles] for one in (written, read))
-    poses, read_poses = ([row.pop("atlas_from_world") for row in each] for each in (rows, read_rows))
+    poses, read_poses = (
+        [row.pop("atlas_from_world") for row in each] for each in (rows, read_rows)
+    )
     assert read_rows == rows
     assert np.allclose(read_poses[1], poses[1], atol=1e-12)
     assert [tile.tile_id for tile in read.tiles] == ["a", "b"]
@@ -40,17 +59,25 @@ def test_what_is_written_is_read():
 
 
 def test_georeferenced_tiles_lie_in_one_world():
-    """Two maps of one corner, georeferenced from different origins: the corner is one point of the atlas."""
+    """Two maps of one corner, georeferenced from different origins: the corner is one point of the
+    atlas."""
     near, far = GeoPoint(50.0, 4.0, 30.0), GeoPoint(50.001, 4.001, 35.0)
     corner_ecef = GeoPoint(50.0005, 4.0002, 33.0).ecef()
     turns = [Rigid3(exp_so3(np.array([0.0, 0.0, angle])), np.zeros(3)) for angle in (0.4, 2.0)]
-    tiles = {name: _tile(name, Georeference(at, turn, "origin")) for name, at, turn in zip("ab", (near, far), turns, strict=True)}
+    tiles = {
+        name: _tile(name, Georeference(at, turn, "origin"))
+        for name, at, turn in zip("ab", (near, far), turns, strict=True)
+    }
     manifest = Manifest().with_tiles(tiles, now=0.0)
     corners = []
     for tile in manifest.tiles:
         assert tile.georeference is not None
         assert tile.atlas_from_world is not None
-        corner_world = (tile.georeference.origin.ecef_from_enu() @ tile.georeference.enu_from_world).inverse().apply(corner_ecef)
+        corner_world = (
+            (tile.georeference.origin.ecef_from_enu() @ tile.georeference.enu_from_world)
+            .inverse()
+            .apply(corner_ecef)
+        )
         corners.append(tile.atlas_from_world.apply(corner_world))
     assert np.allclose(corners[0], corners[1], atol=1e-6)
     assert np.allclose(corners[0], near.ecef_from_enu().inverse().apply(corner_ecef), atol=1e-6)
@@ -89,7 +116,9 @@ def test_damage_is_refused_in_one_line(keys: list[Any], value: Any):
     for key in keys[:-1]:
         at = at[key]
     at[keys[-1]] = value
-    with pytest.raises(AtlasError, match=r"^here is no manifest of an atlas, or a damaged one: .+$"):
+    with pytest.raises(
+        AtlasError, match=r"^here is no manifest of an atlas, or a damaged one: .+$"
+    ):
         Manifest.from_bytes(json.dumps(data).encode(), "here")
 
 
@@ -100,7 +129,10 @@ def test_two_tiles_of_one_id_are_refused():
         Manifest.from_bytes(json.dumps(data).encode(), "here")
 
 
-_JSON = st.recursive(st.none() | st.booleans() | st.floats() | st.text(), lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner))
+_JSON = st.recursive(
+    st.none() | st.booleans() | st.floats() | st.text(),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+)
 
 
 @given(st.binary(max_size=200) | _JSON.map(lambda value: json.dumps(value).encode()))

@@ -1,4 +1,5 @@
-"""`topoloc merge` of atlases: every tile as it was, worlds and joins their own, and nothing where two tiles are taken for one."""
+"""`topoloc merge` of atlases: every tile as it was, worlds and joins their own, and nothing where
+two tiles are taken for one."""
 
 from __future__ import annotations
 
@@ -25,7 +26,9 @@ def _atlas(where: Path, *maps: Path, tile_id: str | None = None, world: str | No
     return str(where)
 
 
-def test_tiles_of_both_are_there_with_their_files(room_map: Path, other_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_tiles_of_both_are_there_with_their_files(
+    room_map: Path, other_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     first = _atlas(tmp_path / "first", room_map)
     out = tmp_path / "both"
     assert main(["merge", first, str(other_map), str(out), "--json", "-"]) == 0
@@ -40,7 +43,11 @@ def test_tiles_of_both_are_there_with_their_files(room_map: Path, other_map: Pat
 def test_joins_stay_and_worlds_of_one_name_are_two(room_map: Path, other_map: Path, tmp_path: Path):
     pair = _atlas(tmp_path / "pair", room_map, other_map)
     tiles = Atlas.open(pair).manifest.by_id
-    add_joins(pair, [Join("other", "room", Rigid3(np.eye(3), np.array([1.0, 2.0, 3.0])), 1e-6 * np.eye(6), 5)], tiles)
+    add_joins(
+        pair,
+        [Join("other", "room", Rigid3(np.eye(3), np.array([1.0, 2.0, 3.0])), 1e-6 * np.eye(6), 5)],
+        tiles,
+    )
     same_name = _atlas(tmp_path / "alone", room_map, tile_id="twin", world="room")
     merged = merge_atlases([pair, same_name], str(tmp_path / "all"))
     assert [join.pair for join in merged.joins] == [("other", "room")]
@@ -50,15 +57,25 @@ def test_joins_stay_and_worlds_of_one_name_are_two(room_map: Path, other_map: Pa
     assert by_id["twin"].from_world_of(by_id["room"]) is None
 
 
-def test_a_map_that_both_hold_is_one_tile_and_makes_their_worlds_one(room_map: Path, other_map: Path, tmp_path: Path):
+def test_a_map_that_both_hold_is_one_tile_and_makes_their_worlds_one(
+    room_map: Path, other_map: Path, tmp_path: Path
+):
     one = _atlas(tmp_path / "one", room_map, other_map, world="campus")
     two = _atlas(tmp_path / "two", room_map, world="yard")
     merged = merge_atlases([one, two, str(room_map)], str(tmp_path / "all"))
-    assert {tile.tile_id: tile.world for tile in merged.tiles} == {"room": "campus", "other": "campus"}
+    assert {tile.tile_id: tile.world for tile in merged.tiles} == {
+        "room": "campus",
+        "other": "campus",
+    }
 
 
-def test_two_maps_of_one_name_are_refused(room_map: Path, other_map: Path, tmp_path: Path, complaint: Complaint):
-    one, two = _atlas(tmp_path / "one", room_map), _atlas(tmp_path / "two", other_map, tile_id="room")
+def test_two_maps_of_one_name_are_refused(
+    room_map: Path, other_map: Path, tmp_path: Path, complaint: Complaint
+):
+    one, two = (
+        _atlas(tmp_path / "one", room_map),
+        _atlas(tmp_path / "two", other_map, tile_id="room"),
+    )
     with pytest.raises(AtlasError, match="has a tile room too"):
         merge_atlases([one, two], str(tmp_path / "all"))
     assert "is an atlas already" in complaint("merge", one, str(other_map), two)

@@ -1,4 +1,5 @@
-"""An atlas behind the service: tiles are maps under their ids, and every map is asked through the atlas."""
+"""An atlas behind the service: tiles are maps under their ids, and every map is asked through the
+atlas."""
 
 from __future__ import annotations
 
@@ -25,14 +26,18 @@ from topoloc.service.config import ServiceConfig
 
 @pytest.fixture
 def client(own_atlas: Path) -> Iterator[TestClient]:
-    application = make_application(Maps([str(own_atlas)], Localizer, 100_000_000), ServiceConfig(workers=1), Access())
+    application = make_application(
+        Maps([str(own_atlas)], Localizer, 100_000_000), ServiceConfig(workers=1), Access()
+    )
     with TestClient(application, base_url="http://127.0.0.1") as client:
         yield client
 
 
 def _asked(client: TestClient, path: str, queries: Path) -> dict[str, object]:
     camera = (queries / "camera.json").read_text()
-    answer = client.post(path, files={"image": (queries / "view02.png").open("rb")}, data={"camera": camera})
+    answer = client.post(
+        path, files={"image": (queries / "view02.png").open("rb")}, data={"camera": camera}
+    )
     assert answer.status_code == 200, answer.text
     return answer.json()
 
@@ -48,7 +53,9 @@ def test_tiles_are_maps_and_the_atlas_finds_the_right_one(client: TestClient, qu
     assert client.get("/v1/maps/other").json()["num_nodes"] == 4
 
 
-def test_an_atlas_that_is_written_again_is_read_again(client: TestClient, own_atlas: Path, room_map: Path, queries: Path):
+def test_an_atlas_that_is_written_again_is_read_again(
+    client: TestClient, own_atlas: Path, room_map: Path, queries: Path
+):
     assert _asked(client, "/v1/localize", queries)["map"] == "room"
     remove_tiles(str(own_atlas), ["room"])
     assert _asked(client, "/v1/localize", queries)["localized"] is False
@@ -60,24 +67,36 @@ def test_an_atlas_that_is_written_again_is_read_again(client: TestClient, own_at
 
 def test_a_prior_is_of_one_map(client: TestClient, queries: Path):
     prior = '{"translation": [0.2, 0.0, 1.4], "quat_wxyz": [1, 0, 0, 0]}'
-    answer = client.post("/v1/localize", files={"image": (queries / "view02.png").open("rb")}, data={"prior": prior})
+    answer = client.post(
+        "/v1/localize", files={"image": (queries / "view02.png").open("rb")}, data={"prior": prior}
+    )
     assert answer.status_code == 422
     assert "one map's world" in answer.json()["error"]
 
 
 def _geopose(client: TestClient, queries: Path, *readings: dict[str, float]) -> Any:
     camera = json.loads((queries / "camera.json").read_text())
-    params = {"model": "PINHOLE", "modelParams": [camera["fx"], camera["fy"], camera["cx"] + 0.5, camera["cy"] + 0.5]}
-    picture = {"imageBytes": base64.b64encode((queries / "view02.png").read_bytes()).decode(), "params": params}
+    params = {
+        "model": "PINHOLE",
+        "modelParams": [camera["fx"], camera["fy"], camera["cx"] + 0.5, camera["cy"] + 0.5],
+    }
+    picture = {
+        "imageBytes": base64.b64encode((queries / "view02.png").read_bytes()).decode(),
+        "params": params,
+    }
     said = {"cameraReadings": [picture], "geolocationReadings": list(readings)}
     return client.post("/localize/geopose", json={"id": "1", "sensorReadings": said})
 
 
-def test_geopose_asks_the_atlas_and_only_tiles_near_the_device(client: TestClient, own_atlas: Path, room_map: Path, queries: Path):
+def test_geopose_asks_the_atlas_and_only_tiles_near_the_device(
+    client: TestClient, own_atlas: Path, room_map: Path, queries: Path
+):
     assert _geopose(client, queries).status_code == 409
     with TopoMetricMap.load(room_map) as topomap:
         turned = Rigid3(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.zeros(3))
-        placed = replace(topomap, georeference=Georeference(GeoPoint(50.87, 4.70, 30.0), turned, "origin"))
+        placed = replace(
+            topomap, georeference=Georeference(GeoPoint(50.87, 4.70, 30.0), turned, "origin")
+        )
         placed.save(own_atlas.parent / "room.topo")
     add_tiles(str(own_atlas), new_tiles([str(own_atlas.parent / "room.topo")]), replaces=True)
     native = _asked(client, "/v1/maps/room/localize", queries)
@@ -87,16 +106,24 @@ def test_geopose_asks_the_atlas_and_only_tiles_near_the_device(client: TestClien
         answer = _geopose(client, queries, *readings)
         assert answer.status_code == 200, answer.text
         for part in ("position", "quaternion"):
-            assert answer.json()["geopose"][part] == pytest.approx(native["geopose"][part], abs=1e-9)  # pyright: ignore
+            assert answer.json()["geopose"][part] == pytest.approx(
+                native["geopose"][part], abs=1e-9
+            )  # pyright: ignore
     refused = _geopose(client, queries, away)
     assert (refused.status_code, refused.json()["reason"]) == (404, "not_in_map")
     assert "no tile lies within 130 m of 50.9" in refused.json()["ERROR"]
-    answer = client.post("/v1/localize", files={"image": (queries / "view02.png").open("rb")}, data={"near": "50.9,4.7,10"})
+    answer = client.post(
+        "/v1/localize",
+        files={"image": (queries / "view02.png").open("rb")},
+        data={"near": "50.9,4.7,10"},
+    )
     assert answer.json()["localized"] is False
 
 
 @pytest.mark.parametrize("near", ["here", "50,4", "100,0,5", "50,4,0"])
 def test_near_must_be_a_place(client: TestClient, queries: Path, near: str):
-    answer = client.post("/v1/localize", files={"image": (queries / "view02.png").open("rb")}, data={"near": near})
+    answer = client.post(
+        "/v1/localize", files={"image": (queries / "view02.png").open("rb")}, data={"near": near}
+    )
     assert answer.status_code == 422
     assert answer.json()["error"].startswith("near: ")

@@ -1,4 +1,5 @@
-"""`topoloc update ATLAS`: recordings join the tiles that they are of, as they would join the tile's map file; nobody is overwritten."""
+"""`topoloc update ATLAS`: recordings join the tiles that they are of, as they would join the tile's
+map file; nobody is overwritten."""
 
 from __future__ import annotations
 
@@ -39,7 +40,10 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "night": (1, np.arange(0.25, 5.5, 0.25)),
         "elsewhere": (2, np.arange(0.0, 6.0, 0.5)),
     }
-    return {name: write_stereo_recording(folder / name, seed, indices.tolist()) for name, (seed, indices) in rows.items()}
+    return {
+        name: write_stereo_recording(folder / name, seed, indices.tolist())
+        for name, (seed, indices) in rows.items()
+    }
 
 
 @pytest.fixture(params=["folder", "memory"])
@@ -84,7 +88,9 @@ def test_each_recording_joins_its_tile_as_it_would_join_the_map(
 ):
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
     other = _map(own_atlas, "other")
-    updated = _updated(capsys, 1, own_atlas, sessions["elsewhere"], sessions["evening"], "--light", "dusk")
+    updated = _updated(
+        capsys, 1, own_atlas, sessions["elsewhere"], sessions["evening"], "--light", "dusk"
+    )
     refused, joined = updated["recordings"]
     assert (refused["state"], joined["state"], joined["tile_id"]) == ("failed", "updated", "room")
     assert "no tile recognises it" in refused["reason"]
@@ -96,15 +102,24 @@ def test_each_recording_joins_its_tile_as_it_would_join_the_map(
     assert (tile.num_nodes, tile.map.num_bytes) == (joined["num_nodes"], joined["changes"]["bytes"])
     before = (own_atlas / "atlas.json").read_bytes()
     again = _updated(capsys, 0, own_atlas, sessions["evening"])
-    assert [(one["state"], one["tile_id"], one["reason"]) for one in again["recordings"]] == [("there", "room", None)]
+    assert [(one["state"], one["tile_id"], one["reason"]) for one in again["recordings"]] == [
+        ("there", "room", None)
+    ]
     assert (own_atlas / "atlas.json").read_bytes() == before
 
 
-def test_a_tile_that_is_named_is_not_sought(own_atlas: Path, sessions: dict[str, Path], capsys: pytest.CaptureFixture[str]):
+def test_a_tile_that_is_named_is_not_sought(
+    own_atlas: Path, sessions: dict[str, Path], capsys: pytest.CaptureFixture[str]
+):
     """What is of another one does not fit it; the others go on."""
     before = _map(own_atlas, "room")
-    updated = _updated(capsys, 1, own_atlas, sessions["evening"], sessions["night"], "--tile", "other")
-    assert [(one["state"], one["tile_id"]) for one in updated["recordings"]] == [("failed", "other"), ("updated", "other")]
+    updated = _updated(
+        capsys, 1, own_atlas, sessions["evening"], sessions["night"], "--tile", "other"
+    )
+    assert [(one["state"], one["tile_id"]) for one in updated["recordings"]] == [
+        ("failed", "other"),
+        ("updated", "other"),
+    ]
     assert "the map stays as it is" in updated["recordings"][0]["reason"]
     assert _map(own_atlas, "room") == before
 
@@ -120,13 +135,21 @@ def test_a_tile_that_is_named_is_not_sought(own_atlas: Path, sessions: dict[str,
     ],
 )
 def test_what_cannot_be_meant_is_said(
-    args: list[str], said: str, status: int, own_atlas: Path, room_map: Path, sessions: dict[str, Path], complaint: Complaint
+    args: list[str],
+    said: str,
+    status: int,
+    own_atlas: Path,
+    room_map: Path,
+    sessions: dict[str, Path],
+    complaint: Complaint,
 ):
     paths = {"ATLAS": own_atlas, "MAP": room_map, "SEQ": sessions["evening"]}
     assert said in complaint("update", *(paths.get(arg, arg) for arg in args), status=status)
 
 
-def test_who_replaced_the_tile_meanwhile_is_not_overwritten(somewhere: str, room_map: Path, other_map: Path):
+def test_who_replaced_the_tile_meanwhile_is_not_overwritten(
+    somewhere: str, room_map: Path, other_map: Path
+):
     create_atlas(somewhere, [NewTile("hall", room_map, "campus", "ab" * 32)])
     num_nodes = list[int]()
 
@@ -144,7 +167,9 @@ def test_who_replaced_the_tile_meanwhile_is_not_overwritten(somewhere: str, room
     assert _notes(somewhere, "hall") == ["try 2"]
 
 
-def test_others_who_are_always_faster_are_left_alone(somewhere: str, room_map: Path, tmp_path: Path):
+def test_others_who_are_always_faster_are_left_alone(
+    somewhere: str, room_map: Path, tmp_path: Path
+):
     create_atlas(somewhere, new_tiles([str(room_map)], "hall"))
     theirs = Path(shutil.copy(room_map, tmp_path / "theirs.topo"))
 
@@ -160,7 +185,10 @@ def test_others_who_are_always_faster_are_left_alone(somewhere: str, room_map: P
 
 
 def test_joins_world_and_recipe_stay_what_they_are(somewhere: str, room_map: Path, other_map: Path):
-    create_atlas(somewhere, [NewTile("hall", room_map, "hall", "ab" * 32), NewTile("yard", other_map, "yard")])
+    create_atlas(
+        somewhere,
+        [NewTile("hall", room_map, "hall", "ab" * 32), NewTile("yard", other_map, "yard")],
+    )
     tiles = Atlas.open(somewhere).manifest.by_id
     pose = Rigid3(np.eye(3), np.array([3.0, 1.0, 0.0]))
     before = add_joins(somewhere, [Join("hall", "yard", pose, 1e-4 * np.eye(6), 20)], tiles)
@@ -173,7 +201,9 @@ def test_joins_world_and_recipe_stay_what_they_are(somewhere: str, room_map: Pat
     assert tile.map.sha256 != before.by_id["hall"].map.sha256
 
 
-def test_nothing_is_left_and_nothing_changed_where_it_fails(own_atlas: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_nothing_is_left_and_nothing_changed_where_it_fails(
+    own_atlas: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     scratch = tmp_path / "scratch"
     (scratch / "topoloc-tile-left").mkdir(parents=True)  # of one that was killed
     monkeypatch.setattr("tempfile.tempdir", str(scratch))
@@ -195,12 +225,16 @@ def test_nothing_is_left_and_nothing_changed_where_it_fails(own_atlas: Path, tmp
 
 def _answers(**counts: int) -> list[Localization]:
     def one(tile_id: str) -> Localization:
-        return Localization(Rigid3.identity(), np.eye(6), 1.0, 0, [], 10, 10, provenance=Provenance(tile=tile_id))
+        return Localization(
+            Rigid3.identity(), np.eye(6), 1.0, 0, [], 10, 10, provenance=Provenance(tile=tile_id)
+        )
 
     return [one(tile_id) for tile_id, number in counts.items() for _ in range(number)]
 
 
-def test_a_recording_is_of_the_tile_that_most_pictures_name_or_of_none(own_atlas: Path, room_map: Path):
+def test_a_recording_is_of_the_tile_that_most_pictures_name_or_of_none(
+    own_atlas: Path, room_map: Path
+):
     add_tiles(str(own_atlas), [NewTile("annex", room_map, "room")])
     tiles, config = Atlas.open(str(own_atlas)).manifest.by_id, TileChoiceConfig()
 
@@ -211,8 +245,13 @@ def test_a_recording_is_of_the_tile_that_most_pictures_name_or_of_none(own_atlas
     assert chosen(room=6, other=2).tile_id == "room"
     assert chosen(room=5, annex=6).tile_id == "annex", "both are of one world"
     assert chosen(room=3, annex=3).tile_id == "annex"
-    for counts, said in (({"room": 2}, "no tile recognises it: room knows 2 of 12"), ({}, "none knows any")):
+    for counts, said in (
+        ({"room": 2}, "no tile recognises it: room knows 2 of 12"),
+        ({}, "none knows any"),
+    ):
         with pytest.raises(TrajectoryError, match=said):
             chosen(**counts)
-    with pytest.raises(TrajectoryError, match="looks like several tiles: room knows 4, other knows 3 of 12"):
+    with pytest.raises(
+        TrajectoryError, match="looks like several tiles: room knows 4, other knows 3 of 12"
+    ):
         chosen(room=4, other=3)

@@ -30,16 +30,30 @@ def _tile(name: str, world: str | None = None) -> Tile:
 def _pose(evidence: Evidence, x: float = 0.0, probability: float = 0.95) -> Localization:
     pose = Rigid3(np.eye(3), np.array([x, 0.0, 0.0]))
     return Localization(
-        pose, np.eye(6) * 1e-6, probability, 3, [NodeScore(3, 0.5)], 9, 8, evidence=evidence, provenance=Provenance(features="surf")
+        pose,
+        np.eye(6) * 1e-6,
+        probability,
+        3,
+        [NodeScore(3, 0.5)],
+        9,
+        8,
+        evidence=evidence,
+        provenance=Provenance(features="surf"),
     )
 
 
-def _heard(tile: Tile, result: Localization | NotLocalized, is_full: bool = True, **more: Any) -> Heard:
-    return Heard(tile, result, (result,) if isinstance(result, Localization) else (), is_full, **more)
+def _heard(
+    tile: Tile, result: Localization | NotLocalized, is_full: bool = True, **more: Any
+) -> Heard:
+    return Heard(
+        tile, result, (result,) if isinstance(result, Localization) else (), is_full, **more
+    )
 
 
 def test_the_only_tile_that_vouches_answers():
-    result = joint_result([_heard(_tile("a"), NotLocalized("not_in_map")), _heard(_tile("b"), _pose(STRONG))])
+    result = joint_result(
+        [_heard(_tile("a"), NotLocalized("not_in_map")), _heard(_tile("b"), _pose(STRONG))]
+    )
     assert isinstance(result, Localization)
     assert result.provenance.tile == "b"
     assert result.probability == pytest.approx(0.95)
@@ -56,7 +70,12 @@ def test_a_pose_with_far_more_for_it_leads_and_pays_for_its_rival():
 
 @pytest.mark.parametrize("second_is_full", [True, False])
 def test_two_poses_with_as_much_for_them_are_both_named(second_is_full: bool):
-    result = joint_result([_heard(_tile("a"), _pose(FAIR)), _heard(_tile("b"), _pose(FAIR, x=3.0), is_full=second_is_full)])
+    result = joint_result(
+        [
+            _heard(_tile("a"), _pose(FAIR)),
+            _heard(_tile("b"), _pose(FAIR, x=3.0), is_full=second_is_full),
+        ]
+    )
     assert isinstance(result, NotLocalized)
     assert result.reason == "ambiguous"
     assert {one.tile for one in result.alternatives} == {"a", "b"}
@@ -66,23 +85,36 @@ def test_two_poses_with_as_much_for_them_are_both_named(second_is_full: bool):
 
 def test_the_same_pose_in_two_tiles_of_one_world_is_one():
     a, b = _tile("a", "house"), _tile("b", "house")
-    assert isinstance(joint_result([_heard(a, _pose(FAIR)), _heard(b, _pose(FAIR, x=0.01))]), Localization)
-    assert isinstance(joint_result([_heard(a, _pose(FAIR)), _heard(b, _pose(FAIR, x=5.0))]), NotLocalized)
+    assert isinstance(
+        joint_result([_heard(a, _pose(FAIR)), _heard(b, _pose(FAIR, x=0.01))]), Localization
+    )
+    assert isinstance(
+        joint_result([_heard(a, _pose(FAIR)), _heard(b, _pose(FAIR, x=5.0))]), NotLocalized
+    )
 
 
 def test_tiles_that_lie_in_the_atlas_are_compared_there():
     shift = Rigid3(np.eye(3), np.array([10.0, 0.0, 0.0]))
-    a, b = (replace(_tile(name), atlas_from_world=pose) for name, pose in (("a", Rigid3.identity()), ("b", shift)))
+    a, b = (
+        replace(_tile(name), atlas_from_world=pose)
+        for name, pose in (("a", Rigid3.identity()), ("b", shift))
+    )
     agreed = joint_result([_heard(a, _pose(FAIR, x=12.0)), _heard(b, _pose(FAIR, x=2.0))])
     assert isinstance(agreed, Localization)
     assert agreed.provenance.atlas_from_cam is not None
     assert np.allclose(agreed.provenance.atlas_from_cam.translation, [12.0, 0.0, 0.0])
-    assert isinstance(joint_result([_heard(a, _pose(FAIR, x=2.0)), _heard(b, _pose(FAIR, x=2.0))]), NotLocalized)
+    assert isinstance(
+        joint_result([_heard(a, _pose(FAIR, x=2.0)), _heard(b, _pose(FAIR, x=2.0))]), NotLocalized
+    )
 
 
 def test_a_refusal_is_that_of_the_tile_that_knows_most():
     few, more = NotLocalized("too_few_matches"), NotLocalized("not_in_map", num_inliers=9)
-    heard = [_heard(_tile("a"), few), _heard(_tile("b"), more), _heard(_tile("c"), replace(more, num_inliers=99), is_full=False)]
+    heard = [
+        _heard(_tile("a"), few),
+        _heard(_tile("b"), more),
+        _heard(_tile("c"), replace(more, num_inliers=99), is_full=False),
+    ]
     result = joint_result(heard)
     assert isinstance(result, NotLocalized)
     assert (result.reason, result.provenance.tile) == ("not_in_map", "b")

@@ -1,4 +1,5 @@
-"""The index lies in files that are made once, go on with an atlas that grows and shrinks, and are made anew where they are damaged."""
+"""The index lies in files that are made once, go on with an atlas that grows and shrinks, and are
+made anew where they are damaged."""
 
 from __future__ import annotations
 
@@ -34,7 +35,11 @@ class Campus:
         centres = self.rng.standard_normal((len(names), 1, 128))
         rows = centres + 0.7 * self.rng.standard_normal((len(names), PLACES_A_TILE, 128))
         for name, one in zip(names, rows, strict=True):
-            self.vectors[name] = (one / np.linalg.norm(one, axis=1, keepdims=True)).astype(np.float16).astype(np.float32)
+            self.vectors[name] = (
+                (one / np.linalg.norm(one, axis=1, keepdims=True))
+                .astype(np.float16)
+                .astype(np.float32)
+            )
 
     def open(self) -> OpenedIndex:
         vocabulary, tiles = shared_vocabulary("surf"), []
@@ -42,7 +47,22 @@ class Campus:
         for name, rows in sorted(self.vectors.items()):
             stored = StoredFile(f"tiles/{name}.places", f"{abs(hash(rows.tobytes())):064x}", 1)
             versions = {"surf": vocabulary.version}
-            tiles.append(Tile(name, stored, stored, versions, "0" * 16, 1, ("surf",), len(rows), (), 300.0, np.zeros((2, 3)), name))
+            tiles.append(
+                Tile(
+                    name,
+                    stored,
+                    stored,
+                    versions,
+                    "0" * 16,
+                    1,
+                    ("surf",),
+                    len(rows),
+                    (),
+                    300.0,
+                    np.zeros((2, 3)),
+                    name,
+                )
+            )
         self.read.clear()
         return open_index(tiles, self._read, self.folder)
 
@@ -57,10 +77,14 @@ class Campus:
         for name, rows in self.vectors.items():
             asked = rows[7] + 0.03 * self.rng.standard_normal(128).astype(np.float32)
             asked /= np.linalg.norm(asked)
-            best = {other: float((of_other @ asked).max()) for other, of_other in self.vectors.items()}
+            best = {
+                other: float((of_other @ asked).max()) for other, of_other in self.vectors.items()
+            }
             ranked = opened.index.rank({"surf": asked}, 3)
             assert [one for one, _ in ranked] == sorted(best, key=lambda one: -best[one])[:3], name
-            assert [likeness for _, likeness in ranked] == pytest.approx([best[one] for one, _ in ranked], abs=1e-3)
+            assert [likeness for _, likeness in ranked] == pytest.approx(
+                [best[one] for one, _ in ranked], abs=1e-3
+            )
 
     @property
     def files(self) -> list[Path]:
@@ -89,7 +113,9 @@ def test_an_index_is_made_once(campus: Campus):
     assert (campus.read, again.notes, campus.files[0].stat().st_ino) == ([], [], before)
     file.unlink()
     campus.open()
-    assert file.read_bytes() == data  # so it does not matter which of two processes is the last to write it
+    assert (
+        file.read_bytes() == data
+    )  # so it does not matter which of two processes is the last to write it
 
 
 def test_few_tiles_that_come_are_compared_and_many_become_a_shard(campus: Campus):
@@ -153,7 +179,11 @@ def test_a_damaged_file_is_made_anew_with_one_note(campus: Campus, damage: str):
     (file,) = campus.files
     data = bytearray(file.read_bytes())
     data[{"rotten": len(data) // 2, "rotten header": 70}.get(damage, 0)] ^= 0x10
-    file.write_bytes({"short": bytes(data[:-100]), "empty": b"", "text": b"no index\n" * 99}.get(damage, bytes(data)))
+    file.write_bytes(
+        {"short": bytes(data[:-100]), "empty": b"", "text": b"no index\n" * 99}.get(
+            damage, bytes(data)
+        )
+    )
     opened = campus.open()
     assert len(opened.notes) == 1
     assert "missing or damaged" in opened.notes[0]

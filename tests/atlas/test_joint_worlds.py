@@ -1,4 +1,5 @@
-"""Joins adjusted as a pose graph of worlds, kept by the manifest, and refused where they cannot be."""
+"""Joins adjusted as a pose graph of worlds, kept by the manifest, and refused where they cannot
+be."""
 
 from __future__ import annotations
 
@@ -20,7 +21,10 @@ from topoloc.geometry.rigid import Rigid3, exp_so3
 SIGMA_M, SIGMA_RAD = 0.02, 0.005
 COVARIANCE = np.diag([SIGMA_M**2] * 3 + [SIGMA_RAD**2] * 3)
 # a_from_room of each tile's world
-WORLDS = {name: Rigid3(exp_so3(np.array([0.1 * k, -0.2 * k, 0.7 * k])), np.array([3.0 * k, -k, 0.1 * k])) for k, name in enumerate("abcd")}
+WORLDS = {
+    name: Rigid3(exp_so3(np.array([0.1 * k, -0.2 * k, 0.7 * k])), np.array([3.0 * k, -k, 0.1 * k]))
+    for k, name in enumerate("abcd")
+}
 EACH_ITS_OWN = {name: name for name in WORLDS}
 
 
@@ -33,15 +37,36 @@ def _off(seed: int) -> Rigid3:
     return Rigid3.exp(np.random.default_rng(seed).multivariate_normal(np.zeros(6), COVARIANCE))
 
 
-def _tile(name: str, world: str | None = None, georeference: Georeference | None = None, contents: str = "ab") -> Tile:
+def _tile(
+    name: str,
+    world: str | None = None,
+    georeference: Georeference | None = None,
+    contents: str = "ab",
+) -> Tile:
     stored = StoredFile(f"tiles/{name}-0123.topo", contents * 32, 10)
     box = np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 5.5]])
     places = replace(stored, name=f"tiles/{name}-0123.places")
-    return Tile(name, stored, places, {"surf": "12ab"}, "0" * 16, 1, ("surf",), 4, ("walk",), 300.0, box, world or name, georeference)
+    return Tile(
+        name,
+        stored,
+        places,
+        {"surf": "12ab"},
+        "0" * 16,
+        1,
+        ("surf",),
+        4,
+        ("walk",),
+        300.0,
+        box,
+        world or name,
+        georeference,
+    )
 
 
 def _manifest(joins: list[Join], **worlds: str) -> Manifest:
-    return Manifest().with_tiles({name: _tile(name, worlds.get(name)) for name in WORLDS}, 1.0, joins)
+    return Manifest().with_tiles(
+        {name: _tile(name, worlds.get(name)) for name in WORLDS}, 1.0, joins
+    )
 
 
 def test_three_worlds_in_a_loop_share_what_does_not_close():
@@ -50,7 +75,9 @@ def test_three_worlds_in_a_loop_share_what_does_not_close():
     misses = []
     for name in "bc":
         true = WORLDS["a"] @ WORLDS[name].inverse()
-        misses.append(np.linalg.norm((found.places[name].joint_from_world @ true.inverse()).log()[:3]))
+        misses.append(
+            np.linalg.norm((found.places[name].joint_from_world @ true.inverse()).log()[:3])
+        )
         assert found.places[name].joint == "a"
     by_way_of_b = joins[0].first_from_second @ joins[1].first_from_second
     direct = joins[2].first_from_second
@@ -64,7 +91,12 @@ def test_three_worlds_in_a_loop_share_what_does_not_close():
 
 def test_a_join_that_contradicts_what_more_pictures_say_is_left_out():
     wrong = Rigid3(np.eye(3), np.array([5.0, 0.0, 0.0]))
-    joins = [_join("a", "b"), _join("b", "c"), _join("a", "c", wrong, num_agreeing=9), _join("c", "d")]
+    joins = [
+        _join("a", "b"),
+        _join("b", "c"),
+        _join("a", "c", wrong, num_agreeing=9),
+        _join("c", "d"),
+    ]
     found = adjusted(joins, EACH_ITS_OWN, {})
     assert [(join.pair, join.residual is None) for join in found.joins] == [
         (("a", "b"), False),
@@ -73,7 +105,11 @@ def test_a_join_that_contradicts_what_more_pictures_say_is_left_out():
         (("c", "d"), False),
     ]
     for name in "bcd":
-        assert np.allclose(found.places[name].joint_from_world.matrix(), (WORLDS["a"] @ WORLDS[name].inverse()).matrix(), atol=1e-6)
+        assert np.allclose(
+            found.places[name].joint_from_world.matrix(),
+            (WORLDS["a"] @ WORLDS[name].inverse()).matrix(),
+            atol=1e-6,
+        )
 
 
 def test_uncertainty_grows_with_the_way():
@@ -84,9 +120,15 @@ def test_uncertainty_grows_with_the_way():
 
 
 def test_joins_do_not_move_what_knows_its_place_on_earth():
-    """b and d are 1 km apart by their georeferences; joins that bring them together by c are wrong, the weaker is left out."""
-    on_earth: Mapping[str, Rigid3] = {"b": Rigid3.identity(), "d": Rigid3(np.eye(3), np.array([1000.0, 0.0, 0.0]))}
-    found = adjusted([_join("b", "c", num_agreeing=30), _join("c", "d", num_agreeing=10)], EACH_ITS_OWN, on_earth)
+    """b and d are 1 km apart by their georeferences; joins that bring them together by c are wrong,
+    the weaker is left out."""
+    on_earth: Mapping[str, Rigid3] = {
+        "b": Rigid3.identity(),
+        "d": Rigid3(np.eye(3), np.array([1000.0, 0.0, 0.0])),
+    }
+    found = adjusted(
+        [_join("b", "c", num_agreeing=30), _join("c", "d", num_agreeing=10)], EACH_ITS_OWN, on_earth
+    )
     assert [join.residual is None for join in found.joins] == [False, True]
     assert found.places.keys() == {"b", "c"}
     assert found.places["c"].joint == "b"
@@ -104,17 +146,25 @@ def test_tiles_of_one_world_are_joined_together():
 
 
 def test_one_tile_on_earth_is_enough():
-    known = Georeference(GeoPoint(50.0, 4.0, 30.0), Rigid3(np.eye(3), np.array([7.0, 0.0, 0.0])), "origin")
+    known = Georeference(
+        GeoPoint(50.0, 4.0, 30.0), Rigid3(np.eye(3), np.array([7.0, 0.0, 0.0])), "origin"
+    )
     tiles = {name: _tile(name, georeference=known if name == "c" else None) for name in WORLDS}
     manifest = Manifest().with_tiles(tiles, 1.0, [_join("a", "b"), _join("b", "c")])
     pose = manifest.by_id["a"].atlas_from_world
     assert pose is not None
-    assert np.allclose(pose.matrix(), (known.enu_from_world @ WORLDS["c"] @ WORLDS["a"].inverse()).matrix(), atol=1e-6)
+    assert np.allclose(
+        pose.matrix(),
+        (known.enu_from_world @ WORLDS["c"] @ WORLDS["a"].inverse()).matrix(),
+        atol=1e-6,
+    )
     assert manifest.by_id["d"].atlas_from_world is None
     place = manifest.georeference_of(manifest.by_id["a"])
     assert place is not None
     assert np.allclose(
-        place.geopoint(np.zeros(3)).ecef(), known.geopoint((WORLDS["c"] @ WORLDS["a"].inverse()).translation).ecef(), atol=1e-3
+        place.geopoint(np.zeros(3)).ecef(),
+        known.geopoint((WORLDS["c"] @ WORLDS["a"].inverse()).translation).ecef(),
+        atol=1e-3,
     )
     assert not np.isnan(manifest.geo_boxes[0]).any()
 
@@ -124,13 +174,23 @@ def test_what_is_written_is_read():
     written = _manifest([_join("a", "b", _off(4)), _join("b", "c"), _join("a", "c", wrong, 5)])
     read = Manifest.from_bytes(written.to_bytes(), "here")
     for join, again in zip(written.joins, read.joins, strict=True):
-        assert (again.pair, again.num_agreeing, again.residual) == (join.pair, join.num_agreeing, join.residual)
-        assert np.allclose(again.first_from_second.matrix(), join.first_from_second.matrix(), atol=1e-12)
+        assert (again.pair, again.num_agreeing, again.residual) == (
+            join.pair,
+            join.num_agreeing,
+            join.residual,
+        )
+        assert np.allclose(
+            again.first_from_second.matrix(), join.first_from_second.matrix(), atol=1e-12
+        )
         assert np.array_equal(again.covariance, join.covariance)
     for tile, again in zip(written.tiles, read.tiles, strict=True):
         assert (again.joint is None) == (tile.joint is None)
         assert again.in_joint_world.joint == tile.in_joint_world.joint
-        assert np.allclose(again.in_joint_world.joint_from_world.matrix(), tile.in_joint_world.joint_from_world.matrix(), atol=1e-12)
+        assert np.allclose(
+            again.in_joint_world.joint_from_world.matrix(),
+            tile.in_joint_world.joint_from_world.matrix(),
+            atol=1e-12,
+        )
         assert np.allclose(again.in_joint_world.covariance, tile.in_joint_world.covariance)
 
 
@@ -143,7 +203,9 @@ def test_a_manifest_of_before_there_were_joins_is_read():
 
 def test_a_tile_that_goes_or_is_replaced_loses_its_joins():
     before = _manifest([_join("a", "b"), _join("b", "c"), _join("c", "d")])
-    without = before.with_tiles({name: tile for name, tile in before.by_id.items() if name != "b"}, 2.0)
+    without = before.with_tiles(
+        {name: tile for name, tile in before.by_id.items() if name != "b"}, 2.0
+    )
     assert [join.pair for join in without.joins] == [("c", "d")]
     assert without.by_id["a"].joint is None
     replaced = before.with_tiles(before.by_id | {"c": _tile("c", contents="cd")}, 2.0)
@@ -186,7 +248,9 @@ def test_damage_is_refused_in_one_line(keys: list[Any], value: Any):
     for key in keys[:-1]:
         at = at[key]
     at[keys[-1]] = value
-    with pytest.raises(AtlasError, match=r"^here is no manifest of an atlas, or a damaged one: .+$") as caught:
+    with pytest.raises(
+        AtlasError, match=r"^here is no manifest of an atlas, or a damaged one: .+$"
+    ) as caught:
         Manifest.from_bytes(json.dumps(data).encode(), "here")
     assert "\n" not in str(caught.value)
 

@@ -24,11 +24,29 @@ from topoloc.localization.result import Localization, NotLocalized
 
 def _tile(name: str, origin: GeoPoint | None = None, world: str | None = None) -> Tile:
     """A box of 10 by 10 metres; where it is georeferenced it begins at its origin."""
-    stored, box = StoredFile(f"tiles/{name}.topo", "ab" * 32, 10), np.array([[0.0, 0.0, 0.0], [10.0, 10.0, 0.0]])
+    stored, box = (
+        StoredFile(f"tiles/{name}.topo", "ab" * 32, 10),
+        np.array([[0.0, 0.0, 0.0], [10.0, 10.0, 0.0]]),
+    )
     known = None if origin is None else Georeference(origin, Rigid3.identity(), "origin")
     corners = [] if known is None else [known.geopoint(corner) for corner in box]
     geo_box = (corners[0].lat, corners[0].lon, corners[1].lat, corners[1].lon) if corners else None
-    return Tile(name, stored, stored, {}, "0" * 16, 1, ("surf",), 4, (), 300.0, box, world or name, known, geo_box)
+    return Tile(
+        name,
+        stored,
+        stored,
+        {},
+        "0" * 16,
+        1,
+        ("surf",),
+        4,
+        (),
+        300.0,
+        box,
+        world or name,
+        known,
+        geo_box,
+    )
 
 
 def _manifest(*tiles: Tile) -> Manifest:
@@ -37,10 +55,18 @@ def _manifest(*tiles: Tile) -> Manifest:
 
 def test_distance_is_along_the_ground_to_the_box():
     boxes = _manifest(_tile("a", GeoPoint(50.0, 4.0, 0.0)), _tile("unknown")).geo_boxes
-    west = GeoPoint.from_ecef(GeoPoint(50.0, 4.0, 0.0).ecef_from_enu().apply(np.array([-300.0, 5.0, 0.0])))
-    assert metres_to_boxes(NearPlace(west.lat, west.lon, 1.0), boxes) == pytest.approx([300.0, 0.0], rel=0.005)
-    inside = GeoPoint.from_ecef(GeoPoint(50.0, 4.0, 0.0).ecef_from_enu().apply(np.array([3.0, 5.0, 0.0])))
-    assert metres_to_boxes(NearPlace(inside.lat, inside.lon, 1.0), boxes) == pytest.approx([0.0, 0.0])
+    west = GeoPoint.from_ecef(
+        GeoPoint(50.0, 4.0, 0.0).ecef_from_enu().apply(np.array([-300.0, 5.0, 0.0]))
+    )
+    assert metres_to_boxes(NearPlace(west.lat, west.lon, 1.0), boxes) == pytest.approx(
+        [300.0, 0.0], rel=0.005
+    )
+    inside = GeoPoint.from_ecef(
+        GeoPoint(50.0, 4.0, 0.0).ecef_from_enu().apply(np.array([3.0, 5.0, 0.0]))
+    )
+    assert metres_to_boxes(NearPlace(inside.lat, inside.lon, 1.0), boxes) == pytest.approx(
+        [0.0, 0.0]
+    )
 
 
 def test_the_date_line_is_no_border():
@@ -50,10 +76,20 @@ def test_the_date_line_is_no_border():
 
 
 def test_only_tiles_that_are_known_to_lie_elsewhere_are_out_of_reach():
-    manifest = _manifest(_tile("here", GeoPoint(50.0, 4.0, 0.0)), _tile("far", GeoPoint(50.1, 4.0, 0.0)), _tile("island"))
+    manifest = _manifest(
+        _tile("here", GeoPoint(50.0, 4.0, 0.0)),
+        _tile("far", GeoPoint(50.1, 4.0, 0.0)),
+        _tile("island"),
+    )
     assert set(tiles_in_reach(manifest, NearPlace(50.0, 4.001, 200.0))) == {"here", "island"}
-    assert set(tiles_in_reach(manifest, NearPlace(50.0, 4.001, 200.0), placed_only=True)) == {"here"}
-    assert set(tiles_in_reach(manifest, NearPlace(50.0, 4.001, 20_000.0))) == {"here", "far", "island"}
+    assert set(tiles_in_reach(manifest, NearPlace(50.0, 4.001, 200.0), placed_only=True)) == {
+        "here"
+    }
+    assert set(tiles_in_reach(manifest, NearPlace(50.0, 4.001, 20_000.0))) == {
+        "here",
+        "far",
+        "island",
+    }
     assert set(tiles_in_reach(manifest, None, placed_only=True)) == {"here", "far"}
 
 
@@ -62,7 +98,9 @@ def test_a_pose_is_brought_into_the_worlds_of_the_tiles_in_reach():
     near, far = (Georeference(GeoPoint(lat, 4.0, 0.0), turned, "origin") for lat in (50.0, 50.1))
     beside = replace(_tile("beside", GeoPoint(50.0, 4.0, 0.0)), georeference=near)
     away = replace(_tile("away", GeoPoint(50.1, 4.0, 0.0)), georeference=far)
-    manifest = _manifest(_tile("here", GeoPoint(50.0, 4.0, 0.0), "campus"), beside, away, _tile("island"))
+    manifest = _manifest(
+        _tile("here", GeoPoint(50.0, 4.0, 0.0), "campus"), beside, away, _tile("island")
+    )
     pose = Rigid3(np.eye(3), np.array([5.0, 2.0, 1.0]))
     reached = tiles_in_reach(manifest, NearPose("campus", pose, 30.0))
     assert set(reached) == {"beside", "here"}
@@ -70,7 +108,12 @@ def test_a_pose_is_brought_into_the_worlds_of_the_tiles_in_reach():
     expected = turned.inverse() @ pose
     assert reached["beside"] is not None
     assert np.allclose(reached["beside"].matrix(), expected.matrix(), atol=1e-6)
-    assert tiles_in_reach(manifest, NearPose("campus", Rigid3(np.eye(3), np.array([50.0, 0.0, 0.0])), 30.0)) == {}
+    assert (
+        tiles_in_reach(
+            manifest, NearPose("campus", Rigid3(np.eye(3), np.array([50.0, 0.0, 0.0])), 30.0)
+        )
+        == {}
+    )
 
 
 def test_what_is_no_place_is_refused():
@@ -98,4 +141,6 @@ def test_a_picture_is_asked_only_of_tiles_in_reach(atlas: Path):
     assert isinstance(nowhere, NotLocalized)
     assert (nowhere.reason, nowhere.provenance.t_ns) == ("not_in_map", 5)
     assert "no tile lies within 5 m of 0, 0, 500 in the world room" in nowhere.detail
-    assert isinstance(localizer.localize(image, CAMERA), Localization)  # the one that it came from asks all as before
+    assert isinstance(
+        localizer.localize(image, CAMERA), Localization
+    )  # the one that it came from asks all as before

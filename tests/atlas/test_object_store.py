@@ -30,13 +30,19 @@ def silent(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{listener.getsockname()[1]}")
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_DEFAULT_REGION"):
         monkeypatch.setenv(name, "us-east-1")
-    monkeypatch.setattr(object_store, "S3_CLIENT", object_store.S3_CLIENT | {"connect_timeout": 0.3, "read_timeout": 0.3})
+    monkeypatch.setattr(
+        object_store,
+        "S3_CLIENT",
+        object_store.S3_CLIENT | {"connect_timeout": 0.3, "read_timeout": 0.3},
+    )
     s3fs.S3FileSystem.clear_instance_cache()
     yield "s3://campus/atlas"
     listener.close()
 
 
-def test_a_store_that_says_nothing_is_given_up(silent: str, room_map: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_store_that_says_nothing_is_given_up(
+    silent: str, room_map: Path, capsys: pytest.CaptureFixture[str]
+):
     start = time.monotonic()
     for args in (["info", silent], ["add", silent, str(room_map)]):
         assert main(["atlas", *args]) == 1
@@ -65,14 +71,18 @@ def test_pictures_are_localized_in_an_atlas_on_s3(s3_bucket: str, room_map: Path
         assert result.provenance.tile == tile
 
 
-def test_what_nobody_names_is_removed_from_s3_after_its_time(s3_bucket: str, room_map: Path, other_map: Path):
+def test_what_nobody_names_is_removed_from_s3_after_its_time(
+    s3_bucket: str, room_map: Path, other_map: Path
+):
     where = f"{s3_bucket}/campus"
     create_atlas(where, new_tiles([str(room_map)]))
     store = ObjectStore(where)
     assert all(-60.0 < age < 60.0 for age in store.ages().values())
     remove_tiles(where, ["room"])
     assert len(store.ages()) == 2
-    add_tiles(where, new_tiles([str(other_map)]), grace_s=-60.0)  # the clock of the server may be another
+    add_tiles(
+        where, new_tiles([str(other_map)]), grace_s=-60.0
+    )  # the clock of the server may be another
     assert {name.partition("-")[0] for name in store.ages()} == {"tiles/other"}
 
 
@@ -100,7 +110,9 @@ def test_what_another_machine_wrote_since_the_last_listing_is_there(s3_bucket: s
     assert second.commit(b"2", b"3")
 
 
-def test_a_manifest_that_is_removed_while_it_is_read_is_sought_again(s3_bucket: str, monkeypatch: pytest.MonkeyPatch):
+def test_a_manifest_that_is_removed_while_it_is_read_is_sought_again(
+    s3_bucket: str, monkeypatch: pytest.MonkeyPatch
+):
     store = ObjectStore(f"{s3_bucket}/campus")
     assert store.commit(None, b"1")
     assert store.commit(b"1", b"2")
@@ -114,10 +126,15 @@ def test_a_manifest_that_is_removed_while_it_is_read_is_sought_again(s3_bucket: 
     assert store.manifest() == b"2"
 
 
-def test_a_conflict_with_another_writer_is_tried_anew_and_other_failures_are_told(monkeypatch: pytest.MonkeyPatch):
+def test_a_conflict_with_another_writer_is_tried_anew_and_other_failures_are_told(
+    monkeypatch: pytest.MonkeyPatch,
+):
     pytest.importorskip("fsspec", reason="the extra cluster is not installed")
     store = ObjectStore(f"memory://{uuid4().hex}/campus")
-    said = ["An error occurred (ConditionalRequestConflict) when calling the PutObject operation", "no space"]
+    said = [
+        "An error occurred (ConditionalRequestConflict) when calling the PutObject operation",
+        "no space",
+    ]
 
     def refused(*args: object, **kwargs: object) -> None:
         raise OSError(said.pop(0))
@@ -128,7 +145,9 @@ def test_a_conflict_with_another_writer_is_tried_anew_and_other_failures_are_tol
         store.commit(None, b"1")
 
 
-def test_an_answer_that_was_lost_is_no_other_writer(s3_bucket: str, monkeypatch: pytest.MonkeyPatch):
+def test_an_answer_that_was_lost_is_no_other_writer(
+    s3_bucket: str, monkeypatch: pytest.MonkeyPatch
+):
     """The client sends again what has arrived: the object is there, and it is ours."""
     store = ObjectStore(f"{s3_bucket}/campus")
     pipe = store._files.pipe_file

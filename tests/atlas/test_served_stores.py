@@ -1,4 +1,5 @@
-"""Atlases in object stores behind the service: they answer as one in a folder does, and a store that fails or is silent holds nobody up."""
+"""Atlases in object stores behind the service: they answer as one in a folder does, and a store
+that fails or is silent holds nobody up."""
 
 from __future__ import annotations
 
@@ -28,15 +29,27 @@ from topoloc.service.config import ServiceConfig
 
 
 @pytest.fixture(params=["memory", "s3"])
-def store(request: pytest.FixtureRequest, room_map: Path, other_map: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+def store(
+    request: pytest.FixtureRequest,
+    room_map: Path,
+    other_map: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> str:
     """An atlas of the tiles `room` and `other` in an object store."""
-    where = f"{request.getfixturevalue('s3_bucket')}/campus" if request.param == "s3" else _in_memory(tmp_path, monkeypatch)
+    where = (
+        f"{request.getfixturevalue('s3_bucket')}/campus"
+        if request.param == "s3"
+        else _in_memory(tmp_path, monkeypatch)
+    )
     create_atlas(where, new_tiles([str(room_map), str(other_map)]))
     return where
 
 
 @pytest.fixture
-def in_memory(room_map: Path, other_map: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+def in_memory(
+    room_map: Path, other_map: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> str:
     """The same in fsspec's store in memory, which does what a test says."""
     where = _in_memory(tmp_path, monkeypatch)
     create_atlas(where, new_tiles([str(room_map), str(other_map)]))
@@ -50,16 +63,26 @@ def _in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 
 
 @contextmanager
-def _served(*sources: object, fetch_s: float = 20.0, max_bytes: int = 100_000_000) -> Iterator[tuple[TestClient, Maps]]:
+def _served(
+    *sources: object, fetch_s: float = 20.0, max_bytes: int = 100_000_000
+) -> Iterator[tuple[TestClient, Maps]]:
     """A service of these with one worker."""
     config = ServiceConfig(workers=1, fetch_s=fetch_s)
-    maps = Maps([str(source) for source in sources], Localizer, max_bytes, TileFetches(config.fetch_s).path)
-    with TestClient(make_application(maps, config, Access()), base_url="http://127.0.0.1") as client:
+    maps = Maps(
+        [str(source) for source in sources], Localizer, max_bytes, TileFetches(config.fetch_s).path
+    )
+    with TestClient(
+        make_application(maps, config, Access()), base_url="http://127.0.0.1"
+    ) as client:
         yield client, maps
 
 
 def _posted(client: TestClient, path: str, queries: Path) -> Any:
-    return client.post(path, files={"image": ("v.png", (queries / "view02.png").read_bytes())}, data=_camera(queries))
+    return client.post(
+        path,
+        files={"image": ("v.png", (queries / "view02.png").read_bytes())},
+        data=_camera(queries),
+    )
 
 
 def _camera(queries: Path) -> dict[str, str]:
@@ -75,7 +98,11 @@ def _asked(client: TestClient, path: str, queries: Path) -> Any:
 def _timeless(answer: Any) -> Any:
     """Without what differs from one asking to the next."""
     if isinstance(answer, dict):
-        return {name: _timeless(value) for name, value in answer.items() if name not in ("times_ms", "t_ns")}
+        return {
+            name: _timeless(value)
+            for name, value in answer.items()
+            if name not in ("times_ms", "t_ns")
+        }
     return [_timeless(one) for one in answer] if isinstance(answer, list) else answer
 
 
@@ -93,10 +120,16 @@ def _file_of(where: str, tile_id: str) -> str:
 
 def test_it_answers_as_the_atlas_in_a_folder(store: str, atlas: Path, queries: Path):
     with _served(store) as (client, maps), _served(atlas) as (plain, _):
-        assert client.get("/v1/maps").json() == plain.get("/v1/maps").json() == {"maps": ["other", "room"]}
+        assert (
+            client.get("/v1/maps").json()
+            == plain.get("/v1/maps").json()
+            == {"maps": ["other", "room"]}
+        )
         assert maps.num_open == 0
         for path in ("/v1/localize", "/v1/maps/room/localize", "/v1/maps/other/localize"):
-            assert _timeless(_asked(client, path, queries)) == _timeless(_asked(plain, path, queries))
+            assert _timeless(_asked(client, path, queries)) == _timeless(
+                _asked(plain, path, queries)
+            )
         before = maps.lend("room")
         _asked(client, "/v1/maps/room/localize", queries)
         assert maps.lend("room") is before  # it is not opened anew at each request
@@ -107,7 +140,9 @@ def test_a_stream_is_followed_in_a_tile(store: str, queries: Path):
         assert client.post("/v1/maps/nowhere/sessions").status_code == 404
         begun = client.post("/v1/maps/room/sessions", params=_camera(queries))
         assert begun.status_code == 201, begun.text
-        assert _asked(client, f"/v1/maps/room/sessions/{begun.json()['session']}/pictures", queries)["localized"]
+        assert _asked(
+            client, f"/v1/maps/room/sessions/{begun.json()['session']}/pictures", queries
+        )["localized"]
 
 
 def test_tiles_are_closed_beyond_the_budget(in_memory: str, queries: Path):
@@ -117,7 +152,9 @@ def test_tiles_are_closed_beyond_the_budget(in_memory: str, queries: Path):
             assert maps.num_open == 1
 
 
-def test_what_is_written_to_the_store_is_noticed(store: str, room_map: Path, queries: Path, monkeypatch: pytest.MonkeyPatch):
+def test_what_is_written_to_the_store_is_noticed(
+    store: str, room_map: Path, queries: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setattr(served_atlases, "LOOK_S", 0.1)
     with _served(store) as (client, maps):
         assert _asked(client, "/v1/localize", queries)["map"] == "room"
@@ -132,7 +169,11 @@ def test_what_is_written_to_the_store_is_noticed(store: str, room_map: Path, que
 def test_a_look_reads_no_manifest_that_it_knows(in_memory: str, monkeypatch: pytest.MonkeyPatch):
     maps, read = Maps([in_memory], Localizer, 1), list[str]()
     cat_file = (files := ObjectStore(in_memory)._files).cat_file
-    monkeypatch.setattr(type(files), "cat_file", lambda self, path, **more: read.append(path) or cat_file(path, **more))
+    monkeypatch.setattr(
+        type(files),
+        "cat_file",
+        lambda self, path, **more: read.append(path) or cat_file(path, **more),
+    )
     assert not maps.atlases[0].look()
     assert read == []
     remove_tiles(in_memory, ["other"])
@@ -158,7 +199,9 @@ def silent_tiles(in_memory: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[th
     speaks.set()
 
 
-def test_a_silent_store_holds_nobody_else_up(in_memory: str, silent_tiles: threading.Event, room_map: Path, tmp_path: Path, queries: Path):
+def test_a_silent_store_holds_nobody_else_up(
+    in_memory: str, silent_tiles: threading.Event, room_map: Path, tmp_path: Path, queries: Path
+):
     lone = tmp_path / "lone.topo"
     lone.write_bytes(room_map.read_bytes())
     with _served(in_memory, lone, fetch_s=5.0) as (client, _):
@@ -176,10 +219,15 @@ def test_a_silent_store_holds_nobody_else_up(in_memory: str, silent_tiles: threa
             assert _posted(client, refused, queries).status_code == 503
         silent_tiles.set()
         _until(lambda: _posted(client, path, queries).status_code == 200)
-        assert {answer["map"] for answer in _asked(client, "/v1/localize", queries)["answers"]} == {"lone", "room"}
+        assert {answer["map"] for answer in _asked(client, "/v1/localize", queries)["answers"]} == {
+            "lone",
+            "room",
+        }
 
 
-def test_a_tile_that_comes_late_is_waited_for(in_memory: str, silent_tiles: threading.Event, queries: Path):
+def test_a_tile_that_comes_late_is_waited_for(
+    in_memory: str, silent_tiles: threading.Event, queries: Path
+):
     with _served(in_memory) as (client, _):
         threading.Timer(1.0, silent_tiles.set).start()
         start = time.monotonic()
@@ -203,14 +251,21 @@ def test_what_was_opened_answers_while_the_store_is_gone(
                 patched.setattr(type(ObjectStore(in_memory)._files), name, gone)
             _until(lambda: bool(caplog.records))
             time.sleep(0.2)
-            assert [record.getMessage() for record in caplog.records] == ["atlas"]  # once, and not at each look
+            assert [record.getMessage() for record in caplog.records] == [
+                "atlas"
+            ]  # once, and not at each look
             assert _asked(client, "/v1/maps/room/localize", queries)["localized"]
             answer = _posted(client, "/v1/maps/other/localize", queries)
-            assert (answer.status_code, "network is unreachable" in answer.json()["error"]) == (503, True)
+            assert (answer.status_code, "network is unreachable" in answer.json()["error"]) == (
+                503,
+                True,
+            )
         _until(lambda: _posted(client, "/v1/maps/other/localize", queries).status_code == 200)
 
 
-@pytest.mark.parametrize(("is_there", "said"), [(False, "is missing"), (True, "its checksum is another")])
+@pytest.mark.parametrize(
+    ("is_there", "said"), [(False, "is missing"), (True, "its checksum is another")]
+)
 def test_a_missing_or_rotten_tile_is_named_and_the_others_answer(
     in_memory: str, is_there: bool, said: str, queries: Path, caplog: pytest.LogCaptureFixture
 ):
@@ -240,17 +295,27 @@ def test_a_tile_is_fetched_once_for_all_who_ask(in_memory: str, silent_tiles: th
     assert fetches.path(atlas, atlas.tile("room")) == path
 
 
-def test_so_many_tiles_of_one_store_come_at_a_time(in_memory: str, silent_tiles: threading.Event, monkeypatch: pytest.MonkeyPatch):
+def test_so_many_tiles_of_one_store_come_at_a_time(
+    in_memory: str, silent_tiles: threading.Event, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setattr(tile_fetches, "_MAX_AT_A_TIME", 1)
     atlas, fetches = Atlas.open(in_memory), TileFetches(30.0)
     with pytest.raises(TileAwaited):
         fetches.path(atlas, atlas.tile("room"))
-    with pytest.raises(StoreError, match=r"tile other is not here yet, and 1 others are being fetched"):
+    with pytest.raises(
+        StoreError, match=r"tile other is not here yet, and 1 others are being fetched"
+    ):
         fetches.path(atlas, atlas.tile("other"))
 
 
-def test_what_is_no_atlas_is_not_served(in_memory: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    for where, said in ((f"{in_memory}/else", "is no atlas"), ("nostore://campus", "nostore"), (str(tmp_path / "no.topo"), "no such map")):
+def test_what_is_no_atlas_is_not_served(
+    in_memory: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    for where, said in (
+        (f"{in_memory}/else", "is no atlas"),
+        ("nostore://campus", "nostore"),
+        (str(tmp_path / "no.topo"), "no such map"),
+    ):
         with pytest.raises(MapError, match=said):
             Maps([where], Localizer, 1)
     monkeypatch.setattr(type(ObjectStore(in_memory)._files), "ls", lambda *_, **__: 1 / 0)
@@ -258,7 +323,9 @@ def test_what_is_no_atlas_is_not_served(in_memory: str, monkeypatch: pytest.Monk
         Maps([in_memory], Localizer, 1)
 
 
-def test_a_cache_folder_that_cannot_be_written_is_said(in_memory: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_cache_folder_that_cannot_be_written_is_said(
+    in_memory: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     (tmp_path / "file").write_text("no folder")
     monkeypatch.setenv("TOPOLOC_CACHE", str(tmp_path / "file"))
     atlas = Atlas.open(in_memory)

@@ -1,4 +1,5 @@
-"""Commands that edit a map edit the tile of an atlas as they do a map file, and `undo` takes it back to the byte."""
+"""Commands that edit a map edit the tile of an atlas as they do a map file, and `undo` takes it
+back to the byte."""
 
 from __future__ import annotations
 
@@ -36,18 +37,32 @@ def _bytes(where: Path, tile_id: str) -> bytes:
 
 
 def test_an_edit_of_a_tile_is_that_of_its_map_and_is_taken_back(
-    own_atlas: Path, room_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    own_atlas: Path,
+    room_map: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ):
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
     alone = Path(shutil.copy(room_map, tmp_path / "alone.topo"))
     before, other = _bytes(own_atlas, "room"), _bytes(own_atlas, "other")
     on_earth = _done(capsys, "georeference", alone, "--origin", ORIGIN)
-    assert _done(capsys, "georeference", own_atlas, "--tile", "room", "--origin", ORIGIN) == on_earth
+    assert (
+        _done(capsys, "georeference", own_atlas, "--tile", "room", "--origin", ORIGIN) == on_earth
+    )
     assert _bytes(own_atlas, "room") == alone.read_bytes() != before
     tile = Atlas.open(str(own_atlas)).tile("room")
     assert tile.geo_box is not None
     assert tile.undo is not None
-    pruned = _done(capsys, "prune", own_atlas, "--tile", "room", "--max-mb", f"{tile.map.num_bytes * 0.7e-6:.3f}")
+    pruned = _done(
+        capsys,
+        "prune",
+        own_atlas,
+        "--tile",
+        "room",
+        "--max-mb",
+        f"{tile.map.num_bytes * 0.7e-6:.3f}",
+    )
     (changes,) = pruned["tiles"]
     assert (changes["tile_id"], changes["bytes"]) == ("room", len(_bytes(own_atlas, "room")))
     assert changes["bytes"] < tile.map.num_bytes
@@ -62,7 +77,9 @@ def test_an_edit_of_a_tile_is_that_of_its_map_and_is_taken_back(
     assert _bytes(own_atlas, "other") == other
 
 
-def test_all_tiles_are_pruned_and_one_that_cannot_be_leaves_the_others(own_atlas: Path, capsys: pytest.CaptureFixture[str]):
+def test_all_tiles_are_pruned_and_one_that_cannot_be_leaves_the_others(
+    own_atlas: Path, capsys: pytest.CaptureFixture[str]
+):
     atlas = Atlas.open(str(own_atlas))
     pruned = _done(capsys, "prune", own_atlas)
     assert {one["tile_id"] for one in pruned["tiles"]} == {"room", "other"}
@@ -74,7 +91,9 @@ def test_all_tiles_are_pruned_and_one_that_cannot_be_leaves_the_others(own_atlas
     assert captured.err.count("\n") == 1
 
 
-def test_an_undo_file_that_is_gone_or_another_one_costs_no_edit_of_another_tile(own_atlas: Path, complaint: Complaint):
+def test_an_undo_file_that_is_gone_or_another_one_costs_no_edit_of_another_tile(
+    own_atlas: Path, complaint: Complaint
+):
     edited_tile(str(own_atlas), "room", _note)
     atlas = Atlas.open(str(own_atlas))
     undo = atlas.tile("room").undo
@@ -125,7 +144,9 @@ def _note(path: Path) -> None:
         edit.commit(edit.topomap, "note")
 
 
-def test_an_edit_in_an_object_store_is_taken_back(room_map: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_an_edit_in_an_object_store_is_taken_back(
+    room_map: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     pytest.importorskip("fsspec", reason="the extra cluster is not installed")
     monkeypatch.setenv("TOPOLOC_CACHE", str(tmp_path / "cache"))
     where = f"memory://{uuid4().hex}/campus"

@@ -14,7 +14,9 @@ from built_room import unseen_views, write_pictures
 @pytest.fixture(scope="session")
 def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Pictures of another world."""
-    return write_pictures(tmp_path_factory.mktemp("queries") / "elsewhere", unseen_views(seed=1, step=4.0))
+    return write_pictures(
+        tmp_path_factory.mktemp("queries") / "elsewhere", unseen_views(seed=1, step=4.0)
+    )
 
 
 @pytest.fixture

@@ -1,4 +1,5 @@
-"""`topoloc config` and `--config FILE` on every command that has settings; and help that can be read."""
+"""`topoloc config` and `--config FILE` on every command that has settings; and help that can be
+read."""
 
 from __future__ import annotations
 
@@ -20,7 +21,9 @@ FileOf = Callable[[str], str]
 MAX_OPTIONS, MAX_LINES = 25, 80
 
 
-def test_what_config_prints_is_read_back_as_the_defaults(capsys: pytest.CaptureFixture[str], file_of: FileOf):
+def test_what_config_prints_is_read_back_as_the_defaults(
+    capsys: pytest.CaptureFixture[str], file_of: FileOf
+):
     assert main(["config"]) == 0
     printed = capsys.readouterr().out
     assert max(map(len, printed.splitlines())) <= 120
@@ -34,30 +37,43 @@ def test_what_config_prints_is_read_back_as_the_defaults(capsys: pytest.CaptureF
 
 def test_a_command_can_be_named(capsys: pytest.CaptureFixture[str]):
     assert main(["config", "evaluate"]) == 0
-    assert list(tomllib.loads(capsys.readouterr().out)) == ["localize", "atlas", "against_itself", "cluster"]
+    assert list(tomllib.loads(capsys.readouterr().out)) == [
+        "localize",
+        "atlas",
+        "against_itself",
+        "cluster",
+    ]
     assert main(["config", "build"]) == 0
     assert list(tomllib.loads(capsys.readouterr().out)) == ["build", "slam", "join", "cluster"]
     assert main(["config", "train"]) == 0
     assert list(tomllib.loads(capsys.readouterr().out)) == ["train"]
 
 
-def test_a_table_of_a_distribution_that_is_not_installed_names_it(file_of: FileOf, monkeypatch: pytest.MonkeyPatch):
+def test_a_table_of_a_distribution_that_is_not_installed_names_it(
+    file_of: FileOf, monkeypatch: pytest.MonkeyPatch
+):
     path = file_of("train.cnn_fc.label_spread = 0.5")
     assert "train" in all_tables()
     read_settings(path)
     monkeypatch.setattr("importlib.metadata.entry_points", lambda group: [])
-    with pytest.raises(ConfigError, match=r"train: comes with topoloc-training, which is not installed$"):
+    with pytest.raises(
+        ConfigError, match=r"train: comes with topoloc-training, which is not installed$"
+    ):
         read_settings(path)
 
 
 def test_only_commands_with_settings_can_be_named(complaint: Complaint):
-    assert "info has no settings beside its options; build, " in complaint("config", "info", status=2)
+    assert "info has no settings beside its options; build, " in complaint(
+        "config", "info", status=2
+    )
     assert "biuld" in complaint("config", "biuld", status=2)
 
 
 @pytest.mark.parametrize("command", all_commands())
 @pytest.mark.parametrize("columns", ["80", "140"])
-def test_help_is_short(command: str, columns: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+def test_help_is_short(
+    command: str, columns: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setenv("COLUMNS", columns)
     with pytest.raises(SystemExit):
         main([command, "--help"])
@@ -70,9 +86,14 @@ def test_help_is_short(command: str, columns: str, capsys: pytest.CaptureFixture
     assert "(default: False)" not in printed
 
 
-def test_options_and_file_reach_the_map_and_options_win(tiny_recording: Path, tmp_path: Path, file_of: FileOf):
+def test_options_and_file_reach_the_map_and_options_win(
+    tiny_recording: Path, tmp_path: Path, file_of: FileOf
+):
     path, info = tmp_path / "room.topo", tmp_path / "info.json"
-    content = "[build]\nmax_node_points = 60\nsides.spacing = 0\nnodes = {d_thresh = 9, lambda_rot = 0.5}\n[localize]\nnum_candidates = 1"
+    content = (
+        "[build]\nmax_node_points = 60\nsides.spacing = 0\nnodes = {d_thresh = 9, lambda_rot ="
+        " 0.5}\n[localize]\nnum_candidates = 1"
+    )
     options = ["--config", file_of(content), "--lambda", "0.25", "--json", str(info)]
     assert main(["build", f"{tiny_recording}@0:6", str(path), *options]) == 0
     config = json.loads(info.read_text())["config"]
@@ -83,13 +104,38 @@ def test_options_and_file_reach_the_map_and_options_win(tiny_recording: Path, tm
     assert topomap.sides is None
 
 
-def test_settings_reach_the_queries_and_their_stream(room_map: Path, tiny_recording: Path, queries: Path, tmp_path: Path, file_of: FileOf):
-    results, path = tmp_path / "a.json", file_of('[localize]\nnum_candidates = 2\n[track]\nmode = "paper"\nmax_jump = 1e-6\n')
-    assert main(["localize", str(room_map), str(queries), "--config", path, "--json", str(results)]) == 0
+def test_settings_reach_the_queries_and_their_stream(
+    room_map: Path, tiny_recording: Path, queries: Path, tmp_path: Path, file_of: FileOf
+):
+    results, path = (
+        tmp_path / "a.json",
+        file_of('[localize]\nnum_candidates = 2\n[track]\nmode = "paper"\nmax_jump = 1e-6\n'),
+    )
+    assert (
+        main(["localize", str(room_map), str(queries), "--config", path, "--json", str(results)])
+        == 0
+    )
     answers = [json.loads(line) for line in results.read_text().splitlines()]
     assert {len(answer["candidates"]) for answer in answers} == {2}
-    assert main(["localize", str(room_map), f"{tiny_recording}@0:3", "--config", path, "--json", str(results)]) == 0
-    assert [json.loads(line).get("reason") for line in results.read_text().splitlines()] == [None, "jump", "jump"]
+    assert (
+        main(
+            [
+                "localize",
+                str(room_map),
+                f"{tiny_recording}@0:3",
+                "--config",
+                path,
+                "--json",
+                str(results),
+            ]
+        )
+        == 0
+    )
+    assert [json.loads(line).get("reason") for line in results.read_text().splitlines()] == [
+        None,
+        "jump",
+        "jump",
+    ]
 
 
 def test_bad_settings_are_one_line_before_the_work(
@@ -102,23 +148,36 @@ def test_bad_settings_are_one_line_before_the_work(
     build = ("build", tiny_recording, tmp_path / "a.topo")
     for number in ("-1", "0", "nan", "inf"):
         assert "--d-thresh: must be " in complaint(*build, "--d-thresh", number, status=2)
-        assert "my.toml: build.nodes.d_thresh: must be " in refused(f"[build]\nnodes.d_thresh = {number}", *build)
+        assert "my.toml: build.nodes.d_thresh: must be " in refused(
+            f"[build]\nnodes.d_thresh = {number}", *build
+        )
     assert "--lambda: must be " in complaint(*build, "--lambda", "-1", status=2)
-    assert "--max-jump: must be " in complaint("localize", room_map, queries, "--max-jump", "nan", status=2)
-    assert "localize.num_candidates: must be " in refused("[localize]\nnum_candidates = 0", "localize", room_map, queries)
-    assert "localize.num_candidate: no such setting; did you mean localize.num_candidates?" in refused(
-        "localize.num_candidate = 1", "evaluate", room_map, queries
+    assert "--max-jump: must be " in complaint(
+        "localize", room_map, queries, "--max-jump", "nan", status=2
     )
-    assert "slam.odometry.window: a whole number" in refused("slam.odometry.window = 1.5", "slam", tiny_recording, tmp_path / "a.tum")
+    assert "localize.num_candidates: must be " in refused(
+        "[localize]\nnum_candidates = 0", "localize", room_map, queries
+    )
+    assert (
+        "localize.num_candidate: no such setting; did you mean localize.num_candidates?"
+        in refused("localize.num_candidate = 1", "evaluate", room_map, queries)
+    )
+    assert "slam.odometry.window: a whole number" in refused(
+        "slam.odometry.window = 1.5", "slam", tiny_recording, tmp_path / "a.tum"
+    )
     assert "train.cnn_fc.training.held_out: must be " in refused(
         "train.cnn_fc.training.held_out = 1", "train", room_map, "--coarse", "cnn-fc"
     )
     assert "slam.checks.max_baseline: must be " in refused("slam.checks.max_baseline = -1", *build)
     (tmp_path / "my.toml").write_text("")
-    assert "named for something else" in complaint("slam", tiny_recording, tmp_path / "my.toml", "--config", tmp_path / "my.toml")
+    assert "named for something else" in complaint(
+        "slam", tiny_recording, tmp_path / "my.toml", "--config", tmp_path / "my.toml"
+    )
 
 
-def test_build_finds_its_way_by_the_settings_of_slam(tiny_recording: Path, tmp_path: Path, file_of: FileOf, complaint: Complaint):
+def test_build_finds_its_way_by_the_settings_of_slam(
+    tiny_recording: Path, tmp_path: Path, file_of: FileOf, complaint: Complaint
+):
     refusing = file_of("[slam]\nchecks.min_start_points = 100000")
     path = tmp_path / "a.topo"
     said = complaint("build", tiny_recording, path, "--trajectory", "slam", "--config", refusing)

@@ -1,4 +1,5 @@
-"""`topoloc export`: formats by name, outputs whole or not there, links followed, and what cannot be exported."""
+"""`topoloc export`: formats by name, outputs whole or not there, links followed, and what cannot be
+exported."""
 
 from __future__ import annotations
 
@@ -23,11 +24,17 @@ def refusals(tmp_path: Path) -> Path:
 
 
 def test_what_no_name_says_needs_a_format(room_map: Path, tmp_path: Path, complaint: Complaint):
-    assert "--format takes colmap, nerfstudio" in complaint("export", room_map, tmp_path / "room.zip")
-    assert "no format of ours" in complaint("export", room_map, tmp_path / "room.tum", "--format", "fbx")
+    assert "--format takes colmap, nerfstudio" in complaint(
+        "export", room_map, tmp_path / "room.zip"
+    )
+    assert "no format of ours" in complaint(
+        "export", room_map, tmp_path / "room.tum", "--format", "fbx"
+    )
 
 
-def test_a_map_without_a_place_on_earth_makes_no_geojson(room_map: Path, tmp_path: Path, complaint: Complaint):
+def test_a_map_without_a_place_on_earth_makes_no_geojson(
+    room_map: Path, tmp_path: Path, complaint: Complaint
+):
     assert "topoloc georeference" in complaint("export", room_map, tmp_path / "room.geojson")
 
 
@@ -52,7 +59,9 @@ def test_wrong_outputs(room_map: Path, tmp_path: Path, complaint: Complaint):
     full.mkdir()
     (full / "thesis.tex").write_text("years of work")
     assert "holds other things, such as thesis.tex" in complaint("export", room_map, full)
-    assert "it is no folder" in complaint("export", room_map, full / "thesis.tex", "--format", "colmap")
+    assert "it is no folder" in complaint(
+        "export", room_map, full / "thesis.tex", "--format", "colmap"
+    )
 
 
 def test_a_folder_is_replaced_whole_and_links_are_followed(room_map: Path, tmp_path: Path):
@@ -70,4 +79,9 @@ def test_a_folder_is_replaced_whole_and_links_are_followed(room_map: Path, tmp_p
     assert main(["export", str(room_map), str(file_link)]) == 0
     assert file_link.is_symlink()
     assert file.read_text().startswith("# t tx ty tz")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "model", "poses.tum", "real.tum"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "link",
+        "model",
+        "poses.tum",
+        "real.tum",
+    ]

@@ -28,7 +28,9 @@ def _lines(capsys: pytest.CaptureFixture[str], *args: object) -> list[str]:
     return capsys.readouterr().out.splitlines()
 
 
-def test_a_recording_is_answered_as_the_stream_that_it_is(room_map: Path, tiny_recording: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_recording_is_answered_as_the_stream_that_it_is(
+    room_map: Path, tiny_recording: Path, capsys: pytest.CaptureFixture[str]
+):
     followed = [json.loads(line) for line in _lines(capsys, room_map, f"{tiny_recording}@0:4")]
     assert main(["localize", str(room_map), f"{tiny_recording}@0:4", "--json", "-"]) == 0
     localized = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
@@ -40,8 +42,12 @@ def test_a_recording_is_answered_as_the_stream_that_it_is(room_map: Path, tiny_r
     assert "localized" in first
 
 
-def test_a_camera_that_runs_is_followed_until_it_ends(room_map: Path, tiny_recording: Path, capsys: pytest.CaptureFixture[str]):
-    pictures = [cv2.imread(str(path)) for path in sorted((tiny_recording / "image_0").iterdir())[:4]]
+def test_a_camera_that_runs_is_followed_until_it_ends(
+    room_map: Path, tiny_recording: Path, capsys: pytest.CaptureFixture[str]
+):
+    pictures = [
+        cv2.imread(str(path)) for path in sorted((tiny_recording / "image_0").iterdir())[:4]
+    ]
     before_ns = time.time_ns()
     with mjpeg_camera([picture for picture in pictures if picture is not None], 0.5) as url:
         answers = [json.loads(line) for line in _lines(capsys, room_map, url, "--camera", "map")]
@@ -51,13 +57,25 @@ def test_a_camera_that_runs_is_followed_until_it_ends(room_map: Path, tiny_recor
 
 
 def test_it_ends_when_it_is_told_to(room_map: Path, tiny_recording: Path, tmp_path: Path):
-    """A stream that would go on for minutes: two thousand pictures, the same four again and again."""
+    """A stream that would go on for minutes: two thousand pictures, the same four again and
+    again."""
     pictures = sorted((tiny_recording / "image_0").iterdir())[:4]
     for number in range(2000):
         (tmp_path / f"{number:06d}.png").symlink_to(pictures[number % 4])
-    command = [sys.executable, "-m", "topoloc", "follow", str(room_map), str(tmp_path), "--camera", "map"]
+    command = [
+        sys.executable,
+        "-m",
+        "topoloc",
+        "follow",
+        str(room_map),
+        str(tmp_path),
+        "--camera",
+        "map",
+    ]
     environment = os.environ | {"PYTHONPATH": str(ROOT / "src")}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    ) as process:
         assert process.stdout is not None
         first = json.loads(process.stdout.readline())
         process.send_signal(signal.SIGTERM)
@@ -69,7 +87,10 @@ def test_it_ends_when_it_is_told_to(room_map: Path, tiny_recording: Path, tmp_pa
 
 
 def test_robots_hear_what_was_measured(
-    room_map: Path, tiny_recording: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    room_map: Path,
+    tiny_recording: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ):
     published = list[tuple[int, list[float]]]()
 
@@ -82,15 +103,25 @@ def test_robots_hear_what_was_measured(
             published.append((t_ns, world_from_cam.translation.tolist()))
 
     monkeypatch.setattr("topoloc.cli.follow.RosPublisher", Robots)
-    answers = [json.loads(line) for line in _lines(capsys, room_map, f"{tiny_recording}@0:3", "--ros", 7)]
-    measured = [(answer["t_ns"], answer["world_from_cam"]["translation"]) for answer in answers if answer["localized"]]
+    answers = [
+        json.loads(line) for line in _lines(capsys, room_map, f"{tiny_recording}@0:3", "--ros", 7)
+    ]
+    measured = [
+        (answer["t_ns"], answer["world_from_cam"]["translation"])
+        for answer in answers
+        if answer["localized"]
+    ]
     assert published == measured
     assert len(measured) == 3
 
 
-def test_what_cannot_be_followed_is_one_line(complaint: Callable[..., str], room_map: Path, tiny_recording: Path, tmp_path: Path):
+def test_what_cannot_be_followed_is_one_line(
+    complaint: Callable[..., str], room_map: Path, tiny_recording: Path, tmp_path: Path
+):
     assert "no such camera or stream" in complaint("follow", room_map, "/dev/video77")
-    assert "calibration" in complaint("follow", room_map, tiny_recording, "--camera", "unknown", status=2)
+    assert "calibration" in complaint(
+        "follow", room_map, tiny_recording, "--camera", "unknown", status=2
+    )
     picture = cv2.imread(str(next((tiny_recording / "image_0").iterdir())))
     assert picture is not None
     (tmp_path / "walk").mkdir()

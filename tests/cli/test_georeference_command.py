@@ -19,7 +19,11 @@ from topoloc.map.contents import map_id_of
 from topoloc.map.topomap import TopoMetricMap
 
 Complaint = Callable[..., str]
-TRUE = Georeference(GeoPoint(-33.9, 151.2, 40.0), Rigid3(exp_so3(np.array([0.0, 0.0, 2.0])), np.array([5.0, 6.0, 1.0])), "truth")
+TRUE = Georeference(
+    GeoPoint(-33.9, 151.2, 40.0),
+    Rigid3(exp_so3(np.array([0.0, 0.0, 2.0])), np.array([5.0, 6.0, 1.0])),
+    "truth",
+)
 
 
 @pytest.fixture
@@ -43,7 +47,9 @@ def off(path: Path) -> float:
     return float(np.linalg.norm(placed(path).geopoint(point).ecef() - TRUE.geopoint(point).ecef()))
 
 
-def test_results_of_such_a_map_carry_a_geopose(own_map: Path, queries: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_results_of_such_a_map_carry_a_geopose(
+    own_map: Path, queries: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     with TopoMetricMap.load(own_map) as topomap:
         before = (map_id_of(topomap), topomap.version)
     assert main(["georeference", str(own_map), "--origin", "-33.9,151.2,40,90"]) == 0
@@ -63,7 +69,9 @@ def test_results_of_such_a_map_carry_a_geopose(own_map: Path, queries: Path, tmp
     assert "-33.9000000, 151.2000000, 40.00 m (from origin)" in capsys.readouterr().out
 
 
-def test_a_single_photo_has_no_time(own_map: Path, queries: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_single_photo_has_no_time(
+    own_map: Path, queries: Path, capsys: pytest.CaptureFixture[str]
+):
     photo = next(queries.glob("*.png"))
     assert main(["localize", str(own_map), str(photo), "--json", "-"]) == 0
     line = json.loads(capsys.readouterr().out)
@@ -76,12 +84,21 @@ def test_gnss_by_time_and_by_name(own_map: Path, tmp_path: Path):
     with TopoMetricMap.load(own_map) as topomap:
         images, summaries = list(topomap.place_images), list(topomap.summaries)
     poses = [(image.name, image.world_from_cam.translation) for image in images]
-    file.write_text("name,lat,lon,h\n" + "".join(row(name, TRUE.geopoint(position)) for name, position in poses))
+    file.write_text(
+        "name,lat,lon,h\n" + "".join(row(name, TRUE.geopoint(position)) for name, position in poses)
+    )
     assert main(["georeference", str(own_map), "--gnss", str(file)]) == 0
     assert off(own_map) < 0.05
     by_time = [(s.t_ns, s.world_from_cam.translation) for s in summaries]
-    file.write_text("".join(row(f"{t_ns / 1e9:.9f}", TRUE.geopoint(position)) for t_ns, position in by_time))
-    assert main(["georeference", str(own_map), "--gnss", str(file), "--json", str(tmp_path / "g.json")]) == 0
+    file.write_text(
+        "".join(row(f"{t_ns / 1e9:.9f}", TRUE.geopoint(position)) for t_ns, position in by_time)
+    )
+    assert (
+        main(
+            ["georeference", str(own_map), "--gnss", str(file), "--json", str(tmp_path / "g.json")]
+        )
+        == 0
+    )
     assert off(own_map) < 0.05
     facts = json.loads((tmp_path / "g.json").read_text())
     assert facts["num_used"] == facts["num_points"] == len(summaries)
@@ -90,7 +107,10 @@ def test_gnss_by_time_and_by_name(own_map: Path, tmp_path: Path):
 
 def test_three_known_points(own_map: Path, tmp_path: Path):
     points = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.5], [1.0, 4.0, 0.0]])
-    lines = [f"{x},{y},{z},{row('', TRUE.geopoint(np.array([x, y, z]))).lstrip(',')}" for x, y, z in points]
+    lines = [
+        f"{x},{y},{z},{row('', TRUE.geopoint(np.array([x, y, z]))).lstrip(',')}"
+        for x, y, z in points
+    ]
     (tmp_path / "points.csv").write_text("".join(lines))
     assert main(["georeference", str(own_map), "--points", str(tmp_path / "points.csv")]) == 0
     assert off(own_map) < 0.001
@@ -120,7 +140,9 @@ def test_what_does_not_say_where_the_map_lies(own_map: Path, tmp_path: Path, com
         file.write_text(text)
         assert words in complaint("georeference", own_map, "--points", file)
     file.write_text("nowhere.png,48,16,0\n")
-    assert "name of a mapping picture, such as" in complaint("georeference", own_map, "--gnss", file)
+    assert "name of a mapping picture, such as" in complaint(
+        "georeference", own_map, "--gnss", file
+    )
     file.write_text("99999,48,16,0\n99999.1,48,16,0\n")
     assert "no fix is of a time of the map" in complaint("georeference", own_map, "--gnss", file)
     file.write_bytes(b"\x00\xff\xfe")

@@ -18,11 +18,24 @@ NUMBERS = f"{CAMERA.fx},{CAMERA.fy},{CAMERA.cx},{CAMERA.cy}"
 
 
 @pytest.mark.parametrize("options", [(), ("--single",)])
-def test_the_newest_pictures_are_localized(room_map: Path, tmp_path: Path, options: tuple[str, ...], capsys: pytest.CaptureFixture[str]):
+def test_the_newest_pictures_are_localized(
+    room_map: Path, tmp_path: Path, options: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+):
     stream = room_stream()[:12]
     results, found = tmp_path / "results.jsonl", tmp_path / "found.tum"
     with mjpeg_camera([grey for _, grey, _ in stream], 0.15) as url:
-        command = ["localize", str(room_map), url, "--camera", NUMBERS, "--json", str(results), "--tum", str(found), *options]
+        command = [
+            "localize",
+            str(room_map),
+            url,
+            "--camera",
+            NUMBERS,
+            "--json",
+            str(results),
+            "--tum",
+            str(found),
+            *options,
+        ]
         assert main(command) == 0
     printed = capsys.readouterr()
     lines = [json.loads(line) for line in results.read_text().splitlines()]
@@ -40,10 +53,20 @@ def test_the_newest_pictures_are_localized(room_map: Path, tmp_path: Path, optio
     [
         (["rtsp://127.0.0.1:9/none"], 2, "has no calibration"),
         (["rtsp://127.0.0.1:9/none", "--camera", NUMBERS], 1, "does not answer"),
-        (["rtsp://127.0.0.1:9/none", "http://127.0.0.1:9/a", "--camera", NUMBERS], 2, "asked alone"),
-        (["rtsp://127.0.0.1:9/none", "--camera", NUMBERS, "--odometry", "odometry.tum"], 2, "recorded stream"),
+        (
+            ["rtsp://127.0.0.1:9/none", "http://127.0.0.1:9/a", "--camera", NUMBERS],
+            2,
+            "asked alone",
+        ),
+        (
+            ["rtsp://127.0.0.1:9/none", "--camera", NUMBERS, "--odometry", "odometry.tum"],
+            2,
+            "recorded stream",
+        ),
     ],
 )
-def test_what_is_refused(room_map: Path, inputs: list[str], status: int, said: str, capsys: pytest.CaptureFixture[str]):
+def test_what_is_refused(
+    room_map: Path, inputs: list[str], status: int, said: str, capsys: pytest.CaptureFixture[str]
+):
     assert main(["localize", str(room_map), *inputs]) == status
     assert said in capsys.readouterr().err

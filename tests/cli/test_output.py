@@ -19,7 +19,9 @@ class _Terminal(io.StringIO):
         return True
 
 
-def test_nothing_is_lost_where_a_file_cannot_be_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_nothing_is_lost_where_a_file_cannot_be_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     path = tmp_path / "result.json"
     write_text(path, "old")
 
@@ -35,7 +37,10 @@ def test_nothing_is_lost_where_a_file_cannot_be_replaced(tmp_path: Path, monkeyp
 
 def test_outputs_that_can_be_written_pass(tmp_path: Path):
     (tmp_path / "old.json").write_text("{}")
-    check_outputs([None, "-", "-", str(tmp_path / "old.json"), str(tmp_path / "new.json")], inputs=[str(tmp_path / "map.topo")])
+    check_outputs(
+        [None, "-", "-", str(tmp_path / "old.json"), str(tmp_path / "new.json")],
+        inputs=[str(tmp_path / "map.topo")],
+    )
 
 
 @pytest.mark.skipif(not Path(os.devnull).is_char_device(), reason="no device files here")
@@ -46,7 +51,12 @@ def test_devices_are_not_replaced_by_files():
 
 def test_one_path_is_not_two_outputs(tmp_path: Path):
     with pytest.raises(TopolocError, match="named for something else"):
-        check_outputs([str(tmp_path / "a"), str(tmp_path / "sub" / ".." / "a") if (tmp_path / "sub").mkdir() is None else None])
+        check_outputs(
+            [
+                str(tmp_path / "a"),
+                str(tmp_path / "sub" / ".." / "a") if (tmp_path / "sub").mkdir() is None else None,
+            ]
+        )
 
 
 def test_facts_stand_in_columns(capsys: pytest.CaptureFixture[str]):
@@ -76,28 +86,51 @@ def test_a_progress_bar_on_a_terminal_leaves_results_in_their_file(monkeypatch: 
 
 
 # The help of `build` is longer than Python's buffer: it fails in the middle, not at the end.
-SAYING = [(["--help"], "1"), (["--help"], ""), (["--version"], ""), (["build", "--help"], ""), (["info", "MAP"], "")]
+SAYING = [
+    (["--help"], "1"),
+    (["--help"], ""),
+    (["--version"], ""),
+    (["build", "--help"], ""),
+    (["info", "MAP"], ""),
+]
 
 
 @pytest.mark.parametrize(("args", "unbuffered"), SAYING)
-def test_output_that_cannot_be_written_is_one_line_at_most(args: list[str], unbuffered: str, room_map: Path):
-    """To a device that is full, and to a reader that went away: neither leaves a traceback, not even as Python ends."""
-    command = [sys.executable, "-m", "topoloc", *(str(room_map) if arg == "MAP" else arg for arg in args)]
+def test_output_that_cannot_be_written_is_one_line_at_most(
+    args: list[str], unbuffered: str, room_map: Path
+):
+    """To a device that is full, and to a reader that went away: neither leaves a traceback, not
+    even as Python ends."""
+    command = [
+        sys.executable,
+        "-m",
+        "topoloc",
+        *(str(room_map) if arg == "MAP" else arg for arg in args),
+    ]
     environment = os.environ | {"PYTHONUNBUFFERED": unbuffered}
     reading, writing = os.pipe()
     os.close(reading)
     with open(writing, "wb") as gone:
-        done = subprocess.run(command, stdout=gone, stderr=subprocess.PIPE, text=True, env=environment, check=False)
+        done = subprocess.run(
+            command, stdout=gone, stderr=subprocess.PIPE, text=True, env=environment, check=False
+        )
     assert (done.returncode, done.stderr) == (1, "")
     if not Path("/dev/full").is_char_device():
         pytest.skip("no /dev/full here")
     with open("/dev/full", "wb") as full:
-        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, env=environment, check=False)
-    assert (done.returncode, done.stderr) == (1, "error: cannot write the output: No space left on device\n")
+        done = subprocess.run(
+            command, stdout=full, stderr=subprocess.PIPE, text=True, env=environment, check=False
+        )
+    assert (done.returncode, done.stderr) == (
+        1,
+        "error: cannot write the output: No space left on device\n",
+    )
 
 
 def test_who_closes_the_output_wants_none(room_map: Path):
     command = [sys.executable, "-m", "topoloc", "info", str(room_map), "--json", "-"]
     close = "import os, sys; os.close(1); os.execv(sys.argv[1], sys.argv[1:])"
-    done = subprocess.run([sys.executable, "-c", close, *command], stderr=subprocess.PIPE, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", close, *command], stderr=subprocess.PIPE, text=True, check=False
+    )
     assert (done.returncode, done.stderr) == (0, "")

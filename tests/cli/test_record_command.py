@@ -39,11 +39,31 @@ def record(*args: object) -> int:
 
 
 def test_a_webcam(film: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert record("webcam", tmp_path / "out", "--source", film, "--camera", "700,700,671.5,187.5", "--json", "-") == 0
+    assert (
+        record(
+            "webcam",
+            tmp_path / "out",
+            "--source",
+            film,
+            "--camera",
+            "700,700,671.5,187.5",
+            "--json",
+            "-",
+        )
+        == 0
+    )
     facts = json.loads(capsys.readouterr().out)
-    assert facts == {"out": str(tmp_path / "out"), "num_frames": 6, "stereo": False, "depth": False, "poses": False}
+    assert facts == {
+        "out": str(tmp_path / "out"),
+        "num_frames": 6,
+        "stereo": False,
+        "depth": False,
+        "poses": False,
+    }
     read = open_sequence(tmp_path / "out")
-    assert [int(frame.image[5, 5, 0]) for frame in read] == pytest.approx([10 * index for index in range(6)], abs=2)
+    assert [int(frame.image[5, 5, 0]) for frame in read] == pytest.approx(
+        [10 * index for index in range(6)], abs=2
+    )
     assert read[0].camera is not None
     assert read[0].camera.fx == 700.0
 
@@ -77,11 +97,22 @@ def test_the_recording_before_stays(film: Path, tmp_path: Path, capsys: pytest.C
 def test_signals_end_it_in_good_order(film: Path, tmp_path: Path, number: signal.Signals):
     pipe = tmp_path / "endless"  # pictures that never end: MJPEG through a pipe
     os.mkfifo(pipe)
-    command = [sys.executable, "-m", "topoloc", "record", "webcam", str(tmp_path / "out"), "--source", str(pipe)]
+    command = [
+        sys.executable,
+        "-m",
+        "topoloc",
+        "record",
+        "webcam",
+        str(tmp_path / "out"),
+        "--source",
+        str(pipe),
+    ]
     recorder = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     try:
         with pipe.open("wb") as file:
-            data = cv2.imencode(".jpg", np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8))[1].tobytes()
+            data = cv2.imencode(
+                ".jpg", np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+            )[1].tobytes()
             deadline = time.monotonic() + 30.0
             while not (tmp_path / "out/times.txt").exists() and time.monotonic() < deadline:
                 file.write(data)
@@ -116,7 +147,13 @@ def test_signals_end_it_in_good_order(film: Path, tmp_path: Path, number: signal
         (("webcam", "--jpeg", "101"), 2, "from 1 to 100"),
     ],
 )
-def test_what_is_refused(args: tuple[str, ...], status: int, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_what_is_refused(
+    args: tuple[str, ...],
+    status: int,
+    said: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+):
     kind, *options = args
     assert record(kind, tmp_path / "out", *options) == status
     assert said in capsys.readouterr().err
@@ -129,7 +166,9 @@ def test_pictures_that_are_not_two(film: Path, tmp_path: Path, capsys: pytest.Ca
     assert "no calibration of VGA" in capsys.readouterr().err
 
 
-def test_no_carla_server_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+def test_no_carla_server_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
     pytest.importorskip("carla", reason="CARLA's client (extra carla) is not installed")
     monkeypatch.setattr("topoloc.sequences.capture.carla_capture._CONNECT_S", 0.5)
     assert record("carla", tmp_path / "out", "--server", "127.0.0.1:9") == 1

@@ -22,10 +22,14 @@ def making(recording: Path) -> MapMaking:
 
 
 def test_it_stays_where_it_is_sent(making: MapMaking):
-    assert pickle.loads(pickle.dumps(making)).digest() == making.digest() == replace(making).digest()
+    assert (
+        pickle.loads(pickle.dumps(making)).digest() == making.digest() == replace(making).digest()
+    )
 
 
-def test_whatever_decides_changes_it(making: MapMaking, recording: Path, monkeypatch: pytest.MonkeyPatch):
+def test_whatever_decides_changes_it(
+    making: MapMaking, recording: Path, monkeypatch: pytest.MonkeyPatch
+):
     poses = recording / "other.tum"
     poses.write_text("0 0 0 0 0 0 0 1\n")
     digests = [
@@ -56,8 +60,12 @@ def test_no_such_recording(making: MapMaking, tmp_path: Path):
 def test_one_each(making: MapMaking):
     three = replace(making, recordings=("a", "b", "c"))
     assert [one.recordings for one in three.one_each()] == [("a",), ("b",), ("c",)]
-    given = [one.asked.trajectory for one in replace(three, asked=PosesAsked(("x", "y", "z"))).one_each()]
+    given = [
+        one.asked.trajectory for one in replace(three, asked=PosesAsked(("x", "y", "z"))).one_each()
+    ]
     assert given == [("x",), ("y",), ("z",)]
-    assert [one.asked.trajectory for one in replace(three, asked=PosesAsked(("slam",))).one_each()] == [("slam",)] * 3
+    assert [
+        one.asked.trajectory for one in replace(three, asked=PosesAsked(("slam",))).one_each()
+    ] == [("slam",)] * 3
     with pytest.raises(UsageError, match="3 recordings but 2 trajectories"):
         replace(three, asked=PosesAsked(("x", "y"))).one_each()

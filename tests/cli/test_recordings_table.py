@@ -11,7 +11,9 @@ from topoloc.cli.recordings_table import recordings_table, state_text
 from topoloc.cluster.tasks import Running
 from topoloc.cluster.tiles import Outcome
 
-BUILT = Outcome("walks/hall", "hall", "built", num_nodes=12, num_bytes=2_500_000, seconds=31.26, host="one")
+BUILT = Outcome(
+    "walks/hall", "hall", "built", num_nodes=12, num_bytes=2_500_000, seconds=31.26, host="one"
+)
 FAILED = Outcome("walks/yard", "yard", "failed", "walks/yard: no such file or folder")
 
 

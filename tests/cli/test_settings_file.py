@@ -1,4 +1,5 @@
-"""Settings as TOML: how a configuration is printed, what of a file is read, and what is said of a bad one."""
+"""Settings as TOML: how a configuration is printed, what of a file is read, and what is said of a
+bad one."""
 
 from __future__ import annotations
 
@@ -83,7 +84,9 @@ def test_a_table_is_printed_with_its_meanings_and_bounds():
 
 @pytest.mark.usefixtures("cart")
 def test_a_part_of_a_table_changes_that_part_alone(file_of: FileOf):
-    read = read_settings(file_of('[cart]\nname = "Ox"\nloads = [[0, 1], [2, 3.5]]\nfront = {radius = 2}'))
+    read = read_settings(
+        file_of('[cart]\nname = "Ox"\nloads = [[0, 1], [2, 3.5]]\nfront = {radius = 2}')
+    )
     assert read.of(Cart) == Cart(Wheel(2.0), "Ox", loads=((0.0, 1.0), (2.0, 3.5)))
     assert isinstance(read.of(Cart).front.radius, float)
     assert read_settings(file_of("[cart]\nfront = {}")).of(Cart).front == Wheel(0.5)
@@ -107,9 +110,15 @@ def test_a_part_of_a_table_changes_that_part_alone(file_of: FileOf):
         ("[cart.front]\nradius = inf", "cart.front.radius: must be a finite number, not inf"),
         ("[cart.front]\nradius = 0", "cart.front.radius: must be above 0, not 0.0"),
         (f"[cart.front]\nradius = 1{'0' * 400}", "cart.front.radius: must be a finite number"),
-        ("[cart]\nloads = [[1, 2], [3]]", "cart.loads: a list of values is expected, not ((1.0, 2.0), (3.0,))"),
+        (
+            "[cart]\nloads = [[1, 2], [3]]",
+            "cart.loads: a list of values is expected, not ((1.0, 2.0), (3.0,))",
+        ),
         ("[cart]\nloads = [[1, 10]]", "cart.loads: must be from 0 to 9, not 10.0"),
-        ("[cart]\nloads = 2024-01-01", "cart.loads: a list of values is expected, not datetime.date"),
+        (
+            "[cart]\nloads = 2024-01-01",
+            "cart.loads: a list of values is expected, not datetime.date",
+        ),
         ("[cart]\n'a\nb' = 1", "not TOML ("),
         ('[cart]\n"a\\nb" = 1', 'cart."a\\nb": no such setting'),
         ("[cart", "not TOML ("),
@@ -141,8 +150,15 @@ def _keys(config: Any) -> list[str]:
 
 
 _VALUES = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8) | st.sampled_from(["surf", "exact", "motion"]),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.text(max_size=8)
+    | st.sampled_from(["surf", "exact", "motion"]),
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3)
+    ),
     max_leaves=6,
 )
 
@@ -150,7 +166,9 @@ _VALUES = st.recursive(
 @functools.cache
 def _trees(name: str) -> st.SearchStrategy[Any]:
     keys = st.sampled_from(_keys(config_class(name)())) | st.text(max_size=8)
-    return st.recursive(_VALUES, lambda inner: st.dictionaries(keys, inner, max_size=4), max_leaves=12)
+    return st.recursive(
+        _VALUES, lambda inner: st.dictionaries(keys, inner, max_size=4), max_leaves=12
+    )
 
 
 def _refusal(read: Callable[[], Any]) -> str | None:
@@ -173,7 +191,9 @@ def test_whatever_a_table_holds_it_is_read_or_refused_by_its_key(name: str, data
 
 @settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
-    st.binary(max_size=60) | st.text(max_size=60).map(str.encode) | st.sampled_from([f"[{name}]\nx = 1".encode() for name in all_tables()])
+    st.binary(max_size=60)
+    | st.text(max_size=60).map(str.encode)
+    | st.sampled_from([f"[{name}]\nx = 1".encode() for name in all_tables()])
 )
 def test_whatever_a_file_holds_it_is_read_or_refused(tmp_path: Path, content: bytes):
     path = tmp_path / "fuzz.toml"

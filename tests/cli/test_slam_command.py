@@ -12,7 +12,9 @@ from topoloc.cli import main
 from topoloc.sequences.trajectory import read_trajectory
 
 
-def test_slam_writes_a_trajectory_and_says_how_good_it_is(tiny_recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_slam_writes_a_trajectory_and_says_how_good_it_is(
+    tiny_recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     out, told = tmp_path / "room.tum", tmp_path / "room.json"
     assert main(["slam", str(tiny_recording), str(out), "--json", str(told)]) == 0
     printed = capsys.readouterr().out
@@ -36,9 +38,13 @@ def test_a_recording_without_truth_is_mapped_on_slams_poses_and_localizes(
     assert sum(localized) >= len(localized) - 1
 
 
-def test_slam_poses_and_others_do_not_mix(tiny_recording: Path, tmp_path: Path, complaint: Callable[..., str]):
+def test_slam_poses_and_others_do_not_mix(
+    tiny_recording: Path, tmp_path: Path, complaint: Callable[..., str]
+):
     mixed = ["--trajectory", "slam", "--trajectory", "truth"]
-    assert "for all recordings or for none" in complaint("build", *mixed, tiny_recording, tiny_recording, tmp_path / "x.topo", status=2)
+    assert "for all recordings or for none" in complaint(
+        "build", *mixed, tiny_recording, tiny_recording, tmp_path / "x.topo", status=2
+    )
 
 
 def test_single_pictures_are_refused(queries: Path, tmp_path: Path, complaint: Callable[..., str]):

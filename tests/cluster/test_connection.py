@@ -35,12 +35,16 @@ def ray():
         ("ray://127.0.0.1:10001", "no client of Ray"),
     ],
 )
-def test_addresses_that_are_none(address: str, says: str, tiny_recording: Path, tmp_path: Path, complaint: Complaint):
+def test_addresses_that_are_none(
+    address: str, says: str, tiny_recording: Path, tmp_path: Path, complaint: Complaint
+):
     assert says in complaint("build", tiny_recording, tmp_path / "campus", "--ray", address)
 
 
 @needs_ray
-def test_nobody_answers(tiny_recording: Path, tmp_path: Path, complaint: Complaint, monkeypatch: pytest.MonkeyPatch):
+def test_nobody_answers(
+    tiny_recording: Path, tmp_path: Path, complaint: Complaint, monkeypatch: pytest.MonkeyPatch
+):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
     assert f"no Ray cluster answers at 127.0.0.1:{port}" in complaint(
@@ -49,13 +53,20 @@ def test_nobody_answers(tiny_recording: Path, tmp_path: Path, complaint: Complai
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setattr("ray._private.services.find_gcs_addresses", cache(set))
     monkeypatch.setattr("ray._private.utils.read_ray_address", lambda *_: None)
-    with pytest.raises(ClusterError, match="no Ray cluster runs on this machine"), connected("auto"):
+    with (
+        pytest.raises(ClusterError, match="no Ray cluster runs on this machine"),
+        connected("auto"),
+    ):
         pass
 
 
-def test_without_ray_the_extra_is_named(tiny_recording: Path, tmp_path: Path, complaint: Complaint, monkeypatch: pytest.MonkeyPatch):
+def test_without_ray_the_extra_is_named(
+    tiny_recording: Path, tmp_path: Path, complaint: Complaint, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setitem(sys.modules, "ray", None)
-    assert "pip install 'topoloc[cluster]'" in complaint("build", tiny_recording, tmp_path / "campus", "--ray", "auto")
+    assert "pip install 'topoloc[cluster]'" in complaint(
+        "build", tiny_recording, tmp_path / "campus", "--ray", "auto"
+    )
     with pytest.raises(MissingExtraError, match="cluster"), connected("local"):
         pass
 
@@ -96,16 +107,30 @@ def test_what_is_written_past_python_is_not_seen(capfd: pytest.CaptureFixture[st
 
 
 @pytest.mark.parametrize("option", [["--world", "campus"], ["--replace"]])
-def test_options_of_a_cluster_alone(option: list[str], tiny_recording: Path, tmp_path: Path, complaint: Complaint):
-    assert "belong to --ray" in complaint("build", tiny_recording, tmp_path / "room.topo", *option, status=2)
+def test_options_of_a_cluster_alone(
+    option: list[str], tiny_recording: Path, tmp_path: Path, complaint: Complaint
+):
+    assert "belong to --ray" in complaint(
+        "build", tiny_recording, tmp_path / "room.topo", *option, status=2
+    )
 
 
-def test_names_that_no_world_and_no_two_tiles_have(tiny_recording: Path, tmp_path: Path, complaint: Complaint):
-    assert "can be called 'the campus'" in complaint("build", tiny_recording, tmp_path / "campus", "--ray", "auto", "--world", "the campus")
-    assert "named twice" in complaint("build", tiny_recording, tiny_recording, tmp_path / "campus", "--ray", "auto")
+def test_names_that_no_world_and_no_two_tiles_have(
+    tiny_recording: Path, tmp_path: Path, complaint: Complaint
+):
+    assert "can be called 'the campus'" in complaint(
+        "build", tiny_recording, tmp_path / "campus", "--ray", "auto", "--world", "the campus"
+    )
+    assert "named twice" in complaint(
+        "build", tiny_recording, tiny_recording, tmp_path / "campus", "--ray", "auto"
+    )
 
 
-def test_a_forgotten_atlas(tiny_recording: Path, room_map: Path, tmp_path: Path, complaint: Complaint):
+def test_a_forgotten_atlas(
+    tiny_recording: Path, room_map: Path, tmp_path: Path, complaint: Complaint
+):
     for last in (tiny_recording, f"{tiny_recording}@0:5", room_map):
-        assert "was ATLAS forgotten?" in complaint("build", tiny_recording, last, "--ray", "auto", status=2)
+        assert "was ATLAS forgotten?" in complaint(
+            "build", tiny_recording, last, "--ray", "auto", status=2
+        )
     assert "last, the atlas" in complaint("build", tiny_recording, "--ray", "auto", status=2)

@@ -28,7 +28,8 @@ Complaint = Callable[..., str]
 
 @pytest.fixture
 def asked(room_map: Path, queries: Path, tmp_path: Path) -> Path:
-    """A folder with `room.topo`, `pictures` of the room and pictures of `elsewhere`, to be broken."""
+    """A folder with `room.topo`, `pictures` of the room and pictures of `elsewhere`, to be
+    broken."""
     shutil.copy(room_map, tmp_path / "room.topo")
     shutil.copytree(queries, tmp_path / "pictures")
     write_pictures(tmp_path / "elsewhere", unseen_views(seed=1, step=4.0))
@@ -37,7 +38,11 @@ def asked(room_map: Path, queries: Path, tmp_path: Path) -> Path:
 
 def _timeless(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _timeless(one) for key, one in value.items() if key not in ("times_ms", "median_times_ms")}
+        return {
+            key: _timeless(one)
+            for key, one in value.items()
+            if key not in ("times_ms", "median_times_ms")
+        }
     return [_timeless(one) for one in value] if isinstance(value, list) else value
 
 
@@ -49,8 +54,11 @@ def _evaluated(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[Any, 
     return _timeless(json.loads(printed.out)), printed.err
 
 
-def test_the_same_figures_whoever_dies(cluster: Any, asked: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
-    """Paths begin in the folder of the command; the pictures of a page are read where it is written."""
+def test_the_same_figures_whoever_dies(
+    cluster: Any, asked: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    """Paths begin in the folder of the command; the pictures of a page are read where it is
+    written."""
     monkeypatch.setattr(recording_queries, "MAX_PICTURES", 2)
     monkeypatch.setattr(recording_queries, "Piece", DyingPiece)
     monkeypatch.chdir(asked)
@@ -59,11 +67,17 @@ def test_the_same_figures_whoever_dies(cluster: Any, asked: Path, capsys: pytest
     assert alone[0]["num_localized"] == len(unseen_views())
     assert alone[0]["num_elsewhere"] > 0
     assert _evaluated(capsys, *args, "--report", "page.html", "--ray", cluster.address) == alone
-    assert len(list(asked.glob("*.begun-*"))) == len(list(asked.glob("pictures.begun-*"))) + len(list(asked.glob("elsewhere.begun-*"))) >= 3
+    assert (
+        len(list(asked.glob("*.begun-*")))
+        == len(list(asked.glob("pictures.begun-*"))) + len(list(asked.glob("elsewhere.begun-*")))
+        >= 3
+    )
     assert (asked / "page.html").read_text().count("<article>") > 0
 
 
-def test_an_atlas_and_a_tile_that_cannot_be_read(cluster: Any, asked: Path, walks: list[Path], capsys: pytest.CaptureFixture[str]):
+def test_an_atlas_and_a_tile_that_cannot_be_read(
+    cluster: Any, asked: Path, walks: list[Path], capsys: pytest.CaptureFixture[str]
+):
     """What is wrong with a tile is said once, however many pieces meet it."""
     assert main(["build", str(walks[0]), str(asked / "other.topo")]) == 0
     campus = asked / "campus"
@@ -86,7 +100,9 @@ def test_failures_are_those_of_the_plain_command(cluster: Any, asked: Path, comp
 
 
 def test_against_itself_asks_no_cluster(room_map: Path, complaint: Complaint):
-    assert "without --ray" in complaint("evaluate", room_map, "--against-itself", "--ray", "local", status=2)
+    assert "without --ray" in complaint(
+        "evaluate", room_map, "--against-itself", "--ray", "local", status=2
+    )
 
 
 @pytest.fixture
@@ -134,7 +150,9 @@ def test_another_recording_in_its_place_is_not_asked(piece: Piece, asked: Path):
 
 def test_a_machine_without_the_same_features_does_not_answer(piece: Piece):
     other = replace(piece, asked=replace(piece.asked, kinds=frozenset()))
-    with pytest.raises(MissingExtraError, match="has what features surf need, unlike the machine that asks"):
+    with pytest.raises(
+        MissingExtraError, match="has what features surf need, unlike the machine that asks"
+    ):
         other.run(_silent)
 
 

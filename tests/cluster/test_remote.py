@@ -21,7 +21,10 @@ class Witness:
     """Makes nothing, and tells by its error where it was asked and how."""
 
     def make(self, progress: object):
-        raise RecordingError(f"{os.getcwd()} {os.environ.get('SOURCE_DATE_EPOCH')} {os.environ['OPENBLAS_NUM_THREADS']}")
+        raise RecordingError(
+            f"{os.getcwd()} {os.environ.get('SOURCE_DATE_EPOCH')}"
+            f" {os.environ['OPENBLAS_NUM_THREADS']}"
+        )
 
     def digest(self) -> str:
         return "ab" * 32

@@ -16,7 +16,12 @@ def test_each_failure_is_that_of_its_job(cluster: Any, tmp_path: Path):
     does = ("nothing", "refuse", "die", "break", "nothing")
     jobs = [Noting(number, str(tmp_path / "log"), what) for number, what in enumerate(does)]
     heard: list[tuple[int, str | Running]] = []
-    outcomes = run_on_ray(jobs, cluster.address, ClusterConfig(max_retries=1), lambda number, state: heard.append((number, state)))
+    outcomes = run_on_ray(
+        jobs,
+        cluster.address,
+        ClusterConfig(max_retries=1),
+        lambda number, state: heard.append((number, state)),
+    )
     assert [outcome for outcome in outcomes if outcome.startswith("done")] == ["done 0", "done 4"]
     assert outcomes[1] == "failed 1: 1: no pictures"
     assert outcomes[2].startswith("failed 2: its worker ended: ")
@@ -27,11 +32,15 @@ def test_each_failure_is_that_of_its_job(cluster: Any, tmp_path: Path):
 
 
 def test_jobs_of_one_line_are_done_one_after_the_other(cluster: Any, tmp_path: Path):
-    """Also where the one before has failed; another line goes beside. Inside of a block all is one connection."""
+    """Also where the one before has failed; another line goes beside. Inside of a block all is one
+    connection."""
     does = ("nothing", "die", "nothing", "nothing")
     lines = ("a", "a", "b", "a")
     logs = {line: tmp_path / line for line in lines}
-    jobs = [Noting(number, str(logs[line]), what) for number, (line, what) in enumerate(zip(lines, does, strict=True))]
+    jobs = [
+        Noting(number, str(logs[line]), what)
+        for number, (line, what) in enumerate(zip(lines, does, strict=True))
+    ]
     with connected(cluster.address) as ray:
         outcomes = run_on_ray(jobs, cluster.address, ClusterConfig(max_retries=0), lines=lines)
         assert ray.is_initialized()

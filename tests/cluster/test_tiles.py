@@ -45,7 +45,10 @@ def job(room_map: Path) -> TileJob:
     ("recordings", "ids"),
     [
         (["walks/hall", "/data/yard/"], ["hall", "yard"]),
-        (["hall@0:50", "hall@50:100,120:130", "hall@0::2"], ["hall_0-50", "hall_50-100-120-130", "hall_0--2"]),
+        (
+            ["hall@0:50", "hall@50:100,120:130", "hall@0::2"],
+            ["hall_0-50", "hall_50-100-120-130", "hall_0--2"],
+        ),
         (["hall@0-59/100"], ["hall_0-59-100"]),
         (["monday/hall", "tuesday/hall", "yard"], ["monday_hall", "tuesday_hall", "yard"]),
         (["hall", "monday/hall"], ["hall", "monday_hall"]),
@@ -58,7 +61,9 @@ def test_tiles_are_called_as_their_recordings(recordings: list[str], ids: list[s
     assert tile_ids(recordings) == ids
 
 
-@pytest.mark.parametrize("recordings", [["hall", "yard", "hall"], ["hall", "./hall"], ["a b", "a+b"]])
+@pytest.mark.parametrize(
+    "recordings", [["hall", "yard", "hall"], ["hall", "./hall"], ["a b", "a+b"]]
+)
 def test_a_recording_that_is_named_twice(recordings: list[str]):
     with pytest.raises(AtlasError, match="named twice"):
         tile_ids(recordings)
@@ -67,13 +72,23 @@ def test_a_recording_that_is_named_twice(recordings: list[str]):
 def test_a_tile_is_made_once(job: TileJob, room_map: Path, tmp_path: Path):
     where = str(tmp_path / "campus")
     made = build_tile(job, where, False, _nothing)
-    assert (made.state, made.reason, made.notes, made.tile_id) == ("built", None, ("something to know",), "room")
+    assert (made.state, made.reason, made.notes, made.tile_id) == (
+        "built",
+        None,
+        ("something to know",),
+        "room",
+    )
     atlas = Atlas.open(where)
     tile = atlas.tile("room")
     assert atlas.map_path(tile).stat().st_size == made.num_bytes
     assert (tile.recipe, tile.num_nodes) == (job.digest(), made.num_nodes)
     before = (tmp_path / "campus" / "atlas.json").read_bytes()
-    again = build_tile(replace(job, maker=replace(job.maker, fails=AssertionError("made twice"))), where, False, _nothing)
+    again = build_tile(
+        replace(job, maker=replace(job.maker, fails=AssertionError("made twice"))),
+        where,
+        False,
+        _nothing,
+    )
     assert (again.state, again.notes, again.num_nodes) == ("there", (), made.num_nodes)
     assert (tmp_path / "campus" / "atlas.json").read_bytes() == before
 
@@ -101,17 +116,28 @@ def test_what_was_made_otherwise_is_replaced_only_when_it_is_said(job: TileJob, 
         (ZeroDivisionError("in a bug"), "ZeroDivisionError: in a bug"),
     ],
 )
-def test_a_failure_has_a_reason_and_leaves_nothing(job: TileJob, error: Exception, reason: str, tmp_path: Path):
-    failed = build_tile(replace(job, maker=replace(job.maker, fails=error)), str(tmp_path / "campus"), False, _nothing)
+def test_a_failure_has_a_reason_and_leaves_nothing(
+    job: TileJob, error: Exception, reason: str, tmp_path: Path
+):
+    failed = build_tile(
+        replace(job, maker=replace(job.maker, fails=error)),
+        str(tmp_path / "campus"),
+        False,
+        _nothing,
+    )
     assert (failed.state, failed.reason, failed.num_bytes) == ("failed", reason, 0)
     assert any("Traceback" in note for note in failed.notes) == isinstance(error, ZeroDivisionError)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_nothing_stays_in_the_folder_for_temporary_files(job: TileJob, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_nothing_stays_in_the_folder_for_temporary_files(
+    job: TileJob, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     scratch = tmp_path / "scratch"
     scratch.mkdir()
-    (scratch / ".topoloc-tile.topo.0123456789abcdef.part").write_bytes(b"of a worker that was killed")
+    (scratch / ".topoloc-tile.topo.0123456789abcdef.part").write_bytes(
+        b"of a worker that was killed"
+    )
     monkeypatch.setattr("tempfile.tempdir", str(scratch))
     assert build_tile(job, str(tmp_path / "campus"), False, _nothing).state == "built"
     assert list(scratch.iterdir()) == []

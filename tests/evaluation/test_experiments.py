@@ -26,9 +26,13 @@ def views(tmp_path: Path) -> Path:
 
 
 def test_every_frame_with_truth_is_asked_and_told_of(localizer: Localizer, views: Path):
-    (views / "truth.tum").write_text("\n".join((views / "truth.tum").read_text().splitlines()[:2]) + "\n")
+    (views / "truth.tum").write_text(
+        "\n".join((views / "truth.tum").read_text().splitlines()[:2]) + "\n"
+    )
     told = []
-    answers = answer_queries(localizer, open_sequence(views), progress=lambda *step: told.append(step))
+    answers = answer_queries(
+        localizer, open_sequence(views), progress=lambda *step: told.append(step)
+    )
     assert [a.query for a in answers] == ["view00.png", "view01.png"]
     assert told == [("views", 1, 2), ("views", 2, 2)]
     assert max(a.translation_m for a in answers) < 0.02
@@ -52,12 +56,16 @@ def test_truth_of_another_world_is_brought_into_the_maps(localizer: Localizer, v
     for before, after in zip(plain, moved, strict=True):
         assert before.world_from_cam is not None
         assert after.world_from_cam is not None
-        np.testing.assert_allclose(after.world_from_cam.matrix(), (there @ before.world_from_cam).matrix(), atol=1e-12)
+        np.testing.assert_allclose(
+            after.world_from_cam.matrix(), (there @ before.world_from_cam).matrix(), atol=1e-12
+        )
 
 
 def test_images_from_elsewhere_have_no_truth(localizer: Localizer, views: Path):
     told = []
-    answers = answer_elsewhere(localizer, open_sequence(views), progress=lambda *step: told.append(step))
+    answers = answer_elsewhere(
+        localizer, open_sequence(views), progress=lambda *step: told.append(step)
+    )
     assert [a.world_from_cam for a in answers] == [None] * 3
     assert all(a.is_false_accept for a in answers)  # they are of the room after all
     assert told[-1] == ("views (elsewhere)", 3, 3)

@@ -39,7 +39,11 @@ def test_first_poses_that_lead_nowhere_new_are_told_so(localizer: Localizer):
     weights = weights_of("surf")
     weights = replace(weights, evidence=replace(weights.evidence, clear_log_odds=1e9))
     never_clear = Localizer(localizer.topomap, weights=weights)
-    verdicts = [pose.verdict for picture, _ in unseen_views() for pose in explain(never_clear, picture, CAMERA).poses]
+    verdicts = [
+        pose.verdict
+        for picture, _ in unseen_views()
+        for pose in explain(never_clear, picture, CAMERA).poses
+    ]
     assert "the same as one that was found already" in verdicts
     assert verdicts.count("the answer") == len(unseen_views())
 
@@ -57,13 +61,22 @@ def test_a_dark_blank_picture_is_called_so(localizer: Localizer, queries: Path):
 def test_a_wrong_calibration_is_said(localizer: Localizer, queries: Path):
     frame = open_sequence(queries)[0]
     assert frame.camera is not None
-    wrong = type(frame.camera).pinhole(320, 240, 1.12 * frame.camera.fx, 1.12 * frame.camera.fy, frame.camera.cx, frame.camera.cy)
-    assert any("the picture says f = 2" in line for line in explain(localizer, frame.image, wrong).advice)
+    wrong = type(frame.camera).pinhole(
+        320, 240, 1.12 * frame.camera.fx, 1.12 * frame.camera.fy, frame.camera.cx, frame.camera.cy
+    )
+    assert any(
+        "the picture says f = 2" in line for line in explain(localizer, frame.image, wrong).advice
+    )
 
 
-def test_the_command_prints_and_writes_a_page(room_map: Path, queries: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_command_prints_and_writes_a_page(
+    room_map: Path, queries: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     page, facts = tmp_path / "why.html", tmp_path / "why.json"
-    assert main(["explain", str(room_map), f"{queries}@0", "--out", str(page), "--json", str(facts)]) == 0
+    assert (
+        main(["explain", str(room_map), f"{queries}@0", "--out", str(page), "--json", str(facts)])
+        == 0
+    )
     assert "the answer" in capsys.readouterr().out
     text = page.read_text(encoding="utf-8")
     assert text.startswith("<!DOCTYPE html>")
@@ -80,10 +93,14 @@ def test_names_of_pictures_are_no_html(room_map: Path, queries: Path, tmp_path: 
     picture = tmp_path / "<script>alert(1)<img>.png"
     assert cv2.imwrite(str(picture), open_sequence(queries)[0].image)
     page = tmp_path / "why.html"
-    assert main(["explain", str(room_map), str(picture), "--camera", "map", "--out", str(page)]) == 0
+    assert (
+        main(["explain", str(room_map), str(picture), "--camera", "map", "--out", str(page)]) == 0
+    )
     assert "<script>" not in page.read_text(encoding="utf-8")
 
 
-def test_many_pictures_are_too_many(room_map: Path, queries: Path, capsys: pytest.CaptureFixture[str]):
+def test_many_pictures_are_too_many(
+    room_map: Path, queries: Path, capsys: pytest.CaptureFixture[str]
+):
     assert main(["explain", str(room_map), str(queries)]) == 2
     assert "@0 is its first" in capsys.readouterr().err

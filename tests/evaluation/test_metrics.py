@@ -28,7 +28,16 @@ ANSWERS = [
 def test_errors_are_those_put_in():
     assert ANSWERS[1].translation_m == pytest.approx(0.03)
     assert ANSWERS[1].rotation_deg == pytest.approx(3.0)
-    assert [a.is_false_accept for a in ANSWERS] == [False, False, False, True, True, False, False, False]
+    assert [a.is_false_accept for a in ANSWERS] == [
+        False,
+        False,
+        False,
+        True,
+        True,
+        False,
+        False,
+        False,
+    ]
 
 
 def test_counts_medians_and_recall():
@@ -36,7 +45,12 @@ def test_counts_medians_and_recall():
     assert (evaluation["num_queries"], evaluation["num_localized"]) == (8, 5)
     assert evaluation["median_translation_m"] == pytest.approx(0.04)
     assert evaluation["median_rotation_deg"] == pytest.approx(1.0)
-    assert evaluation["recall"] == {"0.05m_5deg": 2 / 8, "0.25m_2deg": 2 / 8, "0.5m_5deg": 3 / 8, "5m_10deg": 4 / 8}
+    assert evaluation["recall"] == {
+        "0.05m_5deg": 2 / 8,
+        "0.25m_2deg": 2 / 8,
+        "0.5m_5deg": 3 / 8,
+        "5m_10deg": 4 / 8,
+    }
     assert evaluation["topological_accuracy"] == 4 / 8
     assert evaluation["false_accepts"] == 2
     assert evaluation["not_localized"] == {"not_in_map": 1, "too_few_inliers": 2}
@@ -45,21 +59,35 @@ def test_counts_medians_and_recall():
 
 def test_poses_for_images_from_elsewhere_are_false_and_nothing_else_changes():
     before = summarize(ANSWERS)
-    evaluation = summarize([*ANSWERS, elsewhere("moon", accepted=True), elsewhere("mars", accepted=False)])
+    evaluation = summarize(
+        [*ANSWERS, elsewhere("moon", accepted=True), elsewhere("mars", accepted=False)]
+    )
     assert evaluation["num_elsewhere"] == 2
     assert evaluation["false_accepts"] == before["false_accepts"] + 1
-    for key in ("num_queries", "num_localized", "median_translation_m", "recall", "topological_accuracy"):
+    for key in (
+        "num_queries",
+        "num_localized",
+        "median_translation_m",
+        "recall",
+        "topological_accuracy",
+    ):
         assert evaluation[key] == before[key]
 
 
 def test_times_are_medians_over_all_queries():
-    evaluation = summarize([elsewhere("x", accepted=False), elsewhere("y", accepted=False), lost("f", 0.0)])
+    evaluation = summarize(
+        [elsewhere("x", accepted=False), elsewhere("y", accepted=False), lost("f", 0.0)]
+    )
     assert evaluation["median_times_ms"]["features"] == 30.0
     assert evaluation["median_times_ms"]["total"] == 41.0
     assert evaluation["median_times_ms"]["pnp"] == 0.0  # two of three never came so far
 
 
-@pytest.mark.parametrize("answers", [[lost("f", 0.0)], [elsewhere("moon", accepted=False)]], ids=["none localized", "no truth"])
+@pytest.mark.parametrize(
+    "answers",
+    [[lost("f", 0.0)], [elsewhere("moon", accepted=False)]],
+    ids=["none localized", "no truth"],
+)
 def test_what_is_not_known_is_null_and_never_nan(answers: list):
     evaluation = summarize(answers)
     assert evaluation["median_translation_m"] is None
@@ -74,14 +102,18 @@ def test_each_recording_is_judged_alone_too():
     assert [row["name"] for row in rows] == ["walk", "night", "moon"]
     for row, answers in zip(rows, (ANSWERS, night), strict=False):
         alone = summarize(answers)
-        assert {key: value for key, value in row.items() if key != "name"} == {k: v for k, v in alone.items() if k != "recordings"}
+        assert {key: value for key, value in row.items() if key != "name"} == {
+            k: v for k, v in alone.items() if k != "recordings"
+        }
     assert (rows[2]["num_queries"], rows[2]["num_elsewhere"], rows[2]["false_accepts"]) == (0, 1, 1)
     assert sum(row["num_queries"] for row in rows) == evaluation["num_queries"]
 
 
 def test_an_answer_is_written_with_its_truth_and_read_again(tmp_path: Path):
     asked = [answer("a", 0.3, 0.02, 0.5), lost("b", 0.4), elsewhere("c", accepted=False)]
-    (tmp_path / "evaluation.json").write_text(json.dumps({"answers": [one.to_json() for one in asked]}))
+    (tmp_path / "evaluation.json").write_text(
+        json.dumps({"answers": [one.to_json() for one in asked]})
+    )
     walk, moon = read_results(tmp_path / "evaluation.json")
     assert [one["query"] for one in walk.answers] == ["a", "b"]
     assert [one["query"] for one in moon.answers] == ["c"]

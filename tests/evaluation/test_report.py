@@ -1,4 +1,5 @@
-"""The page of an evaluation: whole, self-contained, the same twice, and right about what was worst."""
+"""The page of an evaluation: whole, self-contained, the same twice, and right about what was
+worst."""
 
 from __future__ import annotations
 
@@ -20,7 +21,13 @@ from topoloc.evaluation.report_tables import PublishedResult, ReportWords
 from topoloc.localization.result import Localization
 
 GOOD = [answer(f"good{i}", 0.1 * i, error_m=0.001 * (i + 1), error_deg=0.1) for i in range(9)]
-MIXED = [*GOOD, lost("lost", 0.4), answer("far", 0.5, 40.0, 2.0, node_id=1), elsewhere("moon", True), elsewhere("mars", False)]
+MIXED = [
+    *GOOD,
+    lost("lost", 0.4),
+    answer("far", 0.5, 40.0, 2.0, node_id=1),
+    elsewhere("moon", True),
+    elsewhere("mars", False),
+]
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +90,9 @@ def test_the_worst_come_first():
 
 
 def test_the_worst_are_shown_beside_the_node_they_were_matched_with(page: str):
-    articles = re.findall(r"<article>.*?</article>", page[page.index("The worst queries") :], re.DOTALL)
+    articles = re.findall(
+        r"<article>.*?</article>", page[page.index("The worst queries") :], re.DOTALL
+    )
     assert len(articles) == 6
     (far,) = [article for article in articles if "walk/far" in article]
     assert "node 1" in far
@@ -125,7 +134,10 @@ def test_each_recording_has_its_row_its_colour_and_its_curve(tmp_path: Path):
     rows = re.findall(r"<tr><td><i.*?</tr>", page, re.DOTALL)
     assert [re.sub(r"<[^>]*>", " ", row).split()[0] for row in rows] == ["walk", "night", "moon"]
     assert all(text in rows[0] for text in ("9 of 9", "0.50 cm, 0.10°", "100 %"))
-    assert all(text in rows[1] for text in ("night &amp; rain", "2 of 3", "4.00 cm, 1.50°", "67 %", ">0</span> of 3"))
+    assert all(
+        text in rows[1]
+        for text in ("night &amp; rain", "2 of 3", "4.00 cm, 1.50°", "67 %", ">0</span> of 3")
+    )
     assert "images from elsewhere" in rows[2]
     colours = [re.findall(r"background:(#\w+)", row) for row in rows]
     assert colours[0] != colours[1]
@@ -133,7 +145,9 @@ def test_each_recording_has_its_row_its_colour_and_its_curve(tmp_path: Path):
     for figure in re.findall(r"<svg .*?</svg>", page, re.DOTALL)[:3]:
         assert all(colour[0] in figure for colour in colours[:2])
     assert "localized, 9 of 9 queries, walk" in page, "the headline is that of the first recording"
-    assert "<b>66.7 %</b><span>localized, night &amp; rain, the hardest of the others</span>" in page
+    assert (
+        "<b>66.7 %</b><span>localized, night &amp; rain, the hardest of the others</span>" in page
+    )
 
 
 def test_words_and_published_figures_stand_on_the_page(tmp_path: Path):
@@ -143,7 +157,9 @@ def test_words_and_published_figures_stand_on_the_page(tmp_path: Path):
         about={"walk": "by day"},
         published=[PublishedResult("elsewhere", 0.0202, 0.35)],
     )
-    write_report(tmp_path / "report.html", summarize(MIXED) | {"map": MAP_INFO}, MIXED, two_nodes(), words)
+    write_report(
+        tmp_path / "report.html", summarize(MIXED) | {"map": MAP_INFO}, MIXED, two_nodes(), words
+    )
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "<h1>A &lt;title&gt;</h1>" in page
     assert '<p class="lead">What the night costs.</p>' in page
@@ -158,7 +174,13 @@ def test_a_hard_recording_leaves_places_for_the_worst_of_the_others():
 
 
 def test_the_typical_query_is_that_of_the_median_error():
-    typical = typical_queries([*GOOD, *_night([lost("n0", 0.0), lost("n1", 0.1), lost("n2", 0.2)]), elsewhere("mars", accepted=False)])
+    typical = typical_queries(
+        [
+            *GOOD,
+            *_night([lost("n0", 0.0), lost("n1", 0.1), lost("n2", 0.2)]),
+            elsewhere("mars", accepted=False),
+        ]
+    )
     assert [a.query for a in typical] == ["good4", "n1", "mars"]
 
 

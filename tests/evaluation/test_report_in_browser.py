@@ -1,4 +1,5 @@
-"""The report in a real browser: it holds the scene, nothing is cut off on a phone, and it can be read by light and by dark."""
+"""The report in a real browser: it holds the scene, nothing is cut off on a phone, and it can be
+read by light and by dark."""
 
 from __future__ import annotations
 
@@ -13,8 +14,15 @@ from in_browser import CONTRASTS, UNNAMED, chromium, opened
 from topoloc.evaluation.metrics import summarize
 from topoloc.evaluation.report import write_report
 
-ANSWERS = [*(answer(f"good{i}", 0.1 * i, error_m=0.001 * (i + 1), error_deg=0.1) for i in range(4)), lost("lost", 0.4)]
-ANSWERS += [answer("far", 0.5, 40.0, 2.0, node_id=1), elsewhere("moon", True), elsewhere("mars", False)]
+ANSWERS = [
+    *(answer(f"good{i}", 0.1 * i, error_m=0.001 * (i + 1), error_deg=0.1) for i in range(4)),
+    lost("lost", 0.4),
+]
+ANSWERS += [
+    answer("far", 0.5, 40.0, 2.0, node_id=1),
+    elsewhere("moon", True),
+    elsewhere("mars", False),
+]
 # Text of tables that lies outside of the window, and cannot be scrolled to within a box of its own.
 CUT = """() => [...document.querySelectorAll("td, th")].filter((cell) => {
   const box = cell.getBoundingClientRect();
@@ -35,7 +43,11 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.parametrize(("width", "dark"), [(1300, False), (400, False), (400, True)], ids=["wide", "phone", "phone, dark"])
+@pytest.mark.parametrize(
+    ("width", "dark"),
+    [(1300, False), (400, False), (400, True)],
+    ids=["wide", "phone", "phone, dark"],
+)
 def test_nothing_is_cut_off_and_all_can_be_read(browser: Any, report: Path, width: int, dark: bool):
     with opened(browser, report.as_uri(), width, dark) as page:
         assert page.evaluate("document.documentElement.scrollWidth") <= width
@@ -48,7 +60,14 @@ def test_nothing_is_cut_off_and_all_can_be_read(browser: Any, report: Path, widt
 def test_the_scene_holds_every_answer(browser: Any, report: Path):
     with opened(browser, report.as_uri(), 1300) as page:
         shown = page.locator("[data-part=list] option").all_inner_texts()
-        assert {"good0", "good3", "lost (not localized)", "far", "moon", "mars (not localized)"} <= set(shown)
+        assert {
+            "good0",
+            "good3",
+            "lost (not localized)",
+            "far",
+            "moon",
+            "mars (not localized)",
+        } <= set(shown)
         page.get_by_label("Go to").select_option("far")
         assert "Wrongly placed" in page.inner_text("[data-part=details]")
         page.get_by_label("Go to").select_option("moon")

@@ -13,14 +13,27 @@ from topoloc.localization.result import Localization, NotLocalized
 MAP_FROM_TRUTH = Rigid3.exp(np.array([3.0, -1.0, 0.5, 0.1, -0.2, 0.3]))
 
 
-def answers(map_from_truth: Rigid3, noise: float, num_wrong: int = 0, num: int = 20) -> list[Answer]:
-    """Poses along a straight way, each off by `noise` (metres, radians), some of them anywhere; and one refusal."""
-    rng, found = np.random.default_rng(0), [Answer("none", NotLocalized("not_in_map"), Rigid3.identity(), recording="walk")]
+def answers(
+    map_from_truth: Rigid3, noise: float, num_wrong: int = 0, num: int = 20
+) -> list[Answer]:
+    """Poses along a straight way, each off by `noise` (metres, radians), some of them anywhere; and
+    one refusal."""
+    rng, found = (
+        np.random.default_rng(0),
+        [Answer("none", NotLocalized("not_in_map"), Rigid3.identity(), recording="walk")],
+    )
     for number in range(num):
         true = Rigid3.exp(np.array([0.2 * number, 0.0, 0.0, 0.0, 0.1 * np.sin(number), 0.0]))
         off = Rigid3.exp(rng.normal(size=6) * (5.0 if number < num_wrong else noise))
         pose = off @ map_from_truth @ true
-        found.append(Answer(f"{number}", Localization(pose, np.eye(6) * 1e-4, 0.99, 0, [], 50, 40), true, recording="walk"))
+        found.append(
+            Answer(
+                f"{number}",
+                Localization(pose, np.eye(6) * 1e-4, 0.99, 0, [], 50, 40),
+                true,
+                recording="walk",
+            )
+        )
     return found
 
 

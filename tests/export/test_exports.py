@@ -39,7 +39,7 @@ rgb = [point.color.tolist() for point in model.points3D.values()]
 tracks = [point.track.length() for point in model.points3D.values()]
 print(json.dumps({"images": images, "rgb": rgb, "tracks": tracks, "num_rigs": model.num_rigs(), "num_frames": model.num_frames(),
                   "error": model.compute_mean_reprojection_error(), "camera": [c.params.tolist() for c in model.cameras.values()]}))
-"""
+"""  # noqa: E501
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,13 @@ def export(source: Path, out: Path, *options: str) -> Path:
 
 def colmap_of(folder: Path) -> dict:
     """What pycolmap reads; in a process of its own, for it and OpenCV do not get on."""
-    done = subprocess.run([sys.executable, "-c", READ_COLMAP, str(folder)], capture_output=True, text=True, env=os.environ, timeout=120)
+    done = subprocess.run(
+        [sys.executable, "-c", READ_COLMAP, str(folder)],
+        capture_output=True,
+        text=True,
+        env=os.environ,
+        timeout=120,
+    )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
 
@@ -82,7 +88,9 @@ def test_pycolmap_reads_the_model_and_its_tracks_fit(room_map: Path, scene: Scen
     for view in scene.views:
         image = model["images"][view.name]
         np.testing.assert_allclose(image["centre"], view.world_from_cam.translation, atol=1e-9)
-        np.testing.assert_allclose(image["rotation"], view.world_from_cam.inverse().rotation, atol=1e-9)
+        np.testing.assert_allclose(
+            image["rotation"], view.world_from_cam.inverse().rotation, atol=1e-9
+        )
     errors = np.concatenate([image["errors"] for image in model["images"].values()])
     assert errors.mean() < 1.0  # the worst that is let in is 1.5 pixels, in pictures of 320
     assert errors.max() < 2.0
@@ -100,7 +108,11 @@ def test_pycolmap_reads_results(results: Path, tmp_path: Path):
     assert set(model["images"]) == {line["query"] for line in lines if line["localized"]}
     for line in lines:
         if line["localized"]:
-            np.testing.assert_allclose(model["images"][line["query"]]["centre"], line["world_from_cam"]["translation"], atol=1e-9)
+            np.testing.assert_allclose(
+                model["images"][line["query"]]["centre"],
+                line["world_from_cam"]["translation"],
+                atol=1e-9,
+            )
 
 
 def test_the_lab_of_the_zed_as_a_colmap_model(shared: Path, tmp_path: Path):
@@ -112,7 +124,9 @@ def test_the_lab_of_the_zed_as_a_colmap_model(shared: Path, tmp_path: Path):
     assert np.mean(np.array(model["tracks"]) >= 2) > 0.3
 
 
-def test_nerfstudio_finds_pictures_cameras_and_poses(placed_map: Path, scene: Scene, tmp_path: Path):
+def test_nerfstudio_finds_pictures_cameras_and_poses(
+    placed_map: Path, scene: Scene, tmp_path: Path
+):
     folder = export(placed_map, tmp_path / "nerf", "--format", "nerfstudio")
     transforms = json.loads((folder / "transforms.json").read_text())
     assert transforms["camera_model"] == "OPENCV"
@@ -124,11 +138,21 @@ def test_nerfstudio_finds_pictures_cameras_and_poses(placed_map: Path, scene: Sc
         # a point in front of the camera lies at negative z in OpenGL's axes, and where its pixel is
         seen = np.flatnonzero(view.point_rows >= 0)[:20]
         world = scene.points.world[view.point_rows[seen]]
-        gl = (np.column_stack([world, np.ones(len(world))]) @ np.linalg.inv(np.array(frame["transform_matrix"])).T)[:, :3]
+        gl = (
+            np.column_stack([world, np.ones(len(world))])
+            @ np.linalg.inv(np.array(frame["transform_matrix"])).T
+        )[:, :3]
         assert (gl[:, 2] < 0).all()
         assert view.camera is not None
-        pixels = np.column_stack([frame["cx"] - frame["fl_x"] * gl[:, 0] / gl[:, 2], frame["cy"] + frame["fl_y"] * gl[:, 1] / gl[:, 2]])
-        np.testing.assert_allclose(pixels * view.camera.width / frame["w"] - 0.5, view.points_img[seen], atol=2.5)
+        pixels = np.column_stack(
+            [
+                frame["cx"] - frame["fl_x"] * gl[:, 0] / gl[:, 2],
+                frame["cy"] + frame["fl_y"] * gl[:, 1] / gl[:, 2],
+            ]
+        )
+        np.testing.assert_allclose(
+            pixels * view.camera.width / frame["w"] - 0.5, view.points_img[seen], atol=2.5
+        )
 
 
 def test_trimesh_reads_the_points(placed_map: Path, scene: Scene, tmp_path: Path):
@@ -139,21 +163,36 @@ def test_trimesh_reads_the_points(placed_map: Path, scene: Scene, tmp_path: Path
 
 
 def test_evo_reads_trajectories(placed_map: Path, results: Path, scene: Scene, tmp_path: Path):
-    file_interface = pytest.importorskip("evo.tools.file_interface", reason="evo is of the GPL, so nothing here asks for it")
+    file_interface = pytest.importorskip(
+        "evo.tools.file_interface", reason="evo is of the GPL, so nothing here asks for it"
+    )
     tum = file_interface.read_tum_trajectory_file(export(placed_map, tmp_path / "room.tum"))
-    np.testing.assert_allclose(tum.positions_xyz, [view.world_from_cam.translation for view in scene.views], atol=1e-9)
+    np.testing.assert_allclose(
+        tum.positions_xyz, [view.world_from_cam.translation for view in scene.views], atol=1e-9
+    )
     np.testing.assert_allclose(tum.timestamps, [(view.t_ns or 0) / 1e9 for view in scene.views])
     kitti = file_interface.read_kitti_poses_file(export(placed_map, tmp_path / "room.kitti"))
-    np.testing.assert_allclose(kitti.poses_se3, [pose.matrix() for pose in scene.trajectory], atol=1e-9)
+    np.testing.assert_allclose(
+        kitti.poses_se3, [pose.matrix() for pose in scene.trajectory], atol=1e-9
+    )
     assert len(kitti.poses_se3) == 14  # all mapping pictures
     asked = file_interface.read_tum_trajectory_file(export(results, tmp_path / "asked.tum"))
     lines = [json.loads(line) for line in results.read_text().splitlines()]
-    np.testing.assert_allclose(asked.timestamps, [line["t_ns"] / 1e9 for line in lines if line["localized"]])
+    np.testing.assert_allclose(
+        asked.timestamps, [line["t_ns"] / 1e9 for line in lines if line["localized"]]
+    )
 
 
 def test_geojson_is_valid_and_where_the_map_is(placed_map: Path, results: Path, tmp_path: Path):
-    position = {"type": "array", "prefixItems": [{"minimum": 16.36, "maximum": 16.38}, {"minimum": 48.19, "maximum": 48.21}], "minItems": 3}
-    coordinates = {"Point": position, "LineString": {"type": "array", "items": position, "minItems": 2}}
+    position = {
+        "type": "array",
+        "prefixItems": [{"minimum": 16.36, "maximum": 16.38}, {"minimum": 48.19, "maximum": 48.21}],
+        "minItems": 3,
+    }
+    coordinates = {
+        "Point": position,
+        "LineString": {"type": "array", "items": position, "minItems": 2},
+    }
     for source in (placed_map, results):
         data = json.loads(export(source, tmp_path / f"{source.stem}.geojson").read_text())
         assert data["type"] == "FeatureCollection"
@@ -162,7 +201,9 @@ def test_geojson_is_valid_and_where_the_map_is(placed_map: Path, results: Path, 
         assert kinds["Point"] > 3
         for feature in data["features"]:
             assert set(feature) == {"type", "geometry", "properties"}
-            Draft202012Validator(coordinates[feature["geometry"]["type"]]).validate(feature["geometry"]["coordinates"])
+            Draft202012Validator(coordinates[feature["geometry"]["type"]]).validate(
+                feature["geometry"]["coordinates"]
+            )
 
 
 def test_mcap_holds_foxgloves_schemas(placed_map: Path, scene: Scene, tmp_path: Path):
@@ -183,7 +224,10 @@ def test_mcap_holds_foxgloves_schemas(placed_map: Path, scene: Scene, tmp_path: 
     for pose, view in zip(poses, scene.views, strict=True):
         assert pose.frame_id == "map"
         assert pose.timestamp.seconds * 10**9 + pose.timestamp.nanos == view.t_ns
-        np.testing.assert_allclose([pose.pose.position.x, pose.pose.position.y, pose.pose.position.z], view.world_from_cam.translation)
+        np.testing.assert_allclose(
+            [pose.pose.position.x, pose.pose.position.y, pose.pose.position.z],
+            view.world_from_cam.translation,
+        )
     (cloud,) = [decoded for _, channel, _, decoded in found if channel.topic == "/points"]
     assert len(cloud.data) == cloud.point_stride * len(scene.points.world)
     fixes = [decoded for _, channel, _, decoded in found if channel.topic == "/camera/fix"]

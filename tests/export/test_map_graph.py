@@ -25,11 +25,24 @@ def test_the_graph_is_that_of_the_map(room_map: Path):
         at = {summary.node_id: summary.world_from_cam for summary in topomap.summaries}
         for (source, target), facts in graph.ways.items():
             way = at[source].inverse() @ at[target]
-            np.testing.assert_allclose([facts["x"], facts["y"], facts["z"]], way.translation, atol=1e-12)
-            assert abs(facts["metres"] - np.linalg.norm(at[source].translation - at[target].translation)) < 1e-12
+            np.testing.assert_allclose(
+                [facts["x"], facts["y"], facts["z"]], way.translation, atol=1e-12
+            )
+            assert (
+                abs(
+                    facts["metres"]
+                    - np.linalg.norm(at[source].translation - at[target].translation)
+                )
+                < 1e-12
+            )
             assert facts["times"] >= 1
-    degrees = {node: len({b for a, b in graph.ways if a == node} | {a for a, b in graph.ways if b == node}) for node in graph.nodes}
-    assert {node: facts["is_junction"] for node, facts in graph.nodes.items()} == {node: n > 2 for node, n in degrees.items()}
+    degrees = {
+        node: len({b for a, b in graph.ways if a == node} | {a for a, b in graph.ways if b == node})
+        for node in graph.nodes
+    }
+    assert {node: facts["is_junction"] for node, facts in graph.nodes.items()} == {
+        node: n > 2 for node, n in degrees.items()
+    }
 
 
 def test_graphml_declares_what_it_holds(room_map: Path, tmp_path: Path):
@@ -50,7 +63,9 @@ def test_graphml_declares_what_it_holds(room_map: Path, tmp_path: Path):
     assert all({edge.get("source"), edge.get("target")} <= names for edge in edges)
 
 
-def test_geojson_needs_a_place_on_earth(room_map: Path, tmp_path: Path, complaint: Callable[..., str]):
+def test_geojson_needs_a_place_on_earth(
+    room_map: Path, tmp_path: Path, complaint: Callable[..., str]
+):
     path = Path(shutil.copy(room_map, tmp_path / "room.topo"))
     assert "topoloc georeference" in complaint("info", path, "--graph", tmp_path / "room.geojson")
     assert "graphml or .geojson" in complaint("info", path, "--graph", tmp_path / "room.txt")

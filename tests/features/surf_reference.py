@@ -1,4 +1,5 @@
-"""A slow retelling in NumPy of what OpenCV's SURF does for orientation and descriptor: the yardstick of the tests."""
+"""A slow retelling in NumPy of what OpenCV's SURF does for orientation and descriptor: the
+yardstick of the tests."""
 
 from __future__ import annotations
 
@@ -18,7 +19,12 @@ def _orientation_deg(integral: np.ndarray, x: float, y: float, s: float) -> floa
     side = 2 * round(2 * s)
     left = np.rint(x + dx[inside] * s - (side - 1) / 2).astype(int)
     top = np.rint(y + dy[inside] * s - (side - 1) / 2).astype(int)
-    valid = (left >= 0) & (top >= 0) & (left < integral.shape[1] - side) & (top < integral.shape[0] - side)
+    valid = (
+        (left >= 0)
+        & (top >= 0)
+        & (left < integral.shape[1] - side)
+        & (top < integral.shape[0] - side)
+    )
     left, top, weights = left[valid], top[valid], weights[valid]
 
     def box(x0: int, y0: int, x1: int, y1: int) -> np.ndarray:
@@ -41,7 +47,10 @@ def _descriptor(image: np.ndarray, x: float, y: float, s: float, angle_deg: floa
     cosine, sine = np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))
     along, across = np.meshgrid(np.arange(side) - (side - 1) / 2, np.arange(side) - (side - 1) / 2)
     map_x, map_y = x + along * cosine - across * sine, y + along * sine + across * cosine
-    map_x, map_y = np.clip(map_x, 0, image.shape[1] - 1.001), np.clip(map_y, 0, image.shape[0] - 1.001)
+    map_x, map_y = (
+        np.clip(map_x, 0, image.shape[1] - 1.001),
+        np.clip(map_y, 0, image.shape[0] - 1.001),
+    )
     left, top = map_x.astype(int), map_y.astype(int)
     fx, fy = map_x - left, map_y - top
     grey = image.astype(np.float64)
@@ -52,7 +61,12 @@ def _descriptor(image: np.ndarray, x: float, y: float, s: float, angle_deg: floa
     weights = np.outer(_gaussian(20, 3.3), _gaussian(20, 3.3))
     dx = (patch[:-1, 1:] - patch[:-1, :-1] + patch[1:, 1:] - patch[1:, :-1]) * weights
     dy = (patch[1:, :-1] - patch[:-1, :-1] + patch[1:, 1:] - patch[:-1, 1:]) * weights
-    cells = np.stack([dx, dy, abs(dx), abs(dy)], axis=-1).reshape(4, 5, 4, 5, 4).sum(axis=(1, 3)).ravel()
+    cells = (
+        np.stack([dx, dy, abs(dx), abs(dy)], axis=-1)
+        .reshape(4, 5, 4, 5, 4)
+        .sum(axis=(1, 3))
+        .ravel()
+    )
     return cells / (np.linalg.norm(cells) + np.finfo(np.float32).eps)
 
 

@@ -1,4 +1,5 @@
-"""Work shared out to threads: every row and item once and in order, errors raised, and a forked child has threads of its own."""
+"""Work shared out to threads: every row and item once and in order, errors raised, and a forked
+child has threads of its own."""
 
 from __future__ import annotations
 

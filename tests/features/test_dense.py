@@ -50,14 +50,21 @@ def test_points_of_elsewhere_agree_by_chance_alone():
 def test_points_at_the_border_and_none_at_all():
     planes = _scene()
     corners = np.array([[0.0, 0.0], [127.4, 95.4], [-0.5, 95.4]])
-    assert Planes(planes, STRIDE).agrees(corners, _of_points(planes, np.maximum(corners, 0.0))).all()
+    assert (
+        Planes(planes, STRIDE).agrees(corners, _of_points(planes, np.maximum(corners, 0.0))).all()
+    )
     assert len(Planes(planes, STRIDE).agrees(np.zeros((0, 2)), np.zeros((0, 16), np.float32))) == 0
 
 
 def test_two_levels_are_the_sum_of_the_coarse_one_enlarged_and_the_fine_one_weighted():
     rng = np.random.default_rng(6)
-    coarse, fine, weights = (rng.normal(size=size).astype(np.float32) for size in ((6, 8, 16), (12, 16, 4), (4, 16)))
-    enlarged = np.stack([cv2.resize(coarse[..., k], (16, 12), interpolation=cv2.INTER_LINEAR) for k in range(16)], axis=-1)
+    coarse, fine, weights = (
+        rng.normal(size=size).astype(np.float32) for size in ((6, 8, 16), (12, 16, 4), (4, 16))
+    )
+    enlarged = np.stack(
+        [cv2.resize(coarse[..., k], (16, 12), interpolation=cv2.INTER_LINEAR) for k in range(16)],
+        axis=-1,
+    )
     whole = Planes(np.ascontiguousarray((enlarged + fine @ weights).transpose(2, 0, 1)), STRIDE)
     levels = TwoLevels(coarse, fine, weights, STRIDE)
     assert levels.size == whole.size == 16
@@ -66,4 +73,6 @@ def test_two_levels_are_the_sum_of_the_coarse_one_enlarged_and_the_fine_one_weig
     np.testing.assert_allclose(levels.at(points), whole.at(points), atol=2e-6)
     np.testing.assert_allclose(levels._grid, whole._grid, atol=2e-6)
     descriptors = whole.at(rng.permutation(points))
-    np.testing.assert_array_equal(levels.agrees(points, descriptors), whole.agrees(points, descriptors))
+    np.testing.assert_array_equal(
+        levels.agrees(points, descriptors), whole.agrees(points, descriptors)
+    )

@@ -5,18 +5,28 @@ import cv2
 import numpy as np
 import pytest
 
-from topoloc.features.extraction import NORMALIZATIONS, FeatureConfig, extract_features, extract_normalized, normalize_image
+from topoloc.features.extraction import (
+    NORMALIZATIONS,
+    FeatureConfig,
+    extract_features,
+    extract_normalized,
+    normalize_image,
+)
 from topoloc.features.matching import MatchingConfig, match_features
 
 
 def picture(seed: int = 0) -> np.ndarray:
     random = np.random.default_rng(seed)
-    layers = [cv2.resize(random.random((240 // k, 320 // k)), (320, 240), interpolation=cv2.INTER_CUBIC) for k in (4, 8, 16)]
+    layers = [
+        cv2.resize(random.random((240 // k, 320 // k)), (320, 240), interpolation=cv2.INTER_CUBIC)
+        for k in (4, 8, 16)
+    ]
     return np.clip(sum(layers) * 85, 0, 255).astype(np.uint8)
 
 
 def darkened(image: np.ndarray, seed: int = 0) -> np.ndarray:
-    """A third of the light, falling off to a tenth at the right, a gamma curve, and the sensor's noise."""
+    """A third of the light, falling off to a tenth at the right, a gamma curve, and the sensor's
+    noise."""
     light = image / 255 / 3 * np.linspace(1.0, 0.3, image.shape[1])
     noise = np.random.default_rng(seed).normal(0, 4, image.shape)
     return np.clip(np.rint(255 * light**0.6 + noise), 0, 255).astype(np.uint8)
@@ -37,7 +47,9 @@ def test_the_two_steps_are_the_whole_and_threads_do_not_matter():
     config = FeatureConfig()
     image = picture()
     whole = extract_features(image, config)
-    stepwise = extract_normalized(normalize_image(image, config, num_threads=1), config, num_threads=1)
+    stepwise = extract_normalized(
+        normalize_image(image, config, num_threads=1), config, num_threads=1
+    )
     for field in dataclasses.fields(whole):
         assert np.array_equal(getattr(whole, field.name), getattr(stepwise, field.name))
 
@@ -53,7 +65,10 @@ def test_config_survives_the_map_file():
     assert FeatureConfig(**json.loads(json.dumps(dataclasses.asdict(config)))) == config
 
 
-@pytest.mark.parametrize("image", [np.zeros((60, 80), np.uint8), np.full((9, 9), 50, np.uint8), np.full((1, 1), 50, np.uint8)])
+@pytest.mark.parametrize(
+    "image",
+    [np.zeros((60, 80), np.uint8), np.full((9, 9), 50, np.uint8), np.full((1, 1), 50, np.uint8)],
+)
 @pytest.mark.parametrize("kind", ["surf", "sift"])
 def test_pictures_without_anything_have_no_features(kind, image):
     assert len(extract_features(image, FeatureConfig(kind=kind))) == 0
@@ -77,6 +92,8 @@ def test_wide_normalisation_beats_the_papers_on_a_real_picture(shared, number):
     path = shared / "data/seven_scenes/kitchen/seq-01" / f"frame-{number:06d}.color.jpg"
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     dark = darkened(image)
-    wide, paper = (num_right(dark, image, FeatureConfig(normalization=name)) for name in ("wide", "paper"))
+    wide, paper = (
+        num_right(dark, image, FeatureConfig(normalization=name)) for name in ("wide", "paper")
+    )
     assert wide > 1.2 * paper
     assert wide > 100

@@ -11,10 +11,14 @@ from topoloc.features.kinds import KINDS, FeatureConfig, FeatureKind, find_kind
 
 
 @pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: kind.name)
-def test_what_a_kind_says_of_itself_is_so(kind: FeatureKind, shared_picture: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_what_a_kind_says_of_itself_is_so(
+    kind: FeatureKind, shared_picture: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     if kind.network is not None:  # of a network that stands for the real one
         monkeypatch.setenv("TOPOLOC_CACHE", str(tmp_path))
-        write_network(tmp_path / f"{kind.network}.onnx", kind.network, descriptor_size=kind.descriptor_size)
+        write_network(
+            tmp_path / f"{kind.network}.onnx", kind.network, descriptor_size=kind.descriptor_size
+        )
     features = kind.extract(shared_picture, FeatureConfig(kind=kind.name, max_features=200), 1)
     assert 100 < len(features) <= 200
     assert features.descriptors.shape[1] == kind.descriptor_size

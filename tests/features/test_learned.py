@@ -27,9 +27,13 @@ def network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def _bumps(centres: list[tuple[float, float]], height: int, width: int) -> np.ndarray:
-    """Scores with a Gaussian bump around each (x, y), the first the highest: the logarithm of each is a parabola."""
+    """Scores with a Gaussian bump around each (x, y), the first the highest: the logarithm of each
+    is a parabola."""
     y, x = np.mgrid[:height, :width]
-    bumps = [(0.9 - 0.1 * k) * np.exp(-((x - u) ** 2 + (y - v) ** 2) / 8.0) for k, (u, v) in enumerate(centres)]
+    bumps = [
+        (0.9 - 0.1 * k) * np.exp(-((x - u) ** 2 + (y - v) ** 2) / 8.0)
+        for k, (u, v) in enumerate(centres)
+    ]
     return np.max(bumps, axis=0).astype(np.float32)
 
 
@@ -47,15 +51,40 @@ def test_key_points_lie_at_the_tops_to_a_fraction_of_a_pixel():
 
 
 def test_none_lies_at_the_border_or_in_what_continues_the_picture():
-    scores = _bumps([(30.0, 20.0), (3.0, 20.0), (4.0, 40.0), (59.0, 10.0), (60.0, 30.0), (20.0, 45.0), (45.0, 44.0), (40.0, 2.0)], 64, 64)
-    points, _ = find_maxima(scores, 48, 64, 4, np.float32(0.1))  # the picture ends at row 48, the scores do not
-    assert len(find_maxima(scores, 8, 64, 4, np.float32(0.1))[0]) == len(find_maxima(scores, 48, 7, 4, np.float32(0.1))[0]) == 0
-    np.testing.assert_allclose(points[np.argsort(points[:, 0])], [(4.0, 40.0), (30.0, 20.0), (59.0, 10.0)], atol=0.01)
+    scores = _bumps(
+        [
+            (30.0, 20.0),
+            (3.0, 20.0),
+            (4.0, 40.0),
+            (59.0, 10.0),
+            (60.0, 30.0),
+            (20.0, 45.0),
+            (45.0, 44.0),
+            (40.0, 2.0),
+        ],
+        64,
+        64,
+    )
+    points, _ = find_maxima(
+        scores, 48, 64, 4, np.float32(0.1)
+    )  # the picture ends at row 48, the scores do not
+    assert (
+        len(find_maxima(scores, 8, 64, 4, np.float32(0.1))[0])
+        == len(find_maxima(scores, 48, 7, 4, np.float32(0.1))[0])
+        == 0
+    )
+    np.testing.assert_allclose(
+        points[np.argsort(points[:, 0])], [(4.0, 40.0), (30.0, 20.0), (59.0, 10.0)], atol=0.01
+    )
 
 
 def test_weak_ones_and_those_beside_stronger_ones_are_none_and_of_equals_there_is_one():
     scores = np.zeros((32, 32), np.float32)
-    scores[10, 10], scores[10, 12], scores[8, 11] = 0.5, 0.4, 0.3  # within two pixels of the strongest
+    scores[10, 10], scores[10, 12], scores[8, 11] = (
+        0.5,
+        0.4,
+        0.3,
+    )  # within two pixels of the strongest
     scores[20, 20] = scores[20, 21] = scores[21, 20] = scores[22, 22] = 0.2
     scores[25, 8] = 0.1
     points, found = find_maxima(scores, 32, 32, 4, np.float32(0.1))
@@ -85,8 +114,13 @@ def test_key_points_are_what_no_window_exceeds():
 def _bilinear(dense: np.ndarray, points: np.ndarray, stride: float) -> np.ndarray:
     """In NumPy; beyond the outermost points of the grid it goes on as they are."""
     rows, columns = dense.shape[1:]
-    u, v = (np.clip((points[:, k] + 0.5) / stride - 0.5, 0, n - 1) for k, n in ((0, columns), (1, rows)))
-    x, y = np.minimum(np.floor(u).astype(int), columns - 2), np.minimum(np.floor(v).astype(int), rows - 2)
+    u, v = (
+        np.clip((points[:, k] + 0.5) / stride - 0.5, 0, n - 1) for k, n in ((0, columns), (1, rows))
+    )
+    x, y = (
+        np.minimum(np.floor(u).astype(int), columns - 2),
+        np.minimum(np.floor(v).astype(int), rows - 2),
+    )
     s, t = u - x, v - y
     above = (1 - s) * dense[:, y, x] + s * dense[:, y, x + 1]
     below = (1 - s) * dense[:, y + 1, x] + s * dense[:, y + 1, x + 1]
@@ -100,7 +134,9 @@ def test_descriptors_are_bilinear_and_of_unit_length():
     points = (rng.random((200, 2)) * (7 * STRIDE - 1, 5 * STRIDE - 1)).astype(np.float32)
     points[:4] = [(0, 0), (55, 39), (0, 39), (3.5, 3.5)]
     found = sample_descriptors(dense, points, np.float32(STRIDE))
-    np.testing.assert_allclose(found, _bilinear(dense.astype(np.float64), points.astype(np.float64), STRIDE), atol=1e-5)
+    np.testing.assert_allclose(
+        found, _bilinear(dense.astype(np.float64), points.astype(np.float64), STRIDE), atol=1e-5
+    )
     at_a_point = dense[:, 0, 0] / np.linalg.norm(dense[:, 0, 0])
     np.testing.assert_allclose(found[3], at_a_point, atol=1e-6)  # the middle of the first cell
 
@@ -118,23 +154,34 @@ def test_pictures_of_any_size_are_continued_by_their_border(network: Path, heigh
     assert scores.shape == (32 * -(-height // 32), 32 * -(-width // 32))
     assert dense.shape == (64, scores.shape[0] // STRIDE, scores.shape[1] // STRIDE)
     np.testing.assert_allclose(scores[:height, :width], picture / 255.0, atol=1e-6)
-    np.testing.assert_array_equal(scores[height:, :width], np.tile(scores[height - 1, :width], (len(scores) - height, 1)))
-    np.testing.assert_array_equal(scores[:, width:], np.tile(scores[:, width - 1 : width], (1, scores.shape[1] - width)))
+    np.testing.assert_array_equal(
+        scores[height:, :width], np.tile(scores[height - 1, :width], (len(scores) - height, 1))
+    )
+    np.testing.assert_array_equal(
+        scores[:, width:], np.tile(scores[:, width - 1 : width], (1, scores.shape[1] - width))
+    )
     first = np.einsum("cij,ij->c", cells()[:, 0], scores[:STRIDE, :STRIDE])
     np.testing.assert_allclose(dense[:, 0, 0], first, atol=1e-4)
 
 
 def test_features_are_the_strongest_first_with_the_descriptors_of_their_places(network: Path):
-    picture = (255 * _bumps([(70.0, 20.0), (20.0, 30.0), (50.0, 50.0), (90.0, 60.0)], 75, 110)).astype(np.uint8)
+    picture = (
+        255 * _bumps([(70.0, 20.0), (20.0, 30.0), (50.0, 50.0), (90.0, 60.0)], 75, 110)
+    ).astype(np.uint8)
     features = extract_learned(picture, CONFIG)
-    np.testing.assert_allclose(features.points_img, [(70, 20), (20, 30), (50, 50), (90, 60)], atol=0.1)
+    np.testing.assert_allclose(
+        features.points_img, [(70, 20), (20, 30), (50, 50), (90, 60)], atol=0.1
+    )
     assert (np.diff(features.responses) < 0).all()
     assert (np.ptp(features.sizes_px), np.ptp(features.angles)) == (0.0, 0.0)
     dense = run_network(picture, "xfeat").dense
     assert isinstance(dense, Planes)
     expected = _bilinear(dense.planes, features.points_img, STRIDE)
     np.testing.assert_allclose(features.descriptors, expected, atol=1e-4)
-    np.testing.assert_array_equal(extract_learned(picture, LearnedConfig("xfeat", 64, 2, 0.05)).points_img, features.points_img[:2])
+    np.testing.assert_array_equal(
+        extract_learned(picture, LearnedConfig("xfeat", 64, 2, 0.05)).points_img,
+        features.points_img[:2],
+    )
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 5), (8, 400), (240, 320)], ids=str)
@@ -146,7 +193,10 @@ def test_a_picture_without_any_gives_none(network: Path, size: tuple[int, int]):
 
 def test_the_same_on_any_number_of_threads(network: Path):
     picture = np.random.default_rng(3).integers(0, 256, (120, 160), dtype=np.uint8)
-    one, two = (extract_learned(picture, LearnedConfig("xfeat", 64, 500, 0.05, num_threads)) for num_threads in (1, 2))
+    one, two = (
+        extract_learned(picture, LearnedConfig("xfeat", 64, 500, 0.05, num_threads))
+        for num_threads in (1, 2)
+    )
     np.testing.assert_array_equal(one.points_img, two.points_img)
     np.testing.assert_array_equal(one.descriptors, two.descriptors)
 
@@ -157,7 +207,9 @@ def test_the_same_on_any_number_of_threads(network: Path):
 def test_cells_are_means_over_the_picture_and_nothing_beyond_it(network: Path):
     learned.close_networks()
     write_network(network, outputs=("scores", "descriptors", "places"))
-    picture = np.random.default_rng(4).integers(0, 256, (96, 144), dtype=np.uint8)  # continued to 96x160
+    picture = np.random.default_rng(4).integers(
+        0, 256, (96, 144), dtype=np.uint8
+    )  # continued to 96x160
     features = extract_learned(picture, CONFIG)
     assert features.cells is not None
     expected = picture.reshape(4, 24, 6, 24).mean(axis=(1, 3)) / 255.0
@@ -195,7 +247,11 @@ def test_a_network_that_is_damaged_missing_or_another_is_told_in_one_line(networ
 def test_without_onnx_runtime_the_extra_is_named(network: Path, monkeypatch: pytest.MonkeyPatch):
     learned.close_networks()
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    for ask in (lambda: extract_learned(np.zeros((64, 64), np.uint8), CONFIG), lambda: check_available("xfeat"), learned_kind):
+    for ask in (
+        lambda: extract_learned(np.zeros((64, 64), np.uint8), CONFIG),
+        lambda: check_available("xfeat"),
+        learned_kind,
+    ):
         with pytest.raises(MissingExtraError, match=r"pip install 'topoloc\[learned\]'"):
             ask()
 

@@ -3,7 +3,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from topoloc.features.matching import Matcher, MatchingConfig, alike_pairs, match_features, match_pooled
+from topoloc.features.matching import (
+    Matcher,
+    MatchingConfig,
+    alike_pairs,
+    match_features,
+    match_pooled,
+)
 from topoloc.features.matching_kernels import TILE
 
 
@@ -41,11 +47,16 @@ def naive(query: np.ndarray, train: np.ndarray, ratio: float, mutual: bool) -> d
     st.booleans(),
 )
 def test_exact_is_the_textbook(seed, num_query, num_train, size, ratio, mutual):
-    query, train = random_descriptors(seed, num_query, size), random_descriptors(seed + 1, num_train, size)
+    query, train = (
+        random_descriptors(seed, num_query, size),
+        random_descriptors(seed + 1, num_train, size),
+    )
     half = min(num_query, num_train) // 2
     query[:half] = blurred(train[:half], seed + 2)
     matches = match_features(query, train, MatchingConfig(ratio=ratio, mutual=mutual))
-    assert dict(zip(matches.query_idx.tolist(), matches.train_idx.tolist(), strict=True)) == naive(query, train, ratio, mutual)
+    assert dict(zip(matches.query_idx.tolist(), matches.train_idx.tolist(), strict=True)) == naive(
+        query, train, ratio, mutual
+    )
     exact = np.linalg.norm(query[matches.query_idx] - train[matches.train_idx], axis=1)
     np.testing.assert_allclose(matches.distances, exact, atol=1e-3)
 
@@ -90,22 +101,34 @@ def test_mutual_keeps_one_query_a_train_feature():
     train = random_descriptors(0, 40)
     query = np.concatenate([blurred(train, 1), blurred(train, 2)])
     assert len(match_features(query, train, MatchingConfig(mutual=False))) == 80
-    assert len(set(match_features(query, train, MatchingConfig()).train_idx)) == len(match_features(query, train, MatchingConfig())) == 40
+    assert (
+        len(set(match_features(query, train, MatchingConfig()).train_idx))
+        == len(match_features(query, train, MatchingConfig()))
+        == 40
+    )
 
 
 @pytest.mark.parametrize("method", ["exact", "flann"])
 @pytest.mark.parametrize(("num_query", "num_train"), [(0, 5), (5, 0), (0, 0)])
 def test_nothing_to_match(method, num_query, num_train):
-    empty = match_features(np.zeros((num_query, 64), np.float32), np.zeros((num_train, 64), np.float32), MatchingConfig(method=method))
+    empty = match_features(
+        np.zeros((num_query, 64), np.float32),
+        np.zeros((num_train, 64), np.float32),
+        MatchingConfig(method=method),
+    )
     assert len(empty) == 0
 
 
 def test_flann_finds_nearly_what_exact_finds_and_the_same_again():
     train = random_descriptors(0, 800)
     query = blurred(train, 1)
-    exact, flann = (match_features(query, train, MatchingConfig(method=method)) for method in ("exact", "flann"))
+    exact, flann = (
+        match_features(query, train, MatchingConfig(method=method)) for method in ("exact", "flann")
+    )
     again = match_features(query, train, MatchingConfig(method="flann"))
-    agreeing = set(zip(exact.query_idx, exact.train_idx, strict=True)) & set(zip(flann.query_idx, flann.train_idx, strict=True))
+    agreeing = set(zip(exact.query_idx, exact.train_idx, strict=True)) & set(
+        zip(flann.query_idx, flann.train_idx, strict=True)
+    )
     assert len(agreeing) > 0.8 * len(exact)
     assert np.array_equal(flann.query_idx, again.query_idx)
     assert np.array_equal(flann.train_idx, again.train_idx)
@@ -140,7 +163,8 @@ def test_the_wider_radius_of_the_two_decides():
 @pytest.mark.parametrize("num_train", [TILE - 1, TILE, TILE + 1, 3 * TILE + 7])
 @pytest.mark.parametrize("ratio", [0.0, 0.8, 0.95])
 def test_the_nearest_and_its_rivals_are_those_of_the_whole_table(num_train: int, ratio: float):
-    """Whatever tile and lane they lie in; of equal ones the first, and columns that only fill the last tile never."""
+    """Whatever tile and lane they lie in; of equal ones the first, and columns that only fill the
+    last tile never."""
     train = random_descriptors(1, num_train)
     query = blurred(train[np.random.default_rng(4).integers(0, num_train, 70)], 2, 0.15)
     train[num_train // 2] = blurred(query[7:8], 2, 0.1)[0]
@@ -148,15 +172,21 @@ def test_the_nearest_and_its_rivals_are_those_of_the_whole_table(num_train: int,
         train[TILE] = train[0] = query[5]  # two equal columns of one lane
     points, radii = np.random.default_rng(3).uniform(0, 2, (num_train, 3)), np.full(num_train, 0.8)
     matches = match_pooled(query, train, points, radii, MatchingConfig(ratio=ratio, mutual=False))
-    products = np.array([[float(np.sum(q.astype(np.float64) * t)) for t in train] for q in query])  # a BLAS rounds columns differently
+    products = np.array(
+        [[float(np.sum(q.astype(np.float64) * t)) for t in train] for q in query]
+    )  # a BLAS rounds columns differently
     expected = dict[int, int]()
     for row, of_row in enumerate(products):
         winner = int(of_row.argmax())
         limit = min(of_row[winner], 1 - (1 - of_row[winner]) / ratio**2) if ratio else np.inf
-        rivals = np.flatnonzero((of_row >= limit) & (np.linalg.norm(points - points[winner], axis=1) > 0.8))
+        rivals = np.flatnonzero(
+            (of_row >= limit) & (np.linalg.norm(points - points[winner], axis=1) > 0.8)
+        )
         if not np.any(rivals != winner):
             expected[row] = winner
-    assert dict(zip(matches.query_idx.tolist(), matches.train_idx.tolist(), strict=True)) == expected
+    assert (
+        dict(zip(matches.query_idx.tolist(), matches.train_idx.tolist(), strict=True)) == expected
+    )
     assert len(expected) > 0
 
 
@@ -171,16 +201,24 @@ def test_broken_map_descriptors_are_nobodys_match_and_break_no_other():
 def test_more_of_the_same_features_are_matched_as_if_they_were_the_first(method: str):
     """Also mutual: one of the first loses its match to a later one that is nearer."""
     train = random_descriptors(0, 500)
-    query = np.concatenate([blurred(train[:120], 1, 0.1), random_descriptors(2, 81), blurred(train[:200], 3, 0.02)])
+    query = np.concatenate(
+        [blurred(train[:120], 1, 0.1), random_descriptors(2, 81), blurred(train[:200], 3, 0.02)]
+    )
     points, radii = np.random.default_rng(4).uniform(0, 2, (500, 3)), np.full(500, 0.1)
     config = MatchingConfig(ratio=0.9, method=method)
     matcher = Matcher(query, train, (points, radii), config)
     for count in (120, 201, None):
-        found, at_once = matcher.of_first(count), match_pooled(query[:count], train, points, radii, config)
+        found, at_once = (
+            matcher.of_first(count),
+            match_pooled(query[:count], train, points, radii, config),
+        )
         assert np.array_equal(found.query_idx, at_once.query_idx)
         assert np.array_equal(found.train_idx, at_once.train_idx)
         assert np.array_equal(found.distances, at_once.distances)
-    first, every = set(Matcher(query, train, (points, radii), config).of_first(120).query_idx), set(found.query_idx)
+    first, every = (
+        set(Matcher(query, train, (points, radii), config).of_first(120).query_idx),
+        set(found.query_idx),
+    )
     assert len(first - every) > 50
 
 
@@ -190,8 +228,13 @@ def test_of_equal_query_features_the_first_is_matched():
     assert np.array_equal(match_features(query, train, MatchingConfig()).query_idx, np.arange(30))
 
 
-@pytest.mark.parametrize(("num_few", "num_many", "size"), [(128, 1501, 64), (3, 1, 64), (70, 300, 66), (0, 5, 64), (5, 0, 64)])
-def test_pairs_that_are_alike_are_all_that_have_this_product_in_their_order(num_few: int, num_many: int, size: int):
+@pytest.mark.parametrize(
+    ("num_few", "num_many", "size"),
+    [(128, 1501, 64), (3, 1, 64), (70, 300, 66), (0, 5, 64), (5, 0, 64)],
+)
+def test_pairs_that_are_alike_are_all_that_have_this_product_in_their_order(
+    num_few: int, num_many: int, size: int
+):
     few, many = random_descriptors(1, num_few, size), random_descriptors(2, num_many, size)
     rows, columns = alike_pairs(few, many, 0.2)
     expected = np.nonzero(few @ many.T >= np.float32(0.2))

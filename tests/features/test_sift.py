@@ -27,7 +27,9 @@ def test_key_points_follow_a_turned_picture():
     image = picture()
     turned = np.ascontiguousarray(np.rot90(image, -1))  # clockwise: (x, y) goes to (h - 1 - y, x)
     before, after = (extract_sift(i, SiftConfig(max_features=100)) for i in (image, turned))
-    expected = np.stack([image.shape[0] - 1 - before.points_img[:, 1], before.points_img[:, 0]], axis=1)
+    expected = np.stack(
+        [image.shape[0] - 1 - before.points_img[:, 1], before.points_img[:, 0]], axis=1
+    )
     distances = np.linalg.norm(expected[:, None] - after.points_img[None], axis=2)
     found = distances.min(1) < 1.0
     assert found.mean() > 0.8

@@ -1,4 +1,5 @@
-"""SURF against OpenCV's own numbers, on turned, shrunk and darkened images, and at the edges of what it may be given."""
+"""SURF against OpenCV's own numbers, on turned, shrunk and darkened images, and at the edges of
+what it may be given."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ ALL = SurfConfig(max_features=5000)
 
 
 def load_reference(shared: Path, name: str, kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The image, OpenCV's key points (x, y, size, angle in degrees, ...), strongest first, and their descriptors."""
+    """The image, OpenCV's key points (x, y, size, angle in degrees, ...), strongest first, and
+    their descriptors."""
     path = shared / "reference" / "surf" / f"{name}.npz"
     if not path.is_file():
         pytest.skip(f"no reference values at {path}")
@@ -30,14 +32,21 @@ def texture(height: int, width: int, seed: int = 0) -> np.ndarray:
     """Smooth noise of several scales, full contrast."""
     rng = np.random.default_rng(seed)
     layers = [
-        cv2.resize(rng.normal(size=(height // s + 2, width // s + 2)), (width, height), interpolation=cv2.INTER_CUBIC) for s in (4, 9, 20)
+        cv2.resize(
+            rng.normal(size=(height // s + 2, width // s + 2)),
+            (width, height),
+            interpolation=cv2.INTER_CUBIC,
+        )
+        for s in (4, 9, 20)
     ]
     return cv2.normalize(sum(layers), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
 def assert_same(first: Features, second: Features) -> None:
     for field in fields(Features):
-        np.testing.assert_array_equal(getattr(first, field.name), getattr(second, field.name), err_msg=field.name)
+        np.testing.assert_array_equal(
+            getattr(first, field.name), getattr(second, field.name), err_msg=field.name
+        )
 
 
 @pytest.mark.parametrize("name", IMAGES)
@@ -48,7 +57,9 @@ def test_key_points_are_those_of_opencv(shared: Path, name: str) -> None:
     strongest = keypoints[:500]
     distances = np.linalg.norm(features.points_img[None] - strongest[:, None, :2], axis=2)
     sizes_agree = abs(features.sizes_px[None] / strongest[:, None, 2] - 1) < 0.15
-    angles_apart = abs((np.rad2deg(features.angles)[None] - strongest[:, None, 3] + 180) % 360 - 180)
+    angles_apart = abs(
+        (np.rad2deg(features.angles)[None] - strongest[:, None, 3] + 180) % 360 - 180
+    )
     found = (distances < 1) & sizes_agree
     assert np.mean(found.any(axis=1)) >= 0.98
     assert np.mean((found & (angles_apart < 5)).any(axis=1)) >= 0.97
@@ -58,7 +69,9 @@ def test_key_points_are_those_of_opencv(shared: Path, name: str) -> None:
 
 @pytest.mark.parametrize("kind", ["rotated", "upright"])
 @pytest.mark.parametrize("name", IMAGES)
-def test_descriptors_can_be_matched_with_those_of_opencv(shared: Path, name: str, kind: str) -> None:
+def test_descriptors_can_be_matched_with_those_of_opencv(
+    shared: Path, name: str, kind: str
+) -> None:
     image, keypoints, descriptors = load_reference(shared, name, kind)
     features = extract_surf(image, replace(ALL, upright=kind == "upright"))
     nearest = np.argmax(descriptors @ features.descriptors.T, axis=1)
@@ -75,7 +88,9 @@ def turn(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     rotation = np.array([[cosine, -sine], [sine, cosine]])
     size = np.ceil(abs(rotation) @ [width, height]).astype(int)
     affine = np.c_[rotation, (size - 1) / 2 - rotation @ [(width - 1) / 2, (height - 1) / 2]]
-    return cv2.warpAffine(image, affine, tuple(size.tolist()), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), affine
+    return cv2.warpAffine(
+        image, affine, tuple(size.tolist()), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    ), affine
 
 
 def shrink(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -90,7 +105,11 @@ def darken(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def count_right_matches(
-    points: np.ndarray, descriptors: np.ndarray, other_points: np.ndarray, other_descriptors: np.ndarray, affine: np.ndarray
+    points: np.ndarray,
+    descriptors: np.ndarray,
+    other_points: np.ndarray,
+    other_descriptors: np.ndarray,
+    affine: np.ndarray,
 ) -> int:
     """Matches that pass Lowe's test at 0.8 and lie within 3 pixels of where the point has gone."""
     squares = np.maximum(2 - 2 * descriptors @ other_descriptors.T, 0)
@@ -104,13 +123,21 @@ def count_right_matches(
 @pytest.mark.parametrize("change", [turn, shrink, darken])
 @pytest.mark.parametrize("name", ["kitchen", "zed"])
 def test_as_many_right_matches_as_opencv(shared: Path, name: str, change) -> None:
-    """Within 3 %: which of two images does a little better is chance; over many images and changes they are even."""
+    """Within 3 %: which of two images does a little better is chance; over many images and changes
+    they are even."""
     image, keypoints, descriptors = load_reference(shared, name, "rotated")
     changed, affine = change(image)
     ours, theirs = extract_surf(image, ALL), extract_surf(changed, ALL)
     _, of_opencv = describe_as_opencv(changed, np.c_[theirs.points_img, theirs.sizes_px])
-    yardstick = count_right_matches(keypoints[:, :2], descriptors, theirs.points_img, of_opencv, affine)
-    assert count_right_matches(ours.points_img, ours.descriptors, theirs.points_img, theirs.descriptors, affine) >= 0.97 * yardstick
+    yardstick = count_right_matches(
+        keypoints[:, :2], descriptors, theirs.points_img, of_opencv, affine
+    )
+    assert (
+        count_right_matches(
+            ours.points_img, ours.descriptors, theirs.points_img, theirs.descriptors, affine
+        )
+        >= 0.97 * yardstick
+    )
 
 
 def test_the_yardstick_is_opencv(shared: Path) -> None:
@@ -153,7 +180,9 @@ def test_place_and_size_of_a_blob() -> None:
     def strongest(sigma: float) -> Features:
         y, x = np.mgrid[:200, :240]
         square = (x - 120.25) ** 2 + (y - 90.75) ** 2
-        return extract_surf((200 * np.exp(-square / (2 * sigma**2))).astype(np.uint8)).select(np.array([0]))
+        return extract_surf((200 * np.exp(-square / (2 * sigma**2))).astype(np.uint8)).select(
+            np.array([0])
+        )
 
     small, large = strongest(3.0), strongest(9.0)
     for found in (small, large):
@@ -161,7 +190,10 @@ def test_place_and_size_of_a_blob() -> None:
     np.testing.assert_allclose(large.sizes_px / small.sizes_px, 3, rtol=0.15)
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 300), (300, 1), (8, 8), (26, 26), (28, 28), (33, 70), (40, 500), (36, 66000)])
+@pytest.mark.parametrize(
+    "shape",
+    [(1, 1), (1, 300), (300, 1), (8, 8), (26, 26), (28, 28), (33, 70), (40, 500), (36, 66000)],
+)
 def test_small_and_narrow_images(shape: tuple[int, int]) -> None:
     image = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
     features = extract_surf(image, SurfConfig(hessian_threshold=0.0, num_threads=3))
@@ -171,7 +203,10 @@ def test_small_and_narrow_images(shape: tuple[int, int]) -> None:
 
 
 def test_flat_image_has_no_key_points() -> None:
-    assert len(extract_surf(np.full((200, 200), 255, np.uint8), SurfConfig(hessian_threshold=0.0))) == 0
+    assert (
+        len(extract_surf(np.full((200, 200), 255, np.uint8), SurfConfig(hessian_threshold=0.0)))
+        == 0
+    )
 
 
 def test_read_only_and_strided_images() -> None:
@@ -184,7 +219,8 @@ def test_read_only_and_strided_images() -> None:
 
 
 def test_sums_beyond_32_bits_wrap_harmlessly() -> None:
-    """A white image of 17 megapixels sums to more than 2^32; a patch in its far corner is described as on its own."""
+    """A white image of 17 megapixels sums to more than 2^32; a patch in its far corner is described
+    as on its own."""
     patch = texture(200, 200)
     framed = np.full((4200, 4100), 255, np.uint8)
     framed[-300:-100, -300:-100] = patch
@@ -198,7 +234,14 @@ def test_sums_beyond_32_bits_wrap_harmlessly() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"num_octaves": 0}, {"num_layers": 0}, {"num_threads": 0}, {"hessian_threshold": -1.0}, {"num_octaves": 12}]
+    "wrong",
+    [
+        {"num_octaves": 0},
+        {"num_layers": 0},
+        {"num_threads": 0},
+        {"hessian_threshold": -1.0},
+        {"num_octaves": 12},
+    ],
 )
 def test_nonsense_is_refused(wrong: dict) -> None:
     with pytest.raises(ValueError, match="SURF"):

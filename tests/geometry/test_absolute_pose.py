@@ -31,14 +31,23 @@ class Scene:
 
 
 def make_scene(
-    rng: np.random.Generator, camera: Camera, n: int = 100, outliers: float = 0.0, sigma_px: float = 0.0, depth_noise: float = 0.0
+    rng: np.random.Generator,
+    camera: Camera,
+    n: int = 100,
+    outliers: float = 0.0,
+    sigma_px: float = 0.0,
+    depth_noise: float = 0.0,
 ) -> Scene:
-    """Points seen by a camera at a random pose; `depth_noise` d moves them along the ray of a mapping camera by d z^2 (1 sigma)."""
+    """Points seen by a camera at a random pose; `depth_noise` d moves them along the ray of a
+    mapping camera by d z^2 (1 sigma)."""
     cam_from_world = random_rigid(rng)
     pixels = rng.uniform([0, 0], [camera.width - 1, camera.height - 1], (n, 2))
-    points_cam = np.column_stack([camera.normalized_from_img(pixels), np.ones(n)]) * rng.uniform(2.0, 12.0, (n, 1))
+    points_cam = np.column_stack([camera.normalized_from_img(pixels), np.ones(n)]) * rng.uniform(
+        2.0, 12.0, (n, 1)
+    )
     points_world = cam_from_world.inverse().apply(points_cam)
-    # Mapped from two metres beside and behind, so that the error along that ray is seen here from the side.
+    # Mapped from two metres beside and behind, so that the error along that ray is seen here from
+    # the side.
     rays = points_world - cam_from_world.inverse().apply(np.array([2.0, 0.3, -2.0]))
     distances = np.linalg.norm(rays, axis=1, keepdims=True)
     rays = rays / distances
@@ -47,19 +56,26 @@ def make_scene(
     covariances = sigmas[:, :, None] ** 2 * rays[:, :, None] * rays[:, None, :] + 1e-8 * np.eye(3)
     pixels = pixels + sigma_px * rng.normal(size=(n, 2))
     num_outliers = int(outliers * n)
-    pixels[:num_outliers] = rng.uniform([0, 0], [camera.width - 1, camera.height - 1], (num_outliers, 2))
+    pixels[:num_outliers] = rng.uniform(
+        [0, 0], [camera.width - 1, camera.height - 1], (num_outliers, 2)
+    )
     return Scene(pixels, points_world, covariances, cam_from_world, num_outliers)
 
 
 def _errors_px(pose: AbsolutePose, scene: Scene, camera: Camera) -> np.ndarray:
-    return np.linalg.norm(camera.img_from_cam(pose.cam_from_world.apply(scene.points_world)) - scene.points_img, axis=1)
+    return np.linalg.norm(
+        camera.img_from_cam(pose.cam_from_world.apply(scene.points_world)) - scene.points_img,
+        axis=1,
+    )
 
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("model", sorted(CAMERAS))
 def test_exact_matches_give_the_exact_pose(method, model):
     scene = make_scene(np.random.default_rng(0), CAMERAS[model], n=50)
-    pose = estimate_absolute_pose(scene.points_img, scene.points_world, CAMERAS[model], AbsolutePoseConfig(method=method))
+    pose = estimate_absolute_pose(
+        scene.points_img, scene.points_world, CAMERAS[model], AbsolutePoseConfig(method=method)
+    )
     assert pose is not None
     assert translation_error(pose.cam_from_world, scene.cam_from_world) < 1e-6
     assert rotation_error(pose.cam_from_world, scene.cam_from_world) < 1e-7
@@ -79,8 +95,12 @@ def test_any_exact_scene_is_solved(seed, n):
 
 @pytest.mark.parametrize(("method", "outliers"), [("poselib", 0.8), ("opencv", 0.5)])
 def test_outliers_are_told_from_inliers(method, outliers):
-    scene = make_scene(np.random.default_rng(1), CAMERAS["OPENCV"], n=400, outliers=outliers, sigma_px=0.5)
-    pose = estimate_absolute_pose(scene.points_img, scene.points_world, CAMERAS["OPENCV"], AbsolutePoseConfig(method=method))
+    scene = make_scene(
+        np.random.default_rng(1), CAMERAS["OPENCV"], n=400, outliers=outliers, sigma_px=0.5
+    )
+    pose = estimate_absolute_pose(
+        scene.points_img, scene.points_world, CAMERAS["OPENCV"], AbsolutePoseConfig(method=method)
+    )
     assert pose is not None
     assert pose.inliers[scene.num_outliers :].mean() > 0.97
     assert pose.inliers[: scene.num_outliers].mean() < 0.02
@@ -92,7 +112,9 @@ def test_priorities_lead_to_a_pose_among_very_many_outliers():
     scene = make_scene(np.random.default_rng(2), PINHOLE, n=600, outliers=0.95, sigma_px=0.5)
     config = AbsolutePoseConfig(max_iterations=300)
     priorities = np.linspace(0.0, 1.0, 600)  # the inliers come last here
-    pose = estimate_absolute_pose(scene.points_img, scene.points_world, PINHOLE, config, priorities=priorities)
+    pose = estimate_absolute_pose(
+        scene.points_img, scene.points_world, PINHOLE, config, priorities=priorities
+    )
     assert pose is not None
     assert translation_error(pose.cam_from_world, scene.cam_from_world) < 0.1
     assert pose.inliers[scene.num_outliers :].mean() > 0.9
@@ -100,15 +122,30 @@ def test_priorities_lead_to_a_pose_among_very_many_outliers():
 
 @pytest.mark.parametrize("method", METHODS)
 def test_same_input_gives_the_same_bytes(method):
-    scene = make_scene(np.random.default_rng(3), PINHOLE, n=200, outliers=0.5, sigma_px=1.0, depth_noise=0.003)
+    scene = make_scene(
+        np.random.default_rng(3), PINHOLE, n=200, outliers=0.5, sigma_px=1.0, depth_noise=0.003
+    )
     results = [
         estimate_absolute_pose(
-            scene.points_img, scene.points_world, PINHOLE, AbsolutePoseConfig(method=method), point_covariances=scene.covariances
+            scene.points_img,
+            scene.points_world,
+            PINHOLE,
+            AbsolutePoseConfig(method=method),
+            point_covariances=scene.covariances,
         )
         for _ in range(3)
     ]
     assert all(result is not None for result in results)
-    assert len({result.cam_from_world.matrix().tobytes() + result.covariance.tobytes() for result in results if result}) == 1
+    assert (
+        len(
+            {
+                result.cam_from_world.matrix().tobytes() + result.covariance.tobytes()
+                for result in results
+                if result
+            }
+        )
+        == 1
+    )
 
 
 def nans(n: int) -> np.ndarray:
@@ -119,14 +156,29 @@ DEGENERATE = {
     "none": (np.zeros((0, 2)), np.zeros((0, 3))),
     "three": (np.array([[0.0, 0.0], [600.0, 0.0], [0.0, 300.0]]), np.eye(3)),
     "one point": (np.full((20, 2), 100.0), np.ones((20, 3))),
-    "one point, scattered pixels": (np.random.default_rng(0).uniform(0, 300, (20, 2)), np.ones((20, 3))),
-    "one pixel, scattered points": (np.full((20, 2), 100.0), np.random.default_rng(0).normal(size=(20, 3))),
-    "on a line": (np.column_stack([np.linspace(0, 600, 20), np.full(20, 90.0)]), np.outer(np.arange(20.0), [1.0, 0.5, 2.0])),
-    "points on a line, scattered pixels": (np.random.default_rng(0).uniform(0, 300, (20, 2)), np.outer(np.arange(20.0), [1.0, 0.5, 2.0])),
+    "one point, scattered pixels": (
+        np.random.default_rng(0).uniform(0, 300, (20, 2)),
+        np.ones((20, 3)),
+    ),
+    "one pixel, scattered points": (
+        np.full((20, 2), 100.0),
+        np.random.default_rng(0).normal(size=(20, 3)),
+    ),
+    "on a line": (
+        np.column_stack([np.linspace(0, 600, 20), np.full(20, 90.0)]),
+        np.outer(np.arange(20.0), [1.0, 0.5, 2.0]),
+    ),
+    "points on a line, scattered pixels": (
+        np.random.default_rng(0).uniform(0, 300, (20, 2)),
+        np.outer(np.arange(20.0), [1.0, 0.5, 2.0]),
+    ),
     "nan points": (np.random.default_rng(0).uniform(0, 300, (20, 2)), nans(20)),
     "nan pixels": (nans(20)[:, :2], np.random.default_rng(0).normal(size=(20, 3))),
     "infinite": (np.full((20, 2), np.inf), np.full((20, 3), -np.inf)),
-    "four noise": (np.random.default_rng(4).uniform(0, 300, (4, 2)), np.random.default_rng(5).normal(size=(4, 3))),
+    "four noise": (
+        np.random.default_rng(4).uniform(0, 300, (4, 2)),
+        np.random.default_rng(5).normal(size=(4, 3)),
+    ),
 }
 
 
@@ -137,7 +189,12 @@ def test_degenerate_matches_give_no_pose_and_no_warning(method, name, model):
     points_img, points_world = DEGENERATE[name]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert estimate_absolute_pose(points_img, points_world, CAMERAS[model], AbsolutePoseConfig(method=method)) is None
+        assert (
+            estimate_absolute_pose(
+                points_img, points_world, CAMERAS[model], AbsolutePoseConfig(method=method)
+            )
+            is None
+        )
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -145,20 +202,33 @@ def test_matches_that_are_not_finite_are_outliers(method):
     scene = make_scene(np.random.default_rng(6), PINHOLE, n=40)
     scene.points_world[3], scene.points_img[5], scene.covariances[7] = np.nan, np.inf, np.nan
     pose = estimate_absolute_pose(
-        scene.points_img, scene.points_world, PINHOLE, AbsolutePoseConfig(method=method), point_covariances=scene.covariances
+        scene.points_img,
+        scene.points_world,
+        PINHOLE,
+        AbsolutePoseConfig(method=method),
+        point_covariances=scene.covariances,
     )
     assert pose is not None
     assert np.flatnonzero(~pose.inliers).tolist() == [3, 5, 7]
     assert translation_error(pose.cam_from_world, scene.cam_from_world) < 1e-3
 
 
-def mean_normalized_error(camera: Camera, num_trials: int, config: AbsolutePoseConfig | None = None, **noise: float) -> float:
-    """Mean of xi' C^-1 xi with the error xi as left perturbation: 6 where the covariance C is right."""
+def mean_normalized_error(
+    camera: Camera, num_trials: int, config: AbsolutePoseConfig | None = None, **noise: float
+) -> float:
+    """Mean of xi' C^-1 xi with the error xi as left perturbation: 6 where the covariance C is
+    right."""
     rng = np.random.default_rng(7)
     errors = []
     for _ in range(num_trials):
         scene = make_scene(rng, camera, n=80, **noise)
-        pose = estimate_absolute_pose(scene.points_img, scene.points_world, camera, config, point_covariances=scene.covariances)
+        pose = estimate_absolute_pose(
+            scene.points_img,
+            scene.points_world,
+            camera,
+            config,
+            point_covariances=scene.covariances,
+        )
         assert pose is not None
         xi = (pose.cam_from_world @ scene.cam_from_world.inverse()).log()
         errors.append(xi @ np.linalg.solve(pose.covariance, xi))
@@ -168,7 +238,11 @@ def mean_normalized_error(camera: Camera, num_trials: int, config: AbsolutePoseC
 @pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "OPENCV_FISHEYE"])
 @pytest.mark.parametrize("depth_noise", [0.0, 0.002])
 def test_covariance_tells_the_error(model, depth_noise):
-    assert 4.5 < mean_normalized_error(CAMERAS[model], 100, sigma_px=1.0, depth_noise=depth_noise) < 8.0
+    assert (
+        4.5
+        < mean_normalized_error(CAMERAS[model], 100, sigma_px=1.0, depth_noise=depth_noise)
+        < 8.0
+    )
 
 
 def test_covariance_grows_where_the_noise_is_more_than_assumed():
@@ -177,7 +251,11 @@ def test_covariance_grows_where_the_noise_is_more_than_assumed():
 
 
 def test_covariance_tells_the_error_among_outliers():
-    assert 4.5 < mean_normalized_error(PINHOLE, 100, sigma_px=1.0, depth_noise=0.002, outliers=0.3) < 8.0
+    assert (
+        4.5
+        < mean_normalized_error(PINHOLE, 100, sigma_px=1.0, depth_noise=0.002, outliers=0.3)
+        < 8.0
+    )
 
 
 def test_point_uncertainty_makes_the_pose_better():
@@ -186,9 +264,13 @@ def test_point_uncertainty_makes_the_pose_better():
     for _ in range(100):
         scene = make_scene(rng, PINHOLE, n=60, sigma_px=0.5, depth_noise=0.003)
         for errors, covariances in ((with_covariances, scene.covariances), (without, None)):
-            pose = estimate_absolute_pose(scene.points_img, scene.points_world, PINHOLE, point_covariances=covariances)
+            pose = estimate_absolute_pose(
+                scene.points_img, scene.points_world, PINHOLE, point_covariances=covariances
+            )
             assert pose is not None
-            errors.append(translation_error(pose.cam_from_world.inverse(), scene.cam_from_world.inverse()))
+            errors.append(
+                translation_error(pose.cam_from_world.inverse(), scene.cam_from_world.inverse())
+            )
     assert np.median(with_covariances) < 0.9 * np.median(without)
 
 
@@ -196,17 +278,30 @@ def test_covariance_of_the_inverse_follows_its_perturbations():
     rng = np.random.default_rng(9)
     cam_from_world = random_rigid(rng)
     step = 1e-6
-    perturbed = [(Rigid3.exp(step * direction) @ cam_from_world).inverse() for direction in np.eye(6)]
-    by_xi = np.column_stack([(world_from_cam @ cam_from_world).log() / step for world_from_cam in perturbed])
-    by_position = np.column_stack([(p.translation - cam_from_world.inverse().translation) / step for p in perturbed])
+    perturbed = [
+        (Rigid3.exp(step * direction) @ cam_from_world).inverse() for direction in np.eye(6)
+    ]
+    by_xi = np.column_stack(
+        [(world_from_cam @ cam_from_world).log() / step for world_from_cam in perturbed]
+    )
+    by_position = np.column_stack(
+        [(p.translation - cam_from_world.inverse().translation) / step for p in perturbed]
+    )
     root = rng.normal(size=(6, 6))
     covariance = root @ root.T
     expected = by_xi @ covariance @ by_xi.T
-    np.testing.assert_allclose(covariance_of_inverse(cam_from_world, covariance), expected, atol=1e-4 * expected.max())
-    of_position = position_covariance(cam_from_world, covariance)
-    np.testing.assert_allclose(of_position, by_position @ covariance @ by_position.T, rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(
-        covariance_of_inverse(cam_from_world.inverse(), covariance_of_inverse(cam_from_world, covariance)), covariance
+        covariance_of_inverse(cam_from_world, covariance), expected, atol=1e-4 * expected.max()
+    )
+    of_position = position_covariance(cam_from_world, covariance)
+    np.testing.assert_allclose(
+        of_position, by_position @ covariance @ by_position.T, rtol=1e-4, atol=1e-4
+    )
+    np.testing.assert_allclose(
+        covariance_of_inverse(
+            cam_from_world.inverse(), covariance_of_inverse(cam_from_world, covariance)
+        ),
+        covariance,
     )
 
 
@@ -215,9 +310,13 @@ def test_depth_sensor_covariances_fit_the_call():
     scene = make_scene(rng, PINHOLE, n=30)
     points_cam = scene.cam_from_world.apply(scene.points_world)
     rotation = scene.cam_from_world.rotation
-    of_points = ray_covariances(points_cam, depth_sigmas(points_cam[:, 2]), PINHOLE, np.full(len(points_cam), 0.7))
+    of_points = ray_covariances(
+        points_cam, depth_sigmas(points_cam[:, 2]), PINHOLE, np.full(len(points_cam), 0.7)
+    )
     covariances = rotation.T @ of_points @ rotation
-    pose = estimate_absolute_pose(scene.points_img, scene.points_world, PINHOLE, point_covariances=covariances)
+    pose = estimate_absolute_pose(
+        scene.points_img, scene.points_world, PINHOLE, point_covariances=covariances
+    )
     exact = estimate_absolute_pose(scene.points_img, scene.points_world, PINHOLE)
     assert pose is not None
     assert exact is not None

@@ -1,4 +1,5 @@
-"""Pose and focal length of a camera that nobody has calibrated, from exact and from noisy matches."""
+"""Pose and focal length of a camera that nobody has calibrated, from exact and from noisy
+matches."""
 
 from __future__ import annotations
 
@@ -17,13 +18,23 @@ UNKNOWN = RoughCamera.unknown(640, 480)
 CONFIG = AbsolutePoseConfig(max_reprojection_error_px=8.0)
 
 
-def _scene(focal: float, rng: np.random.Generator, num: int = 200, depth: tuple[float, float] = (2.0, 6.0), noise_px: float = 0.0):
+def _scene(
+    focal: float,
+    rng: np.random.Generator,
+    num: int = 200,
+    depth: tuple[float, float] = (2.0, 6.0),
+    noise_px: float = 0.0,
+):
     camera = UNKNOWN.with_focal(focal)
     pixels = rng.uniform([0, 0], [639, 479], (num, 2))
     z = rng.uniform(*depth, num)
     points_cam = np.column_stack([camera.normalized_from_img(pixels) * z[:, None], z])
     points_world = CAM_FROM_WORLD.inverse().apply(points_cam)
-    return pixels + rng.normal(0.0, noise_px, pixels.shape) if noise_px else pixels, points_world, np.zeros((num, 3, 3))
+    return (
+        pixels + rng.normal(0.0, noise_px, pixels.shape) if noise_px else pixels,
+        points_world,
+        np.zeros((num, 3, 3)),
+    )
 
 
 @pytest.mark.parametrize("focal", [300.0, 525.0, 900.0, 1700.0])
@@ -47,9 +58,13 @@ def test_the_right_focal_length_is_found_where_few_matches_are_right(num: int, n
         pixels, points, covariances = _scene(focal, rng, num, noise_px=1.0)
         wrong, right = np.split(rng.permutation(num), [num - num_right])
         pixels[wrong] = rng.uniform([0, 0], [639, 479], (len(wrong), 2))
-        found = estimate_pose_and_focal(pixels, points, UNKNOWN, CONFIG, point_covariances=covariances)
+        found = estimate_pose_and_focal(
+            pixels, points, UNKNOWN, CONFIG, point_covariances=covariances
+        )
         assert found is not None
-        num_found += found[1].fx == pytest.approx(focal, rel=0.1) and np.mean(found[0].inliers[right]) >= 0.8
+        num_found += (
+            found[1].fx == pytest.approx(focal, rel=0.1) and np.mean(found[0].inliers[right]) >= 0.8
+        )
     assert num_found >= 18
 
 
@@ -58,16 +73,27 @@ def test_of_random_matches_only_so_many_agree_as_by_chance():
     for num in (15, 40, 100):
         pixels, points, covariances = _scene(600.0, rng, num=num)
         pixels = rng.uniform([0, 0], [639, 479], pixels.shape)
-        found = estimate_pose_and_focal(pixels, points, UNKNOWN, CONFIG, point_covariances=covariances)
+        found = estimate_pose_and_focal(
+            pixels, points, UNKNOWN, CONFIG, point_covariances=covariances
+        )
         assert found is None or np.count_nonzero(found[0].inliers) <= 14
 
 
 def test_the_same_matches_give_the_same_bytes_and_useless_ones_change_nothing():
     pixels, points, covariances = _scene(800.0, np.random.default_rng(3), num=60, noise_px=1.0)
     pixels[:30] = pixels[30:]
-    first, again = (estimate_pose_and_focal(pixels, points, UNKNOWN, CONFIG, point_covariances=covariances) for _ in range(2))
-    broken = np.vstack([pixels, [np.nan, 1.0]]), np.vstack([points, [1.0, 2.0, 3.0]]), np.concatenate([covariances, covariances[:1]])
-    with_broken = estimate_pose_and_focal(broken[0], broken[1], UNKNOWN, CONFIG, point_covariances=broken[2])
+    first, again = (
+        estimate_pose_and_focal(pixels, points, UNKNOWN, CONFIG, point_covariances=covariances)
+        for _ in range(2)
+    )
+    broken = (
+        np.vstack([pixels, [np.nan, 1.0]]),
+        np.vstack([points, [1.0, 2.0, 3.0]]),
+        np.concatenate([covariances, covariances[:1]]),
+    )
+    with_broken = estimate_pose_and_focal(
+        broken[0], broken[1], UNKNOWN, CONFIG, point_covariances=broken[2]
+    )
     assert first is not None
     for other in (again, with_broken):
         assert other is not None
@@ -78,16 +104,21 @@ def test_the_same_matches_give_the_same_bytes_and_useless_ones_change_nothing():
 
 
 def test_the_inliers_gather_where_some_are_near_and_most_are_far():
-    """What is near agrees with a wrong focal length, too: a few rounds leave it at that, and the far ones out."""
+    """What is near agrees with a wrong focal length, too: a few rounds leave it at that, and the
+    far ones out."""
     street = RoughCamera.unknown(1241, 376)
     for seed in range(12):
         rng, camera = np.random.default_rng(seed), street.with_focal(720.0)
         near = rng.uniform([0, 100, 5.0], [1240, 300, 6.5], (48, 3))
         far = rng.uniform([434, 120, 40.0], [806, 250, 48.0], (112, 3))
         pixels, z = np.split(np.vstack([near, far]), [2], axis=1)
-        points = CAM_FROM_WORLD.inverse().apply(np.column_stack([camera.normalized_from_img(pixels), np.ones(160)]) * z)
+        points = CAM_FROM_WORLD.inverse().apply(
+            np.column_stack([camera.normalized_from_img(pixels), np.ones(160)]) * z
+        )
         pixels += rng.normal(0.0, 1.0, pixels.shape)
-        found = estimate_pose_and_focal(pixels, points, street, CONFIG, point_covariances=np.zeros((160, 3, 3)))
+        found = estimate_pose_and_focal(
+            pixels, points, street, CONFIG, point_covariances=np.zeros((160, 3, 3))
+        )
         assert found is not None
         assert found[1].fx == pytest.approx(720.0, rel=0.015)
         assert np.count_nonzero(found[0].inliers) >= 155
@@ -96,20 +127,28 @@ def test_the_inliers_gather_where_some_are_near_and_most_are_far():
 def test_the_covariance_counts_what_is_not_known_of_the_focal_length():
     distances, plain = [], []
     for seed in range(40):
-        pixels, points, covariances = _scene(600.0, np.random.default_rng(seed), depth=(4.0, 4.6), noise_px=1.0)
-        found = estimate_pose_and_focal(pixels, points, UNKNOWN, CONFIG, point_covariances=covariances)
+        pixels, points, covariances = _scene(
+            600.0, np.random.default_rng(seed), depth=(4.0, 4.6), noise_px=1.0
+        )
+        found = estimate_pose_and_focal(
+            pixels, points, UNKNOWN, CONFIG, point_covariances=covariances
+        )
         assert found is not None
         xi = (CAM_FROM_WORLD @ found[0].cam_from_world.inverse()).log()
         distances.append(float(xi @ np.linalg.solve(found[0].covariance, xi)))
         plain.append(float(np.sqrt(found[0].covariance[2, 2])))
-    assert 0.5 < np.median(distances) < 9.0  # chi-square of six degrees: median 5.3; the principal point is in the middle here
+    assert (
+        0.5 < np.median(distances) < 9.0
+    )  # chi-square of six degrees: median 5.3; the principal point is in the middle here
     assert np.median(plain) > 0.03, "distance and focal length trade places in a flat scene"
 
 
 def test_a_start_is_refined_and_the_focal_length_stays_in_its_range():
     pixels, points, covariances = _scene(600.0, np.random.default_rng(1), noise_px=0.5)
     start = (CAM_FROM_WORLD, UNKNOWN.with_focal(560.0))
-    found = estimate_pose_and_focal(pixels, points, UNKNOWN, CONFIG, point_covariances=covariances, start=start)
+    found = estimate_pose_and_focal(
+        pixels, points, UNKNOWN, CONFIG, point_covariances=covariances, start=start
+    )
     assert found is not None
     assert found[1].fx == pytest.approx(600.0, rel=0.01)
     narrow = RoughCamera.noted(640, 480, 500.0)
@@ -120,15 +159,22 @@ def test_a_start_is_refined_and_the_focal_length_stays_in_its_range():
 
 def test_three_matches_give_nothing():
     pixels, points, covariances = _scene(600.0, np.random.default_rng(2), num=3)
-    assert estimate_pose_and_focal(pixels, points, UNKNOWN, CONFIG, point_covariances=covariances) is None
+    assert (
+        estimate_pose_and_focal(pixels, points, UNKNOWN, CONFIG, point_covariances=covariances)
+        is None
+    )
 
 
 def test_a_rough_camera_keeps_its_field_of_view_when_its_picture_is_resized():
     half = UNKNOWN.rescaled(320, 240)
-    assert (half.min_focal, half.max_focal) == pytest.approx((UNKNOWN.min_focal / 2, UNKNOWN.max_focal / 2))
+    assert (half.min_focal, half.max_focal) == pytest.approx(
+        (UNKNOWN.min_focal / 2, UNKNOWN.max_focal / 2)
+    )
 
 
-@pytest.mark.parametrize("focals", [(0.0, 100.0), (200.0, 100.0), (float("nan"), 100.0), (10.0, float("inf"))])
+@pytest.mark.parametrize(
+    "focals", [(0.0, 100.0), (200.0, 100.0), (float("nan"), 100.0), (10.0, float("inf"))]
+)
 def test_a_rough_camera_needs_a_range(focals: tuple[float, float]):
     with pytest.raises(CalibrationError, match="a range of focal lengths"):
         RoughCamera(640, 480, *focals)

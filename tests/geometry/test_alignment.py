@@ -22,7 +22,9 @@ seeds = st.integers(0, 2**31)
 @given(rigids, seeds, st.integers(3, 30))
 def test_points_give_back_the_transform(a_from_b, seed, n):
     points_b = np.random.default_rng(seed).normal(size=(n, 3))
-    np.testing.assert_allclose(align_points(a_from_b.apply(points_b), points_b).matrix(), a_from_b.matrix(), atol=1e-6)
+    np.testing.assert_allclose(
+        align_points(a_from_b.apply(points_b), points_b).matrix(), a_from_b.matrix(), atol=1e-6
+    )
 
 
 def test_planar_and_noisy_points_never_give_a_reflection():
@@ -45,7 +47,13 @@ def test_alignment_is_the_least_squares_one():
 
 @pytest.mark.parametrize(
     "points",
-    [np.zeros((5, 3)), np.outer(np.arange(6.0), [1.0, 2.0, 3.0]), np.eye(3)[:2], np.full((4, 3), np.nan), np.zeros((0, 3))],
+    [
+        np.zeros((5, 3)),
+        np.outer(np.arange(6.0), [1.0, 2.0, 3.0]),
+        np.eye(3)[:2],
+        np.full((4, 3), np.nan),
+        np.zeros((0, 3)),
+    ],
     ids=["standing", "straight", "two", "nan", "none"],
 )
 def test_points_that_fix_no_rotation_are_refused(points):
@@ -72,7 +80,8 @@ def test_long_trajectories_are_aligned_by_their_positions():
     # Orientations all wrong by the same 3 degrees, positions right.
     tilt = Rigid3.exp(np.array([0.0, 0.0, 0.0, 0.05, 0.0, 0.0]))
     world_a_from_cams = [
-        Rigid3(tilt.rotation @ moved.rotation, moved.translation) for moved in (world_a_from_world_b @ b for b in world_b_from_cams)
+        Rigid3(tilt.rotation @ moved.rotation, moved.translation)
+        for moved in (world_a_from_world_b @ b for b in world_b_from_cams)
     ]
     by_positions = align_trajectories(world_a_from_cams, world_b_from_cams)
     by_poses = align_poses(world_a_from_cams, world_b_from_cams)
@@ -112,7 +121,11 @@ def test_trajectories_of_different_lengths_are_refused():
 
 @given(rigids, st.floats(1e-9, 3.0))
 def test_errors_measure_the_known_difference(world_from_cam, angle):
-    other = world_from_cam @ Rigid3.exp(np.array([0.3, 0.0, 0.4, 0.0, 0.0, 0.0])) @ Rigid3.exp(np.array([0.0, 0.0, 0.0, 0.0, angle, 0.0]))
+    other = (
+        world_from_cam
+        @ Rigid3.exp(np.array([0.3, 0.0, 0.4, 0.0, 0.0, 0.0]))
+        @ Rigid3.exp(np.array([0.0, 0.0, 0.0, 0.0, angle, 0.0]))
+    )
     assert translation_error(world_from_cam, other) == pytest.approx(0.5)
     assert rotation_error(world_from_cam, other) == pytest.approx(angle, rel=1e-5, abs=1e-14)
     assert rotation_error(other, world_from_cam) == pytest.approx(angle, rel=1e-5, abs=1e-14)

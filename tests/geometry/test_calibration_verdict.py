@@ -13,7 +13,12 @@ CAMERA = Camera.pinhole(640, 480, 400.0, 400.0, 319.5, 239.5)
 SIGMAS = np.array([0.02, 0.015, 0.015])  # a picture alone: 5 % of the focal length are 2.5 sigmas
 
 
-def pictures(deviation: tuple[float, float, float], num: int, rng: np.random.Generator, num_places: int | None = None) -> list[SeenCamera]:
+def pictures(
+    deviation: tuple[float, float, float],
+    num: int,
+    rng: np.random.Generator,
+    num_places: int | None = None,
+) -> list[SeenCamera]:
     """Each with noise of its own size, as its covariance says; pictures of one place share it."""
     seen = []
     places = np.arange(num) % (num_places or num)
@@ -21,21 +26,35 @@ def pictures(deviation: tuple[float, float, float], num: int, rng: np.random.Gen
     for place in places:
         spread = SIGMAS * rng.uniform(0.5, 2.0)
         shared = noise[place] if num_places else rng.normal(size=3)
-        seen.append(SeenCamera(np.array(deviation) + spread * shared, np.diag(spread**2), int(place)))
+        seen.append(
+            SeenCamera(np.array(deviation) + spread * shared, np.diag(spread**2), int(place))
+        )
     return seen
 
 
 @pytest.mark.parametrize(
     ("deviation", "is_of_focal_length", "is_of_centre"),
-    [((0.05, 0.0, 0.0), True, False), ((-0.05, 0.0, 0.0), True, False), ((0.0, 0.08, 0.0), False, True), ((0.0, 0.0, -0.08), False, True)],
+    [
+        ((0.05, 0.0, 0.0), True, False),
+        ((-0.05, 0.0, 0.0), True, False),
+        ((0.0, 0.08, 0.0), False, True),
+        ((0.0, 0.0, -0.08), False, True),
+    ],
 )
-def test_together_they_name_what_one_cannot(deviation: tuple[float, float, float], is_of_focal_length: bool, is_of_centre: bool):
+def test_together_they_name_what_one_cannot(
+    deviation: tuple[float, float, float], is_of_focal_length: bool, is_of_centre: bool
+):
     rng = np.random.default_rng(0)
     for _ in range(20):
         verdict = verdict_of_pictures(pictures(deviation, 40, rng), CAMERA)
         assert verdict is not None
-        assert (verdict.is_of_focal_length, verdict.is_of_centre) == (is_of_focal_length, is_of_centre)
-        assert verdict.focal_length_px == pytest.approx(400.0 * np.exp(deviation[0]), abs=4.0 * verdict.focal_sigma_px)
+        assert (verdict.is_of_focal_length, verdict.is_of_centre) == (
+            is_of_focal_length,
+            is_of_centre,
+        )
+        assert verdict.focal_length_px == pytest.approx(
+            400.0 * np.exp(deviation[0]), abs=4.0 * verdict.focal_sigma_px
+        )
         centre = np.array([319.5, 239.5]) + 400.0 * np.array(deviation[1:])
         assert (np.abs(verdict.centre_px - centre) < 4.0 * verdict.centre_sigma_px).all()
         assert "the pictures say" in str(verdict)
@@ -45,7 +64,9 @@ def test_right_calibrations_are_not_accused_and_sigmas_are_honest():
     rng = np.random.default_rng(1)
     normed = []
     for _ in range(200):
-        verdict = verdict_of_pictures(pictures((0.0, 0.0, 0.0), int(rng.integers(MIN_PICTURES, 60)), rng), CAMERA)
+        verdict = verdict_of_pictures(
+            pictures((0.0, 0.0, 0.0), int(rng.integers(MIN_PICTURES, 60)), rng), CAMERA
+        )
         assert verdict is not None
         assert not verdict.contradicts
         assert "agree" in str(verdict)
@@ -66,7 +87,10 @@ def test_a_few_wrong_pictures_do_not_count():
 
 def test_pictures_of_one_place_count_as_one():
     rng = np.random.default_rng(3)
-    many, few = (verdict_of_pictures(pictures((0.0, 0.0, 0.0), 60, rng, places), CAMERA) for places in (60, 6))
+    many, few = (
+        verdict_of_pictures(pictures((0.0, 0.0, 0.0), 60, rng, places), CAMERA)
+        for places in (60, 6)
+    )
     assert many is not None
     assert few is not None
     assert few.focal_sigma_px > 2.0 * many.focal_sigma_px
@@ -74,7 +98,10 @@ def test_pictures_of_one_place_count_as_one():
 
 def test_a_scatter_beyond_their_noise_is_seen():
     rng = np.random.default_rng(4)
-    sure = [SeenCamera(rng.normal(0.0, 0.05, 3), np.diag((0.001 * np.ones(3)) ** 2), place) for place in range(20)]
+    sure = [
+        SeenCamera(rng.normal(0.0, 0.05, 3), np.diag((0.001 * np.ones(3)) ** 2), place)
+        for place in range(20)
+    ]
     verdict = verdict_of_pictures(sure, CAMERA)
     assert verdict is not None
     assert verdict.focal_sigma_px > 400.0 * 0.05 / np.sqrt(20) / 2.0
@@ -89,7 +116,10 @@ def test_few_pictures_say_nothing():
 
 
 def test_pictures_that_all_say_the_same():
-    verdict = verdict_of_pictures([SeenCamera(np.zeros(3), np.diag(SIGMAS**2), place) for place in range(MIN_PICTURES)], CAMERA)
+    verdict = verdict_of_pictures(
+        [SeenCamera(np.zeros(3), np.diag(SIGMAS**2), place) for place in range(MIN_PICTURES)],
+        CAMERA,
+    )
     assert verdict is not None
     assert not verdict.contradicts
     assert verdict.to_json()["principal_point_px"] == pytest.approx([319.5, 239.5])

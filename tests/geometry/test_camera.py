@@ -17,7 +17,9 @@ depths = st.floats(0.1, 100.0)
 
 def grid(camera: Camera, num: int = 21) -> np.ndarray:
     """Pixels all over the image, its corners included."""
-    x, y = np.meshgrid(np.linspace(0.0, camera.width - 1.0, num), np.linspace(0.0, camera.height - 1.0, num))
+    x, y = np.meshgrid(
+        np.linspace(0.0, camera.width - 1.0, num), np.linspace(0.0, camera.height - 1.0, num)
+    )
     return np.column_stack([x.ravel(), y.ravel()])
 
 
@@ -32,15 +34,21 @@ def test_projection_undoes_unprojection(model, x, y, z):
     normalized = camera.normalized_from_img(pixel)
     point_cam = np.append(normalized, [[1.0]], axis=1) * z
     np.testing.assert_allclose(camera.img_from_cam(point_cam), pixel, atol=1e-8)
-    np.testing.assert_allclose(camera.normalized_from_img(camera.img_from_cam(point_cam)), normalized, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        camera.normalized_from_img(camera.img_from_cam(point_cam)), normalized, rtol=1e-9, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("model", sorted(CAMERAS))
 def test_projection_agrees_with_opencv(model):
     camera = CAMERAS[model]
-    points_cam = np.append(camera.normalized_from_img(grid(camera)), np.ones((21 * 21, 1)), axis=1) * 3.0
+    points_cam = (
+        np.append(camera.normalized_from_img(grid(camera)), np.ones((21 * 21, 1)), axis=1) * 3.0
+    )
     project = cv2.fisheye.projectPoints if camera.is_fisheye else cv2.projectPoints
-    expected = project(points_cam[:, None], np.zeros(3), np.zeros(3), camera.matrix(), camera.distortion())[0][:, 0]
+    expected = project(
+        points_cam[:, None], np.zeros(3), np.zeros(3), camera.matrix(), camera.distortion()
+    )[0][:, 0]
     np.testing.assert_allclose(camera.img_from_cam(points_cam), expected, atol=1e-8)
 
 
@@ -51,7 +59,10 @@ def test_jacobian_agrees_with_differences(model):
     jacobian = camera.normalized_jacobian(camera.normalized_from_img(pixels))
     for axis in range(2):
         offset = step * np.eye(2)[axis]
-        difference = (camera.normalized_from_img(pixels + offset) - camera.normalized_from_img(pixels - offset)) / (2 * step)
+        difference = (
+            camera.normalized_from_img(pixels + offset)
+            - camera.normalized_from_img(pixels - offset)
+        ) / (2 * step)
         np.testing.assert_allclose(jacobian[:, :, axis], difference, rtol=1e-4, atol=1e-8)
 
 
@@ -68,7 +79,9 @@ def test_rescaled_camera_sees_the_same_rays(model, width, height):
     rescaled = camera.rescaled(width, height)
     pixels = grid(camera, 5)
     scaled_pixels = (pixels + 0.5) * [width / camera.width, height / camera.height] - 0.5
-    np.testing.assert_allclose(rescaled.normalized_from_img(scaled_pixels), camera.normalized_from_img(pixels), atol=1e-9)
+    np.testing.assert_allclose(
+        rescaled.normalized_from_img(scaled_pixels), camera.normalized_from_img(pixels), atol=1e-9
+    )
 
 
 def test_rescaling_keeps_the_model_where_both_scales_agree():
@@ -87,11 +100,17 @@ def test_points_behind_the_camera_have_no_pixel(model):
 def test_points_beyond_the_fold_of_the_distortion_have_no_pixel():
     camera = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.3))
     fold = np.sqrt(1 / 0.9)  # where 1 - 3 * 0.3 r^2 = 0
-    points_cam = np.array([[0.98 * fold, 0.0, 1.0], [1.02 * fold, 0.0, 1.0], [2.0 * fold, 0.0, 1.0]])
+    points_cam = np.array(
+        [[0.98 * fold, 0.0, 1.0], [1.02 * fold, 0.0, 1.0], [2.0 * fold, 0.0, 1.0]]
+    )
     assert np.isfinite(camera.img_from_cam(points_cam)).all(axis=1).tolist() == [True, False, False]
     farthest = 320.0 + 500.0 * fold * (1 - 0.3 * fold**2)
     pixels = np.array([[farthest - 1.0, 240.0], [farthest + 1.0, 240.0], [1e6, 240.0]])
-    assert np.isfinite(camera.normalized_from_img(pixels)).all(axis=1).tolist() == [True, False, False]
+    assert np.isfinite(camera.normalized_from_img(pixels)).all(axis=1).tolist() == [
+        True,
+        False,
+        False,
+    ]
 
 
 def test_pixels_that_look_sideways_or_backwards_have_no_ray():
@@ -127,8 +146,14 @@ def test_colmap_and_json_round_trips(model):
         ({"width": 640, "height": 480, "fx": 500, "fy": 500, "cx": 320}, "'cy' is missing"),
         ({"model": "EYE", "width": 640, "height": 480}, "unknown camera model"),
         ({"width": 640, "height": 480, "fx": "wide", "fy": 500, "cx": 320, "cy": 240}, "wide"),
-        ({"width": float("inf"), "height": 480, "fx": 500, "fy": 500, "cx": 320, "cy": 240}, "infinity"),
-        ({"width": 640, "height": 480, "fx": float("nan"), "fy": 500, "cx": 320, "cy": 240}, "not finite"),
+        (
+            {"width": float("inf"), "height": 480, "fx": 500, "fy": 500, "cx": 320, "cy": 240},
+            "infinity",
+        ),
+        (
+            {"width": 640, "height": 480, "fx": float("nan"), "fy": 500, "cx": 320, "cy": 240},
+            "not finite",
+        ),
         ({"width": 640, "height": 480, "fx": -500, "fy": 500, "cx": 320, "cy": 240}, "positive"),
         ({"width": 0, "height": 480, "fx": 500, "fy": 500, "cx": 320, "cy": 240}, "positive"),
     ],

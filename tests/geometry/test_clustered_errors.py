@@ -16,7 +16,8 @@ NO_COVARIANCES = np.zeros((300, 3, 3))
 
 
 def seen(seed: int, moved: float, count: int = 300) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels with noise of one pixel, and points; half of the things that fill the picture were moved, by metres of this deviation."""
+    """Pixels with noise of one pixel, and points; half of the things that fill the picture were
+    moved, by metres of this deviation."""
     rng = np.random.default_rng(seed)
     exact = rng.uniform([10.0, 10.0], [629.0, 469.0], (count, 2))
     depths = rng.uniform(2.0, 6.0, count)
@@ -28,13 +29,18 @@ def seen(seed: int, moved: float, count: int = 300) -> tuple[np.ndarray, np.ndar
 
 
 def coherence_of(seed: int, moved: float) -> tuple[float, float]:
-    """And the pose's squared error in standard deviations of a covariance that takes all errors for independent."""
+    """And the pose's squared error in standard deviations of a covariance that takes all errors for
+    independent."""
     points_img, points = seen(seed, moved)
-    pose = estimate_absolute_pose(points_img, points, CAMERA, CONFIG, point_covariances=NO_COVARIANCES)
+    pose = estimate_absolute_pose(
+        points_img, points, CAMERA, CONFIG, point_covariances=NO_COVARIANCES
+    )
     assert pose is not None
     xi = pose.cam_from_world.inverse().log()
     rows = pose.inliers
-    found = coherence(points_img[rows], points[rows], NO_COVARIANCES[rows], CAMERA, pose.cam_from_world, CONFIG)
+    found = coherence(
+        points_img[rows], points[rows], NO_COVARIANCES[rows], CAMERA, pose.cam_from_world, CONFIG
+    )
     return found, float(xi @ np.linalg.solve(pose.covariance, xi))
 
 
@@ -48,7 +54,9 @@ def test_what_was_moved_shows_and_widens_as_much_as_it_is_off():
     still, moved = ([coherence_of(seed, by) for seed in range(20)] for by in (0.0, 0.02))
     assert np.median([found for found, _ in moved]) > 1.7 * np.median([found for found, _ in still])
     off = np.array(moved)
-    assert np.mean(off[:, 1] < 12.592) < 0.75  # of independent errors the ellipsoid does not hold the truth
+    assert (
+        np.mean(off[:, 1] < 12.592) < 0.75
+    )  # of independent errors the ellipsoid does not hold the truth
     assert np.mean(off[:, 1] / off[:, 0] ** 2 < 12.592) > 0.9
 
 
@@ -58,4 +66,7 @@ def test_of_few_matches_nothing_is_said(count: int):
     arguments = points_img[:count], points[:count], NO_COVARIANCES[:count]
     assert coherence(*arguments, CAMERA, Rigid3.identity(), CONFIG) == 1.0
     crowded = np.full((9, 2), 100.0) + np.arange(9)[:, None]
-    assert coherence(crowded, np.ones((9, 3)), NO_COVARIANCES[:9], CAMERA, Rigid3.identity(), CONFIG) == 1.0
+    assert (
+        coherence(crowded, np.ones((9, 3)), NO_COVARIANCES[:9], CAMERA, Rigid3.identity(), CONFIG)
+        == 1.0
+    )

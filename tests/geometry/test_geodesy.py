@@ -21,7 +21,9 @@ LATITUDES, LONGITUDES, HEIGHTS = st.floats(-90, 90), st.floats(-180, 180), st.fl
 
 @given(lat=LATITUDES, lon=LONGITUDES, h=HEIGHTS)
 def test_earth_centred_coordinates_are_those_of_proj(lat: float, lon: float, h: float):
-    np.testing.assert_allclose(GeoPoint(lat, lon, h).ecef(), ECEF_FROM_GEODETIC.transform(lon, lat, h), atol=1e-6)
+    np.testing.assert_allclose(
+        GeoPoint(lat, lon, h).ecef(), ECEF_FROM_GEODETIC.transform(lon, lat, h), atol=1e-6
+    )
 
 
 @given(lat=LATITUDES, lon=LONGITUDES, h=HEIGHTS)
@@ -33,22 +35,41 @@ def test_the_way_back_ends_where_it_began(lat: float, lon: float, h: float):
     assert again.h == pytest.approx(h, abs=1e-6)
 
 
-@given(lat=st.floats(-89, 89), lon=LONGITUDES, h=st.floats(-100, 1000), east=st.floats(-900, 900), north=st.floats(-900, 900))
+@given(
+    lat=st.floats(-89, 89),
+    lon=LONGITUDES,
+    h=st.floats(-100, 1000),
+    east=st.floats(-900, 900),
+    north=st.floats(-900, 900),
+)
 def test_east_north_up_is_that_of_proj(lat: float, lon: float, h: float, east: float, north: float):
-    pipeline = f"+proj=pipeline +step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84 +lat_0={lat!r} +lon_0={lon!r} +h_0={h!r}"
-    place = Georeference(GeoPoint(lat, lon, h), Rigid3.identity(), "test").geopoint(np.array([east, north, 12.5]))
-    np.testing.assert_allclose(Transformer.from_pipeline(pipeline).transform(place.lon, place.lat, place.h), (east, north, 12.5), atol=1e-5)
+    pipeline = (
+        "+proj=pipeline +step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84"
+        f" +lat_0={lat!r} +lon_0={lon!r} +h_0={h!r}"
+    )
+    place = Georeference(GeoPoint(lat, lon, h), Rigid3.identity(), "test").geopoint(
+        np.array([east, north, 12.5])
+    )
+    np.testing.assert_allclose(
+        Transformer.from_pipeline(pipeline).transform(place.lon, place.lat, place.h),
+        (east, north, 12.5),
+        atol=1e-5,
+    )
 
 
 def test_axes_of_a_geopose():
-    """In a world that lies east-north-up a camera that looks east is a body that is not turned at all; one that looks north is turned
-    by a quarter about up."""
+    """In a world that lies east-north-up a camera that looks east is a body that is not turned at
+    all; one that looks north is turned by a quarter about up."""
     world = Georeference(GeoPoint(0.0, 0.0, 0.0), Rigid3.identity(), "test")
     looks_east = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    np.testing.assert_allclose(world.geopose(Rigid3(looks_east, np.zeros(3))).quat_wxyz, [1, 0, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(
+        world.geopose(Rigid3(looks_east, np.zeros(3))).quat_wxyz, [1, 0, 0, 0], atol=1e-12
+    )
     looks_north = exp_so3(np.array([0.0, 0.0, math.pi / 2])) @ looks_east
     root = math.sqrt(0.5)
-    np.testing.assert_allclose(world.geopose(Rigid3(looks_north, np.zeros(3))).quat_wxyz, [root, 0, 0, root], atol=1e-12)
+    np.testing.assert_allclose(
+        world.geopose(Rigid3(looks_north, np.zeros(3))).quat_wxyz, [root, 0, 0, root], atol=1e-12
+    )
     assert world.heading_deg(looks_north[:, 2]) == pytest.approx(0.0, abs=1e-9)
     assert world.heading_deg(looks_east[:, 2]) == pytest.approx(90.0)
 
@@ -58,21 +79,36 @@ def test_up_is_that_of_the_cameras_own_place():
     world = Georeference(GeoPoint(0.0, 10.0, 0.0), Rigid3.identity(), "test")
     geopose = world.geopose(Rigid3(np.eye(3), np.array([1e5, 0.0, 0.0])))
     at_origin = world.geopose(Rigid3.identity())
-    turned = Rigid3.from_quat_wxyz(geopose.quat_wxyz, np.zeros(3)).inverse() @ Rigid3.from_quat_wxyz(at_origin.quat_wxyz, np.zeros(3))
+    turned = Rigid3.from_quat_wxyz(
+        geopose.quat_wxyz, np.zeros(3)
+    ).inverse() @ Rigid3.from_quat_wxyz(at_origin.quat_wxyz, np.zeros(3))
     assert math.degrees(turned.angle()) == pytest.approx(0.898, abs=0.01)
 
 
 def test_json_is_strict_and_comes_again():
-    place = Georeference(GeoPoint(-33.9, 151.2, 40.0), Rigid3(exp_so3(np.array([0.1, 0.2, 0.3])), np.array([1.0, 2.0, 3.0])), "gnss", 0.25)
+    place = Georeference(
+        GeoPoint(-33.9, 151.2, 40.0),
+        Rigid3(exp_so3(np.array([0.1, 0.2, 0.3])), np.array([1.0, 2.0, 3.0])),
+        "gnss",
+        0.25,
+    )
     again = Georeference.from_json(json.loads(json.dumps(place.to_json())))
     assert (again.origin, again.source, again.rms_m) == (place.origin, "gnss", 0.25)
-    np.testing.assert_allclose(again.enu_from_world.matrix(), place.enu_from_world.matrix(), atol=1e-15)
+    np.testing.assert_allclose(
+        again.enu_from_world.matrix(), place.enu_from_world.matrix(), atol=1e-15
+    )
     geopose = place.geopose(Rigid3.identity())
-    assert {key: set(value) for key, value in geopose.to_json().items()} == {"position": {"lat", "lon", "h"}, "quaternion": set("xyzw")}
+    assert {key: set(value) for key, value in geopose.to_json().items()} == {
+        "position": {"lat", "lon", "h"},
+        "quaternion": set("xyzw"),
+    }
     assert GeoPose.from_json(geopose.to_json()).to_json() == geopose.to_json()
 
 
-@pytest.mark.parametrize(("lat", "lon", "h"), [(91.0, 0.0, 0.0), (0.0, 400.0, 0.0), (0.0, 0.0, 1e9), (math.nan, 0.0, 0.0)])
+@pytest.mark.parametrize(
+    ("lat", "lon", "h"),
+    [(91.0, 0.0, 0.0), (0.0, 400.0, 0.0), (0.0, 0.0, 1e9), (math.nan, 0.0, 0.0)],
+)
 def test_no_place_on_earth(lat: float, lon: float, h: float):
     with pytest.raises(GeoreferenceError):
         GeoPoint(lat, lon, h)

@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 
 from topoloc.errors import TrajectoryError
-from topoloc.geometry.pose_conventions import AXES, MEANINGS, ROTATIONS, UNITS, PoseReading, meaning, mended
+from topoloc.geometry.pose_conventions import (
+    AXES,
+    MEANINGS,
+    ROTATIONS,
+    UNITS,
+    PoseReading,
+    meaning,
+    mended,
+)
 from topoloc.geometry.rigid import Rigid3, exp_so3
 
 POSE = Rigid3(exp_so3(np.array([0.4, -1.1, 0.7])), np.array([1.0, 2.0, -3.0]))
@@ -39,7 +47,9 @@ def test_left_handed_worlds_are_mirrored():
 
 def test_a_quaternion_read_in_the_wrong_order():
     w, x, y, z = POSE.quat_wxyz()
-    as_read = Rigid3.from_quat_wxyz(np.array([z, w, x, y]), POSE.translation)  # "w x y z" taken for x, y, z, w
+    as_read = Rigid3.from_quat_wxyz(
+        np.array([z, w, x, y]), POSE.translation
+    )  # "w x y z" taken for x, y, z, w
     assert_same(mended(as_read, ["wxyz"]), POSE)
 
 
@@ -47,7 +57,9 @@ def test_units_bodies_and_combinations():
     assert_same(mended(Rigid3(POSE.rotation, 1000.0 * POSE.translation), ["mm"]), POSE)
     assert_same(mended(Rigid3(POSE.rotation, POSE.translation / 0.42), ["scale=0.42"]), POSE)
     w, x, y, z = BODY_FROM_CAM.quat_wxyz()
-    text = "inverse,body=" + ",".join(str(number) for number in (*BODY_FROM_CAM.translation, x, y, z, w))
+    text = "inverse,body=" + ",".join(
+        str(number) for number in (*BODY_FROM_CAM.translation, x, y, z, w)
+    )
     assert_same(PoseReading.of(text).mend((POSE @ BODY_FROM_CAM.inverse()).inverse()), POSE)
 
 
@@ -59,7 +71,18 @@ def test_what_the_option_says():
 
 
 @pytest.mark.parametrize(
-    "text", ["upside", "scale", "scale=0", "scale=a", "mm=3", "body=1,2", "shift=nan", "clock=-1", "body=0,0,0,0,0,0,0"]
+    "text",
+    [
+        "upside",
+        "scale",
+        "scale=0",
+        "scale=a",
+        "mm=3",
+        "body=1,2",
+        "shift=nan",
+        "clock=-1",
+        "body=0,0,0,0,0,0,0",
+    ],
 )
 def test_what_makes_no_sense_is_an_error(text: str):
     with pytest.raises(TrajectoryError):

@@ -1,4 +1,5 @@
-"""The motion of a single camera between two pictures: turn and direction, among wrong matches; nothing where it cannot be seen."""
+"""The motion of a single camera between two pictures: turn and direction, among wrong matches;
+nothing where it cannot be seen."""
 
 from __future__ import annotations
 
@@ -14,7 +15,8 @@ SECOND = Camera("OPENCV", 640, 480, (420.0, 421.0, 318.0, 241.0, -0.05, 0.01, 0.
 
 
 def seen(second_from_first: Rigid3, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """300 points 2 to 8 m away by pixels of both cameras, 0.3 pixels of noise, a third of them wrong in the second."""
+    """300 points 2 to 8 m away by pixels of both cameras, 0.3 pixels of noise, a third of them
+    wrong in the second."""
     rng = np.random.default_rng(seed)
     depths = rng.uniform(2.0, 8.0, 300)
     points = np.column_stack([rng.uniform(-0.6, 0.6, (300, 2)) * depths[:, None], depths])
@@ -32,7 +34,10 @@ def test_turn_and_direction_are_found(way: tuple[float, float, float]):
     assert np.linalg.norm(found.second_from_first.translation) == pytest.approx(1.0)
     direction = truth.translation / np.linalg.norm(truth.translation)
     assert np.degrees(np.arccos(found.second_from_first.translation @ direction)) < 3.0
-    assert np.degrees((found.second_from_first @ Rigid3(truth.rotation, direction).inverse()).angle()) < 0.5
+    assert (
+        np.degrees((found.second_from_first @ Rigid3(truth.rotation, direction).inverse()).angle())
+        < 0.5
+    )
     assert 150 < np.count_nonzero(found.inliers) < 240
 
 

@@ -20,7 +20,21 @@ RIGS = {
     "pinhole": StereoRig(CAMERAS["PINHOLE"], CAMERAS["PINHOLE"].rescaled(1241, 376), TILT),
     "distorted": StereoRig(
         CAMERAS["OPENCV"],
-        Camera("OPENCV", 752, 480, (457.587, 456.134, 379.999, 255.238, -0.28368365, 0.07451284, -0.00010473, -3.55590700e-05)),
+        Camera(
+            "OPENCV",
+            752,
+            480,
+            (
+                457.587,
+                456.134,
+                379.999,
+                255.238,
+                -0.28368365,
+                0.07451284,
+                -0.00010473,
+                -3.55590700e-05,
+            ),
+        ),
         TILT,
     ),
     "fisheye": StereoRig(WIDE, WIDE, TILT),
@@ -39,8 +53,17 @@ def euroc_camera(path: Path) -> tuple[Camera, Rigid3]:
 
     text = path.read_text()
     width, height = numbers("resolution")
-    camera = Camera("OPENCV", int(width), int(height), (*numbers("intrinsics"), *numbers("distortion_coefficients")))
-    return camera, Rigid3.from_matrix(np.reshape(re.findall(r"[-\d.e]+", text.split("data: [")[1].split("]")[0]), (4, 4)).astype(float))
+    camera = Camera(
+        "OPENCV",
+        int(width),
+        int(height),
+        (*numbers("intrinsics"), *numbers("distortion_coefficients")),
+    )
+    return camera, Rigid3.from_matrix(
+        np.reshape(re.findall(r"[-\d.e]+", text.split("data: [")[1].split("]")[0]), (4, 4)).astype(
+            float
+        )
+    )
 
 
 def sample(image_map: np.ndarray, x: float, y: float) -> np.ndarray:
@@ -52,7 +75,12 @@ def sample(image_map: np.ndarray, x: float, y: float) -> np.ndarray:
 
 
 @settings(max_examples=60)
-@given(st.sampled_from(sorted(RIGS)), st.floats(0.02, 0.98), st.floats(0.02, 0.98), st.floats(0.5, 50.0))
+@given(
+    st.sampled_from(sorted(RIGS)),
+    st.floats(0.02, 0.98),
+    st.floats(0.02, 0.98),
+    st.floats(0.5, 50.0),
+)
 def test_a_point_has_one_row_in_both_rectified_images(name, x, y, depth):
     rig, rectification = RIGS[name], RECTIFICATIONS[name]
     rectified = rectification.rig
@@ -68,18 +96,26 @@ def test_a_point_has_one_row_in_both_rectified_images(name, x, y, depth):
     assert right_pixel[0] <= pixel[0, 0]
     if 0 <= right_pixel[0] < rectified.right.width - 1:
         right_raw = rig.right.img_from_cam(rig.right_from_left.apply(point_left))[0]
-        np.testing.assert_allclose(sample(rectification.right_map, *right_pixel), right_raw, atol=1e-2)
+        np.testing.assert_allclose(
+            sample(rectification.right_map, *right_pixel), right_raw, atol=1e-2
+        )
 
 
 @pytest.mark.parametrize("name", sorted(RIGS))
 def test_rectified_images_have_no_black_border_and_waste_little(name):
     rig, rectification = RIGS[name], RECTIFICATIONS[name]
     shares = []
-    for camera, image_map in ((rig.left, rectification.left_map), (rig.right, rectification.right_map)):
+    for camera, image_map in (
+        (rig.left, rectification.left_map),
+        (rig.right, rectification.right_map),
+    ):
         white = np.full((camera.height, camera.width), 255, np.uint8)
         assert np.mean(cv2.remap(white, image_map, None, cv2.INTER_LINEAR) < 255) < 0.002
-        shares.append(np.ptp(image_map[..., 0]) * np.ptp(image_map[..., 1]) / (camera.width * camera.height))
-    # The two cameras of "unlike" have different fields of view, and the wider one is cut to the narrower.
+        shares.append(
+            np.ptp(image_map[..., 0]) * np.ptp(image_map[..., 1]) / (camera.width * camera.height)
+        )
+    # The two cameras of "unlike" have different fields of view, and the wider one is cut to the
+    # narrower.
     assert max(shares) > 0.75
     assert rectification.rig.is_rectified
     assert rectification.rig.baseline == pytest.approx(rig.baseline)
@@ -88,9 +124,19 @@ def test_rectified_images_have_no_black_border_and_waste_little(name):
 def test_rotation_and_view_agree_with_opencv():
     rig, rectification = RIGS["distorted"], RECTIFICATIONS["distorted"]
     motion = rig.right_from_left
-    cameras = (rig.left.matrix(), rig.left.distortion(), rig.right.matrix(), rig.right.distortion(), (rig.left.width, rig.left.height))
+    cameras = (
+        rig.left.matrix(),
+        rig.left.distortion(),
+        rig.right.matrix(),
+        rig.right.distortion(),
+        (rig.left.width, rig.left.height),
+    )
     rotation, _, projection, *_ = cv2.stereoRectify(
-        *cameras, motion.rotation, motion.translation.reshape(3, 1), flags=cv2.CALIB_ZERO_DISPARITY, alpha=0
+        *cameras,
+        motion.rotation,
+        motion.translation.reshape(3, 1),
+        flags=cv2.CALIB_ZERO_DISPARITY,
+        alpha=0,
     )
     np.testing.assert_allclose(rectification.rectified_from_left.rotation, rotation, atol=1e-9)
     assert rectification.rig.left.fx == pytest.approx(projection[0, 0], rel=0.05)
@@ -117,7 +163,11 @@ def test_a_rectified_rig_stays_as_it_is():
 )
 def test_rigs_that_are_not_left_and_right_are_refused(translation, message):
     with pytest.raises(CalibrationError, match=message):
-        rectify(StereoRig(CAMERAS["OPENCV"], CAMERAS["OPENCV"], Rigid3(TILT.rotation, np.array(translation))))
+        rectify(
+            StereoRig(
+                CAMERAS["OPENCV"], CAMERAS["OPENCV"], Rigid3(TILT.rotation, np.array(translation))
+            )
+        )
 
 
 def test_cameras_of_different_sizes_are_refused():
@@ -139,13 +189,21 @@ def load_grey(path: Path) -> np.ndarray:
     return image
 
 
-def vertical_disparities(rectification: Rectification, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+def vertical_disparities(
+    rectification: Rectification, left: np.ndarray, right: np.ndarray
+) -> np.ndarray:
     sift = cv2.SIFT_create(800)
-    left_key_points, left_descriptors = sift.detectAndCompute(cv2.remap(left, rectification.left_map, None, cv2.INTER_LINEAR), None)
-    right_key_points, right_descriptors = sift.detectAndCompute(cv2.remap(right, rectification.right_map, None, cv2.INTER_LINEAR), None)
+    left_key_points, left_descriptors = sift.detectAndCompute(
+        cv2.remap(left, rectification.left_map, None, cv2.INTER_LINEAR), None
+    )
+    right_key_points, right_descriptors = sift.detectAndCompute(
+        cv2.remap(right, rectification.right_map, None, cv2.INTER_LINEAR), None
+    )
     pairs = cv2.BFMatcher().knnMatch(left_descriptors, right_descriptors, k=2)
     good = [best for best, second in pairs if best.distance < 0.7 * second.distance]
-    return np.array([left_key_points[m.queryIdx].pt[1] - right_key_points[m.trainIdx].pt[1] for m in good])
+    return np.array(
+        [left_key_points[m.queryIdx].pt[1] - right_key_points[m.trainIdx].pt[1] for m in good]
+    )
 
 
 def test_real_pair_has_equal_rows(shared):
@@ -154,6 +212,10 @@ def test_real_pair_has_equal_rows(shared):
     right, body_from_right = euroc_camera(folder / "cam1/sensor.yaml")
     rectification = rectify(StereoRig(left, right, body_from_right.inverse() @ body_from_left))
     name = sorted(path.name for path in (folder / "cam0/data").glob("*.png"))[10]
-    rows = vertical_disparities(rectification, load_grey(folder / "cam0/data" / name), load_grey(folder / "cam1/data" / name))
+    rows = vertical_disparities(
+        rectification,
+        load_grey(folder / "cam0/data" / name),
+        load_grey(folder / "cam1/data" / name),
+    )
     assert len(rows) > 100
     assert np.median(np.abs(rows)) < 0.5

@@ -6,7 +6,14 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from topoloc.errors import TrajectoryError
-from topoloc.geometry.rigid import Rigid3, exp_so3, log_so3, matrix_from_quat_wxyz, quat_wxyz_from_matrix, skew
+from topoloc.geometry.rigid import (
+    Rigid3,
+    exp_so3,
+    log_so3,
+    matrix_from_quat_wxyz,
+    quat_wxyz_from_matrix,
+    skew,
+)
 
 
 def assert_same(a: Rigid3, b: Rigid3, atol: float = 1e-9) -> None:
@@ -84,7 +91,10 @@ def test_quaternion_round_trip(a):
 
 
 def test_quaternion_order_is_scalar_first():
-    np.testing.assert_allclose(quat_wxyz_from_matrix(exp_so3(np.array([0.0, 0.0, np.pi / 2]))), [np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
+    np.testing.assert_allclose(
+        quat_wxyz_from_matrix(exp_so3(np.array([0.0, 0.0, np.pi / 2]))),
+        [np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)],
+    )
 
 
 @given(vectors, vectors)
@@ -97,7 +107,9 @@ def test_interpolation_meets_both_ends_and_turns_evenly(a, b, fraction):
     assert_same(a.interpolate(b, 0.0), a)
     assert_same(a.interpolate(b, 1.0), b, atol=1e-7)
     whole = (a.inverse() @ b).angle()
-    assert (a.inverse() @ a.interpolate(b, fraction)).angle() == pytest.approx(fraction * whole, abs=1e-7)
+    assert (a.inverse() @ a.interpolate(b, fraction)).angle() == pytest.approx(
+        fraction * whole, abs=1e-7
+    )
 
 
 def test_from_matrix_makes_rounded_rotations_exact():
@@ -122,7 +134,9 @@ def test_what_is_no_pose_is_refused(matrix, message):
         Rigid3.from_matrix(matrix)
 
 
-@pytest.mark.parametrize("quat_wxyz", [np.zeros(4), np.array([1.0, np.nan, 0.0, 0.0]), np.full(4, np.inf)])
+@pytest.mark.parametrize(
+    "quat_wxyz", [np.zeros(4), np.array([1.0, np.nan, 0.0, 0.0]), np.full(4, np.inf)]
+)
 def test_what_is_no_quaternion_is_refused(quat_wxyz):
     with pytest.raises(TrajectoryError, match="not a rotation"):
         Rigid3.from_quat_wxyz(quat_wxyz, np.zeros(3))

@@ -18,7 +18,8 @@ from topoloc.geometry.stereo import (
 
 LEFT = Camera.pinhole(640, 480, 500.0, 505.0, 320.0, 240.0)
 RIG = StereoRig.rectified(LEFT, 0.12)
-# Rectified, but its principal points differ, as some calibrations have it: disparity at infinity is 5 px.
+# Rectified, but its principal points differ, as some calibrations have it: disparity at infinity is
+# 5 px.
 SHIFTED = StereoRig(LEFT, Camera.pinhole(640, 480, 500.0, 505.0, 315.0, 240.0), RIG.right_from_left)
 
 
@@ -26,17 +27,24 @@ SHIFTED = StereoRig(LEFT, Camera.pinhole(640, 480, 500.0, 505.0, 315.0, 240.0), 
 @given(x=st.floats(-5.0, 5.0), y=st.floats(-5.0, 5.0), z=st.floats(0.2, 200.0))
 def test_points_come_back_from_their_two_images(rig, x, y, z):
     point_cam = np.array([[x, y, z]])
-    left, right = rig.left.img_from_cam(point_cam), rig.right.img_from_cam(rig.right_from_left.apply(point_cam))
+    left, right = (
+        rig.left.img_from_cam(point_cam),
+        rig.right.img_from_cam(rig.right_from_left.apply(point_cam)),
+    )
     assert left[0, 1] == pytest.approx(right[0, 1])
     disparity_px = left[:, 0] - right[:, 0]
     np.testing.assert_allclose(depth_from_disparity(disparity_px, rig), [z], rtol=1e-6)
-    np.testing.assert_allclose(points_from_disparity(left, disparity_px, rig), point_cam, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(
+        points_from_disparity(left, disparity_px, rig), point_cam, rtol=1e-6, atol=1e-6
+    )
 
 
 def test_no_depth_without_disparity():
     assert np.isnan(depth_from_disparity(np.array([0.0, -1.0, np.nan]), RIG)).all()
     assert np.isnan(depth_from_disparity(np.array([4.0]), SHIFTED)).all()
-    assert np.isnan(points_from_depth(np.full((3, 2), 100.0), np.array([0.0, -1.0, np.nan]), LEFT)).all()
+    assert np.isnan(
+        points_from_depth(np.full((3, 2), 100.0), np.array([0.0, -1.0, np.nan]), LEFT)
+    ).all()
 
 
 def test_stereo_covariance_agrees_with_samples():
@@ -44,7 +52,9 @@ def test_stereo_covariance_agrees_with_samples():
     point_cam = np.array([[1.0, -0.7, 4.0]])
     pixel, disparity_px = RIG.left.img_from_cam(point_cam), LEFT.fx * RIG.baseline / point_cam[:, 2]
     n = 100_000
-    samples = points_from_disparity(pixel + 0.8 * rng.normal(size=(n, 2)), disparity_px + 0.3 * rng.normal(size=n), RIG)
+    samples = points_from_disparity(
+        pixel + 0.8 * rng.normal(size=(n, 2)), disparity_px + 0.3 * rng.normal(size=n), RIG
+    )
     sigma_z = depth_sigmas_of_disparity(point_cam[:, 2], np.array([0.3]), RIG)
     expected = ray_covariances(point_cam, sigma_z, RIG.left, np.array([0.8]))[0]
     np.testing.assert_allclose(np.cov(samples.T), expected, rtol=0.05, atol=0.03 * expected.max())
@@ -69,7 +79,11 @@ def test_stereo_uncertainty_in_depth_grows_with_its_square():
 
 
 def test_no_points_have_no_covariance():
-    assert ray_covariances(np.zeros((0, 3)), np.zeros(0), CAMERAS["OPENCV"], np.zeros(0)).shape == (0, 3, 3)
+    assert ray_covariances(np.zeros((0, 3)), np.zeros(0), CAMERAS["OPENCV"], np.zeros(0)).shape == (
+        0,
+        3,
+        3,
+    )
 
 
 def test_rectified_rig_is_recognised():

@@ -10,9 +10,14 @@ from topoloc.geometry.alignment import absolute_trajectory_errors, relative_drif
 from topoloc.geometry.rigid import Rigid3, exp_so3
 
 
-def circle(num: int, radius: float = 10.0, yaw_error: float = 0.0, scale: float = 1.0) -> list[Rigid3]:
+def circle(
+    num: int, radius: float = 10.0, yaw_error: float = 0.0, scale: float = 1.0
+) -> list[Rigid3]:
     """A camera going round in steps of one kind; with a yaw error a step, or steps too long."""
-    step = Rigid3(exp_so3(np.array([0.0, 2 * np.pi / num + yaw_error, 0.0])), np.array([0.0, 0.0, scale * 2 * np.pi * radius / num]))
+    step = Rigid3(
+        exp_so3(np.array([0.0, 2 * np.pi / num + yaw_error, 0.0])),
+        np.array([0.0, 0.0, scale * 2 * np.pi * radius / num]),
+    )
     poses = [Rigid3.identity()]
     for _ in range(num - 1):
         poses.append(poses[-1] @ step)
@@ -35,7 +40,9 @@ def test_steps_two_percent_too_long_are_two_percent_of_drift():
     longer = [Rigid3(np.eye(3), 1.02 * pose.translation) for pose in straight]
     assert relative_drift(straight, longer) is not None
     # a straight way fixes no rotation by positions alone: the errors are those along it, centred
-    np.testing.assert_allclose(absolute_trajectory_errors(straight, longer), 0.02 * np.abs(np.arange(60) - 29.5), atol=1e-6)
+    np.testing.assert_allclose(
+        absolute_trajectory_errors(straight, longer), 0.02 * np.abs(np.arange(60) - 29.5), atol=1e-6
+    )
 
 
 def test_rotation_drift_is_a_metre():

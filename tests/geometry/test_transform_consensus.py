@@ -14,13 +14,24 @@ seeds = st.integers(0, 2**31)
 
 
 def random_covariances(rng: np.random.Generator, num: int) -> np.ndarray:
-    """Some of them three times as wide as others, no two of the same shape: a centimetre or two, half a degree."""
-    factors = np.diag([0.01] * 3 + [0.005] * 3) @ rng.normal(size=(num, 6, 6)) * rng.uniform(0.5, 1.5, size=(num, 1, 1)) / np.sqrt(6)
+    """Some of them three times as wide as others, no two of the same shape: a centimetre or two,
+    half a degree."""
+    factors = (
+        np.diag([0.01] * 3 + [0.005] * 3)
+        @ rng.normal(size=(num, 6, 6))
+        * rng.uniform(0.5, 1.5, size=(num, 1, 1))
+        / np.sqrt(6)
+    )
     return factors @ factors.transpose(0, 2, 1) + np.diag([0.005**2] * 3 + [0.002**2] * 3)
 
 
-def estimates_of(a_from_b: Rigid3, covariances: np.ndarray, rng: np.random.Generator) -> list[Rigid3]:
-    return [Rigid3.exp(rng.multivariate_normal(np.zeros(6), covariance)) @ a_from_b for covariance in covariances]
+def estimates_of(
+    a_from_b: Rigid3, covariances: np.ndarray, rng: np.random.Generator
+) -> list[Rigid3]:
+    return [
+        Rigid3.exp(rng.multivariate_normal(np.zeros(6), covariance)) @ a_from_b
+        for covariance in covariances
+    ]
 
 
 def in_sigma(found: Rigid3, true: Rigid3, covariance: np.ndarray) -> float:
@@ -30,7 +41,9 @@ def in_sigma(found: Rigid3, true: Rigid3, covariance: np.ndarray) -> float:
 
 @given(rigids, tangents.filter(lambda xi: np.linalg.norm(xi[3:]) < 3.1))
 def test_residuals_are_logarithms(hypothesis, xi):
-    np.testing.assert_allclose(_residuals(hypothesis, [Rigid3.exp(xi) @ hypothesis])[0], xi, atol=1e-5)
+    np.testing.assert_allclose(
+        _residuals(hypothesis, [Rigid3.exp(xi) @ hypothesis])[0], xi, atol=1e-5
+    )
 
 
 @settings(max_examples=25)
@@ -39,7 +52,9 @@ def test_the_truth_is_found_among_twice_as_many_outliers(seed, num_right, num_wr
     rng = np.random.default_rng(seed)
     num_wrong = min(num_wrong, 2 * num_right)
     a_from_b, covariances = random_rigid(rng, 10.0), random_covariances(rng, num_right + num_wrong)
-    estimates = estimates_of(a_from_b, covariances[:num_right], rng) + [random_rigid(rng, 10.0) for _ in range(num_wrong)]
+    estimates = estimates_of(a_from_b, covariances[:num_right], rng) + [
+        random_rigid(rng, 10.0) for _ in range(num_wrong)
+    ]
     order = rng.permutation(len(estimates))
     found = find_consensus([estimates[k] for k in order], covariances[order], CONFIG)
     assert found is not None
@@ -63,16 +78,25 @@ def test_the_covariance_says_how_wrong_the_consensus_is():
 @given(seeds)
 def test_estimates_of_different_transforms_are_no_consensus(seed):
     rng = np.random.default_rng(seed)
-    assert find_consensus([random_rigid(rng, 10.0) for _ in range(30)], random_covariances(rng, 30), CONFIG) is None
+    assert (
+        find_consensus(
+            [random_rigid(rng, 10.0) for _ in range(30)], random_covariances(rng, 30), CONFIG
+        )
+        is None
+    )
 
 
-@pytest.mark.parametrize(("num_rivals", "is_believed"), [(0, True), (2, True), (3, False), (6, False)])
+@pytest.mark.parametrize(
+    ("num_rivals", "is_believed"), [(0, True), (2, True), (3, False), (6, False)]
+)
 def test_as_likely_as_another_one_is_not_believed(num_rivals, is_believed):
     """A panel further on: six say here, the others a metre beside it, as one."""
     rng = np.random.default_rng(0)
     a_from_b, covariances = random_rigid(rng), random_covariances(rng, 6 + num_rivals)
     beside = Rigid3.exp(np.array([1.0, 0, 0, 0, 0, 0])) @ a_from_b
-    estimates = estimates_of(a_from_b, covariances[:6], rng) + estimates_of(beside, covariances[6:], rng)
+    estimates = estimates_of(a_from_b, covariances[:6], rng) + estimates_of(
+        beside, covariances[6:], rng
+    )
     assert (find_consensus(estimates, covariances, CONFIG) is not None) == is_believed
 
 
@@ -88,7 +112,10 @@ def test_many_estimates_from_one_picture_are_one():
     found = find_consensus(estimates_of(a_from_b, covariances, rng), covariances, CONFIG, crosswise)
     assert found is not None
     assert found.num_independent == 3
-    assert np.linalg.slogdet(found.covariance)[1] > np.linalg.slogdet(np.linalg.inv(np.linalg.inv(covariances).sum(axis=0)))[1]
+    assert (
+        np.linalg.slogdet(found.covariance)[1]
+        > np.linalg.slogdet(np.linalg.inv(np.linalg.inv(covariances).sum(axis=0)))[1]
+    )
 
 
 @settings(max_examples=25)
@@ -98,7 +125,10 @@ def test_the_order_of_the_estimates_does_not_matter(seed):
     a_from_b, covariances = random_rigid(rng), random_covariances(rng, 9)
     estimates = estimates_of(a_from_b, covariances[:6], rng) + [random_rigid(rng) for _ in range(3)]
     order = rng.permutation(9)
-    first, second = (find_consensus([estimates[k] for k in rows], covariances[rows], CONFIG) for rows in (np.arange(9), order))
+    first, second = (
+        find_consensus([estimates[k] for k in rows], covariances[rows], CONFIG)
+        for rows in (np.arange(9), order)
+    )
     assert first is not None
     assert second is not None
     np.testing.assert_array_equal(first.agrees[order], second.agrees)
@@ -108,7 +138,9 @@ def test_the_order_of_the_estimates_does_not_matter(seed):
 def test_of_very_many_a_sample_of_hypotheses_is_enough():
     rng = np.random.default_rng(2)
     a_from_b, covariances = random_rigid(rng), random_covariances(rng, 500)
-    estimates = estimates_of(a_from_b, covariances[:100], rng) + [random_rigid(rng, 10.0) for _ in range(400)]
+    estimates = estimates_of(a_from_b, covariances[:100], rng) + [
+        random_rigid(rng, 10.0) for _ in range(400)
+    ]
     found = find_consensus(estimates, covariances, ConsensusConfig(max_hypotheses=100))
     assert found is not None
     assert np.count_nonzero(found.agrees) == 100

@@ -1,4 +1,5 @@
-"""A walk of a single camera adjusted as a whole: what the map says of its first part tells how long the rest is."""
+"""A walk of a single camera adjusted as a whole: what the map says of its first part tells how long
+the rest is."""
 
 from __future__ import annotations
 
@@ -22,7 +23,15 @@ KNOWN = range(8)
 def stretch() -> Stretch:
     odometry, panels = SingleCameraOdometry(SingleCameraConfig()), room()
     for number, pose in enumerate(TRUTH):
-        odometry.process(number, StereoFrame(f"{number}", number * 100_000_000, render(panels, pose, noise_seed=number)[0], CAMERA))
+        odometry.process(
+            number,
+            StereoFrame(
+                f"{number}",
+                number * 100_000_000,
+                render(panels, pose, noise_seed=number)[0],
+                CAMERA,
+            ),
+        )
     (found,) = odometry.stretches
     return found
 
@@ -30,13 +39,17 @@ def stretch() -> Stretch:
 def _too_long(by: float) -> list[Rigid3 | None]:
     """The truth, but what lies beyond the known part is stretched."""
     last = TRUTH[KNOWN[-1]].translation
-    beyond = [Rigid3(pose.rotation, last + by * (pose.translation - last)) for pose in TRUTH[len(KNOWN) :]]
+    beyond = [
+        Rigid3(pose.rotation, last + by * (pose.translation - last)) for pose in TRUTH[len(KNOWN) :]
+    ]
     return [*TRUTH[: len(KNOWN)], *beyond]
 
 
 def _off(poses: list[Rigid3 | None]) -> float:
     return max(
-        float(np.linalg.norm(pose.translation - true.translation)) for pose, true in zip(poses, TRUTH, strict=True) if pose is not None
+        float(np.linalg.norm(pose.translation - true.translation))
+        for pose, true in zip(poses, TRUTH, strict=True)
+        if pose is not None
     )
 
 

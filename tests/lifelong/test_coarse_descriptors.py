@@ -29,7 +29,9 @@ def path(room_map: Path, tmp_path: Path) -> Path:
 
 def _descriptors(path: Path) -> list[np.ndarray]:
     with TopoMetricMap.load(path) as topomap:
-        return [node.features.descriptors for kind in topomap.kinds for node in topomap.nodes_of(kind)]
+        return [
+            node.features.descriptors for kind in topomap.kinds for node in topomap.nodes_of(kind)
+        ]
 
 
 def test_the_file_is_smaller_and_the_same_is_found(path: Path):
@@ -41,8 +43,13 @@ def test_the_file_is_smaller_and_the_same_is_found(path: Path):
         np.testing.assert_allclose(np.linalg.norm(coarse, axis=1), 1.0, atol=1e-5)
         assert np.median(np.sum(fine * coarse, axis=1)) > 0.97
     with TopoMetricMap.load(path) as topomap:
-        found = [(Localizer(topomap).localize(picture, CAMERA), pose) for picture, pose in unseen_views()]
-    assert all(isinstance(one, Localization) and translation_error(pose, one.world_from_cam) < 0.02 for one, pose in found)
+        found = [
+            (Localizer(topomap).localize(picture, CAMERA), pose) for picture, pose in unseen_views()
+        ]
+    assert all(
+        isinstance(one, Localization) and translation_error(pose, one.world_from_cam) < 0.02
+        for one, pose in found
+    )
 
 
 def test_what_is_rounded_stays_as_it_is(path: Path):
@@ -61,10 +68,18 @@ def test_it_is_undone_to_the_byte(path: Path):
 
 
 def test_more_landmarks_fit_into_the_same_bytes(path: Path, tmp_path: Path):
-    fine, budget = Path(shutil.copy(path, tmp_path / "fine.topo")), f"{0.7 * path.stat().st_size / 1e6:.4f}"
+    fine, budget = (
+        Path(shutil.copy(path, tmp_path / "fine.topo")),
+        f"{0.7 * path.stat().st_size / 1e6:.4f}",
+    )
     dropped, said = [], tmp_path / "said.json"
     for one, form in ((fine, "fine"), (path, "coarse")):
-        assert main(["prune", str(one), "--max-mb", budget, "--descriptors", form, "--json", str(said)]) == 0
+        assert (
+            main(
+                ["prune", str(one), "--max-mb", budget, "--descriptors", form, "--json", str(said)]
+            )
+            == 0
+        )
         assert one.stat().st_size <= float(budget) * 1e6
         dropped.append(json.loads(said.read_text())["landmarks_dropped"])
     assert dropped[1] < 0.6 * dropped[0]
@@ -76,5 +91,7 @@ def test_a_node_is_described_in_a_third_of_the_bytes(path: Path):
         rounded = coarser(node, STEP)
     assert node.stored_descriptors is not None
     assert rounded.stored_descriptors is not None
-    assert len(array_packed(rounded.stored_descriptors)) < 0.5 * len(array_packed(node.stored_descriptors))
+    assert len(array_packed(rounded.stored_descriptors)) < 0.5 * len(
+        array_packed(node.stored_descriptors)
+    )
     assert coarser(rounded, STEP) is rounded

@@ -22,21 +22,57 @@ def test_a_map_that_lost_its_landmarks_localizes_fewer_of_its_earlier_nodes(room
         poorer = replace(topomap, nodes=nodes, summaries=[node.summary for node in nodes])
         counts = earlier_recall(topomap, poorer, 4)
         assert earlier_recall(topomap, poorer, 0) == {}
-    assert counts == {"earlier_asked": 4, "earlier_localized_before": 4, "earlier_localized_after": 0}
-    assert described(counts) == "of 4 earlier nodes, each asked without itself, 4 localized before and 0 after"
+    assert counts == {
+        "earlier_asked": 4,
+        "earlier_localized_before": 4,
+        "earlier_localized_after": 0,
+    }
+    assert (
+        described(counts)
+        == "of 4 earlier nodes, each asked without itself, 4 localized before and 0 after"
+    )
     assert described({"landmarks_gone": 3}) is None
 
 
 def test_the_history_tells_it(room_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     path, settings = Path(shutil.copy(room_map, tmp_path / "room.topo")), tmp_path / "prune.toml"
     settings.write_text("[prune]\nearlier_asked = 3\n")
-    assert main(["prune", str(path), "--max-mb", f"{0.8 * path.stat().st_size / 1e6:.4f}", "--config", str(settings)]) == 0
+    assert (
+        main(
+            [
+                "prune",
+                str(path),
+                "--max-mb",
+                f"{0.8 * path.stat().st_size / 1e6:.4f}",
+                "--config",
+                str(settings),
+            ]
+        )
+        == 0
+    )
     capsys.readouterr()
     assert main(["history", str(path)]) == 0
-    assert "of 3 earlier nodes, each asked without itself, 3 localized before and 3 after" in capsys.readouterr().out
+    assert (
+        "of 3 earlier nodes, each asked without itself, 3 localized before and 3 after"
+        in capsys.readouterr().out
+    )
     assert main(["history", str(path), "--json", "-"]) == 0
-    assert json.loads(capsys.readouterr().out)["edits"][-1]["changes"]["earlier_localized_after"] == 3
+    assert (
+        json.loads(capsys.readouterr().out)["edits"][-1]["changes"]["earlier_localized_after"] == 3
+    )
     settings.write_text("[prune]\nearlier_asked = 0\n")
-    assert main(["prune", str(path), "--max-mb", f"{0.7 * path.stat().st_size / 1e6:.4f}", "--config", str(settings)]) == 0
+    assert (
+        main(
+            [
+                "prune",
+                str(path),
+                "--max-mb",
+                f"{0.7 * path.stat().st_size / 1e6:.4f}",
+                "--config",
+                str(settings),
+            ]
+        )
+        == 0
+    )
     with TopoMetricMap.load(path) as topomap:
         assert "earlier_asked" not in (topomap.edits[-1].changes or {})

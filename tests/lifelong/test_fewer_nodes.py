@@ -1,4 +1,5 @@
-"""Nodes that others hold go where a budget leaves every node few landmarks: the most redundant first, none that nothing else holds."""
+"""Nodes that others hold go where a budget leaves every node few landmarks: the most redundant
+first, none that nothing else holds."""
 
 from __future__ import annotations
 
@@ -41,7 +42,8 @@ def test_what_nothing_else_holds_stays():
 
 
 def test_what_went_is_not_forgotten():
-    """Node 1 is held by 0 and by 2; once it is gone, 0 alone holds 1's place and may not go though 2 shows enough of 0."""
+    """Node 1 is held by 0 and by 2; once it is gone, 0 alone holds 1's place and may not go though
+    2 shows enough of 0."""
     holds = _holds([[500, 300, 100], [300, 400, 30], [50, 30, 500]], [1, 1, 5])
     order = [row for row, _ in dropped_one_by_one(holds, 60)]
     assert order == [1]
@@ -51,7 +53,9 @@ def test_pictures_edges_and_place_vectors_go_to_the_node_that_holds(room_map: Pa
     path = tmp_path / "fewer.topo"
     with TopoMetricMap.load(room_map) as topomap:
         holds, num = holds_of(topomap, 4), len(topomap.summaries)
-        assert (holds.landmarks[:, 0] == [summary.num_points for summary in topomap.summaries]).all()
+        assert (
+            holds.landmarks[:, 0] == [summary.num_points for summary in topomap.summaries]
+        ).all()
         assert holds.landmarks[:, 1].min() > 0
         rows = np.arange(num)
         without_nodes(topomap, [2], np.where(rows == 2, 3, rows)).save(path)
@@ -60,17 +64,41 @@ def test_pictures_edges_and_place_vectors_go_to_the_node_that_holds(room_map: Pa
     with TopoMetricMap.load(path) as topomap:
         assert [summary.node_id for summary in topomap.summaries] == ids[:2] + ids[3:]
         assert ids[2] not in {image.node_id for image in topomap.place_images}
-        assert all({edge.source_id, edge.target_id} <= set(ids) - {ids[2]} for edge in topomap.edges)
+        assert all(
+            {edge.source_id, edge.target_id} <= set(ids) - {ids[2]} for edge in topomap.edges
+        )
         assert topomap.free_ids.node > max(ids)
 
 
-def test_a_budget_below_few_landmarks_a_node_drops_nodes_and_still_localizes(room_map: Path, tmp_path: Path, complaint: Callable[..., str]):
-    path, said, settings = Path(shutil.copy(room_map, tmp_path / "room.topo")), tmp_path / "said.json", tmp_path / "prune.toml"
+def test_a_budget_below_few_landmarks_a_node_drops_nodes_and_still_localizes(
+    room_map: Path, tmp_path: Path, complaint: Callable[..., str]
+):
+    path, said, settings = (
+        Path(shutil.copy(room_map, tmp_path / "room.topo")),
+        tmp_path / "said.json",
+        tmp_path / "prune.toml",
+    )
     data, budget = path.read_bytes(), 0.5 * path.stat().st_size / 1e6
     settings.write_text("[prune]\nmin_points = 150\nfew_points = 150\nmin_held = 1000\n")
-    assert "landmarks each its" in complaint("prune", path, "--max-mb", f"{budget:.4f}", "--config", settings)
+    assert "landmarks each its" in complaint(
+        "prune", path, "--max-mb", f"{budget:.4f}", "--config", settings
+    )
     settings.write_text("[prune]\nmin_points = 150\nfew_points = 150\nmin_held = 20\n")
-    assert main(["prune", str(path), "--max-mb", f"{budget:.4f}", "--config", str(settings), "--json", str(said)]) == 0
+    assert (
+        main(
+            [
+                "prune",
+                str(path),
+                "--max-mb",
+                f"{budget:.4f}",
+                "--config",
+                str(settings),
+                "--json",
+                str(said),
+            ]
+        )
+        == 0
+    )
     facts = json.loads(said.read_text())
     assert facts["nodes_dropped"] > 0
     assert facts["bytes"] == path.stat().st_size <= budget * 1e6
@@ -78,7 +106,13 @@ def test_a_budget_below_few_landmarks_a_node_drops_nodes_and_still_localizes(roo
     with TopoMetricMap.load(path) as topomap:
         localizer = Localizer(topomap)
         found = [(localizer.localize(picture, CAMERA), pose) for picture, pose in unseen_views()]
-    assert max(translation_error(pose, one.world_from_cam) if isinstance(one, Localization) else np.inf for one, pose in found) < 0.03
+    assert (
+        max(
+            translation_error(pose, one.world_from_cam) if isinstance(one, Localization) else np.inf
+            for one, pose in found
+        )
+        < 0.03
+    )
     assert main(["undo", str(path)]) == 0
     assert path.read_bytes() == data
 

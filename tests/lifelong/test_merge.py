@@ -1,4 +1,5 @@
-"""`topoloc merge`: two maps that were made apart become one where they overlap, and stay apart where they do not."""
+"""`topoloc merge`: two maps that were made apart become one where they overlap, and stay apart
+where they do not."""
 
 from __future__ import annotations
 
@@ -30,7 +31,9 @@ SECOND = np.arange(4.0, 17.0)
 def _map_of(folder: Path, target: Path, moved: Rigid3) -> Path:
     sequence = open_sequence(folder)
     poses = [moved @ pose for pose in sequence.poses if pose is not None]
-    build_map(SequenceView(sequence, list(range(len(sequence))), poses), BuildConfig(other_kinds=())).save(target)
+    build_map(
+        SequenceView(sequence, list(range(len(sequence))), poses), BuildConfig(other_kinds=())
+    ).save(target)
     return target
 
 
@@ -40,14 +43,19 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("parts")
     left = write_stereo_recording(folder / "left", indices=[float(k) for k in range(7)])
     right = write_stereo_recording(folder / "right", indices=SECOND.tolist())
-    return _map_of(left, folder / "left.topo", Rigid3.identity()), _map_of(right, folder / "right.topo", OTHER_WORLD)
+    return _map_of(left, folder / "left.topo", Rigid3.identity()), _map_of(
+        right, folder / "right.topo", OTHER_WORLD
+    )
 
 
 def test_two_maps_become_one_in_the_world_of_the_first(maps: tuple[Path, Path], tmp_path: Path):
     before = [path.read_bytes() for path in maps]
     out, said, settings = tmp_path / "both.topo", tmp_path / "said.json", tmp_path / "settings.toml"
     settings.write_text("[update]\nmin_inliers = 250\n")
-    assert main(["merge", *map(str, maps), str(out), "--json", str(said), "--config", str(settings)]) == 0
+    assert (
+        main(["merge", *map(str, maps), str(out), "--json", str(said), "--config", str(settings)])
+        == 0
+    )
     assert [path.read_bytes() for path in maps] == before
     facts = json.loads(said.read_text())
     assert facts["agreeing"] >= 5
@@ -69,26 +77,47 @@ def test_two_maps_become_one_in_the_world_of_the_first(maps: tuple[Path, Path], 
             assert translation_error(path_pose(index), result.world_from_cam) < 0.02
 
 
-def test_maps_of_two_places_stay_apart(maps: tuple[Path, Path], tmp_path: Path, complaint: Callable[..., str]):
-    other = _map_of(write_stereo_recording(tmp_path / "other", seed=5), tmp_path / "other.topo", Rigid3.identity())
+def test_maps_of_two_places_stay_apart(
+    maps: tuple[Path, Path], tmp_path: Path, complaint: Callable[..., str]
+):
+    other = _map_of(
+        write_stereo_recording(tmp_path / "other", seed=5),
+        tmp_path / "other.topo",
+        Rigid3.identity(),
+    )
     assert "nothing is merged" in complaint("merge", maps[0], other, tmp_path / "both.topo")
     assert not (tmp_path / "both.topo").exists()
 
 
-def test_what_cannot_be_merged_is_named(maps: tuple[Path, Path], tmp_path: Path, complaint: Callable[..., str]):
+def test_what_cannot_be_merged_is_named(
+    maps: tuple[Path, Path], tmp_path: Path, complaint: Callable[..., str]
+):
     first, second = maps
     again = Path(shutil.copy(first, tmp_path / "again.topo"))
     assert "one map in two versions" in complaint("merge", first, again, tmp_path / "both.topo")
     assert "a name of its own" in complaint("merge", again, second, again, status=2)
-    assert "No such file" in complaint("merge", first, tmp_path / "none.topo", tmp_path / "both.topo")
+    assert "No such file" in complaint(
+        "merge", first, tmp_path / "none.topo", tmp_path / "both.topo"
+    )
     with TopoMetricMap.load(first) as topomap:
-        replace(topomap, other_kinds={"sift": topomap.nodes}, map_id="0123456789abcdef").save(tmp_path / "two.topo")
-    assert "holds no features sift" in complaint("merge", tmp_path / "two.topo", second, tmp_path / "both.topo")
+        replace(topomap, other_kinds={"sift": topomap.nodes}, map_id="0123456789abcdef").save(
+            tmp_path / "two.topo"
+        )
+    assert "holds no features sift" in complaint(
+        "merge", tmp_path / "two.topo", second, tmp_path / "both.topo"
+    )
 
 
 def test_a_nodes_features_are_localized_as_its_picture_is(maps: tuple[Path, Path]):
     with TopoMetricMap.load(maps[0]) as first, TopoMetricMap.load(maps[1]) as second:
         node = second.nodes[0]
-        result = Localizer(first).ask(Picture.of_features({second.kind: node.features}, node.camera))[0]
+        result = Localizer(first).ask(
+            Picture.of_features({second.kind: node.features}, node.camera)
+        )[0]
         assert isinstance(result, Localization)
-        assert translation_error(OTHER_WORLD.inverse() @ node.summary.world_from_cam, result.world_from_cam) < 0.02
+        assert (
+            translation_error(
+                OTHER_WORLD.inverse() @ node.summary.world_from_cam, result.world_from_cam
+            )
+            < 0.02
+        )

@@ -15,7 +15,10 @@ from topoloc.localization.result import Localization
 CONFIG = SessionPosesConfig()
 FACTORS = CONFIG.motion_factors, CONFIG.answer_factors
 D_THRESH, SIGMA_M = 0.3, 0.02
-TRUTH = {k: Rigid3(exp_so3(np.array([0.0, 0.01 * k, 0.0])), np.array([0.0, 0.0, 0.2 * k])) for k in range(150)}
+TRUTH = {
+    k: Rigid3(exp_so3(np.array([0.0, 0.01 * k, 0.0])), np.array([0.0, 0.0, 0.2 * k]))
+    for k in range(150)
+}
 
 
 def _answers(sigma_m: float, seed: int = 0) -> dict[int, Localization | None]:
@@ -26,7 +29,9 @@ def _answers(sigma_m: float, seed: int = 0) -> dict[int, Localization | None]:
     for k, true in TRUTH.items():
         pose = true @ Rigid3.exp(sigma_m * scatter @ rng.normal(size=6))
         adjoint = pose.adjoint()
-        answers[k] = Localization(pose, adjoint @ (SIGMA_M * scatter) ** 2 @ adjoint.T, 0.99, 0, [], 100, 80)
+        answers[k] = Localization(
+            pose, adjoint @ (SIGMA_M * scatter) ** 2 @ adjoint.T, 0.99, 0, [], 100, 80
+        )
     return answers
 
 
@@ -40,10 +45,20 @@ def _motion(sigma_m: float, seed: int = 1) -> dict[int, Rigid3]:
     return poses
 
 
-def _rms(own: dict[int, Rigid3], answers: dict[int, Localization | None], trust: Trust | None) -> float:
+def _rms(
+    own: dict[int, Rigid3], answers: dict[int, Localization | None], trust: Trust | None
+) -> float:
     held = held_by("walk", own, answers, D_THRESH, CONFIG, trust).world_from_cams
     return float(
-        np.sqrt(np.mean([np.sum(np.square(pose.translation - TRUTH[k].translation)) for k, pose in enumerate(held) if pose is not None]))
+        np.sqrt(
+            np.mean(
+                [
+                    np.sum(np.square(pose.translation - TRUTH[k].translation))
+                    for k, pose in enumerate(held)
+                    if pose is not None
+                ]
+            )
+        )
     )
 
 
@@ -52,7 +67,9 @@ def _rms(own: dict[int, Rigid3], answers: dict[int, Localization | None], trust:
     [(0.0003, SIGMA_M, 0.92), (0.015, 0.004, 0.5)],
     ids=["a lap without drift, asked by night", "a walk that drifts, in a map that knows it well"],
 )
-def test_a_session_is_placed_better_by_what_it_tells_of_itself(of_motion: float, of_answers: float, share: float):
+def test_a_session_is_placed_better_by_what_it_tells_of_itself(
+    of_motion: float, of_answers: float, share: float
+):
     own, answers = _motion(of_motion), _answers(of_answers)
     assert _rms(own, answers, None) < share * _rms(own, answers, Trust())
 
@@ -68,7 +85,9 @@ def _steps(own: dict[int, Rigid3], answers: dict[int, Localization | None]) -> l
         assert answer is not None
         moved = own[k].inverse() @ own[k - 1] if k else Rigid3.identity()
         spread = np.diag([0.003**2] * 3 + [0.001**2] * 3)
-        steps.append(SeenStep(moved, spread, answer.world_from_cam.inverse(), answer.camera_covariance))
+        steps.append(
+            SeenStep(moved, spread, answer.world_from_cam.inverse(), answer.camera_covariance)
+        )
     return steps
 
 
@@ -76,7 +95,10 @@ def test_one_wrong_answer_changes_nothing():
     steps = _steps(_motion(0.0003), _answers(SIGMA_M))
     trust = measured_trust(steps, *FACTORS)
     assert trust == Trust(0.5, 1.0)
-    steps[20] = replace(steps[20], cam_from_world=Rigid3(np.eye(3), np.array([0.4, 0.0, 0.0])) @ steps[20].cam_from_world)
+    steps[20] = replace(
+        steps[20],
+        cam_from_world=Rigid3(np.eye(3), np.array([0.4, 0.0, 0.0])) @ steps[20].cam_from_world,
+    )
     assert measured_trust(steps, *FACTORS) == trust
 
 

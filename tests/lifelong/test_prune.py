@@ -1,4 +1,5 @@
-"""`topoloc prune`: what later sessions never saw again goes, a size is kept, and what is left still localizes."""
+"""`topoloc prune`: what later sessions never saw again goes, a size is kept, and what is left still
+localizes."""
 
 from __future__ import annotations
 
@@ -25,10 +26,19 @@ from topoloc.map.sums import LandmarkSums
 
 def _counts(num_points: int, expected: int, seen: np.ndarray) -> LandmarkSums:
     rows = np.arange(num_points)
-    return LandmarkSums.of(1, rows, np.zeros((num_points, 3, 3)), np.zeros((num_points, 3)), np.full(num_points, expected), seen)
+    return LandmarkSums.of(
+        1,
+        rows,
+        np.zeros((num_points, 3, 3)),
+        np.zeros((num_points, 3)),
+        np.full(num_points, expected),
+        seen,
+    )
 
 
-def _with_later_session(path: Path, seen_of: Callable[[int], np.ndarray], expected: int = 6) -> None:
+def _with_later_session(
+    path: Path, seen_of: Callable[[int], np.ndarray], expected: int = 6
+) -> None:
     """As if a second session had looked at every node."""
     with editing(path) as edit:
         topomap = edit.topomap
@@ -49,7 +59,10 @@ def _errors_m(path: Path) -> list[float]:
     with TopoMetricMap.load(path) as topomap:
         localizer = Localizer(topomap)
         found = [(localizer.localize(picture, CAMERA), pose) for picture, pose in unseen_views()]
-    return [translation_error(pose, one.world_from_cam) if isinstance(one, Localization) else np.inf for one, pose in found]
+    return [
+        translation_error(pose, one.world_from_cam) if isinstance(one, Localization) else np.inf
+        for one, pose in found
+    ]
 
 
 def test_landmarks_that_are_gone_go_and_no_others(room_map: Path, tmp_path: Path):
@@ -80,7 +93,8 @@ def test_what_another_light_hides_is_not_gone(room_map: Path, tmp_path: Path):
 
 
 def test_what_chance_may_have_hidden_is_not_gone(room_map: Path, tmp_path: Path):
-    """A session that finds a third of what is in view misses a landmark in six pictures one time of eleven."""
+    """A session that finds a third of what is in view misses a landmark in six pictures one time of
+    eleven."""
     path = Path(shutil.copy(room_map, tmp_path / "room.topo"))
     _with_later_session(path, lambda num: np.where(np.arange(num) % 3 == 0, 6, 0))
     before = path.read_bytes()
@@ -99,7 +113,9 @@ def test_a_size_is_kept(room_map: Path, tmp_path: Path, share: float):
 def test_a_size_is_kept_and_the_map_still_localizes(room_map: Path, tmp_path: Path):
     path, said = Path(shutil.copy(room_map, tmp_path / "room.topo")), tmp_path / "said.json"
     size = path.stat().st_size
-    assert main(["prune", str(path), "--max-mb", f"{0.75 * size / 1e6:.4f}", "--json", str(said)]) == 0
+    assert (
+        main(["prune", str(path), "--max-mb", f"{0.75 * size / 1e6:.4f}", "--json", str(said)]) == 0
+    )
     assert path.stat().st_size <= 0.75 * size
     facts = json.loads(said.read_text())
     assert facts["bytes"] == path.stat().st_size
@@ -116,11 +132,15 @@ def test_what_is_kept_is_spread_over_the_picture(room_map: Path, tmp_path: Path)
     with TopoMetricMap.load(path) as topomap:
         after = topomap.nodes[3].features.points_img
     assert len(after) < 0.9 * len(before)
-    cells_before, cells_after = ({tuple(cell) for cell in (points // 40).astype(int)} for points in (before, after))
+    cells_before, cells_after = (
+        {tuple(cell) for cell in (points // 40).astype(int)} for points in (before, after)
+    )
     assert len(cells_after) == len(cells_before), "no cell is emptied while others hold many"
 
 
-def test_a_budget_that_is_too_small_changes_nothing(room_map: Path, tmp_path: Path, complaint: Callable[..., str]):
+def test_a_budget_that_is_too_small_changes_nothing(
+    room_map: Path, tmp_path: Path, complaint: Callable[..., str]
+):
     path = Path(shutil.copy(room_map, tmp_path / "room.topo"))
     assert "with 100 landmarks each its" in complaint("prune", path, "--max-mb", 0.01)
     assert "--max-mb" in complaint("prune", path, "--max-mb", -1, status=2)
@@ -134,5 +154,8 @@ def test_points_of_a_node_go_with_what_sessions_know_of_them(room_map: Path):
         fewer = with_points(node, kept)
         assert fewer.summary.num_points == len(fewer.features) == len(fewer.points_cam) == len(kept)
         for before, after in zip(node.sums, fewer.sums, strict=True):
-            of = {int(row): int(count) for row, count in zip(before.rows, before.expected, strict=True)}
+            of = {
+                int(row): int(count)
+                for row, count in zip(before.rows, before.expected, strict=True)
+            }
             assert [of[int(kept[row])] for row in after.rows] == after.expected.tolist()

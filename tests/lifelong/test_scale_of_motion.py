@@ -1,4 +1,5 @@
-"""The metres of a motion in a unit of its own: found by answers of a map, of which some are wrong, while the unit drifts."""
+"""The metres of a motion in a unit of its own: found by answers of a map, of which some are wrong,
+while the unit drifts."""
 
 from __future__ import annotations
 
@@ -11,7 +12,10 @@ from topoloc.lifelong.single_camera_poses import held_stretch
 from topoloc.localization.result import Localization
 
 WORLD_FROM_OWN = Rigid3(exp_so3(np.array([0.4, -0.3, 1.0])), np.array([3.0, -2.0, 1.0]))
-TRUTH = [Rigid3(exp_so3(np.array([0.0, 0.0, 0.02 * k])), np.array([0.2 * k, 0.5 * np.sin(0.1 * k), 0.0])) for k in range(80)]
+TRUTH = [
+    Rigid3(exp_so3(np.array([0.0, 0.0, 0.02 * k])), np.array([0.2 * k, 0.5 * np.sin(0.1 * k), 0.0]))
+    for k in range(80)
+]
 WRONG = Rigid3(np.eye(3), np.array([2.0, 1.0, 0.0]))
 
 
@@ -19,7 +23,9 @@ def _motion(drift: float) -> dict[int, Rigid3]:
     """The motion in units of about half a metre, which grow by `drift` over the whole way."""
     position, own = np.zeros(3), {0: TRUTH[0]}
     for k in range(1, len(TRUTH)):
-        position = position + (TRUTH[k].translation - TRUTH[k - 1].translation) * 2.0 * (1.0 + drift * k / len(TRUTH))
+        position = position + (TRUTH[k].translation - TRUTH[k - 1].translation) * 2.0 * (
+            1.0 + drift * k / len(TRUTH)
+        )
         own[k] = Rigid3(TRUTH[k].rotation, position)
     return own
 
@@ -32,7 +38,9 @@ def _answer(k: int) -> Localization:
 def _answers(numbers: list[int], wrong: list[int]) -> dict[int, Localization]:
     answers = {k: _answer(k) for k in numbers}
     for k in wrong:
-        answers[k] = Localization(WRONG @ answers[k].world_from_cam, answers[k].covariance, 0.99, 0, [], 100, 80)
+        answers[k] = Localization(
+            WRONG @ answers[k].world_from_cam, answers[k].covariance, 0.99, 0, [], 100, 80
+        )
     return answers
 
 
@@ -47,12 +55,17 @@ def test_a_drifting_unit_is_held_between_answers_and_wrong_ones_bend_nothing():
     poses, agreeing = held_stretch("walk", _motion(0.1), answers, 0.6, SessionPosesConfig())
     assert poses is not None
     assert agreeing == [k for k in answers if k != 40]
-    off = [np.linalg.norm(poses[k].translation - (WORLD_FROM_OWN @ TRUTH[k]).translation) for k in range(80)]  # pyright: ignore[reportOptionalMemberAccess]
+    off = [
+        np.linalg.norm(poses[k].translation - (WORLD_FROM_OWN @ TRUTH[k]).translation)
+        for k in range(80)
+    ]  # pyright: ignore[reportOptionalMemberAccess]
     assert max(off) < 0.1
 
 
 def test_too_few_answers_hold_nothing():
-    poses, _ = held_stretch("walk", _motion(0.0), _answers([0, 30, 60], []), 0.6, SessionPosesConfig())
+    poses, _ = held_stretch(
+        "walk", _motion(0.0), _answers([0, 30, 60], []), 0.6, SessionPosesConfig()
+    )
     assert poses is None
 
 
@@ -65,10 +78,13 @@ def test_where_the_unit_is_not_known_there_are_no_poses():
 
 
 def test_where_the_map_and_the_motion_contradict_each_other_nothing_is_said():
-    """The motion's beginning is wrong, and the map knows: four answers to it, and a picture among them that it does not know."""
+    """The motion's beginning is wrong, and the map knows: four answers to it, and a picture among
+    them that it does not know."""
     motion = _motion(0.0)
     for k in range(5):
-        motion[k] = Rigid3(motion[k].rotation, motion[k].translation + np.array([0.0, 0.0, 0.6 - 0.1 * k]))
+        motion[k] = Rigid3(
+            motion[k].rotation, motion[k].translation + np.array([0.0, 0.0, 0.6 - 0.1 * k])
+        )
     answers = _answers([0, 1, 3, 4, *range(6, 60, 2)], [])
     poses, agreeing = held_stretch("walk", motion, answers, 0.6, SessionPosesConfig())
     assert poses is not None

@@ -33,7 +33,9 @@ def _bent(by_m: float, by_deg: float) -> list[Rigid3 | None]:
 
 def _off(poses: list[Rigid3 | None]) -> np.ndarray:
     """Metres and degrees from the truth, a row a frame."""
-    apart = [pose.inverse() @ true for pose, true in zip(poses, TRUTH, strict=True) if pose is not None]
+    apart = [
+        pose.inverse() @ true for pose, true in zip(poses, TRUTH, strict=True) if pose is not None
+    ]
     return np.array([(np.linalg.norm(one.translation), np.degrees(one.angle())) for one in apart])
 
 
@@ -56,17 +58,25 @@ def test_single_answers_and_ones_that_are_not_sure_hardly_move_it():
     beside = Rigid3(np.eye(3), TRUTH[30].translation + np.array([0.08, 0.0, 0.0]))
     answers = {k: _localized(TRUTH[k]) for k in ANSWERED} | {30: _localized(beside)}
     assert _off(straightened(walk, answers, D_THRESH, CONFIG))[:, 0].max() < 0.012
-    unsure = {k: _localized(Rigid3(np.eye(3), TRUTH[k].translation + np.array([0.1, 0.0, 0.0])), 0.5) for k in range(0, 60, 6)}
+    unsure = {
+        k: _localized(Rigid3(np.eye(3), TRUTH[k].translation + np.array([0.1, 0.0, 0.0])), 0.5)
+        for k in range(0, 60, 6)
+    }
     assert _off(straightened(walk, unsure, D_THRESH, CONFIG))[:, 0].max() < 0.005
 
 
 def test_what_the_map_is_sure_of_and_contradicts_is_no_bend():
     walk: list[Rigid3 | None] = [*TRUTH]
-    elsewhere = {k: _localized(Rigid3(np.eye(3), TRUTH[k].translation + np.array([0.2, 0.0, 0.0]))) for k in range(50, 60)}
+    elsewhere = {
+        k: _localized(Rigid3(np.eye(3), TRUTH[k].translation + np.array([0.2, 0.0, 0.0])))
+        for k in range(50, 60)
+    }
     np.testing.assert_array_equal(_off(straightened(walk, elsewhere, D_THRESH, CONFIG)), _off(walk))
 
 
 @pytest.mark.parametrize("answers", [{}, {3: _localized(TRUTH[3])}])
 def test_frames_without_a_pose_stay_without(answers: dict[int, Localization]):
     walk: list[Rigid3 | None] = [*TRUTH[:3], None, *TRUTH[4:], None]
-    assert [k for k, pose in enumerate(straightened(walk, answers, D_THRESH, CONFIG)) if pose is None] == [3, 100]
+    assert [
+        k for k, pose in enumerate(straightened(walk, answers, D_THRESH, CONFIG)) if pose is None
+    ] == [3, 100]

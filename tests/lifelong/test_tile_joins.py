@@ -1,4 +1,5 @@
-"""`topoloc atlas join`: tiles that overlap get one world, tiles of two places do not, however much these share."""
+"""`topoloc atlas join`: tiles that overlap get one world, tiles of two places do not, however much
+these share."""
 
 from __future__ import annotations
 
@@ -44,10 +45,14 @@ PARTS = {"left": range(9), "middle": range(4, 13), "right": range(6, 15)}
 FEW = TileJoinConfig(num_probed=4, num_asked=6, min_near=8)
 
 
-def _map_of(folder: Path, indices: list[float], own_from_room: Rigid3, panels: list[Panel] | None = None) -> Path:
+def _map_of(
+    folder: Path, indices: list[float], own_from_room: Rigid3, panels: list[Panel] | None = None
+) -> Path:
     sequence = open_sequence(write_stereo_recording(folder, indices=indices, panels=panels))
     poses = [own_from_room @ pose for pose in sequence.poses if pose is not None]
-    _built(SequenceView(sequence, list(range(len(sequence))), poses)).save(folder.with_suffix(".topo"))
+    _built(SequenceView(sequence, list(range(len(sequence))), poses)).save(
+        folder.with_suffix(".topo")
+    )
     return folder.with_suffix(".topo")
 
 
@@ -59,11 +64,16 @@ def _built(sequence: SequenceView) -> TopoMetricMap:
 def parts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Maps of three parts of one walk that overlap."""
     folder = tmp_path_factory.mktemp("parts")
-    return {name: _map_of(folder / name, [float(k) for k in PARTS[name]], WORLDS[name]) for name in PARTS}
+    return {
+        name: _map_of(folder / name, [float(k) for k in PARTS[name]], WORLDS[name])
+        for name in PARTS
+    }
 
 
 @pytest.fixture(scope="module")
-def joined_once(parts: dict[str, Path], other_room: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Neighbours]:
+def joined_once(
+    parts: dict[str, Path], other_room: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Neighbours]:
     """An atlas of the three, joined, and of another room; not to be written to."""
     where = tmp_path_factory.mktemp("atlas") / "campus"
     create_atlas(str(where), new_tiles([*map(str, parts.values()), str(other_room)]))
@@ -78,8 +88,16 @@ def joined_atlas(joined_once: tuple[Path, Neighbours]) -> tuple[Path, Manifest]:
 @pytest.fixture(scope="module")
 def other_room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of the same plan, with the same side wall and floor; all else is another room's."""
-    panels = [own if k in (1, 2) else other for k, (own, other) in enumerate(zip(room(), room(9), strict=True))]
-    return _map_of(tmp_path_factory.mktemp("other") / "other", [float(k) for k in range(5)], Rigid3.identity(), panels)
+    panels = [
+        own if k in (1, 2) else other
+        for k, (own, other) in enumerate(zip(room(), room(9), strict=True))
+    ]
+    return _map_of(
+        tmp_path_factory.mktemp("other") / "other",
+        [float(k) for k in range(5)],
+        Rigid3.identity(),
+        panels,
+    )
 
 
 @pytest.fixture
@@ -98,7 +116,12 @@ def test_parts_of_one_walk_become_one_world(joined_atlas: tuple[Path, Manifest])
         assert tile.joint.joint == "left"
         true = WORLDS["left"] @ WORLDS[name].inverse()
         pose = path_pose(8.0)
-        assert translation_error(true @ WORLDS[name] @ pose, tile.joint.joint_from_world @ WORLDS[name] @ pose) < 0.01
+        assert (
+            translation_error(
+                true @ WORLDS[name] @ pose, tile.joint.joint_from_world @ WORLDS[name] @ pose
+            )
+            < 0.01
+        )
         assert np.degrees(rotation_error(true, tile.joint.joint_from_world)) < 0.3
         found = left.from_world_of(tile)
         assert found is not None
@@ -107,7 +130,11 @@ def test_parts_of_one_walk_become_one_world(joined_atlas: tuple[Path, Manifest])
 
 def test_each_join_is_as_certain_as_it_says(joined_atlas: tuple[Path, Manifest]):
     manifest = joined_atlas[1]
-    assert [join.pair for join in manifest.joins] == [("left", "middle"), ("left", "right"), ("middle", "right")]
+    assert [join.pair for join in manifest.joins] == [
+        ("left", "middle"),
+        ("left", "right"),
+        ("middle", "right"),
+    ]
     for join in manifest.joins:
         true = WORLDS[join.first] @ WORLDS[join.second].inverse()
         at = WORLDS[join.second] @ path_pose(8.0)
@@ -120,18 +147,25 @@ def test_each_join_is_as_certain_as_it_says(joined_atlas: tuple[Path, Manifest])
 
 
 def test_a_room_of_the_same_plan_is_not_joined(joined_once: tuple[Path, Neighbours]):
-    """Its side wall and floor are the same to the last spot: pictures of one are recognised in the other, where they agree."""
+    """Its side wall and floor are the same to the last spot: pictures of one are recognised in the
+    other, where they agree."""
     where, neighbours = joined_once
     assert neighbours.manifest.by_id["other"].joint is None
     of_other = [one for one in neighbours.tried if "other" in (one.first, one.second)]
     assert len(of_other) == 3
     assert all(isinstance(one.found, NotJoined) for one in of_other)
-    assert any("answers agree, but" in one.found.reason for one in of_other if isinstance(one.found, NotJoined))
+    assert any(
+        "answers agree, but" in one.found.reason
+        for one in of_other
+        if isinstance(one.found, NotJoined)
+    )
     pairs = [(a.tile_id, b.tile_id) for a, b in likely_pairs(Atlas.open(str(where)), {"left"}, FEW)]
     assert pairs == [("left", "other")]  # what is joined is not compared again
 
 
-def test_answers_agree_through_the_joins_and_say_where_in_the_joint_world(joined_atlas: tuple[Path, Manifest]):
+def test_answers_agree_through_the_joins_and_say_where_in_the_joint_world(
+    joined_atlas: tuple[Path, Manifest],
+):
     """In the overlap two tiles know the place as well; as islands that is ambiguous."""
     where, _ = joined_atlas
     localizer = AtlasLocalizer(Atlas.open(str(where)), Maps([], Localizer, 100_000_000))
@@ -156,8 +190,12 @@ def test_near_a_pose_reaches_tiles_that_are_joined(joined_atlas: tuple[Path, Man
 
 
 def test_one_tile_on_earth_puts_all_there(own: Path, parts: dict[str, Path], tmp_path: Path):
-    """A georeferenced map of the middle comes instead of the one before: its joins go, and are found anew."""
-    place, enu_from_room = GeoPoint(50.87, 4.70, 30.0), Rigid3(exp_so3(np.array([0.0, 0.0, 0.5])), np.array([3.0, 2.0, 1.0]))
+    """A georeferenced map of the middle comes instead of the one before: its joins go, and are
+    found anew."""
+    place, enu_from_room = (
+        GeoPoint(50.87, 4.70, 30.0),
+        Rigid3(exp_so3(np.array([0.0, 0.0, 0.5])), np.array([3.0, 2.0, 1.0])),
+    )
     with TopoMetricMap.load(parts["middle"]) as topomap:
         known = Georeference(place, enu_from_room @ WORLDS["middle"].inverse(), "origin")
         replace(topomap, georeference=known).save(tmp_path / "middle.topo")
@@ -165,14 +203,18 @@ def test_one_tile_on_earth_puts_all_there(own: Path, parts: dict[str, Path], tmp
     assert [join.pair for join in replaced.joins] == [("left", "right")]
     assert replaced.by_id["left"].atlas_from_world is None
     remove_tiles(str(own), ["other"])
-    manifest = join_tiles(str(own), config=FEW, pairs=[("middle", "left"), ("left", "right")]).manifest
+    manifest = join_tiles(
+        str(own), config=FEW, pairs=[("middle", "left"), ("left", "right")]
+    ).manifest
     assert [join.pair for join in manifest.joins] == [("left", "middle"), ("left", "right")]
     for name in PARTS:
         tile = manifest.by_id[name]
         assert tile.in_joint_world.joint == "middle"
         assert tile.atlas_from_world is not None
         at = path_pose(8.0)
-        assert translation_error(enu_from_room @ at, tile.atlas_from_world @ WORLDS[name] @ at) < 0.02
+        assert (
+            translation_error(enu_from_room @ at, tile.atlas_from_world @ WORLDS[name] @ at) < 0.02
+        )
         assert tile.geo_box is not None
         assert abs(tile.geo_box[0] - 50.87) < 1e-3
     localizer = AtlasLocalizer(Atlas.open(str(own)), Maps([], Localizer, 100_000_000))
@@ -187,7 +229,9 @@ def test_one_tile_on_earth_puts_all_there(own: Path, parts: dict[str, Path], tmp
     assert gone.by_id["left"].geo_box is None
 
 
-def test_what_was_found_of_a_map_that_is_replaced_meanwhile_is_left_out(own: Path, parts: dict[str, Path]):
+def test_what_was_found_of_a_map_that_is_replaced_meanwhile_is_left_out(
+    own: Path, parts: dict[str, Path]
+):
     before = Atlas.open(str(own)).manifest
     add_tiles(str(own), new_tiles([str(parts["left"])], "middle"), replaces=True)
     after = add_joins(str(own), before.joins, before.by_id)
@@ -200,24 +244,51 @@ def test_what_lies_far_apart_on_earth_is_not_even_compared(parts: dict[str, Path
     where = tmp_path / "campus"
     for name, lat in (("left", 50.0), ("middle", 50.1)):
         with TopoMetricMap.load(parts[name]) as topomap:
-            replace(topomap, georeference=Georeference(GeoPoint(lat, 4.0, 0.0), Rigid3.identity(), "origin")).save(
-                tmp_path / f"{name}.topo"
-            )
-    create_atlas(str(where), new_tiles([str(tmp_path / "left.topo"), str(tmp_path / "middle.topo")]))
+            replace(
+                topomap,
+                georeference=Georeference(GeoPoint(lat, 4.0, 0.0), Rigid3.identity(), "origin"),
+            ).save(tmp_path / f"{name}.topo")
+    create_atlas(
+        str(where), new_tiles([str(tmp_path / "left.topo"), str(tmp_path / "middle.topo")])
+    )
     assert join_tiles(str(where)).tried == []
 
 
-def test_the_command_line(own: Path, parts: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_command_line(
+    own: Path, parts: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     settings = tmp_path / "few.toml"
     settings.write_text("[join]\nnum_probed = 4\nnum_asked = 6\nmin_near = 8\nmax_pairs = 1\n")
     remove_tiles(str(own), ["other", "middle"])
     shutil.copy(parts["middle"], tmp_path / "centre.topo")
-    assert main(["atlas", "add", str(own), str(tmp_path / "centre.topo"), "--join", "--config", str(settings), "--json", "-"]) == 0
+    assert (
+        main(
+            [
+                "atlas",
+                "add",
+                str(own),
+                str(tmp_path / "centre.topo"),
+                "--join",
+                "--config",
+                str(settings),
+                "--json",
+                "-",
+            ]
+        )
+        == 0
+    )
     facts = json.loads(capsys.readouterr().out)
     assert facts["worlds"] == {"centre": ["centre", "left", "right"]}
-    assert [(join["first"], join["second"]) for join in facts["joins"]] == [("centre", "right"), ("left", "right")]
-    assert all(0.0 < join["sigma_m"] < 0.05 and 0.0 < join["sigma_deg"] < 2.0 for join in facts["joins"])
-    assert [(one["first"], one["second"], one["joined"]) for one in facts["tried"]] == [("centre", "right", True)]
+    assert [(join["first"], join["second"]) for join in facts["joins"]] == [
+        ("centre", "right"),
+        ("left", "right"),
+    ]
+    assert all(
+        0.0 < join["sigma_m"] < 0.05 and 0.0 < join["sigma_deg"] < 2.0 for join in facts["joins"]
+    )
+    assert [(one["first"], one["second"], one["joined"]) for one in facts["tried"]] == [
+        ("centre", "right", True)
+    ]
     settings.write_text("[join]\nmin_near = 1000\nnum_probed = 4\nnum_asked = 6\nmax_pairs = 1\n")
     remove_tiles(str(own), ["right", "centre"])
     add_tiles(str(own), new_tiles([str(parts["middle"])]))
@@ -230,19 +301,27 @@ def test_the_command_line(own: Path, parts: dict[str, Path], tmp_path: Path, cap
 def test_what_cannot_be_meant_is_said(own: Path, complaint: Callable[..., str]):
     assert "has no tile 'attic'" in complaint("atlas", "join", own, "attic")
     assert "--join belongs to create and add" in complaint("atlas", "info", own, "--join", status=2)
-    assert "--config sets how tiles are joined" in complaint("atlas", "info", own, "--config", "few.toml", status=2)
+    assert "--config sets how tiles are joined" in complaint(
+        "atlas", "info", own, "--config", "few.toml", status=2
+    )
 
 
-def test_info_names_worlds_and_joins(joined_atlas: tuple[Path, Manifest], capsys: pytest.CaptureFixture[str]):
+def test_info_names_worlds_and_joins(
+    joined_atlas: tuple[Path, Manifest], capsys: pytest.CaptureFixture[str]
+):
     assert main(["atlas", "info", str(joined_atlas[0])]) == 0
     printed = capsys.readouterr().out
     assert "world  left: left, middle, right" in printed
     assert "join   left and middle: " in printed
 
 
-def test_pieces_of_one_recording_are_joined_by_the_pictures_that_both_have(parts: dict[str, Path], tmp_path: Path):
+def test_pieces_of_one_recording_are_joined_by_the_pictures_that_both_have(
+    parts: dict[str, Path], tmp_path: Path
+):
     """Each in a world of its own; maps of other pictures of the same walk have none in common."""
-    recording = open_sequence(write_stereo_recording(tmp_path / "walk", indices=[float(k) for k in range(7)]))
+    recording = open_sequence(
+        write_stereo_recording(tmp_path / "walk", indices=[float(k) for k in range(7)])
+    )
     maps = list[TopoMetricMap]()
     for rows, own_from_room in ((range(5), WORLDS["left"]), (range(2, 7), WORLDS["middle"])):
         poses = [own_from_room @ path_pose(float(k)) for k in rows]

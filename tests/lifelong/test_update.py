@@ -1,4 +1,5 @@
-"""`topoloc update`: sessions that go on from what is mapped, that show it changed, that show nothing new, and those that do not fit."""
+"""`topoloc update`: sessions that go on from what is mapped, that show it changed, that show
+nothing new, and those that do not fit."""
 
 from __future__ import annotations
 
@@ -13,7 +14,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tiny_world import CAMERA, Panel, path_pose, render, room, smooth_texture, tum_line, write_stereo_recording
+from tiny_world import (
+    CAMERA,
+    Panel,
+    path_pose,
+    render,
+    room,
+    smooth_texture,
+    tum_line,
+    write_stereo_recording,
+)
 from topoloc import Localizer, TopoMetricMap, open_sequence
 from topoloc.cli import main
 from topoloc.errors import TrajectoryError
@@ -54,15 +64,23 @@ def _in_another_world(folder: Path, scale: float = 1.0) -> Path:
     sequence = open_sequence(folder)
     poses = [ELSEWHERE @ pose for pose in sequence.poses if pose is not None]
     poses = [Rigid3(pose.rotation, scale * pose.translation) for pose in poses]
-    (folder / "truth.tum").write_text("".join(tum_line(t / 1e8, pose) + "\n" for t, pose in zip(sequence.t_ns, poses, strict=True)))
+    (folder / "truth.tum").write_text(
+        "".join(
+            tum_line(t / 1e8, pose) + "\n" for t, pose in zip(sequence.t_ns, poses, strict=True)
+        )
+    )
     return folder
 
 
-def _answers(path: Path, indices: np.ndarray, panels: list[Panel] | None = None) -> list[Localization | None]:
+def _answers(
+    path: Path, indices: np.ndarray, panels: list[Panel] | None = None
+) -> list[Localization | None]:
     with TopoMetricMap.load(path) as topomap:
         localizer, found = Localizer(topomap), []
         for index in indices:
-            picture, _ = render(panels or room(), path_pose(float(index)), noise_seed=int(5000 + 10 * index))
+            picture, _ = render(
+                panels or room(), path_pose(float(index)), noise_seed=int(5000 + 10 * index)
+            )
             result = localizer.localize(picture, CAMERA)
             found.append(result if isinstance(result, Localization) else None)
     return found
@@ -88,7 +106,9 @@ def test_a_session_goes_on_from_what_is_mapped(map_file: Path, second_half: Path
     assert np.linalg.norm(positions - truth, axis=1).max() < 0.02
     answers = _answers(map_file, far)
     assert max(_off(answers, far)) < 0.02
-    assert np.median([answer.num_inliers for answer in answers if answer is not None]) > 1.2 * np.median(known)
+    assert np.median(
+        [answer.num_inliers for answer in answers if answer is not None]
+    ) > 1.2 * np.median(known)
     changes = json.loads(said.read_text())["updates"][0]
     assert changes["nodes_added"] > 0
     assert changes["agreeing"] >= 5
@@ -103,23 +123,45 @@ def test_a_session_goes_on_from_what_is_mapped(map_file: Path, second_half: Path
 
 
 def test_stretches_that_nothing_joins_are_each_held_by_the_map(map_file: Path, second_half: Path):
-    """As SLAM leaves them where it was lost between them; one that contradicts the map has no poses, and takes no other with it."""
+    """As SLAM leaves them where it was lost between them; one that contradicts the map has no
+    poses, and takes no other with it."""
     sequence = open_sequence(second_half)
     cut, end = 12, 24
     moved = Rigid3(exp_so3(np.array([-0.5, 0.2, 0.4])), np.array([1.0, 2.0, -3.0]))
     first = [pose if k < cut else None for k, pose in enumerate(sequence.poses)]
-    second = [moved @ pose if pose is not None and cut <= k < end else None for k, pose in enumerate(sequence.poses)]
+    second = [
+        moved @ pose if pose is not None and cut <= k < end else None
+        for k, pose in enumerate(sequence.poses)
+    ]
     bent = [pose and Rigid3(pose.rotation, 2.0 * pose.translation) for pose in second]
     truth = [path_pose(float(k)) for k in ON]
-    for poses, apart, known in ((first, (second,), range(end)), (first, (bent,), range(cut)), (bent, (first,), range(cut))):
+    for poses, apart, known in (
+        (first, (second,), range(end)),
+        (first, (bent,), range(cut)),
+        (bent, (first,), range(cut)),
+    ):
         with TopoMetricMap.load(map_file) as topomap:
             view = SequenceView(sequence, list(range(len(sequence))), poses, apart)
             update = update_map(topomap, view, "slam", UpdateConfig(earlier_asked=0))
         posed = update.sequence.poses
         assert [k for k, pose in enumerate(posed) if pose is not None] == list(known)
-        assert max(translation_error(truth[k], pose) for k, pose in enumerate(posed) if pose is not None) < 0.02
-    with TopoMetricMap.load(map_file) as topomap, pytest.raises(TrajectoryError, match="a metre of its poses is"):
-        update_map(topomap, SequenceView(sequence, list(range(len(sequence))), bent, ([None] * len(sequence),)), "slam")
+        assert (
+            max(
+                translation_error(truth[k], pose)
+                for k, pose in enumerate(posed)
+                if pose is not None
+            )
+            < 0.02
+        )
+    with (
+        TopoMetricMap.load(map_file) as topomap,
+        pytest.raises(TrajectoryError, match="a metre of its poses is"),
+    ):
+        update_map(
+            topomap,
+            SequenceView(sequence, list(range(len(sequence))), bent, ([None] * len(sequence),)),
+            "slam",
+        )
 
 
 def test_a_session_that_shows_nothing_new_adds_counts_alone(map_file: Path, tmp_path: Path):
@@ -145,7 +187,9 @@ def test_a_changed_room_is_learnt_from_a_single_camera(map_file: Path, tmp_path:
     panels = room()
     for number in (0, 3):
         old = panels[number]
-        panels[number] = Panel(old.centre, old.right, old.down, old.half, smooth_texture(7000 + number, old.half))
+        panels[number] = Panel(
+            old.centre, old.right, old.down, old.half, smooth_texture(7000 + number, old.half)
+        )
     asked, indices = np.arange(1.2, 6.0, 0.5), np.arange(0.0, 6.6, 0.2)
     folder = tmp_path / "changed"
     (folder / "images").mkdir(parents=True)
@@ -154,7 +198,9 @@ def test_a_changed_room_is_learnt_from_a_single_camera(map_file: Path, tmp_path:
     for number, index in enumerate(indices):
         picture, _ = render(panels, path_pose(float(index)), noise_seed=3000 + number)
         assert cv2.imwrite(str(folder / "images" / f"{number:06d}.png"), picture)
-    (folder / "times.txt").write_text("".join(f"{number / 10:.9f}\n" for number in range(len(indices))))
+    (folder / "times.txt").write_text(
+        "".join(f"{number / 10:.9f}\n" for number in range(len(indices)))
+    )
     (folder / "camera.json").write_text(json.dumps(CAMERA.to_json()))
     before = _answers(map_file, asked, panels)
     settings = tmp_path / "settings.toml"
@@ -165,30 +211,50 @@ def test_a_changed_room_is_learnt_from_a_single_camera(map_file: Path, tmp_path:
         assert topomap.sessions[-1].poses_from == "map"
         assert topomap.edits[-1].changes is not None
         assert topomap.edits[-1].changes["frames_with_pose"] == len(indices)
-    inliers = [[0 if answer is None else answer.num_inliers for answer in answers] for answers in (before, after)]
+    inliers = [
+        [0 if answer is None else answer.num_inliers for answer in answers]
+        for answers in (before, after)
+    ]
     assert np.median(inliers[1]) > 1.3 * np.median(inliers[0]) + 20
     assert max(_off(after, asked)) < 0.02
     assert damages(map_file) == []
 
 
-def test_a_session_that_does_not_fit_changes_nothing(map_file: Path, second_half: Path, tmp_path: Path, complaint: Callable[..., str]):
+def test_a_session_that_does_not_fit_changes_nothing(
+    map_file: Path, second_half: Path, tmp_path: Path, complaint: Callable[..., str]
+):
     before = map_file.read_bytes()
     other = write_stereo_recording(tmp_path / "other", seed=4)
     assert "recognises 0 of" in complaint("update", map_file, other)
     larger = _in_another_world(shutil.copytree(second_half, tmp_path / "larger"), scale=1.3)
-    assert "a metre of its poses is 0.77 m of the map" in complaint("update", map_file, larger, "--poses", "unchecked")
+    assert "a metre of its poses is 0.77 m of the map" in complaint(
+        "update", map_file, larger, "--poses", "unchecked"
+    )
     few = write_stereo_recording(tmp_path / "few", indices=[1.0, 1.5, 2.0])
     assert "too few to join: it takes 5" in complaint("update", map_file, few)
     fx, _, cx, cy = CAMERA.params
-    wrong = complaint("update", map_file, second_half, "--camera", f"{1.1 * fx},{1.1 * fx},{cx},{cy}", "--poses", "unchecked")
-    assert "its calibration is not that of its camera: the map recognises 7 of 7 pictures where the focal length is about 260" in wrong
+    wrong = complaint(
+        "update",
+        map_file,
+        second_half,
+        "--camera",
+        f"{1.1 * fx},{1.1 * fx},{cx},{cy}",
+        "--poses",
+        "unchecked",
+    )
+    assert (
+        "its calibration is not that of its camera: the map recognises 7 of 7 pictures where the"
+        " focal length is about 260" in wrong
+    )
     assert "nothing to undo" in complaint("undo", map_file)
     assert "at least one recording" in complaint("update", map_file, status=2)
     assert map_file.read_bytes() == before
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no such permissions")
-def test_a_map_that_is_read_only_stays_as_it_is(map_file: Path, second_half: Path, complaint: Callable[..., str]):
+def test_a_map_that_is_read_only_stays_as_it_is(
+    map_file: Path, second_half: Path, complaint: Callable[..., str]
+):
     before = map_file.read_bytes()
     map_file.chmod(0o444)
     for words in (("update", map_file, second_half), ("prune", map_file), ("undo", map_file)):
@@ -211,22 +277,33 @@ def test_the_second_of_two_updates_at_once_waits_and_says_so(map_file: Path, sec
         assert [edit.name for edit in topomap.edits] == ["build", "the first", "update on"]
 
 
-def test_the_same_session_is_not_doubled(map_file: Path, second_half: Path, tiny_recording: Path, complaint: Callable[..., str]):
-    assert "in the map already, as session 0" in complaint("update", map_file, f"{tiny_recording}@0:7")
-    assert "in the map already, as session 0" in complaint("update", map_file, f"{tiny_recording}@3:10"), "frames 3 to 6 are"
+def test_the_same_session_is_not_doubled(
+    map_file: Path, second_half: Path, tiny_recording: Path, complaint: Callable[..., str]
+):
+    assert "in the map already, as session 0" in complaint(
+        "update", map_file, f"{tiny_recording}@0:7"
+    )
+    assert "in the map already, as session 0" in complaint(
+        "update", map_file, f"{tiny_recording}@3:10"
+    ), "frames 3 to 6 are"
     assert main(["update", str(map_file), str(second_half)]) == 0
     assert "in the map already, as session 1" in complaint("update", map_file, second_half)
 
 
 def test_another_day_of_the_same_name_and_clock_is_another_session(map_file: Path, tmp_path: Path):
-    """Two recordings called `room`, with the same names of pictures and the same clock, of which the second goes elsewhere."""
-    other_day = write_stereo_recording(tmp_path / "day2" / "room", indices=[0.5 + k for k in range(7)])
+    """Two recordings called `room`, with the same names of pictures and the same clock, of which
+    the second goes elsewhere."""
+    other_day = write_stereo_recording(
+        tmp_path / "day2" / "room", indices=[0.5 + k for k in range(7)]
+    )
     assert main(["update", str(map_file), str(other_day)]) == 0
     with TopoMetricMap.load(map_file) as topomap:
         assert [session.name for session in topomap.sessions] == ["room", "room"]
 
 
-def test_the_history_tells_what_was_done(map_file: Path, second_half: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_history_tells_what_was_done(
+    map_file: Path, second_half: Path, capsys: pytest.CaptureFixture[str]
+):
     assert main(["update", str(map_file), str(second_half), "--light", "evening"]) == 0
     with TopoMetricMap.load(map_file) as topomap:
         assert [session.light_name for session in topomap.sessions] == [None, "evening"]
@@ -238,4 +315,7 @@ def test_the_history_tells_what_was_done(map_file: Path, second_half: Path, caps
     assert "nodes added" in lines[1]
     assert "takes the last one back" in lines[2]
     assert main(["history", str(map_file), "--json", "-"]) == 0
-    assert [edit["undoable"] for edit in json.loads(capsys.readouterr().out)["edits"]] == [False, True]
+    assert [edit["undoable"] for edit in json.loads(capsys.readouterr().out)["edits"]] == [
+        False,
+        True,
+    ]

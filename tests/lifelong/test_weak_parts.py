@@ -48,7 +48,9 @@ def test_a_node_is_not_held_by_itself(with_outpost: Path):
         picture = Picture.of_features({topomap.kind: last.features}, last.camera)
         assert isinstance(localizer.ask(picture)[0], Localization)
         weak = weak_parts(localizer)
-        assert isinstance(localizer.ask(picture)[0], Localization), "the localizer itself still has all of its nodes"
+        assert isinstance(localizer.ask(picture)[0], Localization), (
+            "the localizer itself still has all of its nodes"
+        )
     *room, outpost = weak.nodes
     assert "not_held" in outpost.reasons
     assert outpost.answer is not None
@@ -61,16 +63,30 @@ def test_a_node_is_not_held_by_itself(with_outpost: Path):
 
 def test_those_beside_a_node_are_left_out_too_where_that_is_wished(room_map: Path):
     with TopoMetricMap.load(room_map) as topomap:
-        alone, beside, all_out = (weak_parts(Localizer(topomap), WeakPartsConfig(max_asked=3, beside=width)) for width in (0.0, 3.0, 1e6))
-    inliers = [sum(node.answer.num_inliers for node in weak.asked if node.answer) for weak in (alone, beside, all_out)]
+        alone, beside, all_out = (
+            weak_parts(Localizer(topomap), WeakPartsConfig(max_asked=3, beside=width))
+            for width in (0.0, 3.0, 1e6)
+        )
+    inliers = [
+        sum(node.answer.num_inliers for node in weak.asked if node.answer)
+        for weak in (alone, beside, all_out)
+    ]
     assert inliers[0] > inliers[1] > 0
     assert inliers[2] == 0
 
 
-def _changed(topomap: TopoMetricMap, change: Callable[[list[TopoNode]], list[TopoNode]]) -> TopoMetricMap:
+def _changed(
+    topomap: TopoMetricMap, change: Callable[[list[TopoNode]], list[TopoNode]]
+) -> TopoMetricMap:
     nodes = change(list(topomap.nodes))
     sessions = [replace(topomap.sessions[0], session_id=k, name=f"walk {k}") for k in range(2)]
-    return replace(topomap, nodes=nodes, summaries=[node.summary for node in nodes], sessions=sessions, repetitions=None)
+    return replace(
+        topomap,
+        nodes=nodes,
+        summaries=[node.summary for node in nodes],
+        sessions=sessions,
+        repetitions=None,
+    )
 
 
 def test_few_landmarks_other_sessions_and_who_looks_back(room_map: Path):
@@ -82,7 +98,13 @@ def test_few_landmarks_other_sessions_and_who_looks_back(room_map: Path):
         seen = LandmarkSums.of(1, rows, *nothing, np.full(len(rows), 3), np.where(rows % 2, 2, 0))
         again = replace(second, sums=[*second.sums, seen])
         back = replace(
-            first, summary=replace(first.summary, node_id=900, world_from_cam=first.summary.world_from_cam @ TURNED, session_id=1)
+            first,
+            summary=replace(
+                first.summary,
+                node_id=900,
+                world_from_cam=first.summary.world_from_cam @ TURNED,
+                session_id=1,
+            ),
         )
         return [few, again, *rest, back]
 
@@ -106,15 +128,37 @@ def test_what_is_asked_is_spread_over_the_map():
     assert evenly(range(3), 0) == []
 
 
-def test_the_command_prints_writes_and_draws(with_outpost: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_command_prints_writes_and_draws(
+    with_outpost: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     said, page = tmp_path / "said.json", tmp_path / "report.html"
-    assert main(["evaluate", str(with_outpost), "--against-itself", "--json", str(said), "--report", str(page)]) == 0
+    assert (
+        main(
+            [
+                "evaluate",
+                str(with_outpost),
+                "--against-itself",
+                "--json",
+                str(said),
+                "--report",
+                str(page),
+            ]
+        )
+        == 0
+    )
     facts = json.loads(said.read_text())["against_itself"]
     printed = capsys.readouterr().out
-    assert f"{facts['num_nodes'] - 1} of {facts['num_nodes']} nodes, each asked without itself" in printed
+    assert (
+        f"{facts['num_nodes'] - 1} of {facts['num_nodes']} nodes, each asked without itself"
+        in printed
+    )
     assert facts["where_next"] in printed
     assert facts["weak"]["not_held"] == 1
-    assert facts["parts"][0] == {"reason": "not_held", "centre": [10.0, 0.0, 0.0], "node_ids": [facts["nodes"][-1]["node_id"]]}
+    assert facts["parts"][0] == {
+        "reason": "not_held",
+        "centre": [10.0, 0.0, 0.0],
+        "node_ids": [facts["nodes"][-1]["node_id"]],
+    }
     html = page.read_text()
     assert not re.search(r"(?:src|href)=\"(?!data:image/jpeg;base64,|#)", html)
     body = html[html.index("<body>") : html.index("</html>")]
@@ -125,14 +169,20 @@ def test_the_command_prints_writes_and_draws(with_outpost: Path, tmp_path: Path,
     assert again.read_text() == html
 
 
-def test_what_is_of_recordings_is_not_taken_beside_it(room_map: Path, queries: Path, tmp_path: Path, complaint: Callable[..., str]):
+def test_what_is_of_recordings_is_not_taken_beside_it(
+    room_map: Path, queries: Path, tmp_path: Path, complaint: Callable[..., str]
+):
     path = Path(shutil.copy(room_map, tmp_path / "room.topo"))
     refused = complaint("evaluate", path, queries, "--against-itself", "--poses", "mm", status=2)
     assert "asks the map alone, without recordings, --poses" in refused
-    assert "give the tile's own file" in complaint("evaluate", _atlas(path, tmp_path), "--against-itself", status=2)
+    assert "give the tile's own file" in complaint(
+        "evaluate", _atlas(path, tmp_path), "--against-itself", status=2
+    )
     assert "or --against-itself" in complaint("evaluate", path, status=2)
     before = path.read_bytes()
-    assert "named for something else" in complaint("evaluate", path, "--against-itself", "--json", path)
+    assert "named for something else" in complaint(
+        "evaluate", path, "--against-itself", "--json", path
+    )
     assert path.read_bytes() == before
 
 

@@ -1,4 +1,5 @@
-"""A map that was glanced at goes on from there, and says cheaply how much could speak for a pose at best."""
+"""A map that was glanced at goes on from there, and says cheaply how much could speak for a pose at
+best."""
 
 from __future__ import annotations
 
@@ -24,7 +25,9 @@ def localizer(room_map: Path) -> Iterator[Localizer]:
         yield Localizer(topomap)
 
 
-def test_by_all_means_after_a_glance_is_by_all_means(localizer: Localizer, monkeypatch: pytest.MonkeyPatch):
+def test_by_all_means_after_a_glance_is_by_all_means(
+    localizer: Localizer, monkeypatch: pytest.MonkeyPatch
+):
     picture = Picture(unseen_views()[0][0], CAMERA)
     at_once, named = localizer.ask(picture)
     asking, num_matched = localizer.asking(picture), list[int]()
@@ -50,7 +53,9 @@ def test_the_best_case_is_no_less_than_what_is_found(localizer: Localizer):
         assert isinstance(result, Localization)
         assert best is not None
         assert result.evidence is not None
-        assert log_odds_of(best, localizer.weights) >= log_odds_of(result.evidence, localizer.weights)
+        assert log_odds_of(best, localizer.weights) >= log_odds_of(
+            result.evidence, localizer.weights
+        )
 
 
 def test_nothing_speaks_for_another_place(localizer: Localizer):

@@ -1,4 +1,5 @@
-"""What is believed of several hypotheses of one image, and what is answered: one posterior, whatever came first."""
+"""What is believed of several hypotheses of one image, and what is answered: one posterior,
+whatever came first."""
 
 from __future__ import annotations
 
@@ -36,7 +37,11 @@ def _along(result: Localization | NotLocalized) -> float:
 
 
 def test_a_hypothesis_of_the_same_pose_replaces_the_weaker_one_and_not_the_stronger():
-    weak, strong, elsewhere = made_hypothesis(1.0), made_hypothesis(3.0, x=0.1), made_hypothesis(0.5, x=9.0)
+    weak, strong, elsewhere = (
+        made_hypothesis(1.0),
+        made_hypothesis(3.0, x=0.1),
+        made_hypothesis(0.5, x=9.0),
+    )
     search = believed([weak, elsewhere, strong, made_hypothesis(2.0, x=0.05)])
     assert {id(one) for one in search.belief.hypotheses} == {id(strong), id(elsewhere)}
     assert search.best is strong
@@ -48,13 +53,25 @@ def test_poses_within_twice_what_is_tolerated_are_one():
     assert not is_same_pose(here, made_fit(0.6), CONFIG)
 
 
-@pytest.mark.parametrize(("moved", "expected"), [(0.0, True), (0.04, True), (5.0, False)], ids=["same", "in doubt", "elsewhere"])
-def test_poses_that_are_not_near_are_one_where_the_same_features_show_the_same_points(moved: float, expected: bool):
-    """One of them is not precise yet; of two places that look alike, the same features show other points."""
+@pytest.mark.parametrize(
+    ("moved", "expected"),
+    [(0.0, True), (0.04, True), (5.0, False)],
+    ids=["same", "in doubt", "elsewhere"],
+)
+def test_poses_that_are_not_near_are_one_where_the_same_features_show_the_same_points(
+    moved: float, expected: bool
+):
+    """One of them is not precise yet; of two places that look alike, the same features show other
+    points."""
     features = made_features(len(POINTS))
     one = made_fit(0.0, POINTS, features)
-    assert is_same_pose(one, made_fit(1.0, POINTS + np.array([moved, 0.0, 0.0]), features), CONFIG) is expected
-    assert not is_same_pose(one, made_fit(1.0, POINTS, made_features(len(POINTS))), CONFIG)  # of other features nothing follows
+    assert (
+        is_same_pose(one, made_fit(1.0, POINTS + np.array([moved, 0.0, 0.0]), features), CONFIG)
+        is expected
+    )
+    assert not is_same_pose(
+        one, made_fit(1.0, POINTS, made_features(len(POINTS))), CONFIG
+    )  # of other features nothing follows
 
 
 def test_poses_so_uncertain_that_both_may_be_right_are_one():
@@ -67,7 +84,11 @@ def test_poses_so_uncertain_that_both_may_be_right_are_one():
 # one posterior
 
 hypotheses_of_nodes = st.builds(
-    made_hypothesis, st.floats(-8.0, 12.0), st.integers(0, 5).map(lambda k: 10.0 * k), st.floats(0.0, 1.0), st.floats(0.01, 50.0)
+    made_hypothesis,
+    st.floats(-8.0, 12.0),
+    st.integers(0, 5).map(lambda k: 10.0 * k),
+    st.floats(0.0, 1.0),
+    st.floats(0.01, 50.0),
 )
 hypotheses_of_walls = st.builds(
     made_hypothesis,
@@ -81,7 +102,9 @@ some_hypotheses = st.lists(hypotheses_of_nodes | hypotheses_of_walls, max_size=6
 
 
 @given(some_hypotheses)
-def test_the_probabilities_of_all_that_excludes_each_other_are_at_most_one(hypotheses: list[Hypothesis]):
+def test_the_probabilities_of_all_that_excludes_each_other_are_at_most_one(
+    hypotheses: list[Hypothesis],
+):
     result = _answered(*hypotheses)
     if isinstance(result, Localization):
         assert CONFIG.min_probability <= result.probability <= 1.0
@@ -106,8 +129,13 @@ def test_an_answer_leads_all_others(hypotheses: list[Hypothesis]):
         assert all(lead(search.best, other, WEIGHTS.rivals) >= MIN_LEAD for other in others)
 
 
-@given(some_hypotheses.filter(lambda those: len({one.log_odds for one in those}) == len(those)), st.randoms(use_true_random=False))
-def test_the_answer_does_not_depend_on_the_order_in_which_hypotheses_arrive(hypotheses: list[Hypothesis], random):
+@given(
+    some_hypotheses.filter(lambda those: len({one.log_odds for one in those}) == len(those)),
+    st.randoms(use_true_random=False),
+)
+def test_the_answer_does_not_depend_on_the_order_in_which_hypotheses_arrive(
+    hypotheses: list[Hypothesis], random
+):
     other_order = list(hypotheses)
     random.shuffle(other_order)
     one, other = _answered(*hypotheses), _answered(*other_order)
@@ -116,12 +144,17 @@ def test_the_answer_does_not_depend_on_the_order_in_which_hypotheses_arrive(hypo
     for key in ("localized", "reason", "detail", "world_from_cam", "node"):
         assert facts.get(key) == others.get(key)
     assert facts.get("probability", 0.0) == pytest.approx(others.get("probability", 0.0))
-    mine, theirs = ([(x["world_from_cam"], pytest.approx(x["probability"])) for x in f.get("alternatives", [])] for f in (facts, others))
+    mine, theirs = (
+        [(x["world_from_cam"], pytest.approx(x["probability"])) for x in f.get("alternatives", [])]
+        for f in (facts, others)
+    )
     assert mine == theirs
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (1, 2, 0), (2, 1, 0), (0, 2, 1)], ids=str)
-def test_poses_that_lead_from_one_to_the_next_are_told_apart_in_the_same_way_in_any_order(order: tuple[int, ...]):
+def test_poses_that_lead_from_one_to_the_next_are_told_apart_in_the_same_way_in_any_order(
+    order: tuple[int, ...],
+):
     """The middle one says the same as both ends, which say different things."""
     chain = [made_hypothesis(3.0, x=0.0), made_hypothesis(2.0, x=0.4), made_hypothesis(1.0, x=0.8)]
     belief = believed([chain[k] for k in order]).belief
@@ -151,37 +184,58 @@ def test_another_hypothesis_far_behind_takes_a_little_of_the_probability():
 
 
 def test_two_places_that_look_alike_are_ambiguous_and_both_are_named():
-    one, other = made_hypothesis(4.0, fit=made_fit(0.0, POINTS, node_id=3)), made_hypothesis(3.8, fit=made_fit(9.0, POINTS, node_id=8))
+    one, other = (
+        made_hypothesis(4.0, fit=made_fit(0.0, POINTS, node_id=3)),
+        made_hypothesis(3.8, fit=made_fit(9.0, POINTS, node_id=8)),
+    )
     result = _answered(one, other)
     assert isinstance(result, NotLocalized)
     assert result.reason == "ambiguous"
     assert [alternative.node_id for alternative in result.alternatives] == [3, 8]
-    assert [alternative.world_from_cam.translation[0] for alternative in result.alternatives] == [0.0, 9.0]
+    assert [alternative.world_from_cam.translation[0] for alternative in result.alternatives] == [
+        0.0,
+        9.0,
+    ]
     assert sum(alternative.probability for alternative in result.alternatives) > 0.95
     assert result.detail == "as much like node 8 as like node 3"
     line = json.loads(json.dumps(result.to_json("a.png"), allow_nan=False))
     assert "world_from_cam" not in line
     assert [named["node"] for named in line["alternatives"]] == [3, 8]
-    assert line["alternatives"][1]["world_from_cam"] == {"translation": [9.0, 0.0, 0.0], "quat_wxyz": [1.0, 0.0, 0.0, 0.0]}
+    assert line["alternatives"][1]["world_from_cam"] == {
+        "translation": [9.0, 0.0, 0.0],
+        "quat_wxyz": [1.0, 0.0, 0.0, 0.0],
+    }
     assert line["alternatives"][0]["probability"] == result.alternatives[0].probability
 
 
 def test_what_is_found_evenly_tells_two_poses_apart_that_have_the_same_odds():
-    full, half = made_hypothesis(5.0, even_share=0.2, doubt=0.1), made_hypothesis(5.0, x=9.0, even_share=0.02, doubt=0.5)
+    full, half = (
+        made_hypothesis(5.0, even_share=0.2, doubt=0.1),
+        made_hypothesis(5.0, x=9.0, even_share=0.02, doubt=0.5),
+    )
     assert _along(_answered(half, full)) == pytest.approx(0.0)
 
 
-@pytest.mark.parametrize(("log_odds", "other", "is_answered"), [(3.0, 0.5, True), (3.0, 1.5, False), (6.0, 5.0, True)])
-def test_a_pose_that_is_not_clear_must_lead_by_its_odds_too(log_odds: float, other: float, is_answered: bool):
+@pytest.mark.parametrize(
+    ("log_odds", "other", "is_answered"), [(3.0, 0.5, True), (3.0, 1.5, False), (6.0, 5.0, True)]
+)
+def test_a_pose_that_is_not_clear_must_lead_by_its_odds_too(
+    log_odds: float, other: float, is_answered: bool
+):
     """What a wrong place of the map has for it, a place that is not in the map may have as well."""
-    best, wrong = made_hypothesis(log_odds, even_share=0.2), made_hypothesis(other, x=9.0, even_share=0.02)
+    best, wrong = (
+        made_hypothesis(log_odds, even_share=0.2),
+        made_hypothesis(other, x=9.0, even_share=0.02),
+    )
     assert isinstance(_answered(best, wrong), Localization) is is_answered
 
 
 # the walls along the way
 
 
-@pytest.mark.parametrize("of_nodes", [[], [made_hypothesis(-3.0)]], ids=["nothing", "hardly anything"])
+@pytest.mark.parametrize(
+    "of_nodes", [[], [made_hypothesis(-3.0)]], ids=["nothing", "hardly anything"]
+)
 def test_walls_are_believed_where_nodes_know_nothing(of_nodes: list[Hypothesis]):
     walls = [made_hypothesis(1.5, x=-9.0, walls=True), made_hypothesis(-2.0, x=4.0, walls=True)]
     result = _answered(*of_nodes, *walls)
@@ -190,9 +244,15 @@ def test_walls_are_believed_where_nodes_know_nothing(of_nodes: list[Hypothesis])
     assert CONFIG.min_probability <= result.probability <= 1.0 / (1.0 + math.exp(-1.5))
 
 
-@pytest.mark.parametrize(("log_odds", "is_answered"), [(2.0, False), (WEIGHTS.evidence.clear_log_odds + 0.1, True)])
-def test_a_pose_that_is_not_clear_must_lead_those_elsewhere_by_what_its_kind_asks(log_odds: float, is_answered: bool):
-    search = believed([made_hypothesis(log_odds, even_share=0.3), made_hypothesis(log_odds - 3.0, x=9.0)])
+@pytest.mark.parametrize(
+    ("log_odds", "is_answered"), [(2.0, False), (WEIGHTS.evidence.clear_log_odds + 0.1, True)]
+)
+def test_a_pose_that_is_not_clear_must_lead_those_elsewhere_by_what_its_kind_asks(
+    log_odds: float, is_answered: bool
+):
+    search = believed(
+        [made_hypothesis(log_odds, even_share=0.3), made_hypothesis(log_odds - 3.0, x=9.0)]
+    )
     assert isinstance(answer(search)[0], Localization)
     strict = replace(WEIGHTS, rivals=replace(WEIGHTS.rivals, unclear_lead=4.0))
     assert isinstance(answer(replace(search, weights=strict))[0], Localization) == is_answered
@@ -202,42 +262,62 @@ def test_walls_need_not_lead_as_an_unclear_pose_of_nodes_must():
     """Each of their points was held against all other walls."""
     strict = replace(WEIGHTS, rivals=replace(WEIGHTS.rivals, unclear_lead=4.0))
     for walls in (True, False):
-        search = believed([made_hypothesis(2.5, x=-9.0, walls=walls), made_hypothesis(2.5 - MIN_LEAD - 0.1)])
+        search = believed(
+            [made_hypothesis(2.5, x=-9.0, walls=walls), made_hypothesis(2.5 - MIN_LEAD - 0.1)]
+        )
         assert isinstance(answer(replace(search, weights=strict))[0], Localization) == walls
 
 
 def test_of_walls_and_nodes_the_one_with_much_more_for_it_is_believed():
     behind = 3.0 - MIN_LEAD - 0.1
-    assert _along(_answered(made_hypothesis(behind), made_hypothesis(3.0, x=-9.0, walls=True))) == pytest.approx(-9.0)
-    assert _along(_answered(made_hypothesis(3.0), made_hypothesis(behind, x=-9.0, walls=True))) == pytest.approx(0.0)
+    assert _along(
+        _answered(made_hypothesis(behind), made_hypothesis(3.0, x=-9.0, walls=True))
+    ) == pytest.approx(-9.0)
+    assert _along(
+        _answered(made_hypothesis(3.0), made_hypothesis(behind, x=-9.0, walls=True))
+    ) == pytest.approx(0.0)
 
 
 @pytest.mark.parametrize("ahead", [-0.9, 0.0, 0.9])
 def test_a_pose_of_the_nodes_that_the_walls_contradict_is_ambiguous(ahead: float):
-    result = _answered(made_hypothesis(2.0), made_hypothesis(2.0 + ahead * MIN_LEAD, x=-9.0, walls=True))
+    result = _answered(
+        made_hypothesis(2.0), made_hypothesis(2.0 + ahead * MIN_LEAD, x=-9.0, walls=True)
+    )
     assert isinstance(result, NotLocalized)
     assert result.reason == "ambiguous"
-    assert {alternative.world_from_cam.translation[0] for alternative in result.alternatives} == {0.0, -9.0}
+    assert {alternative.world_from_cam.translation[0] for alternative in result.alternatives} == {
+        0.0,
+        -9.0,
+    }
 
 
-@pytest.mark.parametrize("of_nodes", [[], [made_hypothesis(2.0)]], ids=["without nodes", "with nodes"])
+@pytest.mark.parametrize(
+    "of_nodes", [[], [made_hypothesis(2.0)]], ids=["without nodes", "with nodes"]
+)
 def test_two_walls_that_look_alike_are_no_answer(of_nodes: list[Hypothesis]):
-    walls = [made_hypothesis(3.0, x=-9.0, walls=True), made_hypothesis(3.0 - 0.9 * MIN_LEAD, x=4.0, walls=True)]
+    walls = [
+        made_hypothesis(3.0, x=-9.0, walls=True),
+        made_hypothesis(3.0 - 0.9 * MIN_LEAD, x=4.0, walls=True),
+    ]
     result = _answered(*of_nodes, *walls)
     assert isinstance(result, NotLocalized)
     assert result.reason == "ambiguous"
 
 
-def test_walls_that_do_not_lead_a_hypothesis_of_the_nodes_are_no_answer_though_that_is_not_believed_itself():
+def test_walls_that_do_not_lead_a_hypothesis_of_the_nodes_are_no_answer_though_that_is_not_believed_itself():  # noqa: E501
     unlikely = made_hypothesis(-0.1)
     assert unlikely.probability < CONFIG.min_probability
     assert isinstance(_answered(unlikely, made_hypothesis(1.5, x=-9.0, walls=True)), NotLocalized)
 
 
 def test_a_place_beyond_doubt_but_imprecise_is_not_answered():
-    evidence = Evidence(150, 40, 60, 200, 12, spread=0.5, doubt=0.3, even_share=0.2, num_distinct=30)
+    evidence = Evidence(
+        150, 40, 60, 200, 12, spread=0.5, doubt=0.3, even_share=0.2, num_distinct=30
+    )
     of_wall = replace(made_hypothesis(8.0, x=-9.0, walls=True), evidence=evidence)
-    precise, imprecise = (_answered(replace(of_wall, evidence=replace(evidence, doubt=doubt))) for doubt in (0.3, 3.0))
+    precise, imprecise = (
+        _answered(replace(of_wall, evidence=replace(evidence, doubt=doubt))) for doubt in (0.3, 3.0)
+    )
     assert isinstance(precise, Localization)
     assert precise.probability > 0.99
     assert isinstance(imprecise, NotLocalized)
@@ -258,12 +338,19 @@ def test_hypotheses_that_are_not_probable_are_no_answer():
 def test_without_a_hypothesis_there_is_none_to_name():
     result = _answered()
     assert isinstance(result, NotLocalized)
-    assert (result.reason, result.candidates, result.alternatives) == ("too_few_matches", CANDIDATES, ())
+    assert (result.reason, result.candidates, result.alternatives) == (
+        "too_few_matches",
+        CANDIDATES,
+        (),
+    )
     assert Belief().best(WEIGHTS.rivals) is None
 
 
 def test_a_search_that_was_cut_short_says_so():
-    imprecise = replace(made_hypothesis(-1.0), evidence=Evidence(150, 90, 300, 1700, 20, spread=0.8, doubt=40.0, even_share=0.15))
+    imprecise = replace(
+        made_hypothesis(-1.0),
+        evidence=Evidence(150, 90, 300, 1700, 20, spread=0.8, doubt=40.0, even_share=0.15),
+    )
     alike = [made_hypothesis(4.0), made_hypothesis(4.0, x=9.0)]
     for hypotheses in ([], [made_hypothesis(-2.0)], [imprecise], alike):
         search = believed(hypotheses)

@@ -45,7 +45,9 @@ def test_a_wrong_focal_length_is_named(localizer: Localizer, queries: Path, scal
             assert doubt.is_of_focal_length
             assert doubt.focal_length_px == pytest.approx(frame.camera.fx, rel=0.02)
             assert result.to_json("a")["calibration_doubt"]["detail"] == str(doubt)
-            way = np.linalg.norm(result.world_from_cam.translation - frame.world_from_cam.translation)
+            way = np.linalg.norm(
+                result.world_from_cam.translation - frame.world_from_cam.translation
+            )
             assert way < 3.0 * np.sqrt(np.trace(result.camera_covariance[:3, :3]))
     assert num_named >= 0.8 * len(open_sequence(queries))
 
@@ -53,7 +55,8 @@ def test_a_wrong_focal_length_is_named(localizer: Localizer, queries: Path, scal
 def test_another_camera_is_named_only_where_it_explains_the_picture_better(
     localizer: Localizer, queries: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """What a map is off by may ask for a camera that shows the points no nearer to where they must be."""
+    """What a map is off by may ask for a camera that shows the points no nearer to where they must
+    be."""
     gains = list[float]()
 
     def gain(before: PoseFit, after: PoseFit) -> float:
@@ -70,7 +73,9 @@ def test_another_camera_is_named_only_where_it_explains_the_picture_better(
     assert gains[-1] > 2.0 * calibration_doubt._LEAST_GAIN
     monkeypatch.setattr(calibration_doubt, "_gain", lambda before, after: 0.0)
     believed = localizer.localize(frame.image, with_focal(frame.camera, 1.08))
-    assert "the picture says f" in (doubted.detail if isinstance(doubted, NotLocalized) else str(doubted.calibration_doubt))
+    assert "the picture says f" in (
+        doubted.detail if isinstance(doubted, NotLocalized) else str(doubted.calibration_doubt)
+    )
     assert isinstance(believed, Localization)
     assert believed.calibration_doubt is None
     assert believed.seen_camera is not None, "what it shows still counts beside what others do"

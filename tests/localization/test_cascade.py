@@ -1,4 +1,5 @@
-"""A map of two kinds of features is asked by the second where the first leaves the pose unclear, and only there."""
+"""A map of two kinds of features is asked by the second where the first leaves the pose unclear,
+and only there."""
 
 from __future__ import annotations
 
@@ -50,7 +51,8 @@ def topomap(tiny_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> T
 
 @pytest.fixture
 def changed(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, Change], list[int]]:
-    """Changes what pictures give of a kind; the list grows with each picture that is asked for them."""
+    """Changes what pictures give of a kind; the list grows with each picture that is asked for
+    them."""
 
     def change(name: str, of: Change) -> list[int]:
         kind, asked = KINDS[name], list[int]()
@@ -76,13 +78,20 @@ def _facts(result: Localization | NotLocalized) -> dict:
 
 
 def _is_right(result: Localization | NotLocalized, truth=TRUTH, metres: float = 0.03) -> bool:
-    return isinstance(result, Localization) and translation_error(result.world_from_cam, truth) < metres
+    return (
+        isinstance(result, Localization)
+        and translation_error(result.world_from_cam, truth) < metres
+    )
 
 
-def test_a_clear_picture_is_never_asked_for_the_second_kind(topomap: TopoMetricMap, changed: Callable[..., list[int]]):
+def test_a_clear_picture_is_never_asked_for_the_second_kind(
+    topomap: TopoMetricMap, changed: Callable[..., list[int]]
+):
     asked = {kind: changed(kind, lambda features: features) for kind in ("surf", "sift")}
     localizer = Localizer(topomap)
-    assert all(_is_right(localizer.localize(picture, CAMERA), truth) for picture, truth in unseen_views())
+    assert all(
+        _is_right(localizer.localize(picture, CAMERA), truth) for picture, truth in unseen_views()
+    )
     assert (len(asked["surf"]), len(asked["sift"])) == (len(unseen_views()), 0)
 
 
@@ -100,12 +109,19 @@ def test_where_another_place_is_nearly_as_likely_the_second_kind_is_asked(
 
 @pytest.mark.parametrize("says", [2.0, -20.0], ids=["yes", "no"])
 def test_around_an_expected_pose_the_second_kind_is_heard_on_what_the_first_is_not_sure_of(
-    topomap: TopoMetricMap, changed: Callable[..., list[int]], monkeypatch: pytest.MonkeyPatch, says: float
+    topomap: TopoMetricMap,
+    changed: Callable[..., list[int]],
+    monkeypatch: pytest.MonkeyPatch,
+    says: float,
 ):
     """A twin of the place is no less likely where a stream that was placed wrongly expects it."""
     changed("sift", _useless)
-    monkeypatch.setattr("topoloc.localization.asking.say_on", lambda search, hypothesis: (says, None))
-    assert _is_right(Localizer(topomap).localize(PICTURE, CAMERA, TRUTH)), "it is settled: nobody else is heard"
+    monkeypatch.setattr(
+        "topoloc.localization.asking.say_on", lambda search, hypothesis: (says, None)
+    )
+    assert _is_right(Localizer(topomap).localize(PICTURE, CAMERA, TRUTH)), (
+        "it is settled: nobody else is heard"
+    )
     monkeypatch.setattr(Search, "is_settled", property(lambda search: False))
     result = Localizer(topomap).localize(PICTURE, CAMERA, TRUTH)
     assert _is_right(result) == result.localized == (says > 0.0)
@@ -115,7 +131,8 @@ def test_around_an_expected_pose_the_second_kind_is_heard_on_what_the_first_is_n
 def test_a_pose_that_both_hold_is_that_of_the_kind_for_which_more_speaks(
     topomap: TopoMetricMap, monkeypatch: pytest.MonkeyPatch, more: float, answers: str
 ):
-    """In other light the points of the first kind are found by chance, around any pose that is nearly right."""
+    """In other light the points of the first kind are found by chance, around any pose that is
+    nearly right."""
 
     def says(search: Search, hypothesis: Hypothesis) -> tuple[float, Hypothesis | None]:
         said, of_last = say_on(search, hypothesis)
@@ -129,7 +146,9 @@ def test_a_pose_that_both_hold_is_that_of_the_kind_for_which_more_speaks(
     assert result.provenance.features == answers
 
 
-def test_a_pose_that_contradicts_its_calibration_is_not_saved_by_coarser_features(topomap: TopoMetricMap, monkeypatch: pytest.MonkeyPatch):
+def test_a_pose_that_contradicts_its_calibration_is_not_saved_by_coarser_features(
+    topomap: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
+):
     """They see too little to contradict it, and the pose is as wrong."""
 
     def doubted(search: Search, fit: PoseFit) -> tuple[SeenCamera | None, CalibrationDoubt | None]:
@@ -145,16 +164,22 @@ def test_a_pose_that_contradicts_its_calibration_is_not_saved_by_coarser_feature
     assert "the calibration is doubtful" in result.detail
 
 
-def test_what_the_first_kind_leaves_open_the_second_answers(topomap: TopoMetricMap, changed: Callable[..., list[int]]):
+def test_what_the_first_kind_leaves_open_the_second_answers(
+    topomap: TopoMetricMap, changed: Callable[..., list[int]]
+):
     changed("surf", _useless)
     asked = changed("sift", lambda features: features)
-    assert isinstance(Localizer(topomap, LocalizerConfig(kinds=("surf",))).localize(PICTURE, CAMERA), NotLocalized)
+    assert isinstance(
+        Localizer(topomap, LocalizerConfig(kinds=("surf",))).localize(PICTURE, CAMERA), NotLocalized
+    )
     assert not asked
     assert _is_right(Localizer(topomap).localize(PICTURE, CAMERA))
     assert len(asked) == 1
 
 
-def test_the_second_begins_with_the_poses_that_the_first_left_open(topomap: TopoMetricMap, changed: Callable[..., list[int]]):
+def test_the_second_begins_with_the_poses_that_the_first_left_open(
+    topomap: TopoMetricMap, changed: Callable[..., list[int]]
+):
     for kind in ("surf", "sift"):
         changed(kind, lambda features: features.select(np.arange(0, len(features), 12)))
     trace = Trace()
@@ -166,42 +191,74 @@ def test_the_second_begins_with_the_poses_that_the_first_left_open(topomap: Topo
 
 @pytest.mark.parametrize("agrees", [True, False])
 def test_dense_descriptors_tell_what_is_found_of_what_must_be_in_view(
-    topomap: TopoMetricMap, changed: Callable[..., list[int]], monkeypatch: pytest.MonkeyPatch, agrees: bool
+    topomap: TopoMetricMap,
+    changed: Callable[..., list[int]],
+    monkeypatch: pytest.MonkeyPatch,
+    agrees: bool,
 ):
     changed("surf", _useless)
-    monkeypatch.setattr(DenseDescriptors, "agrees", lambda dense, points_img, descriptors: np.full(len(points_img), agrees))
-    changed("sift", lambda features: replace(features, dense=Planes(np.zeros((128, 2, 2), np.float32), 4.0)))
+    monkeypatch.setattr(
+        DenseDescriptors,
+        "agrees",
+        lambda dense, points_img, descriptors: np.full(len(points_img), agrees),
+    )
+    changed(
+        "sift",
+        lambda features: replace(features, dense=Planes(np.zeros((128, 2, 2), np.float32), 4.0)),
+    )
     trace = Trace()
     Localizer(topomap).localize(PICTURE, CAMERA, trace=trace)
-    even_share = max(tried.hypothesis.evidence.even_share for tried in trace.tried if tried.hypothesis is not None)
+    even_share = max(
+        tried.hypothesis.evidence.even_share
+        for tried in trace.tried
+        if tried.hypothesis is not None
+    )
     assert even_share > 0.6 if agrees else even_share < 0.1
 
 
-def test_what_is_not_the_place_is_refused_by_both(topomap: TopoMetricMap, changed: Callable[..., list[int]]):
+def test_what_is_not_the_place_is_refused_by_both(
+    topomap: TopoMetricMap, changed: Callable[..., list[int]]
+):
     asked = changed("sift", lambda features: features)
     elsewhere = [picture for picture, _ in unseen_views(seed=1, step=4.0)]
-    assert all(isinstance(Localizer(topomap).localize(picture, CAMERA), NotLocalized) for picture in (NOISE, *elsewhere))
+    assert all(
+        isinstance(Localizer(topomap).localize(picture, CAMERA), NotLocalized)
+        for picture in (NOISE, *elsewhere)
+    )
     assert len(asked) == 1 + len(elsewhere)
 
 
-def test_time_that_is_up_asks_no_second_kind(topomap: TopoMetricMap, changed: Callable[..., list[int]]):
+def test_time_that_is_up_asks_no_second_kind(
+    topomap: TopoMetricMap, changed: Callable[..., list[int]]
+):
     asked = changed("sift", lambda features: features)
     result = Localizer(topomap).localize(NOISE, CAMERA, max_ms=0.0)
     assert "time was up" in result.detail if isinstance(result, NotLocalized) else False
     assert not asked
 
 
-def test_threads_share_a_localizer_of_two_kinds(topomap: TopoMetricMap, changed: Callable[..., list[int]]):
+def test_threads_share_a_localizer_of_two_kinds(
+    topomap: TopoMetricMap, changed: Callable[..., list[int]]
+):
     changed("surf", lambda features: _useless(features) if len(features) % 2 else features)
-    localizer, pictures = Localizer(topomap), [NOISE, *(picture for picture, _ in unseen_views()[:3])]
+    localizer, pictures = (
+        Localizer(topomap),
+        [NOISE, *(picture for picture, _ in unseen_views()[:3])],
+    )
     expected = [_facts(Localizer(topomap).localize(picture, CAMERA)) for picture in pictures]
     with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(lambda picture: _facts(localizer.localize(picture, CAMERA)), 2 * pictures))
+        found = list(
+            pool.map(lambda picture: _facts(localizer.localize(picture, CAMERA)), 2 * pictures)
+        )
     assert found == 2 * expected
 
 
-@pytest.mark.parametrize("of_surf", [lambda features: features, _useless], ids=["clear", "by the second kind"])
-def test_a_stream_goes_through_a_map_of_two_kinds(topomap: TopoMetricMap, changed: Callable[..., list[int]], of_surf: Change):
+@pytest.mark.parametrize(
+    "of_surf", [lambda features: features, _useless], ids=["clear", "by the second kind"]
+)
+def test_a_stream_goes_through_a_map_of_two_kinds(
+    topomap: TopoMetricMap, changed: Callable[..., list[int]], of_surf: Change
+):
     changed("surf", of_surf)
     tracker = Tracker(Localizer(topomap))
     for t_ns, picture, truth in room_stream()[:6]:
@@ -214,7 +271,9 @@ def test_a_stream_goes_through_a_map_of_two_kinds(topomap: TopoMetricMap, change
 
 
 @pytest.fixture
-def learned_map(tiny_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, tuple[str, ...]], TopoMetricMap]:
+def learned_map(
+    tiny_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[str, tuple[str, ...]], TopoMetricMap]:
     """A small map with features of a network that is not here any more."""
 
     def build(kind: str, others: tuple[str, ...]) -> TopoMetricMap:
@@ -228,7 +287,9 @@ def learned_map(tiny_recording: Path, tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("kinds", [("surf", "xfeat"), ("xfeat", "surf")], ids=" then ".join)
-def test_a_kind_whose_network_is_not_here_is_left_out_and_named(learned_map: Callable[..., TopoMetricMap], kinds: tuple[str, str]):
+def test_a_kind_whose_network_is_not_here_is_left_out_and_named(
+    learned_map: Callable[..., TopoMetricMap], kinds: tuple[str, str]
+):
     topomap = learned_map(kinds[0], kinds[1:])
     assert topomap.kinds == list(kinds)
     localizer = Localizer(topomap)
@@ -252,7 +313,8 @@ def test_nothing_is_left_out_of_a_map_whose_kinds_are_here(topomap: TopoMetricMa
 
 
 def test_a_picture_is_out_of_memory_when_it_is_answered(topomap: TopoMetricMap):
-    """Not when the collector of rings comes by, which it does the more rarely the more a service holds."""
+    """Not when the collector of rings comes by, which it does the more rarely the more a service
+    holds."""
     localizer = Localizer(topomap)
     gc.collect()
     gc.disable()

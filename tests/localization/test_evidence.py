@@ -1,4 +1,5 @@
-"""The weighing of evidence: more of it is never less probable, and neither a count nor precision alone is enough."""
+"""The weighing of evidence: more of it is never less probable, and neither a count nor precision
+alone is enough."""
 
 from __future__ import annotations
 
@@ -25,11 +26,26 @@ from topoloc.localization.fitted_weights import FittedWeights, weights_of
 
 CONFIG, WEIGHTS = EvidenceConfig(), weights_of("surf")
 STRONG = Evidence(
-    num_matches=150, num_inliers=90, num_found=300, num_visible=1700, num_by_chance=20, spread=0.8, doubt=0.1, even_share=0.15
+    num_matches=150,
+    num_inliers=90,
+    num_found=300,
+    num_visible=1700,
+    num_by_chance=20,
+    spread=0.8,
+    doubt=0.1,
+    even_share=0.15,
 )
-# What peers accept: scores of inliers, though nearly all that the pose predicts is missing, and chance finds as many.
+# What peers accept: scores of inliers, though nearly all that the pose predicts is missing, and
+# chance finds as many.
 MANY_OF_VERY_MANY = Evidence(
-    num_matches=40, num_inliers=6, num_found=70, num_visible=2000, num_by_chance=60, spread=0.5, doubt=0.3, even_share=0.02
+    num_matches=40,
+    num_inliers=6,
+    num_found=70,
+    num_visible=2000,
+    num_by_chance=60,
+    spread=0.5,
+    doubt=0.3,
+    even_share=0.02,
 )
 
 counts = st.integers(0, 2000)
@@ -93,7 +109,16 @@ def test_no_single_part_of_the_evidence_carries_a_pose(weaker: dict[str, float])
 
 
 def test_a_pose_that_is_only_imprecise_is_told_from_one_that_has_nothing_to_stand_on():
-    small = replace(STRONG, num_inliers=24, num_matches=40, num_found=110, num_by_chance=12, spread=0.2, doubt=30.0, even_share=0.08)
+    small = replace(
+        STRONG,
+        num_inliers=24,
+        num_matches=40,
+        num_found=110,
+        num_by_chance=12,
+        spread=0.2,
+        doubt=30.0,
+        even_share=0.08,
+    )
     assert _probability(small, WEIGHTS) < CONFIG.min_probability
     assert is_only_imprecise(small, WEIGHTS, CONFIG)
     assert not is_only_imprecise(MANY_OF_VERY_MANY, WEIGHTS, CONFIG)
@@ -114,7 +139,11 @@ def test_doubt_is_one_where_the_worst_direction_is_as_uncertain_as_is_tolerated(
 
 def test_spread_counts_cells_not_points():
     corner = np.random.default_rng(0).uniform(0.0, 20.0, (500, 2))
-    everywhere = np.stack(np.meshgrid(np.arange(40, 640, 80), np.arange(40, 480, 80)), axis=-1).reshape(-1, 2).astype(np.float64)
+    everywhere = (
+        np.stack(np.meshgrid(np.arange(40, 640, 80), np.arange(40, 480, 80)), axis=-1)
+        .reshape(-1, 2)
+        .astype(np.float64)
+    )
     assert spread_of(corner, 640, 480) == pytest.approx(1 / 48)
     assert spread_of(everywhere, 640, 480) == 1.0
     assert spread_of(np.array([[-0.5, -0.5], [639.5, 479.5]]), 640, 480) == pytest.approx(2 / 48)
@@ -123,7 +152,10 @@ def test_spread_counts_cells_not_points():
 def test_points_found_everywhere_are_a_larger_even_share_than_as_many_in_one_half():
     visible = np.random.default_rng(0).uniform([0.0, 0.0], [640.0, 480.0], (2000, 2))
     everywhere, in_left_half = visible[:200], visible[visible[:, 0] < 320.0][:200]
-    even, uneven = even_share_of(everywhere, visible, 640, 480), even_share_of(in_left_half, visible, 640, 480)
+    even, uneven = (
+        even_share_of(everywhere, visible, 640, 480),
+        even_share_of(in_left_half, visible, 640, 480),
+    )
     assert even == pytest.approx(0.1, rel=0.15)
     assert uneven < 0.6 * even
     assert even_share_of(np.zeros((0, 2)), visible, 640, 480) < 0.02
@@ -131,7 +163,15 @@ def test_points_found_everywhere_are_a_larger_even_share_than_as_many_in_one_hal
 
 
 OF_WALLS = Evidence(
-    num_matches=150, num_inliers=40, num_found=60, num_visible=200, num_by_chance=12, spread=0.5, doubt=0.3, even_share=0.2, num_distinct=30
+    num_matches=150,
+    num_inliers=40,
+    num_found=60,
+    num_visible=200,
+    num_by_chance=12,
+    spread=0.5,
+    doubt=0.3,
+    even_share=0.2,
+    num_distinct=30,
 )
 MORE = {
     "found": replace(OF_WALLS, num_found=90),
@@ -152,7 +192,9 @@ def test_more_evidence_of_walls_means_better_odds(evidence: Evidence):
 
 def test_both_walls_say_more_than_one_of_them():
     weights = weights_of("topoloc-net-sides")
-    by_both, by_one = (log_odds_of(replace(OF_WALLS, num_lesser_side=num), weights) for num in (30, 1))
+    by_both, by_one = (
+        log_odds_of(replace(OF_WALLS, num_lesser_side=num), weights) for num in (30, 1)
+    )
     assert by_both > by_one + 1.0
 
 
@@ -163,6 +205,8 @@ def test_no_evidence_of_walls_at_all_is_odds_all_the_same():
 
 def test_only_a_pose_by_the_walls_is_asked_for_its_precision_beside_its_odds():
     assert precision_of(replace(STRONG, doubt=8.0)) == 1.0
-    assert precision_of(replace(OF_WALLS, doubt=1.0)) == pytest.approx(0.6827, abs=1e-4)  # one standard deviation
+    assert precision_of(replace(OF_WALLS, doubt=1.0)) == pytest.approx(
+        0.6827, abs=1e-4
+    )  # one standard deviation
     assert precision_of(replace(OF_WALLS, doubt=0.3)) > 0.99
     assert precision_of(replace(OF_WALLS, doubt=8.0)) < 0.11

@@ -57,10 +57,22 @@ def _changed(change: Callable[[dict[str, Any]], Any]) -> str:
         (_changed(lambda read: read["weights"].pop("walls")), "weights lacks walls"),
         (_changed(lambda read: read["weights"].update(rivals=[])), "rivals is no table"),
         (_changed(lambda read: read["weights"]["evidence"].pop("bias")), "evidence lacks bias"),
-        (_changed(lambda read: read["weights"]["evidence"].update(bais=1.0)), "evidence has an unknown bais"),
-        (_changed(lambda read: read["weights"]["evidence"].update(bias="7.6")), "evidence.bias is not a finite number"),
-        (_changed(lambda read: read["weights"]["evidence"].update(bias=float("nan"))), "evidence.bias is not a finite number"),
-        (_changed(lambda read: read["weights"]["shared_errors"].update(factor=True)), "shared_errors.factor is not a finite number"),
+        (
+            _changed(lambda read: read["weights"]["evidence"].update(bais=1.0)),
+            "evidence has an unknown bais",
+        ),
+        (
+            _changed(lambda read: read["weights"]["evidence"].update(bias="7.6")),
+            "evidence.bias is not a finite number",
+        ),
+        (
+            _changed(lambda read: read["weights"]["evidence"].update(bias=float("nan"))),
+            "evidence.bias is not a finite number",
+        ),
+        (
+            _changed(lambda read: read["weights"]["shared_errors"].update(factor=True)),
+            "shared_errors.factor is not a finite number",
+        ),
     ],
 )
 def test_a_damaged_file_is_told_in_one_line(text: str, said: str, tmp_path: Path):

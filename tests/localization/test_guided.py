@@ -11,7 +11,13 @@ from topoloc.features.features import Features
 from topoloc.features.kinds import SURF
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization.guided import GuidedConfig, count_by_chance, expected_key_points, match_guided, visible_points
+from topoloc.localization.guided import (
+    GuidedConfig,
+    count_by_chance,
+    expected_key_points,
+    match_guided,
+    visible_points,
+)
 from topoloc.localization.local_map import LocalMap
 from topoloc.map.topomap import NodeSummary, TopoNode
 
@@ -22,27 +28,53 @@ NUM_POINTS = 200
 
 
 def _node(rng: np.random.Generator) -> TopoNode:
-    """A node at the origin of the world with points on a wall and beside it, each with a descriptor of its own."""
+    """A node at the origin of the world with points on a wall and beside it, each with a descriptor
+    of its own."""
     pixels = rng.uniform([40, 40], [600, 440], (NUM_POINTS, 2))
     depth = rng.uniform(2.0, 4.0, NUM_POINTS)
-    points_cam = np.column_stack([CAMERA.normalized_from_img(pixels) * depth[:, None], depth]).astype(np.float32)
+    points_cam = np.column_stack(
+        [CAMERA.normalized_from_img(pixels) * depth[:, None], depth]
+    ).astype(np.float32)
     descriptors = rng.normal(size=(NUM_POINTS, 64)).astype(np.float32)
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
-    angles, sizes = rng.uniform(0, 6.2, NUM_POINTS).astype(np.float32), rng.uniform(10, 40, NUM_POINTS).astype(np.float32)
-    features = Features(pixels.astype(np.float32), sizes, angles, np.ones(NUM_POINTS, np.float32), descriptors)
+    angles, sizes = (
+        rng.uniform(0, 6.2, NUM_POINTS).astype(np.float32),
+        rng.uniform(10, 40, NUM_POINTS).astype(np.float32),
+    )
+    features = Features(
+        pixels.astype(np.float32), sizes, angles, np.ones(NUM_POINTS, np.float32), descriptors
+    )
     root = np.tile(np.array([0.005, 0, 0.005, 0, 0, 0.02], np.float32), (NUM_POINTS, 1))
-    return TopoNode(NodeSummary(0, "made", "0", 0, Rigid3.identity(), NUM_POINTS), CAMERA, features, points_cam, root, b"")
+    return TopoNode(
+        NodeSummary(0, "made", "0", 0, Rigid3.identity(), NUM_POINTS),
+        CAMERA,
+        features,
+        points_cam,
+        root,
+        b"",
+    )
 
 
-def _seen(node: TopoNode, cam_from_world: Rigid3, shift_px: float = 0.0, turn: float = 0.0, scale: float = 1.0) -> Features:
-    """The node's points as a camera elsewhere sees them, a camera rolled by the rotation about its axis."""
+def _seen(
+    node: TopoNode,
+    cam_from_world: Rigid3,
+    shift_px: float = 0.0,
+    turn: float = 0.0,
+    scale: float = 1.0,
+) -> Features:
+    """The node's points as a camera elsewhere sees them, a camera rolled by the rotation about its
+    axis."""
     points = cam_from_world.apply(node.points_cam.astype(np.float64))
     roll = np.arctan2(cam_from_world.rotation[1, 0], cam_from_world.rotation[0, 0])
     f = node.features
     sizes = f.sizes_px * (node.points_cam[:, 2] / points[:, 2]) * scale
     pixels = CAMERA.img_from_cam(points) + np.array([shift_px, 0.0])
     return Features(
-        pixels.astype(np.float32), sizes.astype(np.float32), (f.angles + roll + turn).astype(np.float32), f.responses, f.descriptors
+        pixels.astype(np.float32),
+        sizes.astype(np.float32),
+        (f.angles + roll + turn).astype(np.float32),
+        f.responses,
+        f.descriptors,
     )
 
 
@@ -66,7 +98,9 @@ def test_every_point_in_view_is_matched_with_itself(cam_from_world: Rigid3):
 @pytest.mark.parametrize("wrong", [{"shift_px": 25.0}, {"turn": 1.2}, {"scale": 2.0}])
 def test_what_is_elsewhere_or_turned_or_of_another_size_is_no_match(wrong: dict[str, float]):
     node = _node(np.random.default_rng(1))
-    matches = match_guided(_seen(node, POSES[0], **wrong), LocalMap.of_node(node), POSES[0], CAMERA, GUIDED)
+    matches = match_guided(
+        _seen(node, POSES[0], **wrong), LocalMap.of_node(node), POSES[0], CAMERA, GUIDED
+    )
     assert len(matches) < 0.03 * NUM_POINTS
 
 
@@ -93,10 +127,19 @@ def test_chance_finds_next_to_nothing_among_descriptors_that_differ():
 def test_chance_finds_as_much_as_the_pose_where_all_descriptors_are_alike():
     node = _node(np.random.default_rng(5))
     same = np.tile(node.features.descriptors[:1], (NUM_POINTS, 1))
-    alike = replace(node, features=replace(node.features, descriptors=same, angles=np.zeros_like(node.features.angles)))
+    alike = replace(
+        node,
+        features=replace(
+            node.features, descriptors=same, angles=np.zeros_like(node.features.angles)
+        ),
+    )
     config = GuidedConfig(min_margin=0.0, max_scale=4.0, radius_px=40.0).resolved(SURF)
-    found = len(match_guided(_seen(alike, POSES[0]), LocalMap.of_node(alike), POSES[0], CAMERA, config))
-    by_chance = count_by_chance(_seen(alike, POSES[0]), LocalMap.of_node(alike), POSES[0], CAMERA, config)
+    found = len(
+        match_guided(_seen(alike, POSES[0]), LocalMap.of_node(alike), POSES[0], CAMERA, config)
+    )
+    by_chance = count_by_chance(
+        _seen(alike, POSES[0]), LocalMap.of_node(alike), POSES[0], CAMERA, config
+    )
     assert by_chance > 0.5 * found > 10
 
 
@@ -105,15 +148,20 @@ def test_a_kind_without_scale_and_angle_is_matched_however_large_and_turned():
     plain = GuidedConfig(max_scale=1.1).resolved(replace(SURF, has_scale=False, has_angle=False))
     cam_from_world = POSES[1] @ POSES[0]
     seen = _seen(node, cam_from_world)
-    constant = replace(seen, sizes_px=np.full_like(seen.sizes_px, 24.0), angles=np.zeros_like(seen.angles))
+    constant = replace(
+        seen, sizes_px=np.full_like(seen.sizes_px, 24.0), angles=np.zeros_like(seen.angles)
+    )
     matches = match_guided(constant, LocalMap.of_node(node), cam_from_world, CAMERA, plain)
     assert len(matches) > 100
     assert np.array_equal(matches.query_idx, matches.train_idx)
-    assert len(match_guided(constant, LocalMap.of_node(node), cam_from_world, CAMERA, GUIDED)) < 0.3 * len(matches)
+    assert len(
+        match_guided(constant, LocalMap.of_node(node), cam_from_world, CAMERA, GUIDED)
+    ) < 0.3 * len(matches)
 
 
 def test_a_lens_without_distortion_expects_points_where_one_with_next_to_none_does():
-    """The one is projected in a kernel, the other by the camera itself; some points lie behind the camera, some beside the picture."""
+    """The one is projected in a kernel, the other by the camera itself; some points lie behind the
+    camera, some beside the picture."""
     local_map = LocalMap.of_node(_node(np.random.default_rng(5)))
     lens = Camera("OPENCV", 640, 480, (500.0, 500.0, 320.0, 240.0, 0.0, 0.0, 1e-15, 0.0))
     assert lens.is_distorted
@@ -121,9 +169,13 @@ def test_a_lens_without_distortion_expects_points_where_one_with_next_to_none_do
         Rigid3(exp_so3(np.array([0.1, 0.5, 0.3])), np.array([0.2, 0.1, 0.4])),
         Rigid3(np.eye(3), np.array([0, 0, -3.0])),
     ):
-        plain, by_camera = (expected_key_points(local_map, cam_from_world, camera) for camera in (CAMERA, lens))
+        plain, by_camera = (
+            expected_key_points(local_map, cam_from_world, camera) for camera in (CAMERA, lens)
+        )
         np.testing.assert_allclose(plain, by_camera, rtol=1e-6)
         assert 0 < np.isnan(plain[:, 0]).sum() < len(plain)
-        (rows, pixels), (lens_rows, lens_pixels) = (visible_points(local_map, cam_from_world, camera) for camera in (CAMERA, lens))
+        (rows, pixels), (lens_rows, lens_pixels) = (
+            visible_points(local_map, cam_from_world, camera) for camera in (CAMERA, lens)
+        )
         np.testing.assert_array_equal(rows, lens_rows)
         np.testing.assert_allclose(pixels, lens_pixels, rtol=1e-9)

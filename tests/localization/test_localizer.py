@@ -49,13 +49,27 @@ def test_a_localization_says_what_it_stands_on(localizer: Localizer):
     assert isinstance(result, Localization)
     assert 12 <= result.num_inliers <= result.num_matches
     assert 0.5 < result.probability <= 1.0
-    assert len({candidate.node_id for candidate in result.candidates}) == len(result.candidates) == localizer.config.num_candidates
+    assert (
+        len({candidate.node_id for candidate in result.candidates})
+        == len(result.candidates)
+        == localizer.config.num_candidates
+    )
     scores = [candidate.score for candidate in result.candidates]
     assert scores == sorted(scores, reverse=True)
     node = localizer.topomap.summaries[result.node_id].world_from_cam
     assert translation_error(node, TRUTH) < 0.6
-    assert result.times_ms.keys() >= {"patch_normalization", "features", "coarse", "matching", "pnp", "total"}
-    assert sum(ms for stage, ms in result.times_ms.items() if stage != "total") <= result.times_ms["total"]
+    assert result.times_ms.keys() >= {
+        "patch_normalization",
+        "features",
+        "coarse",
+        "matching",
+        "pnp",
+        "total",
+    }
+    assert (
+        sum(ms for stage, ms in result.times_ms.items() if stage != "total")
+        <= result.times_ms["total"]
+    )
 
 
 def test_the_covariance_is_one_and_of_the_size_of_the_errors(localizer: Localizer):
@@ -65,7 +79,9 @@ def test_the_covariance_is_one_and_of_the_size_of_the_errors(localizer: Localize
         assert isinstance(result, Localization)
         np.testing.assert_allclose(result.covariance, result.covariance.T, rtol=1e-9, atol=1e-18)
         assert np.linalg.eigvalsh(result.covariance).min() > 0
-        xi = (truth @ result.world_from_cam.inverse()).log()  # the left perturbation that leads to the truth
+        xi = (
+            truth @ result.world_from_cam.inverse()
+        ).log()  # the left perturbation that leads to the truth
         distances.append(float(xi @ np.linalg.solve(result.covariance, xi)))
     assert 0.05 < np.median(distances) < 30.0  # chi-square of six degrees: median 5.3
 
@@ -92,7 +108,9 @@ def test_a_map_from_its_file_answers_as_the_one_in_memory(localizer: Localizer, 
 
 @pytest.mark.parametrize("num_candidates", [1, 100])
 def test_any_number_of_candidates(num_candidates: int, localizer: Localizer):
-    result = Localizer(localizer.topomap, LocalizerConfig(num_candidates=num_candidates)).localize(PICTURE, CAMERA)
+    result = Localizer(localizer.topomap, LocalizerConfig(num_candidates=num_candidates)).localize(
+        PICTURE, CAMERA
+    )
     assert isinstance(result, Localization)
     assert len(result.candidates) == min(num_candidates, len(localizer.topomap.nodes))
     assert translation_error(result.world_from_cam, TRUTH) < 0.02
@@ -106,7 +124,15 @@ def test_any_number_of_candidates(num_candidates: int, localizer: Localizer):
         np.zeros((240, 320), np.uint8),
         *(picture for picture, _ in unseen_views(seed=1, step=4.0)),
     ],
-    ids=["grey noise", "coloured noise", "black", "other world 0", "other world 1", "other world 2", "other world 3"],
+    ids=[
+        "grey noise",
+        "coloured noise",
+        "black",
+        "other world 0",
+        "other world 1",
+        "other world 2",
+        "other world 3",
+    ],
 )
 def test_what_is_not_the_place_is_not_localized(picture: np.ndarray, localizer: Localizer):
     result = localizer.localize(picture, CAMERA)
@@ -118,7 +144,10 @@ def test_what_is_not_the_place_is_not_localized(picture: np.ndarray, localizer: 
 def test_tiny_pictures_are_not_localized(size: tuple[int, int], localizer: Localizer):
     width, height = size
     picture = np.random.default_rng(2).integers(0, 256, (height, width), dtype=np.uint8)
-    assert isinstance(localizer.localize(picture, Camera.pinhole(width, height, 260.0, 260.0, 0.0, 0.0)), NotLocalized)
+    assert isinstance(
+        localizer.localize(picture, Camera.pinhole(width, height, 260.0, 260.0, 0.0, 0.0)),
+        NotLocalized,
+    )
 
 
 def test_a_camera_of_another_size_is_an_error(localizer: Localizer):
@@ -144,7 +173,9 @@ class _FromBelow:
 def test_a_coarse_localizer_of_one_s_own_answers_instead_of_the_map_s(localizer: Localizer):
     own = _FromBelow()
     without = replace(localizer.topomap, coarse_models={})
-    result = Localizer(without, LocalizerConfig(num_candidates=2, coarse="netvlad"), coarse=own).localize(PICTURE, CAMERA)
+    result = Localizer(
+        without, LocalizerConfig(num_candidates=2, coarse="netvlad"), coarse=own
+    ).localize(PICTURE, CAMERA)
     assert own.num_asked == 1
     assert [candidate.node_id for candidate in result.candidates] == [0, 1]
 
@@ -162,8 +193,12 @@ def test_an_unknown_coarse_localizer_names_those_there_are(localizer: Localizer)
 NOISE = np.random.default_rng(0).integers(0, 256, (240, 320), dtype=np.uint8)
 
 
-@pytest.mark.parametrize("picture", [*(picture for picture, _ in unseen_views(step=4.0)), NOISE, np.zeros_like(NOISE)])
-def test_without_any_time_the_first_hypothesis_is_answered_or_it_is_said_that_time_was_up(picture: np.ndarray, localizer: Localizer):
+@pytest.mark.parametrize(
+    "picture", [*(picture for picture, _ in unseen_views(step=4.0)), NOISE, np.zeros_like(NOISE)]
+)
+def test_without_any_time_the_first_hypothesis_is_answered_or_it_is_said_that_time_was_up(
+    picture: np.ndarray, localizer: Localizer
+):
     trace = Trace()
     result = localizer.localize(picture, CAMERA, max_ms=0.0, trace=trace)
     assert [tried.source for tried in trace.tried] == ["retrieval"]
@@ -172,15 +207,25 @@ def test_without_any_time_the_first_hypothesis_is_answered_or_it_is_said_that_ti
 
 def test_a_query_s_own_time_comes_before_that_of_the_settings(localizer: Localizer):
     hurried = Localizer(localizer.topomap, LocalizerConfig(max_ms=0.0))
-    results = [hurried.localize(NOISE, CAMERA), hurried.localize(NOISE, CAMERA, max_ms=1e6), localizer.localize(NOISE, CAMERA)]
-    assert ["time was up" in result.detail for result in results if isinstance(result, NotLocalized)] == [True, False, False]
+    results = [
+        hurried.localize(NOISE, CAMERA),
+        hurried.localize(NOISE, CAMERA, max_ms=1e6),
+        localizer.localize(NOISE, CAMERA),
+    ]
+    assert [
+        "time was up" in result.detail for result in results if isinstance(result, NotLocalized)
+    ] == [True, False, False]
 
 
 # what was tried
 
 
-@pytest.mark.parametrize("picture", [PICTURE, (0.05 * PICTURE).astype(np.uint8), NOISE], ids=["here", "dark", "noise"])
-def test_the_trace_holds_all_that_was_tried_and_the_answer_follows_from_it(picture: np.ndarray, localizer: Localizer):
+@pytest.mark.parametrize(
+    "picture", [PICTURE, (0.05 * PICTURE).astype(np.uint8), NOISE], ids=["here", "dark", "noise"]
+)
+def test_the_trace_holds_all_that_was_tried_and_the_answer_follows_from_it(
+    picture: np.ndarray, localizer: Localizer
+):
     trace, weights, evidence = Trace(), localizer.weights.rivals, localizer.config.evidence
     result = localizer.localize(picture, CAMERA, trace=trace)
     assert trace.tried[0].source == "retrieval"
@@ -200,8 +245,14 @@ def test_the_trace_holds_all_that_was_tried_and_the_answer_follows_from_it(pictu
         np.testing.assert_array_equal(result.world_from_cam.matrix(), best.world_from_cam.matrix())
         assert result.evidence == best.evidence
     else:
-        assert best is None or best.probability < evidence.min_probability or result.reason == "ambiguous"
+        assert (
+            best is None
+            or best.probability < evidence.min_probability
+            or result.reason == "ambiguous"
+        )
 
 
 def test_who_is_traced_gets_the_same_answer(localizer: Localizer):
-    assert _facts(localizer.localize(PICTURE, CAMERA, trace=Trace())) == _facts(localizer.localize(PICTURE, CAMERA))
+    assert _facts(localizer.localize(PICTURE, CAMERA, trace=Trace())) == _facts(
+        localizer.localize(PICTURE, CAMERA)
+    )

@@ -1,4 +1,5 @@
-"""A map of frames in memory, with and without poses; pictures and times of another kind are refused, not answered with "not here"."""
+"""A map of frames in memory, with and without poses; pictures and times of another kind are
+refused, not answered with "not here"."""
 
 from __future__ import annotations
 
@@ -21,7 +22,10 @@ SURF_ALONE = topoloc.BuildConfig(other_kinds=())
 def test_frames_in_memory_give_the_map_of_their_folder(tiny_recording: Path):
     recording = open_sequence(tiny_recording)
     memory = topoloc.MemorySequence([recording[index] for index in range(6)])
-    ours, folders = (topoloc.build_map(sequence, SURF_ALONE) for sequence in (memory, open_sequence(f"{tiny_recording}@0:6")))
+    ours, folders = (
+        topoloc.build_map(sequence, SURF_ALONE)
+        for sequence in (memory, open_sequence(f"{tiny_recording}@0:6"))
+    )
     assert len(ours.nodes) == len(folders.nodes)
     for one, other in zip(ours.nodes, folders.nodes, strict=True):
         np.testing.assert_array_equal(one.points_cam, other.points_cam)
@@ -47,7 +51,9 @@ def test_single_pictures_with_poses(tiny_recording: Path):
     for image, world_from_cam in unseen_views():
         result = localizer.localize(image, frames[0].camera)
         if isinstance(result, topoloc.Localization):
-            errors.append(np.linalg.norm(result.world_from_cam.translation - world_from_cam.translation))
+            errors.append(
+                np.linalg.norm(result.world_from_cam.translation - world_from_cam.translation)
+            )
     assert len(errors) >= len(unseen_views()) - 1
     assert np.median(errors) < 0.02
     assert max(errors) < 0.1
@@ -55,7 +61,9 @@ def test_single_pictures_with_poses(tiny_recording: Path):
 
 def test_single_pictures_without_poses_need_more(tiny_recording: Path):
     recording = open_sequence(tiny_recording)
-    frames = [replace(recording[index], world_from_cam=None, right=None, rig=None) for index in range(3)]
+    frames = [
+        replace(recording[index], world_from_cam=None, right=None, rig=None) for index in range(3)
+    ]
     with pytest.raises(RecordingError, match="stereo pairs or depth images are needed"):
         topoloc.build_map(topoloc.MemorySequence(frames), SURF_ALONE)
 
@@ -80,8 +88,18 @@ for call in (
     except topoloc.TopolocError as error:
         print(type(error).__name__, error)
 """
-    done = subprocess.run([sys.executable, "-c", program, str(room_map)], capture_output=True, text=True, timeout=300, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(room_map)],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=True,
+    )
     lines = done.stdout.splitlines()
     assert [line.split()[0] for line in lines] == ["QueryError"] * 5
-    for line, says in zip(lines, ("float64", "16 bits", "not list", "integer nanoseconds, not 0.25", "axis of its own"), strict=True):
+    for line, says in zip(
+        lines,
+        ("float64", "16 bits", "not list", "integer nanoseconds, not 0.25", "axis of its own"),
+        strict=True,
+    ):
         assert says in line

@@ -1,4 +1,5 @@
-"""The room seen by cameras that did not map it: other lenses, other sizes, rolled, and lenses that nobody has calibrated."""
+"""The room seen by cameras that did not map it: other lenses, other sizes, rolled, and lenses that
+nobody has calibrated."""
 
 from __future__ import annotations
 
@@ -40,25 +41,45 @@ def test_other_lenses_and_other_sizes(factor: float, size: tuple[int, int], loca
     focal = CAMERA.fx * factor * height / CAMERA.height
     camera = Camera.pinhole(width, height, focal, focal, width / 2 - 3.0, height / 2 + 2.0)
     panels = room()
-    results = [(localizer.localize(render(panels, path_pose(i), camera)[0], camera), path_pose(i)) for i in INDICES]
+    results = [
+        (localizer.localize(render(panels, path_pose(i), camera)[0], camera), path_pose(i))
+        for i in INDICES
+    ]
     assert sum(_is_right(result, truth) for result, truth in results) >= 2
-    assert all(result.focal_length_px is None for result, _ in results if isinstance(result, Localization))
+    assert all(
+        result.focal_length_px is None for result, _ in results if isinstance(result, Localization)
+    )
 
 
 @pytest.mark.parametrize("lens", ["calibrated", "focal length noted", "unknown"])
 def test_a_camera_of_many_more_pixels_is_as_good_as_the_map_s_own(lens: str, localizer: Localizer):
-    """Three times the pixels a radian: all that the map knows is too small to be found among them, unless the picture is reduced."""
+    """Three times the pixels a radian: all that the map knows is too small to be found among them,
+    unless the picture is reduced."""
     factor = 3
     camera = CAMERA.rescaled(factor * CAMERA.width, factor * CAMERA.height)
-    known = {"calibrated": camera, "focal length noted": RoughCamera.noted(camera.width, camera.height, 1.05 * camera.fx), "unknown": None}
+    known = {
+        "calibrated": camera,
+        "focal length noted": RoughCamera.noted(camera.width, camera.height, 1.05 * camera.fx),
+        "unknown": None,
+    }
     panels = room()
     pictures = [(render(panels, path_pose(i), camera)[0], path_pose(i)) for i in INDICES]
     results = [(localizer.localize(picture, known[lens]), truth) for picture, truth in pictures]
-    assert all(_is_right(result, truth, metres=0.03 if lens == "calibrated" else 0.15) for result, truth in results)
+    assert all(
+        _is_right(result, truth, metres=0.03 if lens == "calibrated" else 0.15)
+        for result, truth in results
+    )
     whole = Localizer(localizer.topomap, replace(localizer.config, max_finer=1e6))
     not_reduced = [whole.localize(picture, known[lens]) for picture, _ in pictures]
-    assert all(one.num_inliers > 1.2 * other.num_inliers for (one, _), other in zip(results, not_reduced, strict=True))
-    focals = [result.focal_length_px for result, _ in results if isinstance(result, Localization) and result.focal_length_px is not None]
+    assert all(
+        one.num_inliers > 1.2 * other.num_inliers
+        for (one, _), other in zip(results, not_reduced, strict=True)
+    )
+    focals = [
+        result.focal_length_px
+        for result, _ in results
+        if isinstance(result, Localization) and result.focal_length_px is not None
+    ]
     assert len(focals) == (0 if lens == "calibrated" else len(INDICES))
     assert focals == [pytest.approx(camera.fx, rel=0.05)] * len(focals)
 
@@ -70,14 +91,18 @@ def test_the_points_seen_by_a_finer_camera_are_in_its_own_pixels(localizer: Loca
     assert isinstance(result, Localization)
     ((_, seen),) = named
     expected = camera.img_from_cam(truth.inverse().apply(seen.points_world))
-    assert np.median(np.linalg.norm(seen.points_img - expected, axis=1)) < 3.0  # a pixel of the map's camera
+    assert (
+        np.median(np.linalg.norm(seen.points_img - expected, axis=1)) < 3.0
+    )  # a pixel of the map's camera
 
 
 @pytest.mark.parametrize("degrees", [90, 180, 270])
 def test_rolled_cameras(degrees: int, localizer: Localizer):
     panels, turn = room(), Rigid3(exp_so3(np.array([0.0, 0.0, np.deg2rad(degrees)])), np.zeros(3))
     poses = [path_pose(i) @ turn for i in INDICES]
-    assert all(_is_right(localizer.localize(render(panels, pose)[0], CAMERA), pose) for pose in poses)
+    assert all(
+        _is_right(localizer.localize(render(panels, pose)[0], CAMERA), pose) for pose in poses
+    )
 
 
 def test_a_camera_that_nobody_has_calibrated(localizer: Localizer):
@@ -111,4 +136,6 @@ def test_noise_is_not_made_a_place_by_leaving_the_focal_length_open(localizer: L
     rng = np.random.default_rng(0)
     pictures = [rng.integers(0, 256, (240, 320), dtype=np.uint8) for _ in range(5)]
     pictures += [picture for picture, _ in unseen_views(seed=1, step=4.0)]
-    assert not any(isinstance(localizer.localize(picture, None), Localization) for picture in pictures)
+    assert not any(
+        isinstance(localizer.localize(picture, None), Localization) for picture in pictures
+    )

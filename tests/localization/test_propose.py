@@ -1,4 +1,5 @@
-"""Where first poses come from, and when they are not sought: look-alikes, what nodes saw, a prior."""
+"""Where first poses come from, and when they are not sought: look-alikes, what nodes saw, a
+prior."""
 
 from __future__ import annotations
 
@@ -24,7 +25,11 @@ from topoloc.localization.search import Proposal, Search, Trace
 from topoloc.map.topomap import TopoMetricMap
 
 LIGHTS = (0.055, 0.05, 0.045)
-ONLY_RETRIEVAL = LocalizerConfig(look_alikes=LookAlikesConfig(max_groups=0), viewpoints=ViewpointsConfig(num_nodes=0), max_repetitions=0)
+ONLY_RETRIEVAL = LocalizerConfig(
+    look_alikes=LookAlikesConfig(max_groups=0),
+    viewpoints=ViewpointsConfig(num_nodes=0),
+    max_repetitions=0,
+)
 
 
 @pytest.fixture(scope="module")
@@ -39,11 +44,17 @@ def _sources(trace: Trace) -> list[str]:
 # look-alikes
 
 
-def test_a_place_that_is_in_the_map_twice_is_ambiguous_and_both_poses_are_named(room: TopoMetricMap):
+def test_a_place_that_is_in_the_map_twice_is_ambiguous_and_both_poses_are_named(
+    room: TopoMetricMap,
+):
     localizer = Localizer(twice(room))
     results = [(localizer.localize(picture, CAMERA), truth) for picture, truth in unseen_views()]
     assert not any(isinstance(result, Localization) for result, _ in results)
-    ambiguous = [(r, truth) for r, truth in results if isinstance(r, NotLocalized) and r.reason == "ambiguous"]
+    ambiguous = [
+        (r, truth)
+        for r, truth in results
+        if isinstance(r, NotLocalized) and r.reason == "ambiguous"
+    ]
     assert len(ambiguous) >= 0.9 * len(results)
     for result, truth in ambiguous:
         first, second = result.alternatives[:2]
@@ -56,19 +67,29 @@ def test_a_place_that_is_in_the_map_twice_is_ambiguous_and_both_poses_are_named(
         assert [one["node"] for one in named] == [one.node_id for one in result.alternatives]
 
 
-def test_by_retrieval_alone_the_second_place_goes_unnoticed_or_the_image_without_an_answer(room: TopoMetricMap):
+def test_by_retrieval_alone_the_second_place_goes_unnoticed_or_the_image_without_an_answer(
+    room: TopoMetricMap,
+):
     """What other proposals are for."""
     localizer = Localizer(twice(room), ONLY_RETRIEVAL)
     results = [localizer.localize(picture, CAMERA) for picture, _ in unseen_views()]
-    assert not any(isinstance(result, NotLocalized) and result.reason == "ambiguous" for result in results)
+    assert not any(
+        isinstance(result, NotLocalized) and result.reason == "ambiguous" for result in results
+    )
 
 
 def test_a_place_that_is_only_partly_like_another_is_told_apart(room: TopoMetricMap):
     localizer = Localizer(twice(room, share_alike=0.2))
     found = [(localizer.localize(picture, CAMERA), truth) for picture, truth in unseen_views()]
-    right = [isinstance(r, Localization) and translation_error(r.world_from_cam, truth) < 0.05 for r, truth in found]
+    right = [
+        isinstance(r, Localization) and translation_error(r.world_from_cam, truth) < 0.05
+        for r, truth in found
+    ]
     assert np.mean(right) >= 0.8
-    assert not any(isinstance(r, Localization) and translation_error(r.world_from_cam, truth) > 0.5 for r, truth in found)
+    assert not any(
+        isinstance(r, Localization) and translation_error(r.world_from_cam, truth) > 0.5
+        for r, truth in found
+    )
 
 
 def test_a_place_that_is_in_the_map_once_is_answered_as_by_retrieval_alone(room: TopoMetricMap):
@@ -89,15 +110,25 @@ def _dark(picture: np.ndarray, light: float, seed: int) -> np.ndarray:
 
 
 def test_dark_images_are_localized_that_are_not_without_viewpoints(room: TopoMetricMap):
-    views = [(_dark(picture, light, k), truth) for light in LIGHTS for k, (picture, truth) in enumerate(unseen_views())]
+    views = [
+        (_dark(picture, light, k), truth)
+        for light in LIGHTS
+        for k, (picture, truth) in enumerate(unseen_views())
+    ]
     num_right, sources = {}, []
     for num_nodes in (0, ViewpointsConfig().num_nodes):
-        localizer = Localizer(room, LocalizerConfig(viewpoints=ViewpointsConfig(num_nodes=num_nodes)))
+        localizer = Localizer(
+            room, LocalizerConfig(viewpoints=ViewpointsConfig(num_nodes=num_nodes))
+        )
         errors = []
         for picture, truth in views:
             trace = Trace()
             result = localizer.localize(picture, CAMERA, trace=trace)
-            errors += [translation_error(result.world_from_cam, truth)] if isinstance(result, Localization) else []
+            errors += (
+                [translation_error(result.world_from_cam, truth)]
+                if isinstance(result, Localization)
+                else []
+            )
             sources += _sources(trace) if num_nodes == 0 else []
         assert max(errors, default=0.0) < 0.25
         num_right[num_nodes] = len(errors)
@@ -108,24 +139,42 @@ def test_dark_images_are_localized_that_are_not_without_viewpoints(room: TopoMet
 def _never_clear(room: TopoMetricMap, config: LocalizerConfig | None = None) -> Localizer:
     """Every image is treated as one that is not clear."""
     weights = weights_of("surf")
-    return Localizer(room, config, weights=replace(weights, evidence=replace(weights.evidence, clear_log_odds=1e9)))
+    return Localizer(
+        room,
+        config,
+        weights=replace(weights, evidence=replace(weights.evidence, clear_log_odds=1e9)),
+    )
 
 
-def test_images_that_are_never_clear_are_answered_all_the_same_and_those_of_elsewhere_are_not(room: TopoMetricMap):
+def test_images_that_are_never_clear_are_answered_all_the_same_and_those_of_elsewhere_are_not(
+    room: TopoMetricMap,
+):
     localizer = _never_clear(room)
     here = [(localizer.localize(picture, CAMERA), truth) for picture, truth in unseen_views()]
-    assert all(isinstance(result, Localization) and translation_error(result.world_from_cam, truth) < 0.05 for result, truth in here)
-    assert not any(isinstance(localizer.localize(picture, CAMERA), Localization) for picture, _ in unseen_views(seed=7))
+    assert all(
+        isinstance(result, Localization) and translation_error(result.world_from_cam, truth) < 0.05
+        for result, truth in here
+    )
+    assert not any(
+        isinstance(localizer.localize(picture, CAMERA), Localization)
+        for picture, _ in unseen_views(seed=7)
+    )
 
 
-def test_poses_that_viewpoints_agree_on_are_looked_into_once_the_one_with_most_inliers_first(room: TopoMetricMap):
+def test_poses_that_viewpoints_agree_on_are_looked_into_once_the_one_with_most_inliers_first(
+    room: TopoMetricMap,
+):
     """All nodes around show the same place: one pose comes of them."""
     trace = Trace()
     _never_clear(room).localize(unseen_views()[2][0], CAMERA, trace=trace)
     fits = [tried.first for tried in trace.tried if tried.source == "viewpoints"]
     assert 1 <= len(fits) <= ViewpointsConfig().max_poses
-    assert [fit.num_inliers for fit in fits] == sorted((fit.num_inliers for fit in fits), reverse=True)
-    centres = [fit.pose.cam_from_world.inverse().translation for fit in fits if fit.pose is not None]
+    assert [fit.num_inliers for fit in fits] == sorted(
+        (fit.num_inliers for fit in fits), reverse=True
+    )
+    centres = [
+        fit.pose.cam_from_world.inverse().translation for fit in fits if fit.pose is not None
+    ]
     assert len(centres) == len(fits)
     assert all(np.linalg.norm(a - b) > 0.05 for k, a in enumerate(centres) for b in centres[:k])
 
@@ -154,7 +203,9 @@ def fits(monkeypatch: pytest.MonkeyPatch) -> list[PoseFit]:
     return found
 
 
-def test_an_image_from_elsewhere_is_refused_after_the_first_pose(room: TopoMetricMap, fits: list[PoseFit]):
+def test_an_image_from_elsewhere_is_refused_after_the_first_pose(
+    room: TopoMetricMap, fits: list[PoseFit]
+):
     """Neither look-alikes nor RANSAC on what viewpoints show: refusing is as quick as answering."""
     localizer = Localizer(room)
     noise = np.random.default_rng(0).integers(0, 256, (240, 320), dtype=np.uint8)
@@ -194,7 +245,9 @@ def test_a_prior_replaces_the_coarse_search(room: TopoMetricMap, monkeypatch: py
     assert len(result.candidates) == localizer.config.num_candidates
     scores = [candidate.score for candidate in result.candidates]
     assert scores == sorted(scores, reverse=True)
-    nearest = min(room.summaries, key=lambda summary: translation_error(summary.world_from_cam, truth))
+    nearest = min(
+        room.summaries, key=lambda summary: translation_error(summary.world_from_cam, truth)
+    )
     assert nearest.node_id in {candidate.node_id for candidate in result.candidates}
 
 
@@ -207,7 +260,9 @@ def test_a_prior_that_is_wrong_makes_no_place_of_an_image_from_elsewhere(room: T
 # what was found already
 
 
-def test_a_pose_that_was_found_already_is_not_followed_up_again(room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch):
+def test_a_pose_that_was_found_already_is_not_followed_up_again(
+    room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
+):
     followed = list[tuple[Search, Proposal]]()
 
     def hypothesis_of(search: Search, proposal: Proposal) -> Hypothesis | None:
@@ -222,6 +277,10 @@ def test_a_pose_that_was_found_already_is_not_followed_up_again(room: TopoMetric
         assert refine.is_found_already(search, proposal)
         pose = proposal.fit.pose
         assert pose is not None
-        beside = replace(pose, cam_from_world=Rigid3(np.eye(3), np.array([0.3, 0.0, 0.0])) @ pose.cam_from_world)
-        assert not refine.is_found_already(search, replace(proposal, fit=replace(proposal.fit, pose=beside)))
+        beside = replace(
+            pose, cam_from_world=Rigid3(np.eye(3), np.array([0.3, 0.0, 0.0])) @ pose.cam_from_world
+        )
+        assert not refine.is_found_already(
+            search, replace(proposal, fit=replace(proposal.fit, pose=beside))
+        )
         assert not refine.is_found_already(replace(search, belief=Belief()), proposal)

@@ -1,4 +1,5 @@
-"""Which query images are reduced before they are looked at, and how far; what is known of them when."""
+"""Which query images are reduced before they are looked at, and how far; what is known of them
+when."""
 
 from __future__ import annotations
 
@@ -27,7 +28,11 @@ def test_a_finer_picture_is_reduced_to_the_map_s_pixels_a_radian(image: np.ndarr
     reduced, camera = reduced_image(image, _camera(600.0), MAP_FOCAL, 1.15, 1600)
     assert reduced.shape == (240, 320, *image.shape[2:])
     assert camera == _camera(600.0).rescaled(320, 240)
-    np.testing.assert_allclose(reduced, image.reshape(240, 2, 320, 2, -1).mean(axis=(1, 3)).reshape(reduced.shape), atol=1.0)
+    np.testing.assert_allclose(
+        reduced,
+        image.reshape(240, 2, 320, 2, -1).mean(axis=(1, 3)).reshape(reduced.shape),
+        atol=1.0,
+    )
 
 
 @pytest.mark.parametrize("focal", [100.0, 300.0, 340.0])
@@ -52,7 +57,9 @@ def test_a_rough_camera_is_finer_as_far_as_its_whole_range_is():
 
 
 def test_a_picture_of_hardly_a_pixel_keeps_one():
-    reduced, _ = reduced_image(IMAGE[:2, :40], Camera.pinhole(40, 2, 9000.0, 9000.0, 19.5, 0.5), MAP_FOCAL, 1.15, 1600)
+    reduced, _ = reduced_image(
+        IMAGE[:2, :40], Camera.pinhole(40, 2, 9000.0, 9000.0, 19.5, 0.5), MAP_FOCAL, 1.15, 1600
+    )
     assert reduced.shape == (1, 1)
 
 

@@ -16,14 +16,40 @@ TIMES_MS = {"features": 30.12345, "total": 60.0}
 
 
 def test_a_localization_as_json():
-    line = Localization(POSE, np.diag(np.arange(1.0, 7.0)), 0.98, 17, CANDIDATES, 212, 158, TIMES_MS).to_json("a.png")
+    line = Localization(
+        POSE, np.diag(np.arange(1.0, 7.0)), 0.98, 17, CANDIDATES, 212, 158, TIMES_MS
+    ).to_json("a.png")
     assert set(line) == {
-        *("query", "localized", "world_from_cam", "covariance", "position_sigma_m", "rotation_sigma_deg", "probability", "node"),
-        *("candidates", "num_matches", "num_inliers", "times_ms", "map", "version", "t_ns", "camera", "features"),
+        *(
+            "query",
+            "localized",
+            "world_from_cam",
+            "covariance",
+            "position_sigma_m",
+            "rotation_sigma_deg",
+            "probability",
+            "node",
+        ),
+        *(
+            "candidates",
+            "num_matches",
+            "num_inliers",
+            "times_ms",
+            "map",
+            "version",
+            "t_ns",
+            "camera",
+            "features",
+        ),
     }
     assert line["query"] == "a.png"
     assert line["localized"] is True
-    assert (line["node"], line["num_matches"], line["num_inliers"], line["probability"]) == (17, 212, 158, 0.98)
+    assert (line["node"], line["num_matches"], line["num_inliers"], line["probability"]) == (
+        17,
+        212,
+        158,
+        0.98,
+    )
     assert line["candidates"] == [[17, 0.8123], [3, 0.4]]
     assert line["times_ms"] == {"features": 30.123, "total": 60.0}
     assert line == json.loads(json.dumps(line, allow_nan=False))
@@ -41,7 +67,17 @@ def test_the_pose_survives_json_to_the_last_digit():
 def test_a_refusal_as_json_never_holds_a_pose():
     line = NotLocalized("too_few_matches", CANDIDATES, 3, 0, TIMES_MS).to_json("wall.jpg")
     assert set(line) == {
-        *("query", "localized", "reason", "detail", "alternatives", "candidates", "num_matches", "num_inliers", "times_ms"),
+        *(
+            "query",
+            "localized",
+            "reason",
+            "detail",
+            "alternatives",
+            "candidates",
+            "num_matches",
+            "num_inliers",
+            "times_ms",
+        ),
         *("map", "version", "t_ns", "camera", "features"),
     }
     assert line["localized"] is False
@@ -50,9 +86,17 @@ def test_a_refusal_as_json_never_holds_a_pose():
 
 
 def test_detail_and_alternatives_are_there_though_empty():
-    assert NotLocalized("unreadable", detail="a.png: the file is empty").to_json("a.png")["detail"] == "a.png: the file is empty"
+    assert (
+        NotLocalized("unreadable", detail="a.png: the file is empty").to_json("a.png")["detail"]
+        == "a.png: the file is empty"
+    )
     line = NotLocalized("unreadable").to_json("a.png")
-    assert (line["detail"], line["alternatives"], line["camera"], line["t_ns"]) == ("", [], None, None)
+    assert (line["detail"], line["alternatives"], line["camera"], line["t_ns"]) == (
+        "",
+        [],
+        None,
+        None,
+    )
 
 
 def test_the_cameras_own_covariance_is_that_of_a_perturbation_on_its_side():
@@ -72,9 +116,23 @@ def test_a_probability_that_is_not_calibrated_says_so():
 
 def test_an_ambiguity_names_its_alternatives_but_no_answer():
     alternatives = (Alternative(POSE, 0.5, 3), Alternative(POSE.inverse(), 0.4, 8))
-    line = NotLocalized("ambiguous", CANDIDATES, 96, 61, TIMES_MS, "as much like node 8 as like node 3", alternatives).to_json("a.png")
+    line = NotLocalized(
+        "ambiguous",
+        CANDIDATES,
+        96,
+        61,
+        TIMES_MS,
+        "as much like node 8 as like node 3",
+        alternatives,
+    ).to_json("a.png")
     assert line == json.loads(json.dumps(line, allow_nan=False))
     assert "world_from_cam" not in line
-    assert [(one["node"], one["probability"]) for one in line["alternatives"]] == [(3, 0.5), (8, 0.4)]
-    assert line["alternatives"][0]["world_from_cam"] == Localization(POSE, np.eye(6), 1.0, 3, [], 1, 1).to_json("")["world_from_cam"]
+    assert [(one["node"], one["probability"]) for one in line["alternatives"]] == [
+        (3, 0.5),
+        (8, 0.4),
+    ]
+    assert (
+        line["alternatives"][0]["world_from_cam"]
+        == Localization(POSE, np.eye(6), 1.0, 3, [], 1, 1).to_json("")["world_from_cam"]
+    )
     assert "covariance" not in line["alternatives"][0]

@@ -1,4 +1,5 @@
-"""Results read back from JSON: what was written comes again, and what is no result is one error of ours."""
+"""Results read back from JSON: what was written comes again, and what is no result is one error of
+ours."""
 
 from __future__ import annotations
 
@@ -28,7 +29,11 @@ from topoloc.places.coarse import NodeScore
 from topoloc.tracking.tracker import Tracker
 
 POSE = Rigid3(exp_so3(np.array([0.1, -0.2, 0.3])), np.array([1.0, -2.0, 0.5]))
-PLACE = Georeference(GeoPoint(48.2, 16.37, 170.0), Rigid3(exp_so3(np.array([0.0, 0.0, 0.7])), np.array([3.0, 4.0, 0.0])), "origin")
+PLACE = Georeference(
+    GeoPoint(48.2, 16.37, 170.0),
+    Rigid3(exp_so3(np.array([0.0, 0.0, 0.7])), np.array([3.0, 4.0, 0.0])),
+    "origin",
+)
 PROVENANCE = Provenance("0123456789abcdef", 3, "surf", 1_700_000_000_123_456_789, CAMERA)
 LOCALIZED = Localization(
     POSE,
@@ -46,7 +51,16 @@ LOCALIZED = Localization(
     PROVENANCE,
 )
 REFUSED = NotLocalized(
-    *("ambiguous", [NodeScore(3, 0.7)], 96, 61, {"total": 88.1}, "as much like node 8", (Alternative(POSE, 0.5, 3),), PROVENANCE)
+    *(
+        "ambiguous",
+        [NodeScore(3, 0.7)],
+        96,
+        61,
+        {"total": 88.1},
+        "as much like node 8",
+        (Alternative(POSE, 0.5, 3),),
+        PROVENANCE,
+    )
 )
 
 
@@ -54,7 +68,16 @@ SUSPECTED = replace(
     LOCALIZED,
     evidence=Evidence(60, 55, 140, 160, 3, 0.4, 0.3, 0.8, 12),
     noise_share=0.25,
-    calibration_doubt=CalibrationDoubt(261.5, 0.5, 300.0, np.array([320.0, 200.5]), np.array([320.0, 190.0]), True, False, np.arange(6.0)),
+    calibration_doubt=CalibrationDoubt(
+        261.5,
+        0.5,
+        300.0,
+        np.array([320.0, 200.5]),
+        np.array([320.0, 190.0]),
+        True,
+        False,
+        np.arange(6.0),
+    ),
 )
 
 
@@ -143,7 +166,10 @@ def test_real_results_fit_the_schema(tiny_recording: Path):
 def test_streams_fit_the_schema_and_say_their_times(tiny_recording: Path):
     tracker = Tracker(Localizer(replace(built_room(tiny_recording), georeference=PLACE)))
     views = unseen_views(step=0.5)[:4]
-    lines = [tracker.process(picture, CAMERA, 100_000_000 * number).to_json(f"{number}") for number, (picture, _) in enumerate(views)]
+    lines = [
+        tracker.process(picture, CAMERA, 100_000_000 * number).to_json(f"{number}")
+        for number, (picture, _) in enumerate(views)
+    ]
     assert "tracked" in {line["state"] for line in lines}
     for number, line in enumerate(lines):
         check_result(line)
@@ -157,11 +183,15 @@ def test_a_geopose_leads_back_to_the_pose():
     geopose = PLACE.geopose(POSE)
     enu_from_ecef = PLACE.origin.ecef_from_enu().inverse()
     np.testing.assert_allclose(
-        PLACE.enu_from_world.inverse().apply(enu_from_ecef.apply(geopose.position.ecef())), POSE.translation, atol=1e-8
+        PLACE.enu_from_world.inverse().apply(enu_from_ecef.apply(geopose.position.ecef())),
+        POSE.translation,
+        atol=1e-8,
     )
     enu_from_body = Rigid3.from_quat_wxyz(geopose.quat_wxyz, np.zeros(3)).rotation
     # a few metres from the origin, north and up are the same to a millionth
-    np.testing.assert_allclose(enu_from_body, PLACE.enu_from_world.rotation @ POSE.rotation @ CAM_FROM_BODY, atol=3e-6)
+    np.testing.assert_allclose(
+        enu_from_body, PLACE.enu_from_world.rotation @ POSE.rotation @ CAM_FROM_BODY, atol=3e-6
+    )
 
 
 @pytest.mark.parametrize(
@@ -176,14 +206,26 @@ def test_a_geopose_leads_back_to_the_pose():
         {**LOCALIZED.to_json(""), "covariance": [[float("nan")] * 6] * 6},
         {**LOCALIZED.to_json(""), "covariance": [[1.0] * 6] * 5},
         {**LOCALIZED.to_json(""), "covariance": (-np.eye(6)).tolist()},
-        {**LOCALIZED.to_json(""), "world_from_cam": {"translation": [0, 0, 0], "quat_wxyz": [0, 0, 0, 0]}},
-        {**LOCALIZED.to_json(""), "world_from_cam": {"translation": [0, 0, 10**400], "quat_wxyz": [1, 0, 0, 0]}},
+        {
+            **LOCALIZED.to_json(""),
+            "world_from_cam": {"translation": [0, 0, 0], "quat_wxyz": [0, 0, 0, 0]},
+        },
+        {
+            **LOCALIZED.to_json(""),
+            "world_from_cam": {"translation": [0, 0, 10**400], "quat_wxyz": [1, 0, 0, 0]},
+        },
         {**LOCALIZED.to_json(""), "probability": 1.5},
         {**LOCALIZED.to_json(""), "node": True},
         {**LOCALIZED.to_json(""), "camera": {"model": "PINHOLE"}},
         {**LOCALIZED.to_json(""), "camera": 3},
         {**LOCALIZED.to_json(""), "t_ns": 0.5},
-        {**LOCALIZED.to_json(""), "geopose": {"position": {"lat": 100, "lon": 0, "h": 0}, "quaternion": {"x": 0, "y": 0, "z": 0, "w": 1}}},
+        {
+            **LOCALIZED.to_json(""),
+            "geopose": {
+                "position": {"lat": 100, "lon": 0, "h": 0},
+                "quaternion": {"x": 0, "y": 0, "z": 0, "w": 1},
+            },
+        },
         {**LOCALIZED.to_json(""), "geopose": [[[]]]},
         {**LOCALIZED.to_json(""), "candidates": [[1, 2, 3]]},
         {**LOCALIZED.to_json(""), "times_ms": []},
@@ -206,15 +248,21 @@ def test_each_kind_of_result_refuses_the_other():
 
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
-    lambda inner: st.lists(inner, max_size=7) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
+    lambda inner: (
+        st.lists(inner, max_size=7) | st.dictionaries(st.text(max_size=8), inner, max_size=4)
+    ),
     max_leaves=8,
 )
 
 
 @given(
-    result=st.sampled_from([LOCALIZED, REFUSED]), key=st.sampled_from(sorted({*LOCALIZED.to_json(""), *REFUSED.to_json("")})), value=JSON
+    result=st.sampled_from([LOCALIZED, REFUSED]),
+    key=st.sampled_from(sorted({*LOCALIZED.to_json(""), *REFUSED.to_json("")})),
+    value=JSON,
 )
-def test_any_value_under_any_key_is_read_or_refused(result: Localization | NotLocalized, key: str, value: Any):
+def test_any_value_under_any_key_is_read_or_refused(
+    result: Localization | NotLocalized, key: str, value: Any
+):
     try:
         again = result_from_json({**result.to_json(""), key: value})
     except ResultError:

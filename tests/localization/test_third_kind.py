@@ -1,4 +1,5 @@
-"""A kind of features without scale and angle is added by one file (`corner_patches.py`) and one fit."""
+"""A kind of features without scale and angle is added by one file (`corner_patches.py`) and one
+fit."""
 
 from __future__ import annotations
 
@@ -34,7 +35,9 @@ def registered() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def path(registered: None, tiny_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("corners") / "room.topo"
-    build_map(open_sequence(tiny_recording), BuildConfig(features=FeatureConfig(kind=CORNER_PATCHES.name))).save(path)
+    build_map(
+        open_sequence(tiny_recording), BuildConfig(features=FeatureConfig(kind=CORNER_PATCHES.name))
+    ).save(path)
     return path
 
 
@@ -48,7 +51,10 @@ def test_a_map_of_it_is_built_and_asked_from_its_file(path: Path):
         for result, truth in results
     ]
     assert np.mean(within) >= 0.8
-    assert not any(isinstance(localizer.localize(picture, CAMERA), Localization) for picture, _ in unseen_views(seed=3))
+    assert not any(
+        isinstance(localizer.localize(picture, CAMERA), Localization)
+        for picture, _ in unseen_views(seed=3)
+    )
 
 
 def test_until_weights_are_fitted_its_answers_say_so(path: Path):
@@ -57,22 +63,34 @@ def test_until_weights_are_fitted_its_answers_say_so(path: Path):
     assert line["localized"] is True
     assert line["calibrated"] is False
     fitted = replace(weights_of(CORNER_PATCHES.name), calibration_error=0.02)
-    assert "calibrated" not in Localizer(topomap, weights=fitted).localize(picture, CAMERA).to_json("")
+    assert "calibrated" not in Localizer(topomap, weights=fitted).localize(picture, CAMERA).to_json(
+        ""
+    )
 
 
 def test_its_own_thresholds_are_used_unless_others_are_set(path: Path):
     topomap = TopoMetricMap.load(path)
     config = Localizer(topomap).config
     assert (config.guided.min_similarity, config.viewpoints.matching.min_similarity) == (0.8, 0.85)
-    assert (config.matching.ratio, config.pose.sigma_px) == (CORNER_PATCHES.ratio, CORNER_PATCHES.sigma_px)
-    own = LocalizerConfig(matching=replace(LocalizerConfig().matching, ratio=0.7), guided=replace(LocalizerConfig().guided, max_turn=0.1))
+    assert (config.matching.ratio, config.pose.sigma_px) == (
+        CORNER_PATCHES.ratio,
+        CORNER_PATCHES.sigma_px,
+    )
+    own = LocalizerConfig(
+        matching=replace(LocalizerConfig().matching, ratio=0.7),
+        guided=replace(LocalizerConfig().guided, max_turn=0.1),
+    )
     config = Localizer(topomap, own).config
     assert config.matching.ratio == 0.7
     assert config.guided.max_turn == np.inf  # it has no angles to look at
 
 
-def test_a_map_of_a_kind_that_is_not_there_is_refused_in_one_line(path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_map_of_a_kind_that_is_not_there_is_refused_in_one_line(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+):
     topomap = TopoMetricMap.load(path)
     monkeypatch.delitem(KINDS, CORNER_PATCHES.name)
-    with pytest.raises(FeatureKindError, match="no features of kind 'corner-patches'; there are surf, sift"):
+    with pytest.raises(
+        FeatureKindError, match="no features of kind 'corner-patches'; there are surf, sift"
+    ):
         Localizer(topomap)

@@ -13,7 +13,9 @@ from topoloc.map.topomap import TopoMetricMap
 @pytest.fixture(scope="session")
 def tiny_map(tiny_recording: Path) -> TopoMetricMap:
     """Of every other pair of the recording, of SURF alone; in memory."""
-    return topoloc.build_map(topoloc.open_sequence(f"{tiny_recording}@0::2"), topoloc.BuildConfig(other_kinds=()))
+    return topoloc.build_map(
+        topoloc.open_sequence(f"{tiny_recording}@0::2"), topoloc.BuildConfig(other_kinds=())
+    )
 
 
 @pytest.fixture

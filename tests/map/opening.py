@@ -1,4 +1,5 @@
-"""A child process that opens maps as users do: asks each about one picture, then looks at every byte. Prints a line a map, in JSON.
+"""A child process that opens maps as users do: asks each about one picture, then looks at every
+byte. Prints a line a map, in JSON.
 
 python tests/map/opening.py PICTURE.npy CAMERA.json MAP ...
 """
@@ -21,20 +22,32 @@ from topoloc.map.topomap import TopoMetricMap
 
 
 def main() -> None:
-    picture, camera = np.load(sys.argv[1]), Camera.from_json(json.loads(Path(sys.argv[2]).read_text()))
+    picture, camera = (
+        np.load(sys.argv[1]),
+        Camera.from_json(json.loads(Path(sys.argv[2]).read_text())),
+    )
     for path in map(Path, sys.argv[3:]):
         start, outcome = time.process_time(), []
-        for use in (lambda path=path: _asked(path, picture, camera), lambda path=path: _checked(path)):
+        for use in (
+            lambda path=path: _asked(path, picture, camera),
+            lambda path=path: _checked(path),
+        ):
             try:
                 outcome.append(use())
             except TopolocError as error:
                 outcome.append(f"{type(error).__name__}: {error}")
-        told = {"map": str(path), "outcome": outcome, "seconds": time.process_time() - start, "rss_kb": _peak_kb()}
+        told = {
+            "map": str(path),
+            "outcome": outcome,
+            "seconds": time.process_time() - start,
+            "rss_kb": _peak_kb(),
+        }
         print(json.dumps(told), flush=True)
 
 
 def _peak_kb() -> int:
-    """The most memory that this program has held; `getrusage` would count what its parent held when it was started."""
+    """The most memory that this program has held; `getrusage` would count what its parent held when
+    it was started."""
     fields = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
     return int(fields["VmHWM"].split()[0])
 

@@ -52,35 +52,58 @@ def test_a_map_whose_parts_lie_on_disk_while_it_is_made_is_the_same(
 ):
     replace(tiny_map, shared_errors=None, repetitions=None).save(tmp_path / "memory.topo")
     monkeypatch.setattr("topoloc.shelf.DEFAULT_BYTES", 0)
-    build_map(topoloc.open_sequence(f"{tiny_recording}@0::2"), tiny_map.config).save(tmp_path / "disk.topo")
+    build_map(topoloc.open_sequence(f"{tiny_recording}@0::2"), tiny_map.config).save(
+        tmp_path / "disk.topo"
+    )
     assert (tmp_path / "disk.topo").read_bytes() == (tmp_path / "memory.topo").read_bytes()
 
 
-def test_points_are_right_and_refined_better_than_measured(tiny_recording: Path, tiny_map: TopoMetricMap):
+def test_points_are_right_and_refined_better_than_measured(
+    tiny_recording: Path, tiny_map: TopoMetricMap
+):
     measured = replace(tiny_map.config, landmarks=LandmarkConfig(nodes_per_image=0))
     unrefined = build_map(topoloc.open_sequence(f"{tiny_recording}@0::2"), measured)
-    errors, errors_before = (np.concatenate([depth_errors(node) for node in m.nodes]) for m in (tiny_map, unrefined))
+    errors, errors_before = (
+        np.concatenate([depth_errors(node) for node in m.nodes]) for m in (tiny_map, unrefined)
+    )
     assert abs(np.nanmedian(errors)) < 0.01
     assert np.nanmedian(np.abs(errors)) < 0.02
     assert np.nanmedian(np.abs(errors)) <= 1.02 * np.nanmedian(np.abs(errors_before))
-    sigma_z, sigma_z_before = (np.mean([np.median(node.point_sqrt_covs[:, 5]) for node in m.nodes]) for m in (tiny_map, unrefined))
+    sigma_z, sigma_z_before = (
+        np.mean([np.median(node.point_sqrt_covs[:, 5]) for node in m.nodes])
+        for m in (tiny_map, unrefined)
+    )
     assert sigma_z < 0.9 * sigma_z_before
 
 
 def test_a_node_holds_what_the_paper_says(tiny_map: TopoMetricMap):
     node = tiny_map.nodes[1]
-    assert len(node.features) == len(node.points_cam) == len(node.point_sqrt_covs) == node.summary.num_points
+    assert (
+        len(node.features)
+        == len(node.points_cam)
+        == len(node.point_sqrt_covs)
+        == node.summary.num_points
+    )
     assert (np.diff(node.features.responses) <= 0).all()  # strongest first
     np.testing.assert_allclose(np.linalg.norm(node.features.descriptors, axis=1), 1.0, atol=1e-3)
-    assert cv2.imdecode(np.frombuffer(node.template_jpeg, np.uint8), cv2.IMREAD_GRAYSCALE).shape == (240, 320)
-    truth = tiny_world.path_pose(2.0 * [image.name for image in tiny_map.place_images].index(node.summary.name))
+    assert cv2.imdecode(
+        np.frombuffer(node.template_jpeg, np.uint8), cv2.IMREAD_GRAYSCALE
+    ).shape == (240, 320)
+    truth = tiny_world.path_pose(
+        2.0 * [image.name for image in tiny_map.place_images].index(node.summary.name)
+    )
     np.testing.assert_allclose(node.summary.world_from_cam.matrix(), truth.matrix(), atol=1e-6)
 
 
 def test_limits_on_points_are_kept(tiny_recording: Path):
-    few = build_map(topoloc.open_sequence(f"{tiny_recording}@0:4"), replace(ALONE, max_node_points=50, template_side_px=60))
+    few = build_map(
+        topoloc.open_sequence(f"{tiny_recording}@0:4"),
+        replace(ALONE, max_node_points=50, template_side_px=60),
+    )
     assert {summary.num_points for summary in few.summaries} == {50}
-    assert cv2.imdecode(np.frombuffer(few.nodes[0].template_jpeg, np.uint8), cv2.IMREAD_GRAYSCALE).shape == (60, 80)
+    assert cv2.imdecode(
+        np.frombuffer(few.nodes[0].template_jpeg, np.uint8), cv2.IMREAD_GRAYSCALE
+    ).shape == (60, 80)
 
 
 def test_depth_pictures_make_a_map_too(tmp_path: Path):
@@ -104,28 +127,40 @@ def test_two_recordings_make_one_map_without_an_edge_between_them(tiny_recording
 
 def test_two_builds_give_the_same_bytes(tiny_recording: Path, tmp_path: Path):
     for name in ("one", "two"):
-        topoloc.build_map(topoloc.open_sequence(f"{tiny_recording}@0::2")).save(tmp_path / f"{name}.topo")
+        topoloc.build_map(topoloc.open_sequence(f"{tiny_recording}@0::2")).save(
+            tmp_path / f"{name}.topo"
+        )
     assert (tmp_path / "one.topo").read_bytes() == (tmp_path / "two.topo").read_bytes()
 
 
-def test_the_number_of_threads_changes_no_byte(tiny_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_number_of_threads_changes_no_byte(
+    tiny_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     for number in (1, 3):
         monkeypatch.setattr("topoloc.compiled._chosen", [number])
-        topoloc.build_map(topoloc.open_sequence(f"{tiny_recording}@0::2")).save(tmp_path / f"{number}.topo")
+        topoloc.build_map(topoloc.open_sequence(f"{tiny_recording}@0::2")).save(
+            tmp_path / f"{number}.topo"
+        )
     assert (tmp_path / "1.topo").read_bytes() == (tmp_path / "3.topo").read_bytes()
 
 
 def test_two_builds_of_a_real_recording_give_the_same_bytes(shared: Path, tmp_path: Path):
     for name in ("one", "two"):
-        build_map(topoloc.open_sequence(f"{shared}/data/zed_lab/session1@0:24:8")).save(tmp_path / name)
+        build_map(topoloc.open_sequence(f"{shared}/data/zed_lab/session1@0:24:8")).save(
+            tmp_path / name
+        )
     assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
 
 
 def test_progress_is_told(tiny_recording: Path):
     told: list[tuple[str, int, int]] = []
-    build_map(topoloc.open_sequence(f"{tiny_recording}@0:3"), ALONE, lambda *step: told.append(step))
+    build_map(
+        topoloc.open_sequence(f"{tiny_recording}@0:3"), ALONE, lambda *step: told.append(step)
+    )
     assert [step for step in told if step[0] == "images"] == [("images", k, 3) for k in (1, 2, 3)]
-    assert [step[1] for step in told if step[0] == "nodes"][-1] == [step[2] for step in told if step[0] == "nodes"][-1]
+    assert [step[1] for step in told if step[0] == "nodes"][-1] == [
+        step[2] for step in told if step[0] == "nodes"
+    ][-1]
 
 
 class CountedReads:
@@ -166,7 +201,9 @@ def test_the_right_picture_of_what_is_no_node_is_not_read(tiny_recording: Path):
     names = {node.summary.name for node in build_map(recording, ALONE).nodes}
     assert 0 < len(names) < 5
     assert [name in names for name in recording.names] == [bool(reads) for reads in recording.reads]
-    assert [reads + halves for reads, halves in zip(recording.reads, recording.halves, strict=True)] == [1] * 5
+    assert [
+        reads + halves for reads, halves in zip(recording.reads, recording.halves, strict=True)
+    ] == [1] * 5
 
 
 def test_an_unreadable_picture_is_named(own_recording: Path):

@@ -42,7 +42,9 @@ def test_any_flipped_bit_is_found_or_does_no_harm(saved: Path):
     assert found > 0.8 * len(places)
 
 
-def test_damage_is_told_in_one_line_and_by_the_exit_status(saved: Path, capsys: pytest.CaptureFixture[str]):
+def test_damage_is_told_in_one_line_and_by_the_exit_status(
+    saved: Path, capsys: pytest.CaptureFixture[str]
+):
     content = saved.read_bytes()
     place = content.index(TopoMetricMap.load(saved).nodes[1].template_jpeg[:40]) + 20
     saved.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
@@ -59,9 +61,15 @@ def test_nodes_that_were_moved_together_are_found(tiny_recording: Path):
     moved = {1, 2}
     away = Rigid3(np.eye(3), np.array([1.0, 0.0, 0.0]))
     nodes = [
-        replace(node, summary=replace(node.summary, world_from_cam=away @ node.summary.world_from_cam)) if row in moved else node
+        replace(
+            node, summary=replace(node.summary, world_from_cam=away @ node.summary.world_from_cam)
+        )
+        if row in moved
+        else node
         for row, node in enumerate(topomap.nodes)
     ]
-    found = contradictions(replace(topomap, nodes=nodes, summaries=[node.summary for node in nodes]))
+    found = contradictions(
+        replace(topomap, nodes=nodes, summaries=[node.summary for node in nodes])
+    )
     assert {contradiction.node_id for contradiction in found} == moved
     assert all(0.9 < contradiction.metres < 1.1 for contradiction in found)

@@ -64,7 +64,9 @@ def test_what_an_undo_takes_is_small(map_file: Path):
     _without_a_node(map_file)
     with TopoMetricMap.load(map_file) as topomap:
         num_nodes = len(topomap.summaries)
-    assert (map_file.parent / "room.topo.undo").stat().st_size < 4 * map_file.stat().st_size / num_nodes + 20_000
+    assert (
+        map_file.parent / "room.topo.undo"
+    ).stat().st_size < 4 * map_file.stat().st_size / num_nodes + 20_000
 
 
 def test_a_map_of_an_older_schema_is_taken_back_whole(map_file: Path, tmp_path: Path):
@@ -110,7 +112,9 @@ def test_an_entry_for_another_file_is_not_used(map_file: Path):
     _without_a_node(map_file)
     stale = (map_file.parent / "room.topo.undo").read_bytes()
     undo_edit(map_file)
-    (map_file.parent / "room.topo.undo").write_bytes(stale)  # as a process leaves it that was killed before the map was renamed
+    (map_file.parent / "room.topo.undo").write_bytes(
+        stale
+    )  # as a process leaves it that was killed before the map was renamed
     assert undoable_edits(map_file) == 0
     before = map_file.read_bytes()
     _without_a_node(map_file)
@@ -163,7 +167,12 @@ def test_a_map_that_is_read_only_is_not_replaced(map_file: Path):
 
 def test_killed_at_any_moment_the_map_is_whole(map_file: Path):
     script = Path(__file__).parents[2] / "benchmarks" / "kill_edits.py"
-    ended = subprocess.run([sys.executable, script, map_file, "--kills", "6", "--within", "1"], capture_output=True, text=True, check=False)
+    ended = subprocess.run(
+        [sys.executable, script, map_file, "--kills", "6", "--within", "1"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert ended.returncode == 0, ended.stderr
     assert "6 kills" in ended.stdout
     assert "0 times broken, 0 times something left" in ended.stdout

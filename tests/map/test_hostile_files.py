@@ -1,4 +1,5 @@
-"""Map files made to deceive are refused in one line or answered from: no crash, no traceback, no hang, no memory without end."""
+"""Map files made to deceive are refused in one line or answered from: no crash, no traceback, no
+hang, no memory without end."""
 
 from __future__ import annotations
 
@@ -25,15 +26,25 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> list[dict]:
     topomap = build_map(WalkAhead(0, num_pairs=6))
     assert topomap.sides is not None
     topomap.save(folder / "corridor.topo")
-    ((picture, _), *_) = seen_ahead()
+    (picture, _), *_ = seen_ahead()
     np.save(folder / "picture.npy", picture)
     (folder / "camera.json").write_text(json.dumps(WIDE.to_json()))
     maps = [folder / f"{seed}.topo" for seed in range(NUM_MUTATIONS)]
     done = [mutate(folder / "corridor.topo", path, seed) for seed, path in enumerate(maps)]
-    command = [sys.executable, str(OPENING), str(folder / "picture.npy"), str(folder / "camera.json"), str(folder / "corridor.topo")]
-    run = subprocess.run([*command, *map(str, maps)], capture_output=True, text=True, timeout=300, check=False)
+    command = [
+        sys.executable,
+        str(OPENING),
+        str(folder / "picture.npy"),
+        str(folder / "camera.json"),
+        str(folder / "corridor.topo"),
+    ]
+    run = subprocess.run(
+        [*command, *map(str, maps)], capture_output=True, text=True, timeout=300, check=False
+    )
     told = [json.loads(line) for line in run.stdout.splitlines()]
-    assert run.returncode == 0, f"{done[len(told) - 1] if told else 'the map itself'}: {run.returncode} {run.stderr[-2000:]}"
+    assert run.returncode == 0, (
+        f"{done[len(told) - 1] if told else 'the map itself'}: {run.returncode} {run.stderr[-2000:]}"  # noqa: E501
+    )
     return told
 
 
@@ -44,7 +55,9 @@ def test_the_map_itself_is_answered_from_and_whole(opened: list[dict]):
 def test_every_mutation_is_an_answer_or_an_error_of_one_line(opened: list[dict]):
     assert len(opened) == NUM_MUTATIONS + 1
     assert all("\n" not in text for told in opened for text in told["outcome"])
-    refused = [told for told in opened[1:] if "Error" in told["outcome"][0] or told["outcome"][1] != "ok"]
+    refused = [
+        told for told in opened[1:] if "Error" in told["outcome"][0] or told["outcome"][1] != "ok"
+    ]
     assert len(refused) > 0.7 * NUM_MUTATIONS
 
 

@@ -1,4 +1,5 @@
-"""Points refined by what other images see of them: errors shrink, covariances stay honest, contradictions are found."""
+"""Points refined by what other images see of them: errors shrink, covariances stay honest,
+contradictions are found."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ SIGMA_PX = 0.8
 
 @dataclass
 class Scene:
-    """Points as they are and as one stereo pair measured them, and eight views of them from up to a metre away."""
+    """Points as they are and as one stereo pair measured them, and eight views of them from up to a
+    metre away."""
 
     truth: np.ndarray
     measured: np.ndarray
@@ -34,8 +36,17 @@ def scene(num_points: int = 400, seed: int = 0) -> Scene:
     truth = np.column_stack([rng.uniform(-0.5, 0.5, (num_points, 2)) * z[:, None], z])
     sigma_z = z**2 / (500.0 * 0.12) * 0.3
     covariances = ray_covariances(truth, sigma_z, CAMERA, np.full(num_points, SIGMA_PX))
-    measured = truth + np.einsum("nij,nj->ni", np.linalg.cholesky(covariances), rng.standard_normal((num_points, 3)))
-    observations = [view(truth, Rigid3(exp_so3(rng.normal(0, 0.05, 3)), rng.uniform(-1, 1, 3) * [1, 0.3, 0.5]), rng) for _ in range(8)]
+    measured = truth + np.einsum(
+        "nij,nj->ni", np.linalg.cholesky(covariances), rng.standard_normal((num_points, 3))
+    )
+    observations = [
+        view(
+            truth,
+            Rigid3(exp_so3(rng.normal(0, 0.05, 3)), rng.uniform(-1, 1, 3) * [1, 0.3, 0.5]),
+            rng,
+        )
+        for _ in range(8)
+    ]
     return Scene(truth, measured, covariances, observations)
 
 
@@ -107,11 +118,21 @@ def features_at(points_img: np.ndarray, seed: int = 3) -> Features:
 
 def observed(offset_px: np.ndarray) -> tuple[Observations, np.ndarray]:
     """What another image sees of the scene's points whose key points are displaced by this."""
-    s, cam_from_node = scene(60), Rigid3(exp_so3(np.array([0.0, 0.1, 0.0])), np.array([0.3, 0.0, 0.1]))
+    s, cam_from_node = (
+        scene(60),
+        Rigid3(exp_so3(np.array([0.0, 0.1, 0.0])), np.array([0.3, 0.0, 0.1])),
+    )
     points_img = CAMERA.img_from_cam(cam_from_node.apply(s.truth))
     sigmas = np.full(60, SIGMA_PX)
     seen = observe_points(
-        features_at(points_img), s.truth, s.covariances, features_at(points_img + offset_px), sigmas, CAMERA, cam_from_node, CONFIG
+        features_at(points_img),
+        s.truth,
+        s.covariances,
+        features_at(points_img + offset_px),
+        sigmas,
+        CAMERA,
+        cam_from_node,
+        CONFIG,
     )
     return seen, points_img
 
@@ -119,7 +140,9 @@ def observed(offset_px: np.ndarray) -> tuple[Observations, np.ndarray]:
 def test_points_are_found_by_descriptor_where_they_must_be():
     seen, points_img = observed(np.zeros((60, 2)))
     assert sorted(seen.rows.tolist()) == list(range(60))
-    np.testing.assert_allclose(seen.normalized, CAMERA.normalized_from_img(points_img)[seen.rows], atol=1e-6)
+    np.testing.assert_allclose(
+        seen.normalized, CAMERA.normalized_from_img(points_img)[seen.rows], atol=1e-6
+    )
     assert seen.sigmas == pytest.approx(np.hypot(SIGMA_PX, CONFIG.pose_sigma_px) / 500.0)
 
 
@@ -134,5 +157,7 @@ def test_points_behind_the_other_camera_are_not_observed():
     s = scene(30)
     behind = Rigid3(exp_so3(np.array([0.0, np.pi, 0.0])), np.zeros(3))
     features = features_at(CAMERA.img_from_cam(s.truth))
-    seen = observe_points(features, s.truth, s.covariances, features, np.full(30, 1.0), CAMERA, behind, CONFIG)
+    seen = observe_points(
+        features, s.truth, s.covariances, features, np.full(30, 1.0), CAMERA, behind, CONFIG
+    )
     assert len(seen.rows) == 0

@@ -20,7 +20,12 @@ def test_what_was_used_longest_ago_is_let_go_over_all_owners():
         return RememberedNodes(read_row, memory)
 
     one, other = reader("one"), reader("other")
-    one(0), other(0), one(0), other(1)  # the third is remembered, the fourth is too much: other(0) goes
+    (
+        one(0),
+        other(0),
+        one(0),
+        other(1),
+    )  # the third is remembered, the fourth is too much: other(0) goes
     assert read == [("one", 0), ("other", 0), ("other", 1)]
     one(0), other(0)
     assert read[3:] == [("other", 0)]

@@ -23,7 +23,11 @@ from topoloc.map.topomap import TopoMetricMap
 def answers(topomap: TopoMetricMap) -> list[tuple[bytes, int]]:
     results = [Localizer(topomap).localize(picture, WIDE) for picture, _ in seen_ahead()]
     assert all(isinstance(result, Localization) for result in results)
-    return [(result.world_from_cam.matrix().tobytes(), result.node_id) for result in results if isinstance(result, Localization)]
+    return [
+        (result.world_from_cam.matrix().tobytes(), result.node_id)
+        for result in results
+        if isinstance(result, Localization)
+    ]
 
 
 def test_schema_1_answers_the_same_bytes_and_is_saved_as_schema_3(tmp_path: Path):
@@ -35,7 +39,9 @@ def test_schema_1_answers_the_same_bytes_and_is_saved_as_schema_3(tmp_path: Path
     assert list(old.sessions) == [Session(0, "walk")]
     assert old.sides is not None
     assert new.sides is not None
-    assert [summary.of_node for summary in old.sides.summaries] == [summary.of_node for summary in new.sides.summaries]
+    assert [summary.of_node for summary in old.sides.summaries] == [
+        summary.of_node for summary in new.sides.summaries
+    ]
     assert damages(tmp_path / "old.topo") == []
     old.save(tmp_path / "saved.topo")
     saved = TopoMetricMap.load(tmp_path / "saved.topo")
@@ -60,9 +66,13 @@ def test_schema_2_answers_the_same_bytes_and_is_saved_as_schema_3(tmp_path: Path
 
 @pytest.mark.slow
 def test_schema_1_without_side_tables_is_a_map_without_sides(tmp_path: Path):
-    old = TopoMetricMap.load(write_schema_1(replace(built_corridor(), sides=None), tmp_path / "old.topo"))
+    old = TopoMetricMap.load(
+        write_schema_1(replace(built_corridor(), sides=None), tmp_path / "old.topo")
+    )
     assert old.sides is None
-    np.testing.assert_array_equal(answers(old), answers(replace(TopoMetricMap.load(tmp_path / "old.topo"), sides=None)))
+    np.testing.assert_array_equal(
+        answers(old), answers(replace(TopoMetricMap.load(tmp_path / "old.topo"), sides=None))
+    )
 
 
 def read_summaries(path: Path) -> None:

@@ -8,7 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.map.nodes import DEPTH_SHARE, RADIANS_PER_NODE, NearestNodes, NodeConfig, NodePoses, node_distances, place_nodes
+from topoloc.map.nodes import (
+    DEPTH_SHARE,
+    RADIANS_PER_NODE,
+    NearestNodes,
+    NodeConfig,
+    NodePoses,
+    node_distances,
+    place_nodes,
+)
 
 
 def moved(x: float, yaw: float = 0.0) -> Rigid3:
@@ -17,7 +25,11 @@ def moved(x: float, yaw: float = 0.0) -> Rigid3:
 
 def test_distance_is_translation_plus_lambda_times_angle():
     nodes = NodePoses.of([moved(0.0), moved(3.0, 0.5)])
-    np.testing.assert_allclose(node_distances(moved(1.0, 0.2), nodes, lambda_rot=2.0), [1.0 + 2.0 * 0.2, 2.0 + 2.0 * 0.3], atol=1e-12)
+    np.testing.assert_allclose(
+        node_distances(moved(1.0, 0.2), nodes, lambda_rot=2.0),
+        [1.0 + 2.0 * 0.2, 2.0 + 2.0 * 0.3],
+        atol=1e-12,
+    )
 
 
 def test_angle_is_that_of_the_relative_rotation_up_to_half_a_turn():
@@ -51,13 +63,23 @@ def test_one_frame_is_one_node():
     assert place_nodes([moved(0.0)], NodeConfig(1.0, 1.0)).tolist() == [0]
 
 
-@given(st.lists(st.tuples(st.floats(-20, 20), st.floats(-3, 3)), min_size=1, max_size=40), st.floats(0.1, 5), st.floats(0, 5))
-def test_every_frame_is_near_a_node_and_no_two_nodes_are_near(steps: list[tuple[float, float]], d_thresh: float, lambda_rot: float):
+@given(
+    st.lists(st.tuples(st.floats(-20, 20), st.floats(-3, 3)), min_size=1, max_size=40),
+    st.floats(0.1, 5),
+    st.floats(0, 5),
+)
+def test_every_frame_is_near_a_node_and_no_two_nodes_are_near(
+    steps: list[tuple[float, float]], d_thresh: float, lambda_rot: float
+):
     poses = [moved(x, yaw) for x, yaw in steps]
     frame_idx = place_nodes(poses, NodeConfig(d_thresh, lambda_rot))
     nodes = NodePoses.of([poses[i] for i in frame_idx])
-    rounding = 1.0 + 1e-12  # a step of 1e-124 from where a node just is none is seen in one order of the sums and not in the other
-    assert all(node_distances(pose, nodes, lambda_rot).min() <= d_thresh * rounding for pose in poses)
+    rounding = (
+        1.0 + 1e-12
+    )  # a step of 1e-124 from where a node just is none is seen in one order of the sums and not in the other  # noqa: E501
+    assert all(
+        node_distances(pose, nodes, lambda_rot).min() <= d_thresh * rounding for pose in poses
+    )
     between = np.array([node_distances(poses[i], nodes, lambda_rot) for i in frame_idx])
     assert (between[~np.eye(len(frame_idx), dtype=bool)] > d_thresh / rounding).all()
 
@@ -68,8 +90,12 @@ def test_every_frame_is_near_a_node_and_no_two_nodes_are_near(steps: list[tuple[
     st.integers(1, 4),
     st.floats(0, 30),
 )
-def test_the_nearest_nodes_are_those_of_all(nodes: list[tuple[float, float]], camera: tuple[float, float], count: int, lambda_rot: float):
-    poses = NodePoses.of([moved(round(x, 1), round(yaw, 1)) for x, yaw in nodes])  # equal ones among them
+def test_the_nearest_nodes_are_those_of_all(
+    nodes: list[tuple[float, float]], camera: tuple[float, float], count: int, lambda_rot: float
+):
+    poses = NodePoses.of(
+        [moved(round(x, 1), round(yaw, 1)) for x, yaw in nodes]
+    )  # equal ones among them
     right = np.argsort(node_distances(moved(*camera), poses, lambda_rot), kind="stable")[:count]
     assert NearestNodes(poses, lambda_rot).rows(moved(*camera), count).tolist() == right.tolist()
 
@@ -78,5 +104,7 @@ def test_unset_parameters_follow_from_the_scene():
     resolved = NodeConfig().resolved(median_depth=4.0)
     assert resolved.d_thresh == pytest.approx(4.0 * DEPTH_SHARE)
     assert resolved.lambda_rot == pytest.approx(4.0 * DEPTH_SHARE / RADIANS_PER_NODE)
-    assert NodeConfig(d_thresh=1.5).resolved(100.0).lambda_rot == pytest.approx(1.5 / RADIANS_PER_NODE)
+    assert NodeConfig(d_thresh=1.5).resolved(100.0).lambda_rot == pytest.approx(
+        1.5 / RADIANS_PER_NODE
+    )
     assert NodeConfig(0.7, 0.2).resolved(100.0) == NodeConfig(0.7, 0.2)

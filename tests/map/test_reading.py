@@ -27,7 +27,9 @@ def test_entries_are_counted_and_sliced_as_in_a_list(saved: Path):
     topomap = TopoMetricMap.load(saved)
     count = len(topomap.place_images)
     assert topomap.place_images[-1].name == topomap.place_images[count - 1].name
-    assert [image.name for image in topomap.place_images[1:3]] == [topomap.place_images[k].name for k in (1, 2)]
+    assert [image.name for image in topomap.place_images[1:3]] == [
+        topomap.place_images[k].name for k in (1, 2)
+    ]
     with pytest.raises(IndexError):
         topomap.nodes[len(topomap.nodes)]
     with pytest.raises(KeyError):
@@ -60,7 +62,12 @@ print(asked)
 
 def test_opening_reads_no_node(saved: Path):
     """In a process of its own, since checking the types of a map's entries reads them."""
-    answer = subprocess.run([sys.executable, "-c", QUERIES_OF_OPENING, str(saved)], capture_output=True, text=True, check=True)
+    answer = subprocess.run(
+        [sys.executable, "-c", QUERIES_OF_OPENING, str(saved)],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     opening, later = answer.stdout.splitlines()
     assert "FROM map" in opening
     assert "FROM nodes" not in opening
@@ -69,7 +76,9 @@ def test_opening_reads_no_node(saved: Path):
     assert later.count("checksum FROM node_points WHERE") == 1
 
 
-def test_a_map_that_never_measured_its_shared_errors_says_so(tiny_map: TopoMetricMap, tmp_path: Path):
+def test_a_map_that_never_measured_its_shared_errors_says_so(
+    tiny_map: TopoMetricMap, tmp_path: Path
+):
     replace(tiny_map, shared_errors=None).save(tmp_path / "older.topo")
     assert TopoMetricMap.load(tmp_path / "older.topo").shared_errors is None
 
@@ -78,14 +87,22 @@ SPOILT = {
     "half a blob": "UPDATE node_points SET points_cam = substr(points_cam, 1, 100)",
     "a blob of odd length": "UPDATE node_points SET sqrt_covs = sqrt_covs || x'00'",
     "a pose of no length": "UPDATE nodes SET world_from_cam = x''",
-    "a pose that is not finite": "UPDATE nodes SET world_from_cam = zeroblob(88) || x'000000000000f87f'",
-    "a camera that is none": 'UPDATE cameras SET json = \'{"model": "PINHOLE"}\' WHERE camera_id = 1',
+    "a pose that is not finite": (
+        "UPDATE nodes SET world_from_cam = zeroblob(88) || x'000000000000f87f'"
+    ),
+    "a camera that is none": (
+        'UPDATE cameras SET json = \'{"model": "PINHOLE"}\' WHERE camera_id = 1'
+    ),
     "a camera that is no JSON": "UPDATE cameras SET json = '{' WHERE camera_id = 1",
     "no node points": "DELETE FROM node_points",
     "no configuration": "DELETE FROM map",
     "a configuration that is no JSON": "UPDATE map SET value = 'x'",
-    "shared errors that are no number": 'UPDATE map SET value = \'{"rho": "much", "digest": ""}\' WHERE key = \'shared_errors\'',
-    "shared errors below zero": 'UPDATE map SET value = \'{"rho": -1, "digest": ""}\' WHERE key = \'shared_errors\'',
+    "shared errors that are no number": (
+        'UPDATE map SET value = \'{"rho": "much", "digest": ""}\' WHERE key = \'shared_errors\''
+    ),
+    "shared errors below zero": (
+        'UPDATE map SET value = \'{"rho": -1, "digest": ""}\' WHERE key = \'shared_errors\''
+    ),
     "a coarse model cut off": "UPDATE coarse_models SET arrays = substr(arrays, 1, 1000)",
     "a coarse model of nothing": "UPDATE coarse_models SET arrays = x''",
     "a gap in the images": "UPDATE place_images SET image_id = image_id + 100",

@@ -1,4 +1,5 @@
-"""Sessions by their light: which are of one, and that the coarse search makes less of what sets lights apart."""
+"""Sessions by their light: which are of one, and that the coarse search makes less of what sets
+lights apart."""
 
 from __future__ import annotations
 
@@ -32,18 +33,33 @@ def test_sessions_of_one_light_go_together():
 
 
 def test_names_decide_where_there_are_some():
-    sessions = [_session(0, DAY, "noon"), _session(1, CLOUDS, "evening"), _session(2, NIGHT, "evening"), _session(3, CLOUDS)]
+    sessions = [
+        _session(0, DAY, "noon"),
+        _session(1, CLOUDS, "evening"),
+        _session(2, NIGHT, "evening"),
+        _session(3, CLOUDS),
+    ]
     assert light_groups(sessions, {0: 9}) == {0: 0, 1: 1, 2: 1, 3: 0}
     assert light_groups([_session(0, None), _session(1, None, "night")], {0: 9}) == {0: 0, 1: 1}
 
 
-def _model(rng: np.random.Generator, places: np.ndarray, shift: np.ndarray, covered: int) -> SurfVlad:
-    """Places by day, and some of them once more by night; the vectors are what they are, whatever the words."""
+def _model(
+    rng: np.random.Generator, places: np.ndarray, shift: np.ndarray, covered: int
+) -> SurfVlad:
+    """Places by day, and some of them once more by night; the vectors are what they are, whatever
+    the words."""
     vectors = np.concatenate([places, places[:covered] + shift]).astype(np.float32)
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
     p = vectors.shape[1]
     words = rng.normal(size=(1, p)).astype(np.float32)
-    return SurfVlad(words, np.zeros(p, np.float32), np.eye(p, dtype=np.float32), vectors, np.arange(len(vectors)), VladConfig())
+    return SurfVlad(
+        words,
+        np.zeros(p, np.float32),
+        np.eye(p, dtype=np.float32),
+        vectors,
+        np.arange(len(vectors)),
+        VladConfig(),
+    )
 
 
 def _asked(model: SurfVlad, vector: np.ndarray, words: np.ndarray) -> list[int]:
@@ -67,12 +83,15 @@ def test_a_night_of_half_the_way_does_not_draw_the_other_half_to_itself():
     dark = places[20:] + shift + 0.3 * rng.normal(size=(10, 24))
     words = model.to_model().arrays["words"]
     before, after = (
-        sum(_asked(one, view, words)[0] == 20 + k for k, view in enumerate(dark)) for one in (model, model.with_less_between(lights))
+        sum(_asked(one, view, words)[0] == 20 + k for k, view in enumerate(dark))
+        for one in (model, model.with_less_between(lights))
     )
     assert before == 0
     assert after >= 5
     assert model.with_less_between(np.zeros(45, np.int64)) is model
-    assert model.with_less_between(np.r_[np.zeros(38, np.int64), np.ones(7, np.int64)]) is model, "too few to say anything"
+    assert model.with_less_between(np.r_[np.zeros(38, np.int64), np.ones(7, np.int64)]) is model, (
+        "too few to say anything"
+    )
 
 
 def test_a_map_of_one_light_is_asked_as_it_is(room_map: Path):
@@ -82,8 +101,14 @@ def test_a_map_of_one_light_is_asked_as_it_is(room_map: Path):
         node = topomap.nodes[0]
         blank = np.zeros((node.camera.height, node.camera.width), np.uint8)
         asked = [
-            open_coarse_of(replace(topomap, sessions=sessions), "surf-vlad").rank(blank, node.features, 5)
-            for sessions in ([session], [session, replace(session, session_id=1)], [session, replace(session, session_id=1, light=NIGHT)])
+            open_coarse_of(replace(topomap, sessions=sessions), "surf-vlad").rank(
+                blank, node.features, 5
+            )
+            for sessions in (
+                [session],
+                [session, replace(session, session_id=1)],
+                [session, replace(session, session_id=1, light=NIGHT)],
+            )
         ]
     assert asked[0] == asked[1] == asked[2], "no node is of the other session"
 
@@ -91,6 +116,8 @@ def test_a_map_of_one_light_is_asked_as_it_is(room_map: Path):
 @pytest.mark.parametrize("name", [None, "night"])
 def test_the_name_of_a_light_is_kept(room_map: Path, tmp_path: Path, name: str | None):
     with TopoMetricMap.load(room_map) as topomap:
-        replace(topomap, sessions=[replace(topomap.sessions[0], light_name=name)]).save(tmp_path / "named.topo")
+        replace(topomap, sessions=[replace(topomap.sessions[0], light_name=name)]).save(
+            tmp_path / "named.topo"
+        )
     with TopoMetricMap.load(tmp_path / "named.topo") as topomap:
         assert topomap.sessions[0].light_name == name

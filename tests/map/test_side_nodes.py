@@ -1,4 +1,5 @@
-"""Side nodes: the points of the walls as cameras turned to them would know them, and their place in the map file."""
+"""Side nodes: the points of the walls as cameras turned to them would know them, and their place in
+the map file."""
 
 from __future__ import annotations
 
@@ -41,7 +42,9 @@ def sides() -> SideNodes:
 
 def described(view: FrameView, config: SideNodesConfig | None = None) -> list[TopoNode]:
     of_node = NodeSummary(-1, "walk", "a picture", 7, Rigid3.identity(), 99)
-    return describe_sides(of_node, view, FeatureConfig(), MetricPointsConfig(), config or SideNodesConfig())
+    return describe_sides(
+        of_node, view, FeatureConfig(), MetricPointsConfig(), config or SideNodesConfig()
+    )
 
 
 def depth_errors(node: TopoNode) -> np.ndarray:
@@ -77,7 +80,9 @@ def test_covariances_cover_the_errors_and_are_turned_with_the_camera(sides: Side
         lower[:, *np.tril_indices(3)] = node.point_sqrt_covs
         covariances = lower @ lower.transpose(0, 2, 1)
         assert (np.linalg.eigvalsh(covariances)[:, 0] > 0).all()
-        assert np.nanquantile(np.abs(depth_errors(node)) / np.sqrt(covariances[:, 2, 2]), 0.95) < 3.0
+        assert (
+            np.nanquantile(np.abs(depth_errors(node)) / np.sqrt(covariances[:, 2, 2]), 0.95) < 3.0
+        )
         # stereo knows least along the ray, which the side camera sees slanted
         rays = node.points_cam / np.linalg.norm(node.points_cam, axis=1, keepdims=True)
         worst = np.linalg.eigh(covariances)[1][:, :, 2]
@@ -93,10 +98,14 @@ def test_side_nodes_are_numbered_and_say_where_they_come_from(sides: SideNodes):
         s = node.summary
         assert (s.recording, s.num_points) == ("walk", len(node.features))
         assert node.template_jpeg == b""
-        np.testing.assert_allclose(s.world_from_cam.translation, of_names[s.name].translation, atol=1e-9)
+        np.testing.assert_allclose(
+            s.world_from_cam.translation, of_names[s.name].translation, atol=1e-9
+        )
         from_node = of_names[s.name].rotation.T @ s.world_from_cam.rotation
         np.testing.assert_allclose(np.abs(from_node[:, 2]), [1.0, 0.0, 0.0], atol=1e-9)
-    left_and_right = [round(float(node.summary.world_from_cam.rotation[0, 2])) for node in sides.nodes]
+    left_and_right = [
+        round(float(node.summary.world_from_cam.rotation[0, 2])) for node in sides.nodes
+    ]
     assert left_and_right == [-1, 1] * (len(sides.nodes) // 2)
     assert 2 < len(sides.nodes) < len(topomap.nodes)
 
@@ -115,7 +124,10 @@ def test_each_is_ranked_first_by_its_own_looks_and_its_centre_is_where_it_looks(
 
 def test_limits_on_points_are_kept():
     view = frame_view(WalkAhead(0)[4])
-    few, all_of_them = described(view, SideNodesConfig(max_points=50)), described(view, SideNodesConfig(max_points=5000))
+    few, all_of_them = (
+        described(view, SideNodesConfig(max_points=50)),
+        described(view, SideNodesConfig(max_points=5000)),
+    )
     assert [len(node.features) for node in few] == [50, 50]
     for node, whole in zip(few, all_of_them, strict=True):
         assert len(whole.features) > 400
@@ -134,18 +146,28 @@ def test_pictures_that_show_no_walls_have_no_sides():
 
 def test_without_spacing_a_map_has_none(tiny_recording: Path):
     assert nodes_with_sides([Rigid3.identity()], SPACED, SideNodesConfig(spacing=0.0)) == set()
-    config = BuildConfig(nodes=NodeConfig(d_thresh=0.5, lambda_rot=1.0), sides=SideNodesConfig(spacing=0.0))
+    config = BuildConfig(
+        nodes=NodeConfig(d_thresh=0.5, lambda_rot=1.0), sides=SideNodesConfig(spacing=0.0)
+    )
     topomap = build_map(replace(WalkAhead(0), num_pairs=2), config)
     assert topomap.sides is None
     assert len(topomap.nodes) > 0
 
 
 @settings(max_examples=40, deadline=None)
-@given(steps=st.lists(st.tuples(st.floats(0.0, 0.7), st.floats(-0.07, 0.07)), min_size=1, max_size=30), spacing=st.floats(1.0, 5.0))
-def test_no_node_is_far_from_one_with_sides_and_these_are_far_from_each_other(steps: list[tuple[float, float]], spacing: float):
+@given(
+    steps=st.lists(st.tuples(st.floats(0.0, 0.7), st.floats(-0.07, 0.07)), min_size=1, max_size=30),
+    spacing=st.floats(1.0, 5.0),
+)
+def test_no_node_is_far_from_one_with_sides_and_these_are_far_from_each_other(
+    steps: list[tuple[float, float]], spacing: float
+):
     """By Eq. 1 with a larger threshold and turns that count half."""
     ways, turns = np.cumsum(np.array(steps), axis=0).T
-    poses = [Rigid3(exp_so3(np.array([0.0, turn, 0.0])), np.array([0.0, 0.0, way])) for way, turn in zip(ways, turns, strict=True)]
+    poses = [
+        Rigid3(exp_so3(np.array([0.0, turn, 0.0])), np.array([0.0, 0.0, way]))
+        for way, turn in zip(ways, turns, strict=True)
+    ]
     chosen = sorted(nodes_with_sides(poses, SPACED, SideNodesConfig(spacing=spacing)))
     assert chosen[0] == 0
     for k, pose in enumerate(poses):
@@ -157,12 +179,17 @@ def test_no_node_is_far_from_one_with_sides_and_these_are_far_from_each_other(st
 
 def test_a_way_that_was_mapped_in_both_directions_needs_no_sides():
     there = [Rigid3(np.eye(3), np.array([0.0, 0.0, 0.3 * k])) for k in range(80)]
-    back_again = [Rigid3(exp_so3(np.array([0.0, np.pi, 0.0])), np.array([0.5, 0.0, 0.3 * k])) for k in reversed(range(40))]
+    back_again = [
+        Rigid3(exp_so3(np.array([0.0, np.pi, 0.0])), np.array([0.5, 0.0, 0.3 * k]))
+        for k in reversed(range(40))
+    ]
     config = SideNodesConfig()
     alone, both = (nodes_with_sides(poses, SPACED, config) for poses in (there, there + back_again))
     assert both < alone
     assert all(0.3 * k > 0.3 * 39 for k in both)  # only beyond where anybody came back
-    assert {k for k in alone if k > 39 + config.opposite} == {k for k in both if k > 39 + config.opposite}
+    assert {k for k in alone if k > 39 + config.opposite} == {
+        k for k in both if k > 39 + config.opposite
+    }
 
 
 def test_a_narrow_lens_makes_a_map_without_sides():
@@ -184,12 +211,22 @@ def test_sides_come_back_from_the_file(sides: SideNodes, saved_corridor: Path):
     for one, other, summary in zip(loaded.nodes, sides.nodes, loaded.summaries, strict=True):
         for s in (one.summary, summary):
             o = other.summary
-            assert (s.node_id, s.of_node, s.name, s.t_ns, s.num_points) == (o.node_id, o.of_node, o.name, o.t_ns, o.num_points)
+            assert (s.node_id, s.of_node, s.name, s.t_ns, s.num_points) == (
+                o.node_id,
+                o.of_node,
+                o.name,
+                o.t_ns,
+                o.num_points,
+            )
             np.testing.assert_array_equal(s.world_from_cam.matrix(), o.world_from_cam.matrix())
         assert one.camera == other.camera
         for name in ("points_img", "sizes_px", "angles", "responses"):
-            np.testing.assert_array_equal(getattr(one.features, name), getattr(other.features, name))
-        assert np.median(np.sum(one.features.descriptors * other.features.descriptors, axis=1)) > 0.999
+            np.testing.assert_array_equal(
+                getattr(one.features, name), getattr(other.features, name)
+            )
+        assert (
+            np.median(np.sum(one.features.descriptors * other.features.descriptors, axis=1)) > 0.999
+        )
         np.testing.assert_array_equal(one.points_cam, other.points_cam)
         np.testing.assert_allclose(one.point_sqrt_covs, other.point_sqrt_covs, rtol=1e-3, atol=1e-6)
     (one,), (other,) = loaded.coarse_models.values(), sides.coarse_models.values()
@@ -198,13 +235,17 @@ def test_sides_come_back_from_the_file(sides: SideNodes, saved_corridor: Path):
         np.testing.assert_array_equal(one.arrays[name], other.arrays[name])
 
 
-def test_a_loaded_map_keeps_its_sides_when_it_is_saved_again(sides: SideNodes, saved_corridor: Path):
+def test_a_loaded_map_keeps_its_sides_when_it_is_saved_again(
+    sides: SideNodes, saved_corridor: Path
+):
     before = saved_corridor.read_bytes()
     TopoMetricMap.load(saved_corridor).save(saved_corridor)
     assert saved_corridor.read_bytes() == before
     again = TopoMetricMap.load(saved_corridor).sides
     assert again is not None
-    assert [len(node.features) for node in again.nodes] == [len(node.features) for node in sides.nodes]
+    assert [len(node.features) for node in again.nodes] == [
+        len(node.features) for node in sides.nodes
+    ]
 
 
 QUERIES_OF_OPENING = """
@@ -226,7 +267,12 @@ print(asked)
 
 def test_opening_reads_no_side_node(saved_corridor: Path):
     """In a process of its own, since checking the types of a map's entries reads them."""
-    answer = subprocess.run([sys.executable, "-c", QUERIES_OF_OPENING, str(saved_corridor)], capture_output=True, text=True, check=True)
+    answer = subprocess.run(
+        [sys.executable, "-c", QUERIES_OF_OPENING, str(saved_corridor)],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     opening, later = answer.stdout.splitlines()
     assert "FROM map" in opening
     for table in ("side_nodes", "side_node_points", "side_coarse_models"):
@@ -245,14 +291,20 @@ def changed(path: Path, script: str) -> Path:
 def read_sides(path: Path) -> None:
     topomap = TopoMetricMap.load(path)
     assert topomap.sides is not None
-    list(topomap.sides.summaries), list(topomap.sides.nodes), list(topomap.sides.coarse_models.values())
+    (
+        list(topomap.sides.summaries),
+        list(topomap.sides.nodes),
+        list(topomap.sides.coarse_models.values()),
+    )
 
 
 SPOILT = {
     "half a blob": "UPDATE side_node_points SET points_cam = substr(points_cam, 1, 100)",
     "a blob of odd length": "UPDATE side_node_points SET descriptors = descriptors || x'00'",
     "a pose of no length": "UPDATE side_nodes SET world_from_cam = x''",
-    "a pose that is not finite": "UPDATE side_nodes SET world_from_cam = zeroblob(88) || x'000000000000f87f'",
+    "a pose that is not finite": (
+        "UPDATE side_nodes SET world_from_cam = zeroblob(88) || x'000000000000f87f'"
+    ),
     "a camera that is not there": "UPDATE side_nodes SET camera_id = 1000",
     "no points": "DELETE FROM side_node_points",
     "a side node missing": "DELETE FROM side_nodes WHERE node_id = 1",

@@ -1,4 +1,5 @@
-"""Ids are not rows: maps whose middle was removed, two sessions of one name, maps that are closed, pickled and replaced."""
+"""Ids are not rows: maps whose middle was removed, two sessions of one name, maps that are closed,
+pickled and replaced."""
 
 from __future__ import annotations
 
@@ -25,10 +26,14 @@ from topoloc_training.coarse_training import in_ids
 
 
 def with_ids(topomap: TopoMetricMap, ids: list[int], kept: list[int]) -> TopoMetricMap:
-    """The map with its nodes called `ids`, and then all but the rows `kept` removed; the coarse localizers still know those."""
+    """The map with its nodes called `ids`, and then all but the rows `kept` removed; the coarse
+    localizers still know those."""
     of = dict(zip([summary.node_id for summary in topomap.summaries], ids, strict=True))
     nodes = [topomap.nodes[row] for row in kept]
-    nodes = [replace(node, summary=replace(node.summary, node_id=of[node.summary.node_id])) for node in nodes]
+    nodes = [
+        replace(node, summary=replace(node.summary, node_id=of[node.summary.node_id]))
+        for node in nodes
+    ]
     alive = {node.summary.node_id for node in nodes}
     models = {name: in_ids(model, ids) for name, model in topomap.coarse_models.items()}
     edges = [Edge(of[edge.source_id], of[edge.target_id]) for edge in topomap.edges]
@@ -37,7 +42,12 @@ def with_ids(topomap: TopoMetricMap, ids: list[int], kept: list[int]) -> TopoMet
     if sides is not None:
         side_ids = [5 + 3 * row for row in range(len(sides.nodes))]
         described = [
-            replace(node, summary=replace(node.summary, node_id=side_ids[row], of_node=of[node.summary.of_node or 0]))
+            replace(
+                node,
+                summary=replace(
+                    node.summary, node_id=side_ids[row], of_node=of[node.summary.of_node or 0]
+                ),
+            )
             for row, node in enumerate(sides.nodes)
         ]
         described = [node for node in described if node.summary.of_node in alive]
@@ -95,7 +105,9 @@ def test_walls_of_a_map_whose_ids_are_no_rows_are_recognised(renumbered: Path):
 def test_neighbours_are_named_by_their_ids(renumbered: Path):
     topomap = TopoMetricMap.load(renumbered)
     poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
-    distances = node_distances(topomap.summaries[1].world_from_cam, poses, topomap.config.lambda_rot)
+    distances = node_distances(
+        topomap.summaries[1].world_from_cam, poses, topomap.config.lambda_rot
+    )
     near = neighbours_of(topomap, distances)
     assert topomap.summaries[1].node_id in near
     assert near <= {summary.node_id for summary in topomap.summaries}
@@ -104,7 +116,14 @@ def test_neighbours_are_named_by_their_ids(renumbered: Path):
 def test_ids_of_removed_nodes_are_not_used_again(renumbered: Path):
     topomap = TopoMetricMap.load(renumbered)
     assert topomap.next_ids.node == topomap.summaries[-1].node_id + 1
-    fewer = replace(topomap, nodes=topomap.nodes[:2], summaries=topomap.summaries[:2], edges=[], place_images=[], sides=None)
+    fewer = replace(
+        topomap,
+        nodes=topomap.nodes[:2],
+        summaries=topomap.summaries[:2],
+        edges=[],
+        place_images=[],
+        sides=None,
+    )
     fewer.save(renumbered.with_name("fewer.topo"))
     assert TopoMetricMap.load(renumbered.with_name("fewer.topo")).next_ids == topomap.next_ids
 
@@ -118,18 +137,29 @@ def test_a_model_of_removed_nodes_alone_is_a_map_error():
 def test_two_recordings_of_one_name_are_two_sessions(tmp_path: Path):
     first, second = WalkAhead(0, num_pairs=4), WalkAhead(1, num_pairs=4)
     away = Rigid3(np.eye(3), np.array([50.0, 0.0, 0.0]))
-    second = SequenceView(second, [0, 1, 2, 3], [None if pose is None else away @ pose for pose in second.poses])
+    second = SequenceView(
+        second, [0, 1, 2, 3], [None if pose is None else away @ pose for pose in second.poses]
+    )
     topomap = build_map([first, second], poses_from=["truth", "walk.tum"])
     topomap.save(tmp_path / "two.topo")
     loaded = TopoMetricMap.load(tmp_path / "two.topo")
-    assert [(session.name, session.poses_from) for session in loaded.sessions] == [("walk", "truth"), ("walk", "walk.tum")]
-    assert {summary.session_id for summary in loaded.summaries} == {image.session_id for image in loaded.place_images} == {0, 1}
+    assert [(session.name, session.poses_from) for session in loaded.sessions] == [
+        ("walk", "truth"),
+        ("walk", "walk.tum"),
+    ]
+    assert (
+        {summary.session_id for summary in loaded.summaries}
+        == {image.session_id for image in loaded.place_images}
+        == {0, 1}
+    )
     assert loaded.sides is not None
     for summary in loaded.sides.summaries:
         assert summary.of_node is not None
         node = loaded.summaries[loaded.row_of(summary.of_node)]
         assert (node.session_id, node.name) == (summary.session_id, summary.name)
-        np.testing.assert_array_equal(node.world_from_cam.translation, summary.world_from_cam.translation)
+        np.testing.assert_array_equal(
+            node.world_from_cam.translation, summary.world_from_cam.translation
+        )
 
 
 def test_a_session_says_where_it_comes_from_and_what_its_light_was():
@@ -152,14 +182,18 @@ def test_a_closed_map_says_so(renumbered: Path):
     built_corridor().close()
 
 
-def test_a_map_is_pickled_as_its_path_and_knows_when_it_was_replaced(renumbered: Path, tmp_path: Path):
+def test_a_map_is_pickled_as_its_path_and_knows_when_it_was_replaced(
+    renumbered: Path, tmp_path: Path
+):
     path = tmp_path / "map.topo"
     path.write_bytes(renumbered.read_bytes())
     topomap = TopoMetricMap.load(path)
     data = pickle.dumps(topomap)
     assert len(data) < 1000
     again = pickle.loads(data)
-    assert [summary.node_id for summary in again.summaries] == [summary.node_id for summary in topomap.summaries]
+    assert [summary.node_id for summary in again.summaries] == [
+        summary.node_id for summary in topomap.summaries
+    ]
     changed = pickle.loads(pickle.dumps(replace(topomap, default_coarse="cnn-fc")))
     assert changed.default_coarse == "cnn-fc"
     assert len(changed.nodes[0].features) == len(topomap.nodes[0].features)
@@ -173,7 +207,9 @@ def test_readers_keep_what_they_opened(renumbered: Path, tmp_path: Path):
     path.write_bytes(renumbered.read_bytes())
     topomap = TopoMetricMap.load(path)
     built_corridor().save(path)
-    assert [node.summary.node_id for node in topomap.nodes] == [summary.node_id for summary in TopoMetricMap.load(renumbered).summaries]
+    assert [node.summary.node_id for node in topomap.nodes] == [
+        summary.node_id for summary in TopoMetricMap.load(renumbered).summaries
+    ]
     assert len(TopoMetricMap.load(path).nodes) == len(built_corridor().nodes)
 
 
@@ -181,7 +217,10 @@ def test_threads_that_read_one_map_read_the_same(renumbered: Path):
     topomap, found = TopoMetricMap.load(renumbered), []
 
     def read() -> None:
-        found.append([node.features.descriptors.sum() for node in topomap.nodes] + [len(image.jpeg) for image in topomap.place_images])
+        found.append(
+            [node.features.descriptors.sum() for node in topomap.nodes]
+            + [len(image.jpeg) for image in topomap.place_images]
+        )
 
     threads = [threading.Thread(target=read) for _ in range(4)]
     for thread in threads:

@@ -1,4 +1,5 @@
-"""The map file: what goes in comes out, whole or not at all, and a broken one is told from a good one."""
+"""The map file: what goes in comes out, whole or not at all, and a broken one is told from a good
+one."""
 
 from __future__ import annotations
 
@@ -35,15 +36,24 @@ def test_everything_comes_back(tiny_map: TopoMetricMap, saved: Path):
                 other.summary.t_ns,
                 other.summary.num_points,
             )
-            np.testing.assert_array_equal(s.world_from_cam.matrix(), other.summary.world_from_cam.matrix())
+            np.testing.assert_array_equal(
+                s.world_from_cam.matrix(), other.summary.world_from_cam.matrix()
+            )
         assert one.camera == other.camera
         assert one.template_jpeg == other.template_jpeg
         for name in ("points_img", "sizes_px", "angles", "responses"):
-            np.testing.assert_array_equal(getattr(one.features, name), getattr(other.features, name))
+            np.testing.assert_array_equal(
+                getattr(one.features, name), getattr(other.features, name)
+            )
         np.testing.assert_array_equal(one.points_cam, other.points_cam)
         np.testing.assert_allclose(one.point_sqrt_covs, other.point_sqrt_covs, rtol=1e-3, atol=1e-6)
     for one, other in zip(loaded.place_images, tiny_map.place_images, strict=True):
-        assert (one.recording, one.name, one.node_id, one.jpeg) == (other.recording, other.name, other.node_id, other.jpeg)
+        assert (one.recording, one.name, one.node_id, one.jpeg) == (
+            other.recording,
+            other.name,
+            other.node_id,
+            other.jpeg,
+        )
         np.testing.assert_array_equal(one.world_from_cam.matrix(), other.world_from_cam.matrix())
 
 
@@ -52,26 +62,39 @@ def test_descriptors_come_back_within_quantisation(tiny_map: TopoMetricMap, save
         kept = np.abs(other.features.descriptors).max(axis=1) < 127 / SURF.descriptor_scale
         assert kept.mean() > 0.95
         error = np.abs(one.features.descriptors - other.features.descriptors)
-        assert error[kept].max() < 1.5 / (2 * SURF.descriptor_scale) + 0.02 * np.abs(other.features.descriptors).max()
+        assert (
+            error[kept].max()
+            < 1.5 / (2 * SURF.descriptor_scale) + 0.02 * np.abs(other.features.descriptors).max()
+        )
         cosines = np.sum(one.features.descriptors * other.features.descriptors, axis=1)
         assert cosines.min() > 0.95
         assert np.median(cosines) > 0.999
 
 
-def test_each_kind_has_its_own_quantisation(tiny_map: TopoMetricMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_each_kind_has_its_own_quantisation(
+    tiny_map: TopoMetricMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setitem(KINDS, "surf", replace(SURF, descriptor_scale=100.0))
     tiny_map.save(tmp_path / "coarser.topo")
-    for one, other in zip(TopoMetricMap.load(tmp_path / "coarser.topo").nodes, tiny_map.nodes, strict=True):
-        np.testing.assert_array_equal(one.stored_descriptors, np.rint(other.features.descriptors * 100.0))
+    for one, other in zip(
+        TopoMetricMap.load(tmp_path / "coarser.topo").nodes, tiny_map.nodes, strict=True
+    ):
+        np.testing.assert_array_equal(
+            one.stored_descriptors, np.rint(other.features.descriptors * 100.0)
+        )
 
 
-def test_covariances_come_back_positive_and_within_half_precision(tiny_map: TopoMetricMap, saved: Path):
+def test_covariances_come_back_positive_and_within_half_precision(
+    tiny_map: TopoMetricMap, saved: Path
+):
     def covariances(sqrt_covs: np.ndarray) -> np.ndarray:
         lower = np.zeros((len(sqrt_covs), 3, 3))
         lower[:, *np.tril_indices(3)] = sqrt_covs
         return lower @ lower.transpose(0, 2, 1)
 
-    one, other = (covariances(m.nodes[0].point_sqrt_covs) for m in (TopoMetricMap.load(saved), tiny_map))
+    one, other = (
+        covariances(m.nodes[0].point_sqrt_covs) for m in (TopoMetricMap.load(saved), tiny_map)
+    )
     assert (np.linalg.eigvalsh(one)[:, 0] > 0).all()
     scale = np.sqrt(np.einsum("nii->ni", other))
     assert (np.abs(one - other) / (scale[:, :, None] * scale[:, None, :])).max() < 0.01
@@ -84,23 +107,34 @@ def stop(error: BaseException) -> Callable[..., None]:
     return raise_it
 
 
-@pytest.mark.parametrize("error", [sqlite3.OperationalError("database or disk is full"), OSError(28, "No space left on device")])
+@pytest.mark.parametrize(
+    "error",
+    [sqlite3.OperationalError("database or disk is full"), OSError(28, "No space left on device")],
+)
 @pytest.mark.parametrize("there_before", [True, False])
 def test_a_failed_write_leaves_the_old_map_and_nothing_else(
-    tiny_map: TopoMetricMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, there_before: bool
+    tiny_map: TopoMetricMap,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    error: Exception,
+    there_before: bool,
 ):
     path = tmp_path / "room.topo"
     if there_before:
         tiny_map.save(path)
     before = path.read_bytes() if there_before else None
-    monkeypatch.setattr(writing, "_arrays_bytes", stop(error))  # asked for last, after all nodes are written
+    monkeypatch.setattr(
+        writing, "_arrays_bytes", stop(error)
+    )  # asked for last, after all nodes are written
     with pytest.raises(MapError, match=r"cannot write map .*room\.topo"):
         tiny_map.save(path)
     assert (path.read_bytes() if path.exists() else None) == before
     assert list(tmp_path.iterdir()) == ([path] if there_before else [])
 
 
-def test_a_disk_that_is_full_is_a_map_error(tiny_map: TopoMetricMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_disk_that_is_full_is_a_map_error(
+    tiny_map: TopoMetricMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     """SQLite's own error: the file may not grow beyond a few pages."""
 
     def small(*args, **kwargs) -> sqlite3.Connection:
@@ -115,7 +149,9 @@ def test_a_disk_that_is_full_is_a_map_error(tiny_map: TopoMetricMap, tmp_path: P
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_interrupted_write_leaves_nothing(tiny_map: TopoMetricMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_an_interrupted_write_leaves_nothing(
+    tiny_map: TopoMetricMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setattr(writing, "_arrays_bytes", stop(KeyboardInterrupt()))
     with pytest.raises(KeyboardInterrupt):
         tiny_map.save(tmp_path / "room.topo")
@@ -124,7 +160,13 @@ def test_an_interrupted_write_leaves_nothing(tiny_map: TopoMetricMap, tmp_path: 
 
 def test_places_that_cannot_be_written_are_map_errors(tiny_map: TopoMetricMap, tmp_path: Path):
     (tmp_path / "file").write_text("")
-    for path in (tmp_path / "missing" / "room.topo", tmp_path / "file" / "room.topo", tmp_path, tmp_path / ("x" * 300), Path("")):
+    for path in (
+        tmp_path / "missing" / "room.topo",
+        tmp_path / "file" / "room.topo",
+        tmp_path,
+        tmp_path / ("x" * 300),
+        Path(""),
+    ):
         with pytest.raises(MapError, match="cannot write map") as caught:
             tiny_map.save(path)
         assert "\n" not in str(caught.value)
@@ -156,7 +198,10 @@ def test_files_that_are_no_map_are_told_apart(tmp_path: Path):
         TopoMetricMap.load(tmp_path / "other.topo")
 
 
-@pytest.mark.parametrize(("version", "who"), [(SCHEMA_VERSION + 1, "a newer topoloc"), (0, "an older topoloc; build it again")])
+@pytest.mark.parametrize(
+    ("version", "who"),
+    [(SCHEMA_VERSION + 1, "a newer topoloc"), (0, "an older topoloc; build it again")],
+)
 def test_other_schemas_are_named(saved: Path, version: int, who: str):
     with pytest.raises(MapVersionError, match=f"has schema {version}.*{who}"):
         TopoMetricMap.load(with_bytes(saved, 60, version.to_bytes(4, "big")))

@@ -1,4 +1,5 @@
-"""`topoloc benchmark` on the tiny room: all of its parts, the page, and going on from what is there."""
+"""`topoloc benchmark` on the tiny room: all of its parts, the page, and going on from what is
+there."""
 
 from __future__ import annotations
 
@@ -18,15 +19,26 @@ from topoloc_paper.settings import PaperConfig, WeightFiles
 
 @pytest.fixture
 def room(tiny_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The quick run asks the tiny room in the place of the lab, and trains for one epoch; returns --out."""
+    """The quick run asks the tiny room in the place of the lab, and trains for one epoch; returns
+    --out."""
     queries = {
         "day": str(write_pictures(tmp_path / "day", unseen_views()[:4])),
         "night": str(write_pictures(tmp_path / "night", unseen_views()[:2])),
     }
     elsewhere = str(write_pictures(tmp_path / "elsewhere", unseen_views(seed=1, step=6.0)))
-    place = Dataset("lab", "A tiny room", (str(tiny_recording),), queries, 1.0, sweep=(0.4, 1.0), elsewhere=(elsewhere,))
+    place = Dataset(
+        "lab",
+        "A tiny room",
+        (str(tiny_recording),),
+        queries,
+        1.0,
+        sweep=(0.4, 1.0),
+        elsewhere=(elsewhere,),
+    )
     monkeypatch.setattr(benchmark, "quick_datasets", lambda: [place])
-    tiny = replace(PaperConfig.for_quick_run(WeightFiles()), epochs=1, posenet_epochs=1, max_colmap_images=6)
+    tiny = replace(
+        PaperConfig.for_quick_run(WeightFiles()), epochs=1, posenet_epochs=1, max_colmap_images=6
+    )
     monkeypatch.setattr(PaperConfig, "for_quick_run", staticmethod(lambda weights: tiny))
     return tmp_path / "out"
 
@@ -40,18 +52,42 @@ def test_the_paper_is_made_again_and_only_once(room: Path, capsys: pytest.Captur
     results = json.loads((room / "results.json").read_text())
     methods = {row["method"] for row in results["accuracy"]}
     assert methods == {"posenet", "cnn-fc", "cnn-nn", "vlad-nn", "surf-vlad"}
-    assert all("scratch" in row["weights"] for row in results["accuracy"] if row["method"] not in ("surf-vlad",))
-    ours = [row for row in results["accuracy"] if row["method"] == "surf-vlad" and row["queries"] == "day"]
+    assert all(
+        "scratch" in row["weights"]
+        for row in results["accuracy"]
+        if row["method"] not in ("surf-vlad",)
+    )
+    ours = [
+        row
+        for row in results["accuracy"]
+        if row["method"] == "surf-vlad" and row["queries"] == "day"
+    ]
     assert all(row["num_localized"] == 4 and row["median_translation_m"] < 0.02 for row in ours)
-    assert {row["peer"] for row in results["peers"]} == {"topoloc", "the paper's step", "pycolmap, SIFT", "retrieval only"}
+    assert {row["peer"] for row in results["peers"]} == {
+        "topoloc",
+        "the paper's step",
+        "pycolmap, SIFT",
+        "retrieval only",
+    }
     few, many = sorted(results["nodes"], key=lambda row: row["num_nodes"])
     assert few["bytes"] < many["bytes"]
-    assert {row["change"] for row in results["ablation"]} >= {"as it is", "nearest nodes given", "OpenCV's PnP"}
+    assert {row["change"] for row in results["ablation"]} >= {
+        "as it is",
+        "nearest nodes given",
+        "OpenCV's PnP",
+    }
     page = (room / "report.html").read_text(encoding="utf-8")
     assert page.count("<section>") >= 9
     assert not re.search(r'(src|href)="http', page), "the page must stand alone"
     names = {path.name for path in (room / "figures").iterdir()}
-    assert {"lab_from_above.svg", "nodes.png", "times.svg", "topological_accuracy.png", "posenet_lab.svg", "lab_normalized.png"} <= names
+    assert {
+        "lab_from_above.svg",
+        "nodes.png",
+        "times.svg",
+        "topological_accuracy.png",
+        "posenet_lab.svg",
+        "lab_normalized.png",
+    } <= names
     assert main(["benchmark", "nodes", "--quick", "--out", str(room)]) == 0
     assert "stages: 0 done" in capsys.readouterr().out
     assert json.loads((room / "results.json").read_text())["nodes"] == results["nodes"]
@@ -65,7 +101,9 @@ def test_a_part_makes_its_own_tables_alone(room: Path, capsys: pytest.CaptureFix
     assert not (room / "report.html").exists()
 
 
-def test_without_recordings_there_is_nothing_to_ask(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_without_recordings_there_is_nothing_to_ask(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     out = str(tmp_path / "out")
     assert main(["benchmark", "paper", "--at-hand", "--data", str(tmp_path), "--out", out]) == 1
     assert "nothing to ask" in capsys.readouterr().err

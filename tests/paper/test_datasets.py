@@ -10,7 +10,14 @@ import tyro
 
 from topoloc.sequences.trajectory import Trajectory
 from topoloc_paper import datasets
-from topoloc_paper.datasets import RENDERED, PaperRecording, at_hand, is_complete, quick_datasets, real_datasets
+from topoloc_paper.datasets import (
+    RENDERED,
+    PaperRecording,
+    at_hand,
+    is_complete,
+    quick_datasets,
+    real_datasets,
+)
 from topoloc_worlds import simulate
 from topoloc_worlds.conditions import find_condition
 from topoloc_worlds.layout import Layout, prepare
@@ -24,7 +31,9 @@ TINY = PaperRecording("lab_day", "lab", spacing=3.0, lateral=0.1, take=1, mono=T
 @pytest.mark.parametrize("recording", RENDERED, ids=lambda recording: recording.name)
 @pytest.mark.parametrize("draft", [False, True])
 def test_simulate_with_the_same_words_has_the_same_settings(recording: PaperRecording, draft: bool):
-    command = tyro.cli(simulate.Command, args=[*recording.words.split(), *(["--draft"] if draft else [])])
+    command = tyro.cli(
+        simulate.Command, args=[*recording.words.split(), *(["--draft"] if draft else [])]
+    )
     assert find_condition(command.condition) == find_condition(recording.condition)
     assert command._config(find_world(recording.world)) == recording.config(draft)
 
@@ -52,9 +61,13 @@ def test_a_recording_is_complete_with_its_last_picture_and_of_one_quality(tmp_pa
     assert not is_complete(replace(TINY, take=2), layout.folder, draft=True)
 
 
-def test_what_is_at_hand_is_kept_and_the_rest_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_what_is_at_hand_is_kept_and_the_rest_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     there = {"lab_map", "lab_night", "corridor_day"}
-    monkeypatch.setattr(datasets, "is_complete", lambda recording, folder, draft: recording.name in there)
+    monkeypatch.setattr(
+        datasets, "is_complete", lambda recording, folder, draft: recording.name in there
+    )
     kept, missing = at_hand(datasets.rendered_datasets(tmp_path), tmp_path, False)
     assert [(dataset.name, list(dataset.queries)) for dataset in kept] == [("lab", ["night"])]
     assert set(missing) == {recording.name for recording in RENDERED} - there

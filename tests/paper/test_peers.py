@@ -1,4 +1,5 @@
-"""The peers on the tiny room: each finds itself there, each fails where it must, and sizes are what lies on the disk."""
+"""The peers on the tiny room: each finds itself there, each fails where it must, and sizes are what
+lies on the disk."""
 
 from __future__ import annotations
 
@@ -21,14 +22,19 @@ from topoloc_paper.peer_retrieval import Retrieval
 
 @pytest.fixture(scope="module")
 def frames() -> list[StereoFrame]:
-    return [StereoFrame(f"view{i}", i, image, CAMERA, world_from_cam=pose) for i, (image, pose) in enumerate(unseen_views())]
+    return [
+        StereoFrame(f"view{i}", i, image, CAMERA, world_from_cam=pose)
+        for i, (image, pose) in enumerate(unseen_views())
+    ]
 
 
 def _blank() -> StereoFrame:
     return StereoFrame("blank", 0, np.full((CAMERA.height, CAMERA.width), 128, np.uint8), CAMERA)
 
 
-def test_the_papers_step_finds_the_room_and_says_nothing_of_a_blank_picture(tiny_recording: Path, frames: list[StereoFrame]):
+def test_the_papers_step_finds_the_room_and_says_nothing_of_a_blank_picture(
+    tiny_recording: Path, frames: list[StereoFrame]
+):
     peer = PaperStep(built_room(tiny_recording), [open_sequence(tiny_recording)])
     answers = peer.localize([*frames, _blank()])
     assert answers[-1].world_from_cam is None
@@ -39,7 +45,9 @@ def test_the_papers_step_finds_the_room_and_says_nothing_of_a_blank_picture(tiny
     assert peer.feature_name in ("OpenCV SURF", "OpenCV SIFT")
 
 
-def test_retrieval_gives_a_nodes_pose_whatever_it_sees(tiny_recording: Path, frames: list[StereoFrame]):
+def test_retrieval_gives_a_nodes_pose_whatever_it_sees(
+    tiny_recording: Path, frames: list[StereoFrame]
+):
     topomap = built_room(tiny_recording)
     answers = Retrieval(topomap).localize([*frames, _blank()])
     places = np.array([summary.world_from_cam.translation for summary in topomap.summaries])
@@ -76,8 +84,16 @@ def test_far_poses_and_poses_for_strangers_are_counted():
     truth, far = Rigid3.identity(), Rigid3(np.eye(3), np.array([0.6, 0.0, 0.0]))
     here = StereoFrame("a", 0, np.zeros((2, 2), np.uint8), CAMERA, world_from_cam=truth)
     stranger = StereoFrame("b", 0, np.zeros((2, 2), np.uint8), CAMERA)
-    answers = [PeerAnswer(far, 3.0), PeerAnswer(truth, 1.0), PeerAnswer(None, 2.0), PeerAnswer(far, 9.0), PeerAnswer(None, 9.0)]
-    found = summarize_peer(rows_of([here, here, here, stranger, stranger], answers, Rigid3.identity()))
+    answers = [
+        PeerAnswer(far, 3.0),
+        PeerAnswer(truth, 1.0),
+        PeerAnswer(None, 2.0),
+        PeerAnswer(far, 9.0),
+        PeerAnswer(None, 9.0),
+    ]
+    found = summarize_peer(
+        rows_of([here, here, here, stranger, stranger], answers, Rigid3.identity())
+    )
     assert (found["num_queries"], found["num_localized"], found["far_off"]) == (3, 2, 1)
     assert (found["num_elsewhere"], found["accepted"], found["ms"]) == (2, 1, 2.0)
     assert found["median_translation_m"] == pytest.approx(0.3)

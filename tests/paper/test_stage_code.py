@@ -1,4 +1,5 @@
-"""What a stage is done again for: a change of code that its result follows from, and of no other."""
+"""What a stage is done again for: a change of code that its result follows from, and of no
+other."""
 
 from __future__ import annotations
 
@@ -13,7 +14,17 @@ from topoloc.places.coarse import _MODULES, COARSE_NAMES
 from topoloc_paper import stage_code
 from topoloc_paper.peers import _CODE
 from topoloc_paper.posenet_baseline import _CODE as POSENET
-from topoloc_paper.stage_code import COARSE_MODULES, MAPPING, ROOTS, TEACHING_MODULES, StageCode, _file, answering, asking, learning
+from topoloc_paper.stage_code import (
+    COARSE_MODULES,
+    MAPPING,
+    ROOTS,
+    TEACHING_MODULES,
+    StageCode,
+    _file,
+    answering,
+    asking,
+    learning,
+)
 
 LEARNING = {f"learning {name}": learning(module) for name, module in TEACHING_MODULES.items()}
 STAGES: dict[str, StageCode] = {
@@ -32,7 +43,9 @@ def code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of the program that may be changed."""
     for package, root in ROOTS.items():
         shutil.copytree(
-            root / package, tmp_path / package, ignore=lambda folder, names: [n for n in names if Path(n).suffix not in (".py", "")]
+            root / package,
+            tmp_path / package,
+            ignore=lambda folder, names: [n for n in names if Path(n).suffix not in (".py", "")],
         )
         monkeypatch.setitem(ROOTS, package, tmp_path)
     for reading in _READ:
@@ -92,7 +105,9 @@ def _done_again(change: Callable[[], object]) -> set[str]:
         ("topoloc_paper/pose_losses.py", {"learning PoseNet"}),
     ],
 )
-def test_a_change_has_those_stages_done_again_that_run_it(module: str, stages: set[str], code: Path):
+def test_a_change_has_those_stages_done_again_that_run_it(
+    module: str, stages: set[str], code: Path
+):
     path = code / module
     assert _done_again(lambda: path.write_text(path.read_text() + "\nCHANGED = 1\n")) == stages
 
@@ -100,7 +115,9 @@ def test_a_change_has_those_stages_done_again_that_run_it(module: str, stages: s
 def test_comments_and_docstrings_are_no_change(code: Path):
     path = code / "topoloc/localization/localizer.py"
     text = path.read_text()
-    reworded = text.replace("section III-B of the paper", "a part of the paper", 1).replace("import time", "import time  # clocks", 1)
+    reworded = text.replace("section III-B of the paper", "a part of the paper", 1).replace(
+        "import time", "import time  # clocks", 1
+    )
     assert reworded.count("# clocks") == 1
     assert reworded != text.replace("import time", "import time  # clocks", 1)
     assert _done_again(lambda: path.write_text(reworded)) == set()
@@ -109,7 +126,11 @@ def test_comments_and_docstrings_are_no_change(code: Path):
 def test_what_a_stage_comes_to_import_counts(code: Path):
     path = code / "topoloc/places/vlad.py"
     before = MAPPING.files()
-    path.write_text(path.read_text().replace("import numpy as np", "import numpy as np\nfrom topoloc.slam import pose_graph", 1))
+    path.write_text(
+        path.read_text().replace(
+            "import numpy as np", "import numpy as np\nfrom topoloc.slam import pose_graph", 1
+        )
+    )
     _forget()
     assert set(MAPPING.files()) - set(before) >= {"topoloc/slam/pose_graph.py"}
 
@@ -117,14 +138,25 @@ def test_what_a_stage_comes_to_import_counts(code: Path):
 def test_an_import_for_the_type_checker_alone_does_not_count(code: Path):
     path = code / "topoloc/places/vlad.py"
     before = MAPPING.files()
-    guarded = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from topoloc.slam import pose_graph\n"
-    path.write_text(path.read_text().replace("import numpy as np", f"import numpy as np\n{guarded}", 1))
+    guarded = (
+        "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from topoloc.slam import"
+        " pose_graph\n"
+    )
+    path.write_text(
+        path.read_text().replace("import numpy as np", f"import numpy as np\n{guarded}", 1)
+    )
     _forget()
     assert MAPPING.files() == before
 
 
 def test_every_module_named_is_there():
-    assert {f"topoloc/places/{module}.py" for module in _MODULES.values()} == set(COARSE_MODULES.values())
+    assert {f"topoloc/places/{module}.py" for module in _MODULES.values()} == set(
+        COARSE_MODULES.values()
+    )
     assert COARSE_MODULES.keys() == set(COARSE_NAMES)
     assert TEACHING_MODULES.keys() == set(COARSE_NAMES) - {"surf-vlad"}
-    assert [name for name, stage in STAGES.items() if not all(_file(module).is_file() for module in stage.modules)] == []
+    assert [
+        name
+        for name, stage in STAGES.items()
+        if not all(_file(module).is_file() for module in stage.modules)
+    ] == []

@@ -30,8 +30,13 @@ def test_a_stage_is_done_once_and_found_by_the_next_run(tmp_path: Path):
     assert first == again
 
 
-@pytest.mark.parametrize(("settings", "code"), [({"d_thresh": 1.0}, RIGID), ({"d_thresh": 2.0}, StageCode(("topoloc/features/sift.py",)))])
-def test_other_settings_or_other_code_are_another_result(tmp_path: Path, settings: dict[str, float], code: StageCode):
+@pytest.mark.parametrize(
+    ("settings", "code"),
+    [({"d_thresh": 1.0}, RIGID), ({"d_thresh": 2.0}, StageCode(("topoloc/features/sift.py",)))],
+)
+def test_other_settings_or_other_code_are_another_result(
+    tmp_path: Path, settings: dict[str, float], code: StageCode
+):
     work = Counter()
     store = StageStore(tmp_path)
     first = store.get("map", {"d_thresh": 2.0}, work, RIGID)

@@ -19,7 +19,9 @@ from topoloc_paper.stored_answers import answers_of, rows_of
 
 
 def test_stored_answers_are_the_same_answers(tiny_recording: Path, tmp_path: Path):
-    sequence = open_sequence(write_pictures(tmp_path / "views", [*unseen_views()[:3], *unseen_views(seed=1)[:1]]))
+    sequence = open_sequence(
+        write_pictures(tmp_path / "views", [*unseen_views()[:3], *unseen_views(seed=1)[:1]])
+    )
     answers = answer_queries(Localizer(built_room(tiny_recording)), sequence, label="views")
     assert {answer.result.localized for answer in answers} == {True, False}
     rows = json.loads(json.dumps(rows_of(answers)))
@@ -44,7 +46,16 @@ def test_stored_answers_are_the_same_answers(tiny_recording: Path, tmp_path: Pat
 def test_the_alternatives_of_an_ambiguity_are_stored():
     poses = [Rigid3.identity(), Rigid3(np.eye(3), np.array([9.0, 0.0, 1.0]))]
     alternatives = tuple(Alternative(pose, 0.5 - 0.1 * k, k) for k, pose in enumerate(poses))
-    answer = Answer("a.png", NotLocalized("ambiguous", alternatives=alternatives), None, None, "walk", None, None, frozenset())
+    answer = Answer(
+        "a.png",
+        NotLocalized("ambiguous", alternatives=alternatives),
+        None,
+        None,
+        "walk",
+        None,
+        None,
+        frozenset(),
+    )
     (again,) = answers_of(json.loads(json.dumps(rows_of([answer]))), "walk")
     assert isinstance(again.result, NotLocalized)
     assert again.result.to_json("a.png") == answer.result.to_json("a.png")

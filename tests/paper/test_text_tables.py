@@ -1,4 +1,5 @@
-"""The block in docs/benchmarks.md is what the stored results give; tables say what was not run, and hide no query."""
+"""The block in docs/benchmarks.md is what the stored results give; tables say what was not run, and
+hide no query."""
 
 from __future__ import annotations
 
@@ -11,7 +12,12 @@ import pytest
 from topoloc.errors import TopolocError
 from topoloc_paper import targets
 from topoloc_paper.readme_block import BEGIN, END, block_of, update_readme
-from topoloc_paper.text_tables import accuracy_table, markdown_of, normalization_table, targets_table
+from topoloc_paper.text_tables import (
+    accuracy_table,
+    markdown_of,
+    normalization_table,
+    targets_table,
+)
 
 ROOT = Path(__file__).parents[2]
 STORED = ROOT / "docs" / "results" / "paper.json"
@@ -27,7 +33,12 @@ def _row(method: str = "surf-vlad", nodes: str = "D_thresh 2 m", **more: Any) ->
         "paper_m": 0.0202,
         "paper_deg": 0.35,
     }
-    errors = {"num_queries": 20, "num_localized": 18, "median_translation_m": 0.0081, "median_rotation_deg": 0.12}
+    errors = {
+        "num_queries": 20,
+        "num_localized": 18,
+        "median_translation_m": 0.0081,
+        "median_rotation_deg": 0.12,
+    }
     return row | errors | {"topological_accuracy": 0.9, "neighbour_accuracy": 1.0} | more
 
 
@@ -44,7 +55,11 @@ def test_stored_results_name_the_weights_of_every_row():
 
 def test_a_row_says_how_many_queries_it_is_the_median_of_and_what_was_not_run():
     text = accuracy_table(
-        [_row(), _row("cnn-fc", missing="PyTorch is not installed"), _row(median_translation_m=None, num_localized=0)]
+        [
+            _row(),
+            _row("cnn-fc", missing="PyTorch is not installed"),
+            _row(median_translation_m=None, num_localized=0),
+        ]
     ).markdown()
     assert "0.81 cm, 0.12° (18 of 20)" in text
     assert "2.02 cm, 0.35°" in text
@@ -57,17 +72,29 @@ def test_html_escapes_what_it_shows():
 
 
 def test_the_gain_of_normalisation_is_the_share_of_the_error_that_is_gone():
-    rows = [_row(normalization=kind, median_translation_m=metres) for kind, metres in (("none", 0.02), ("paper", 0.015), ("wide", 0.01))]
+    rows = [
+        _row(normalization=kind, median_translation_m=metres)
+        for kind, metres in (("none", 0.02), ("paper", 0.015), ("wide", 0.01))
+    ]
     assert "+25 %" in normalization_table(rows).markdown()
 
 
 @pytest.mark.parametrize(
     ("as_paper", "own", "verdict"),
-    [(0.009, 0.02, "| reached |"), (0.02, 0.009, "| reached with topoloc's own nodes |"), (0.02, 0.03, "| missed |")],
+    [
+        (0.009, 0.02, "| reached |"),
+        (0.02, 0.009, "| reached with topoloc's own nodes |"),
+        (0.02, 0.03, "| missed |"),
+    ],
 )
 def test_a_target_is_reached_or_it_is_not(as_paper: float, own: float, verdict: str):
-    table = [_row(median_translation_m=as_paper), _row(nodes="default nodes", median_translation_m=own)]
-    speed = [{"dataset": "lab", "method": "surf-vlad", "quartiles_s": {"total": [0.03, 0.05, 0.06]}}]
+    table = [
+        _row(median_translation_m=as_paper),
+        _row(nodes="default nodes", median_translation_m=own),
+    ]
+    speed = [
+        {"dataset": "lab", "method": "surf-vlad", "quartiles_s": {"total": [0.03, 0.05, 0.06]}}
+    ]
     text = targets_table(targets.rows(table, [], speed)).markdown()
     assert verdict in text
     assert "missed: surf-vlad 50 ms" in text
@@ -76,7 +103,9 @@ def test_a_target_is_reached_or_it_is_not(as_paper: float, own: float, verdict: 
 def test_the_change_that_helps_most_is_named():
     plain = _row(part="", change="as it is", median_translation_m=0.02)
     other = _row(part="map", change="denser nodes", median_translation_m=0.01)
-    (row,) = targets.rows([_row()], [plain, other, _row(part="coarse", change="x", median_translation_m=0.0195)], [])
+    (row,) = targets.rows(
+        [_row()], [plain, other, _row(part="coarse", change="x", median_translation_m=0.0195)], []
+    )
     assert row["helps"] == "map: denser nodes takes 50 % off the error"
     (row,) = targets.rows([_row()], [plain], [])
     assert "none of the changes" in row["helps"]

@@ -9,11 +9,17 @@ from topoloc.places.backbones import Backbone, normalize_pictures
 from topoloc.places.network_config import BackboneName
 
 
-# Parameters as torchvision's documentation of each model states them; 4.65 million of EfficientNet-lite0, 42,016 numbers of its batch
-# normalisations less and 21,008 biases of its convolutions more.
+# Parameters as torchvision's documentation of each model states them; 4.65 million of
+# EfficientNet-lite0, 42,016 numbers of its batch normalisations less and 21,008 biases of its
+# convolutions more.
 @pytest.mark.parametrize(
     ("name", "num_parameters"),
-    [("squeezenet1_1", 1_235_496), ("vgg11", 132_863_336), ("vgg16", 138_357_544), ("efficientnet_lite0", 4_652_008 - 42_016 + 21_008)],
+    [
+        ("squeezenet1_1", 1_235_496),
+        ("vgg11", 132_863_336),
+        ("vgg16", 138_357_544),
+        ("efficientnet_lite0", 4_652_008 - 42_016 + 21_008),
+    ],
 )
 def test_number_of_parameters_is_torchvisions(name: BackboneName, num_parameters: int):
     with torch.device("meta"):
@@ -23,12 +29,27 @@ def test_number_of_parameters_is_torchvisions(name: BackboneName, num_parameters
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        ("squeezenet1_1", {"features.12.expand3x3.weight": (256, 64, 3, 3), "classifier.1.weight": (1000, 512, 1, 1)}),
-        ("vgg11", {"features.18.weight": (512, 512, 3, 3), "classifier.0.weight": (4096, 25088), "classifier.6.bias": (1000,)}),
+        (
+            "squeezenet1_1",
+            {
+                "features.12.expand3x3.weight": (256, 64, 3, 3),
+                "classifier.1.weight": (1000, 512, 1, 1),
+            },
+        ),
+        (
+            "vgg11",
+            {
+                "features.18.weight": (512, 512, 3, 3),
+                "classifier.0.weight": (4096, 25088),
+                "classifier.6.bias": (1000,),
+            },
+        ),
         ("vgg16", {"features.28.weight": (512, 512, 3, 3), "classifier.3.weight": (4096, 4096)}),
     ],
 )
-def test_names_and_shapes_are_torchvisions(name: BackboneName, expected: dict[str, tuple[int, ...]]):
+def test_names_and_shapes_are_torchvisions(
+    name: BackboneName, expected: dict[str, tuple[int, ...]]
+):
     with torch.device("meta"):
         state = Backbone(name).state_dict()
     assert {key: tuple(state[key].shape) for key in expected} == expected
@@ -45,7 +66,9 @@ def test_a_shallower_backbone_gives_what_the_whole_one_has_on_its_way():
     torch.manual_seed(0)
     whole = Backbone("squeezenet1_1", num_outputs=None).eval()
     part = Backbone("squeezenet1_1", num_outputs=None, depth=5).eval()
-    part.load_state_dict({name: value for name, value in whole.state_dict().items() if name in part.state_dict()})
+    part.load_state_dict(
+        {name: value for name, value in whole.state_dict().items() if name in part.state_dict()}
+    )
     image = torch.randn(1, 3, 64, 64)
     assert torch.equal(part(image), whole.features[:5](image))
     assert part.num_channels == part(image).shape[1] == 128

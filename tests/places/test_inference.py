@@ -1,4 +1,5 @@
-"""Networks answer several threads as they answer one; PyTorch's number of threads is as before, whoever leaves last."""
+"""Networks answer several threads as they answer one; PyTorch's number of threads is as before,
+whoever leaves last."""
 
 from __future__ import annotations
 
@@ -27,7 +28,11 @@ def test_several_threads_get_the_bytes_of_one(monkeypatch: pytest.MonkeyPatch):
     expected = [alone(picture[None]).tobytes() for picture in pictures]
     shared = _predictor()
     with ThreadPoolExecutor(6) as pool:
-        answers = list(pool.map(lambda picture: shared(picture[None]).tobytes(), np.concatenate([pictures] * 4)))
+        answers = list(
+            pool.map(
+                lambda picture: shared(picture[None]).tobytes(), np.concatenate([pictures] * 4)
+            )
+        )
     assert answers == expected * 4
     assert len(frozen) == 2, "once by each predictor"
     assert torch.get_num_threads() == before

@@ -17,16 +17,25 @@ def unit(array: np.ndarray) -> np.ndarray:
 
 @settings(deadline=None)  # the first call compiles
 @given(st.integers(1, 60), st.integers(1, 12), st.integers(1, 70), st.integers(0, 2**32 - 1))
-def test_ranking_is_that_of_each_nodes_best_image(num_images: int, num_nodes: int, num_candidates: int, seed: int):
+def test_ranking_is_that_of_each_nodes_best_image(
+    num_images: int, num_nodes: int, num_candidates: int, seed: int
+):
     rng = np.random.default_rng(seed)
-    vectors, node_ids = unit(rng.standard_normal((num_images, 16))), rng.integers(0, num_nodes, num_images)
+    vectors, node_ids = (
+        unit(rng.standard_normal((num_images, 16))),
+        rng.integers(0, num_nodes, num_images),
+    )
     query = unit(rng.standard_normal(16))
     ranking = PlaceIndex(vectors, node_ids).rank_nodes(query, num_candidates)
     similarities = vectors.astype(np.float64) @ query
     best = {int(node): similarities[node_ids == node].max() for node in np.unique(node_ids)}
     assert len(ranking) == min(num_candidates, len(best))
-    assert [score.score for score in ranking] == pytest.approx(sorted(best.values(), reverse=True)[: len(ranking)], abs=1e-5)
-    assert [score.score for score in ranking] == pytest.approx([best[score.node_id] for score in ranking], abs=1e-5)
+    assert [score.score for score in ranking] == pytest.approx(
+        sorted(best.values(), reverse=True)[: len(ranking)], abs=1e-5
+    )
+    assert [score.score for score in ranking] == pytest.approx(
+        [best[score.node_id] for score in ranking], abs=1e-5
+    )
 
 
 def test_a_node_of_many_images_does_not_hide_the_others():
@@ -52,14 +61,25 @@ def test_many_vectors_are_searched_by_cells_and_nearly_always_as_exactly():
 
 
 def test_cells_look_further_where_one_node_has_most_images():
-    vectors = unit(np.vstack([np.ones((900, 8)) + 0.01 * np.random.default_rng(4).standard_normal((900, 8)), np.eye(8)]))
+    vectors = unit(
+        np.vstack(
+            [
+                np.ones((900, 8)) + 0.01 * np.random.default_rng(4).standard_normal((900, 8)),
+                np.eye(8),
+            ]
+        )
+    )
     node_ids = np.concatenate([np.zeros(900, np.int64), np.arange(1, 9)])
     ranking = PlaceIndex(vectors, node_ids, max_exact=100).rank_nodes(unit(np.ones(8)), 3)
     assert len({score.node_id for score in ranking}) == 3
 
 
 def test_words_do_not_depend_on_the_number_of_threads_which_stays_as_it_was():
-    descriptors, before, words = unit(np.random.default_rng(4).standard_normal((3000, 16))), faiss.omp_get_max_threads(), []
+    descriptors, before, words = (
+        unit(np.random.default_rng(4).standard_normal((3000, 16))),
+        faiss.omp_get_max_threads(),
+        [],
+    )
     try:
         for number in (1, 3):
             faiss.omp_set_num_threads(number)

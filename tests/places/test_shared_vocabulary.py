@@ -13,7 +13,9 @@ from topoloc.places.shared_vocabulary import shared_vocabulary
 
 
 def _files() -> list[str]:
-    return sorted(path.name for path in resources.files("topoloc.places").joinpath("vocabularies").iterdir())
+    return sorted(
+        path.name for path in resources.files("topoloc.places").joinpath("vocabularies").iterdir()
+    )
 
 
 def test_they_are_small_and_of_known_kinds():
@@ -47,14 +49,20 @@ def test_pictures_of_the_same_things_have_like_vectors():
     def vector(first: int, noise_seed: int) -> np.ndarray:
         things, noise = np.random.default_rng(first), np.random.default_rng(noise_seed)
         descriptors = (
-            words[first + things.integers(0, 8, 200)] + 0.05 * things.standard_normal((200, 64)) + 0.02 * noise.standard_normal((200, 64))
+            words[first + things.integers(0, 8, 200)]
+            + 0.05 * things.standard_normal((200, 64))
+            + 0.02 * noise.standard_normal((200, 64))
         )
         unit = (descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True)).astype(np.float32)
         zero = np.zeros(200, np.float32)
-        features = Features(things.uniform(0, 300, (200, 2)).astype(np.float32), zero, zero, zero, unit)
+        features = Features(
+            things.uniform(0, 300, (200, 2)).astype(np.float32), zero, zero, zero, unit
+        )
         return vocabulary.vector(features, 320, 320)
 
     one, again, other = vector(0, 1), vector(0, 2), vector(16, 3)
-    assert [float(np.linalg.norm(each)) for each in (one, again, other)] == pytest.approx([1.0] * 3, abs=1e-4)
+    assert [float(np.linalg.norm(each)) for each in (one, again, other)] == pytest.approx(
+        [1.0] * 3, abs=1e-4
+    )
     assert one @ again > one @ other + 0.3
     assert np.isfinite(vocabulary.vector(Features.empty(64), 320, 320)).all()

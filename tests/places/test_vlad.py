@@ -1,4 +1,5 @@
-"""surf-vlad: vectors of places, what is learnt from them, and whether the right node comes first."""
+"""surf-vlad: vectors of places, what is learnt from them, and whether the right node comes
+first."""
 
 from __future__ import annotations
 
@@ -22,13 +23,19 @@ NO_IMAGE = np.zeros((2, 2), np.uint8)
 
 
 def unit(array: np.ndarray) -> np.ndarray:
-    return (array / np.maximum(np.linalg.norm(array, axis=-1, keepdims=True), 1e-12)).astype(np.float32)
+    return (array / np.maximum(np.linalg.norm(array, axis=-1, keepdims=True), 1e-12)).astype(
+        np.float32
+    )
 
 
 def descriptors(num: int, seed: int, centres: np.ndarray | None = None) -> np.ndarray:
     rng = np.random.default_rng(seed)
     noise = rng.standard_normal((num, 64))
-    return unit(noise if centres is None else 2.0 * centres[rng.integers(0, len(centres), num)] + 0.1 * noise)
+    return unit(
+        noise
+        if centres is None
+        else 2.0 * centres[rng.integers(0, len(centres), num)] + 0.1 * noise
+    )
 
 
 def features_of(rows: np.ndarray) -> Features:
@@ -36,14 +43,25 @@ def features_of(rows: np.ndarray) -> Features:
     return Features(np.zeros((len(rows), 2), np.float32), zero, zero, zero, rows)
 
 
-def fitted(num_images: int, images_a_node: int = 2, dimension: int = 128, num_words: int = 8) -> tuple[SurfVlad, list[np.ndarray]]:
-    """A localizer of places that each have descriptors of their own, and the descriptors of the places' images."""
+def fitted(
+    num_images: int, images_a_node: int = 2, dimension: int = 128, num_words: int = 8
+) -> tuple[SurfVlad, list[np.ndarray]]:
+    """A localizer of places that each have descriptors of their own, and the descriptors of the
+    places' images."""
     rows = [
-        descriptors(120, k, unit(np.random.default_rng(1000 + k // images_a_node).standard_normal((10, 64)))) for k in range(num_images)
+        descriptors(
+            120, k, unit(np.random.default_rng(1000 + k // images_a_node).standard_normal((10, 64)))
+        )
+        for k in range(num_images)
     ]
     config = VladConfig(num_words=num_words, dimension=dimension, position_weight=0.0)
     words = learn_words(np.concatenate(rows), config)
-    return SurfVlad.fit(words, np.stack([vlad(r, words) for r in rows]), np.arange(num_images) // images_a_node, config), rows
+    return SurfVlad.fit(
+        words,
+        np.stack([vlad(r, words) for r in rows]),
+        np.arange(num_images) // images_a_node,
+        config,
+    ), rows
 
 
 def test_vlad_is_the_sum_of_residuals_normalised_thrice():
@@ -104,11 +122,14 @@ def test_a_place_seen_again_comes_first(dimension: int):
         ranking = localizer.rank(NO_IMAGE, features_of(image_rows[::2]), 5)
         assert ranking[0].node_id == k // 2
         assert len({score.node_id for score in ranking}) == 5
-        assert sorted((score.score for score in ranking), reverse=True) == [score.score for score in ranking]
+        assert sorted((score.score for score in ranking), reverse=True) == [
+            score.score for score in ranking
+        ]
 
 
 def things(order: np.ndarray) -> Features:
-    """Sixty things side by side in a picture 200 pixels wide, the same in every picture but for their order."""
+    """Sixty things side by side in a picture 200 pixels wide, the same in every picture but for
+    their order."""
     things_seen = descriptors(60, 11)
     zero = np.zeros(60, np.float32)
     columns = np.stack([3.0 + 3.25 * np.arange(60), np.full(60, 50.0)], axis=1).astype(np.float32)
@@ -124,7 +145,10 @@ def test_the_same_things_elsewhere_in_the_picture_are_another_place(weight: floa
     localizer = SurfVlad.fit(words, np.stack([vlad(s, words) for s in seen]), np.arange(12), config)
     again = SurfVlad.from_model(localizer.to_model())
     picture = np.zeros((100, 200), np.uint8)
-    named = [again.rank(picture, things(order).select(np.arange(3, 60)), 1)[0].node_id for order in orders]
+    named = [
+        again.rank(picture, things(order).select(np.arange(3, 60)), 1)[0].node_id
+        for order in orders
+    ]
     num_right = sum(node_id == k for k, node_id in enumerate(named))
     assert num_right == 12 if weight > 0.0 else num_right < 6
 
@@ -133,15 +157,25 @@ def test_places_count_from_border_to_border_whatever_the_size():
     features = things(np.arange(60))
     small = placed(features, 200, 100, VladConfig(position_weight=0.5))
     assert small.shape == (60, 66)
-    np.testing.assert_allclose(small[[0, -1], 64], [0.5 * (3.5 / 200 - 0.5), 0.5 * (195.25 / 200 - 0.5)], atol=1e-6)
-    large = placed(replace(features, points_img=2.0 * features.points_img + 0.5), 400, 200, VladConfig(position_weight=0.5))
+    np.testing.assert_allclose(
+        small[[0, -1], 64], [0.5 * (3.5 / 200 - 0.5), 0.5 * (195.25 / 200 - 0.5)], atol=1e-6
+    )
+    large = placed(
+        replace(features, points_img=2.0 * features.points_img + 0.5),
+        400,
+        200,
+        VladConfig(position_weight=0.5),
+    )
     np.testing.assert_allclose(small, large, atol=1e-6)
 
 
 def test_maps_without_places_in_their_words_are_read():
     localizer, rows = fitted(6)
     model = localizer.to_model()
-    old = replace(model, settings={key: value for key, value in model.settings.items() if key != "position_weight"})
+    old = replace(
+        model,
+        settings={key: value for key, value in model.settings.items() if key != "position_weight"},
+    )
     assert SurfVlad.from_model(old).rank(NO_IMAGE, features_of(rows[3]), 1)[0].node_id == 1
 
 
@@ -182,7 +216,9 @@ def test_the_stored_model_ranks_alike():
     assert model.name == "surf-vlad"
     reopened = open_coarse(model)
     for image_rows in rows:
-        one, other = (c.rank(NO_IMAGE, features_of(image_rows[:60]), 3) for c in (localizer, reopened))
+        one, other = (
+            c.rank(NO_IMAGE, features_of(image_rows[:60]), 3) for c in (localizer, reopened)
+        )
         assert one[0].node_id == other[0].node_id
         np.testing.assert_allclose([s.score for s in one], [s.score for s in other], atol=5e-3)
 
@@ -212,4 +248,6 @@ def test_the_right_node_is_found_in_a_kitchen(shared: Path):
 def test_the_right_node_is_found_in_the_rendered_room(tiny_recording: Path):
     assert tiny_world.NUM_FRAMES == 14
     config = BuildConfig(nodes=NodeConfig(d_thresh=0.2, lambda_rot=1.0))
-    assert share_of_near_candidates(f"{tiny_recording}@0::2", f"{tiny_recording}@1::2", config) == 1.0
+    assert (
+        share_of_near_candidates(f"{tiny_recording}@0::2", f"{tiny_recording}@1::2", config) == 1.0
+    )

@@ -8,7 +8,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_recordings import BODY_FROM_CAM, CALIB, CAMERA, EUROC_TIMES, HEIGHT, WIDTH, kitti_row, picture, pose, sensor_yaml, tum_line, write
+from tiny_recordings import (
+    BODY_FROM_CAM,
+    CALIB,
+    CAMERA,
+    EUROC_TIMES,
+    HEIGHT,
+    WIDTH,
+    kitti_row,
+    picture,
+    pose,
+    sensor_yaml,
+    tum_line,
+    write,
+)
 
 
 @pytest.fixture
@@ -21,13 +34,16 @@ def kitti(tmp_path: Path) -> Path:
     (folder / "calib.txt").write_text(CALIB)
     (folder / "times.txt").write_text("0.000000e+00\n1.000000e-01\n2.000000e-01\n")
     (tmp_path / "poses").mkdir()
-    (tmp_path / "poses" / "07.txt").write_text("\n".join(kitti_row(pose(index)) for index in range(3)))
+    (tmp_path / "poses" / "07.txt").write_text(
+        "\n".join(kitti_row(pose(index)) for index in range(3))
+    )
     return folder
 
 
 @pytest.fixture
 def euroc(tmp_path: Path) -> Path:
-    """Four pairs 50 ms apart; cam1 lacks the second picture. The body's truth is at the times of the first and last two."""
+    """Four pairs 50 ms apart; cam1 lacks the second picture. The body's truth is at the times of
+    the first and last two."""
     for camera in (0, 1):
         folder = tmp_path / "v1" / "mav0" / f"cam{camera}"
         rows = ["#timestamp [ns],filename"]
@@ -50,9 +66,15 @@ def tum(tmp_path: Path) -> Path:
     for index, (time, depth) in enumerate(zip(times, depths, strict=True)):
         write(folder / "rgb" / f"{time}.png", picture(index, 3, 640, 480))
         write(folder / "depth" / f"{depth}.png", np.full((480, 640), 5000 * (index + 1), np.uint16))
-    (folder / "rgb.txt").write_text("# colour\n" + "".join(f"{time} rgb/{time}.png\n" for time in times))
-    (folder / "depth.txt").write_text("# depth\n" + "".join(f"{time} depth/{time}.png\n" for time in depths))
-    (folder / "groundtruth.txt").write_text("# truth\n" + "".join(tum_line(time, pose(i)) + "\n" for i, time in enumerate(times)))
+    (folder / "rgb.txt").write_text(
+        "# colour\n" + "".join(f"{time} rgb/{time}.png\n" for time in times)
+    )
+    (folder / "depth.txt").write_text(
+        "# depth\n" + "".join(f"{time} depth/{time}.png\n" for time in depths)
+    )
+    (folder / "groundtruth.txt").write_text(
+        "# truth\n" + "".join(tum_line(time, pose(i)) + "\n" for i, time in enumerate(times))
+    )
     return folder
 
 
@@ -72,13 +94,18 @@ def seven_scenes(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def plain(tmp_path: Path) -> Callable[..., Path]:
-    """Makes a folder of three pictures in each of the folders named, with a camera.json of CAMERA and these keys, if any."""
+    """Makes a folder of three pictures in each of the folders named, with a camera.json of CAMERA
+    and these keys, if any."""
 
     def make(*folders: str, **camera_keys: float) -> Path:
         root = tmp_path / "plain"
         for number, folder in enumerate(folders):
             for index in (1, 2, 10):
-                pixels = np.full((HEIGHT, WIDTH), 100 * index, np.uint16) if folder == "depth" else picture(100 * number + index)
+                pixels = (
+                    np.full((HEIGHT, WIDTH), 100 * index, np.uint16)
+                    if folder == "depth"
+                    else picture(100 * number + index)
+                )
                 write(root / folder / f"view{index}.png", pixels)
         if camera_keys:
             (root / "camera.json").write_text(json.dumps(CAMERA | camera_keys))

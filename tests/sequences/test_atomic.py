@@ -12,7 +12,14 @@ from pathlib import Path
 import pytest
 
 from topoloc.errors import TopolocError
-from topoloc.sequences.atomic import remove_all_leftovers, remove_leftovers, replaced_file, scratch_file, write_bytes, write_folder
+from topoloc.sequences.atomic import (
+    remove_all_leftovers,
+    remove_leftovers,
+    replaced_file,
+    scratch_file,
+    write_bytes,
+    write_folder,
+)
 
 WRITER = """
 import sys
@@ -62,7 +69,12 @@ def test_threads_and_processes_that_write_one_file_leave_a_whole_one(tmp_path: P
 
 def begun(path: Path, by: str = "replaced_file") -> tuple[subprocess.Popen[str], Path]:
     """A process in the middle of writing, and what it writes to."""
-    child = subprocess.Popen([sys.executable, "-c", WRITER, str(path), by], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    child = subprocess.Popen(
+        [sys.executable, "-c", WRITER, str(path), by],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
     assert child.stdout is not None
     return child, path.parent / child.stdout.readline().strip()
 
@@ -174,7 +186,11 @@ def test_a_folder_is_written_whole_or_not_at_all(tmp_path: Path):
     write_folder(folder, {"a.txt": b"1", "images/b.jpg": b"2"})
     with pytest.raises(TopolocError, match="cannot write"):
         write_folder(folder, {"a.txt": b"3", "a.txt/b": b"4"})  # a file cannot be a folder
-    assert {path.relative_to(folder).as_posix() for path in folder.rglob("*")} == {"a.txt", "images", "images/b.jpg"}
+    assert {path.relative_to(folder).as_posix() for path in folder.rglob("*")} == {
+        "a.txt",
+        "images",
+        "images/b.jpg",
+    }
     assert (folder / "a.txt").read_bytes() == b"1"
     (folder / "images" / "mine.jpg").write_bytes(b"5")
     with pytest.raises(TopolocError, match=r"other things, such as images/mine\.jpg"):

@@ -13,7 +13,13 @@ import numpy as np
 import pytest
 
 from topoloc.errors import ConfigError, RecordingError
-from topoloc.sequences.capture.carla_capture import CarlaConfig, camera_of, carla_client, carla_frames, world_from_cam_of
+from topoloc.sequences.capture.carla_capture import (
+    CarlaConfig,
+    camera_of,
+    carla_client,
+    carla_frames,
+    world_from_cam_of,
+)
 from topoloc.sequences.capture.folder_writer import FolderWriter
 from topoloc.sequences.open import open_sequence
 
@@ -25,10 +31,14 @@ def ours(vector: Any) -> np.ndarray:
     return np.array([vector.x, -vector.y, vector.z])
 
 
-@pytest.mark.parametrize("angles", [(0, 0, 0), (0, 90, 0), (10, 30, 5), (-35, 200, -60), (80, -170, 179)])
+@pytest.mark.parametrize(
+    "angles", [(0, 0, 0), (0, 90, 0), (10, 30, 5), (-35, 200, -60), (80, -170, 179)]
+)
 def test_axes_are_those_of_the_client(angles: tuple[float, float, float]):
     pitch, yaw, roll = map(float, angles)
-    transform = carla.Transform(carla.Location(3.0, 5.0, 7.0), carla.Rotation(pitch=pitch, yaw=yaw, roll=roll))
+    transform = carla.Transform(
+        carla.Location(3.0, 5.0, 7.0), carla.Rotation(pitch=pitch, yaw=yaw, roll=roll)
+    )
     pose = world_from_cam_of(transform)
     np.testing.assert_allclose(pose.translation, [3.0, -5.0, 7.0], atol=1e-5)
     right, down, forward = pose.rotation.T
@@ -39,10 +49,15 @@ def test_axes_are_those_of_the_client(angles: tuple[float, float, float]):
 
 
 def test_points_in_front_of_a_camera_are_where_carla_has_them():
-    """A point that `carla.Transform` takes from the camera's frame (forward, right, up) to the world."""
-    transform = carla.Transform(carla.Location(-20.0, 4.0, 1.6), carla.Rotation(pitch=-4.0, yaw=135.0, roll=2.0))
+    """A point that `carla.Transform` takes from the camera's frame (forward, right, up) to the
+    world."""
+    transform = carla.Transform(
+        carla.Location(-20.0, 4.0, 1.6), carla.Rotation(pitch=-4.0, yaw=135.0, roll=2.0)
+    )
     point_world = transform.transform(carla.Location(10.0, 2.0, -1.0))
-    np.testing.assert_allclose(world_from_cam_of(transform).inverse().apply(ours(point_world)), [2.0, 1.0, 10.0], atol=1e-4)
+    np.testing.assert_allclose(
+        world_from_cam_of(transform).inverse().apply(ours(point_world)), [2.0, 1.0, 10.0], atol=1e-4
+    )
 
 
 class StandInSensor:
@@ -69,7 +84,11 @@ class StandInWorld:
 
     def __init__(self, num_silent: int = 10**6, late: int = 0) -> None:
         self.sensors: list[StandInSensor] = []
-        self.settings, self.weather, self.blueprints = SimpleNamespace(synchronous_mode=False, fixed_delta_seconds=None), None, []
+        self.settings, self.weather, self.blueprints = (
+            SimpleNamespace(synchronous_mode=False, fixed_delta_seconds=None),
+            None,
+            [],
+        )
         self.step, self.num_silent, self.late = itertools.count(100), num_silent, late
 
     def get_settings(self) -> SimpleNamespace:
@@ -85,7 +104,10 @@ class StandInWorld:
         def find(name: str) -> SimpleNamespace:
             values: dict[str, str] = {"name": name}
             self.blueprints.append(values)
-            return SimpleNamespace(has_attribute=lambda key: key != "lens_k" or "rgb" in name, set_attribute=values.__setitem__)
+            return SimpleNamespace(
+                has_attribute=lambda key: key != "lens_k" or "rgb" in name,
+                set_attribute=values.__setitem__,
+            )
 
         return SimpleNamespace(find=find)
 
@@ -96,10 +118,16 @@ class StandInWorld:
     def tick(self) -> int:
         step = next(self.step)
         for sensor in self.sensors:
-            pixels = np.full((6, 8, 4), (sensor.number, step % 256, round(sensor.transform.location.x) % 256, 255), np.uint8)
+            pixels = np.full(
+                (6, 8, 4),
+                (sensor.number, step % 256, round(sensor.transform.location.x) % 256, 255),
+                np.uint8,
+            )
             if sensor.number == 2:
                 pixels[0, 0] = 255  # sky
-            shown = SimpleNamespace(frame=step + self.late, timestamp=0.1 * step, transform=sensor.transform)
+            shown = SimpleNamespace(
+                frame=step + self.late, timestamp=0.1 * step, transform=sensor.transform
+            )
             shown.raw_data, shown.width, shown.height = pixels.tobytes(), 8, 6
             if step < self.num_silent and sensor.listener is not None:
                 sensor.listener(shown)
@@ -107,19 +135,35 @@ class StandInWorld:
 
     def get_map(self) -> SimpleNamespace:
         start = carla.Transform(carla.Location(60.0, 0.0, 0.2), carla.Rotation(yaw=90.0))
-        return SimpleNamespace(name="Town00", get_spawn_points=lambda: [start], get_waypoint=lambda _: self.waypoint(0.0))
+        return SimpleNamespace(
+            name="Town00",
+            get_spawn_points=lambda: [start],
+            get_waypoint=lambda _: self.waypoint(0.0),
+        )
 
     def waypoint(self, y: float, yaw: float = 90.0) -> SimpleNamespace:
         def following(metres: float) -> list[SimpleNamespace]:
             ahead = y + metres
-            at_junction = [self.waypoint(ahead, 0.0), self.waypoint(ahead), self.waypoint(ahead, 180.0)]
+            at_junction = [
+                self.waypoint(ahead, 0.0),
+                self.waypoint(ahead),
+                self.waypoint(ahead, 180.0),
+            ]
             return [] if ahead > 9.0 else at_junction if ahead == 5.0 else [self.waypoint(ahead)]
 
         transform = carla.Transform(carla.Location(60.0, y, 0.2), carla.Rotation(yaw=yaw))
         return SimpleNamespace(transform=transform, next=following)
 
 
-CONFIG = CarlaConfig(length_m=100.0, spacing_m=1.0, lane_offset_m=2.0, width=8, height=6, timeout_s=0.2, weather="rain")
+CONFIG = CarlaConfig(
+    length_m=100.0,
+    spacing_m=1.0,
+    lane_offset_m=2.0,
+    width=8,
+    height=6,
+    timeout_s=0.2,
+    weather="rain",
+)
 
 
 def client_of(world: StandInWorld) -> SimpleNamespace:
@@ -144,12 +188,19 @@ def test_a_way_is_recorded(tmp_path: Path):
     assert last.right is not None
     assert last.rig.baseline == pytest.approx(CONFIG.baseline_m)
     assert last.rig.left == camera_of(CONFIG)
-    assert last.image[3, 3].tolist()[1:] == [(100 + 20 + 9) % 256, 0]  # RGB: this very step, of the left camera
+    assert last.image[3, 3].tolist()[1:] == [
+        (100 + 20 + 9) % 256,
+        0,
+    ]  # RGB: this very step, of the left camera
     assert last.right[3, 3, 2] == 1
     assert world.weather == carla.WeatherParameters.HardRainNoon
     assert not world.settings.synchronous_mode
     assert [sensor.ended for sensor in world.sensors] == [["stop", "destroy"]] * 3
-    assert [values["name"] for values in world.blueprints] == ["sensor.camera.rgb", "sensor.camera.rgb", "sensor.camera.depth"]
+    assert [values["name"] for values in world.blueprints] == [
+        "sensor.camera.rgb",
+        "sensor.camera.rgb",
+        "sensor.camera.depth",
+    ]
     assert world.blueprints[0]["motion_blur_intensity"] == "0"
     assert "lens_k" not in world.blueprints[2]
 
@@ -159,7 +210,9 @@ def test_depth_is_in_metres():
     assert frame.depth is not None
     assert math.isnan(frame.depth.depth[0, 0])
     red, green, blue = 58, (100 + 20) % 256, 2
-    assert frame.depth.depth[3, 3] == pytest.approx((red + 256 * green + 65536 * blue) / (2**24 - 1) * 1000.0, rel=1e-6)
+    assert frame.depth.depth[3, 3] == pytest.approx(
+        (red + 256 * green + 65536 * blue) / (2**24 - 1) * 1000.0, rel=1e-6
+    )
 
 
 def test_ended_early_the_server_is_left_as_it_was():
@@ -173,7 +226,10 @@ def test_ended_early_the_server_is_left_as_it_was():
 
 @pytest.mark.parametrize(
     ("world", "said"),
-    [(StandInWorld(num_silent=123), "no picture of step 123 for 0.2 s"), (StandInWorld(late=1), "is another client ticking it")],
+    [
+        (StandInWorld(num_silent=123), "no picture of step 123 for 0.2 s"),
+        (StandInWorld(late=1), "is another client ticking it"),
+    ],
 )
 def test_a_server_that_does_not_keep_step(world: StandInWorld, said: str):
     with pytest.raises(RecordingError, match=said):

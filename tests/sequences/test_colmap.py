@@ -10,10 +10,25 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_recordings import HEIGHT, WIDTH, assert_same_pose, kitti_row, picture, pose, tum_line, write
+from tiny_recordings import (
+    HEIGHT,
+    WIDTH,
+    assert_same_pose,
+    kitti_row,
+    picture,
+    pose,
+    tum_line,
+    write,
+)
 
 import topoloc
-from topoloc.errors import CalibrationError, MissingExtraError, RecordingError, TrajectoryError, UnreadableImageError
+from topoloc.errors import (
+    CalibrationError,
+    MissingExtraError,
+    RecordingError,
+    TrajectoryError,
+    UnreadableImageError,
+)
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.colmap import aligned, open_colmap
@@ -27,17 +42,29 @@ METRES = 2.5
 
 def true_pose(index: int) -> Rigid3:
     """Along a bend."""
-    return Rigid3(pose(index).rotation, pose(index).translation + np.array([0.0, 0.0, 0.3 * index**2]))
+    return Rigid3(
+        pose(index).rotation, pose(index).translation + np.array([0.0, 0.0, 0.3 * index**2])
+    )
 
 
 @pytest.fixture
 def model(tmp_path: Path) -> Make:
-    """Makes sparse/0 and images/ of three pictures, in a unit of 2.5 m; `changes` are those of the camera."""
+    """Makes sparse/0 and images/ of three pictures, in a unit of 2.5 m; `changes` are those of the
+    camera."""
 
-    def make(binary: bool = True, names: tuple[str, ...] = ("a1.png", "a2.png", "a10.png"), **changes: Any) -> Path:
+    def make(
+        binary: bool = True,
+        names: tuple[str, ...] = ("a1.png", "a2.png", "a10.png"),
+        **changes: Any,
+    ) -> Path:
         root = tmp_path / "scene"
         found = pycolmap.Reconstruction()
-        lens = {"model": "OPENCV", "width": WIDTH, "height": HEIGHT, "params": [40.0, 41.0, 16.0, 12.0, 0.1, 0.0, 0.0, 0.0]}
+        lens = {
+            "model": "OPENCV",
+            "width": WIDTH,
+            "height": HEIGHT,
+            "params": [40.0, 41.0, 16.0, 12.0, 0.1, 0.0, 0.0, 0.0],
+        }
         found.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=1, **(lens | changes)))
         for number, name in reversed(list(enumerate(names))):
             write(root / "images" / f"{Path(name).stem}.png", picture(number))
@@ -64,7 +91,9 @@ def test_pictures_cameras_and_poses(model: Make, binary: bool):
         assert sequence.names == ["a1.png", "a2.png", "a10.png"]
     assert sequence.t_ns == [0, 10**9, 2 * 10**9]
     # COLMAP counts pixels from the corner of the first one, here they count from its centre
-    assert sequence[0].camera == Camera("OPENCV", WIDTH, HEIGHT, (40.0, 41.0, 15.5, 11.5, 0.1, 0.0, 0.0, 0.0))
+    assert sequence[0].camera == Camera(
+        "OPENCV", WIDTH, HEIGHT, (40.0, 41.0, 15.5, 11.5, 0.1, 0.0, 0.0, 0.0)
+    )
     np.testing.assert_array_equal(sequence[2].image, picture(2))
     for index, found in enumerate(scaled(sequence, METRES).poses):
         assert_same_pose(found, true_pose(index))
@@ -87,7 +116,9 @@ def test_a_model_has_no_scale_until_it_is_given_one(model: Make):
     sequence = open_sequence(model())
     for unscaled in (sequence, sequence_subset(sequence, [2, 0])):
         assert not has_scale(unscaled)
-        with pytest.raises(TrajectoryError, match="a model of pictures alone has no scale; give --scale METRES"):
+        with pytest.raises(
+            TrajectoryError, match="a model of pictures alone has no scale; give --scale METRES"
+        ):
             topoloc.build_map(unscaled)
         assert has_scale(scaled(unscaled, 2.0))
     assert has_scale(topoloc.MemorySequence([sequence[0]]))
@@ -95,14 +126,21 @@ def test_a_model_has_no_scale_until_it_is_given_one(model: Make):
 
 @pytest.mark.parametrize("kind", ["rows", "times"])
 def test_a_trajectory_gives_scale_and_world(model: Make, tmp_path: Path, kind: str):
-    names = ("a1.png", "a2.png", "a10.png", "a11.png") if kind == "rows" else ("12.5.png", "13.25.png", "14.png", "20.000000001.png")
+    names = (
+        ("a1.png", "a2.png", "a10.png", "a11.png")
+        if kind == "rows"
+        else ("12.5.png", "13.25.png", "14.png", "20.000000001.png")
+    )
     sequence = open_sequence(model(names=names))
     metric_from_true = Rigid3(pose(5).rotation, np.array([10.0, 20.0, 30.0]))
     theirs = [metric_from_true @ true_pose(index) for index in range(4)]
     # a measured trajectory knows where the camera was, hardly how it was turned
     measured = [Rigid3(np.eye(3), world_from_cam.translation) for world_from_cam in theirs]
     file = tmp_path / "gnss.txt"
-    rows = [kitti_row(p) if kind == "rows" else tum_line(Path(name).stem, p) for name, p in zip(names, measured, strict=True)]
+    rows = [
+        kitti_row(p) if kind == "rows" else tum_line(Path(name).stem, p)
+        for name, p in zip(names, measured, strict=True)
+    ]
     file.write_text("\n".join(rows))
     if kind == "times":
         assert sequence.t_ns == [12_500_000_000, 13_250_000_000, 14_000_000_000, 20_000_000_001]
@@ -142,7 +180,9 @@ def test_damaged_models(model: Make, file: str, binary: bool, capfd: pytest.Capt
     whole = path.read_bytes()
     for data in (b"\xff" * 200, whole[: len(whole) // 2], whole[: len(whole) * 2 // 3], whole[:9]):
         path.write_bytes(data)
-        with suppress(RecordingError, TrajectoryError):  # what is cut off may be a whole model of fewer things
+        with suppress(
+            RecordingError, TrajectoryError
+        ):  # what is cut off may be a whole model of fewer things
             open_colmap(root)
     path.write_bytes(b"\xff" * 200)
     with pytest.raises(RecordingError, match="damaged, or no model of COLMAP"):

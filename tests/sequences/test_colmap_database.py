@@ -24,16 +24,23 @@ Make = Callable[..., Path]
 def database(tmp_path: Path) -> Make:
     """Makes database.db and images/; each picture's camera is the one of its place, or the last."""
 
-    def make(names: tuple[str, ...] = ("10.png", "9.5.png", "11.png"), cameras: tuple = (OPENCV,)) -> Path:
+    def make(
+        names: tuple[str, ...] = ("10.png", "9.5.png", "11.png"), cameras: tuple = (OPENCV,)
+    ) -> Path:
         root = tmp_path / "scene"
         root.mkdir()
         with pycolmap.Database.open(root / "database.db") as written:
             ids = [
-                written.write_camera(pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=params)) for model, params in cameras
+                written.write_camera(
+                    pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=params)
+                )
+                for model, params in cameras
             ]
             for number, name in enumerate(names):
                 write(root / "images" / name, picture(number))
-                written.write_image(pycolmap.Image(name=name, camera_id=ids[min(number, len(ids) - 1)]))
+                written.write_image(
+                    pycolmap.Image(name=name, camera_id=ids[min(number, len(ids) - 1)])
+                )
         return root
 
     return make
@@ -48,7 +55,9 @@ def test_pictures_and_cameras_come_without_poses(database: Make):
         assert list(sequence.t_ns) == [9_500_000_000, 10_000_000_000, 11_000_000_000]
         assert list(sequence.poses) == [None] * 3
         frame = sequence[0]
-        assert frame.camera == Camera("OPENCV", WIDTH, HEIGHT, (40.0, 41.0, 15.5, 11.5, 0.1, 0.0, 0.0, 0.0))
+        assert frame.camera == Camera(
+            "OPENCV", WIDTH, HEIGHT, (40.0, 41.0, 15.5, 11.5, 0.1, 0.0, 0.0, 0.0)
+        )
         np.testing.assert_array_equal(frame.image, picture(1))
 
 
@@ -103,6 +112,8 @@ def test_mutated_databases_are_read_or_refused(database: Make):
         data = bytearray(whole)
         for at in rng.integers(0, len(data), rng.integers(1, 40)):
             data[at] = rng.integers(0, 256)
-        (root / "database.db").write_bytes(bytes(data[: rng.integers(100, len(data) + 1)] if rng.random() < 0.3 else data))
+        (root / "database.db").write_bytes(
+            bytes(data[: rng.integers(100, len(data) + 1)] if rng.random() < 0.3 else data)
+        )
         with suppress(TopolocError):
             open_sequence(root)

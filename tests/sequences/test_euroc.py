@@ -38,7 +38,9 @@ def test_pairs_are_of_equal_times(euroc: Path):
 
 def test_rig(euroc: Path):
     frame = open_euroc(euroc)[0]
-    assert frame.camera == Camera("OPENCV", 32, 24, (45.5, 45.25, 16.5, 12.5, -0.28, 0.07, 0.0002, 1.7e-05))
+    assert frame.camera == Camera(
+        "OPENCV", 32, 24, (45.5, 45.25, 16.5, 12.5, -0.28, 0.07, 0.0002, 1.7e-05)
+    )
     assert not frame.rig.is_rectified
     point_left = np.array([0.3, -0.2, 4.0])
     point_right = BODY_FROM_CAM[1].inverse().apply(BODY_FROM_CAM[0].apply(point_left))
@@ -48,8 +50,16 @@ def test_rig(euroc: Path):
 def test_truth_is_the_left_cameras(euroc: Path):
     t0, _, t2, t3 = EUROC_TIMES
     # Frame 0 in the middle of a gap of 40 ms, frame 2 in one of 80 ms, frame 3 exact.
-    times = [t0 - 20 * MILLISECOND, t0 + 20 * MILLISECOND, t2 - 45 * MILLISECOND, t2 + 35 * MILLISECOND, t3]
-    poses = [Rigid3(np.eye(3), np.array([float(index), 0.0, 0.0])) for index in range(4)] + [pose(3)]
+    times = [
+        t0 - 20 * MILLISECOND,
+        t0 + 20 * MILLISECOND,
+        t2 - 45 * MILLISECOND,
+        t2 + 35 * MILLISECOND,
+        t3,
+    ]
+    poses = [Rigid3(np.eye(3), np.array([float(index), 0.0, 0.0])) for index in range(4)] + [
+        pose(3)
+    ]
     write_truth(euroc, times, poses)
     sequence = open_euroc(euroc)
     middle = Rigid3(np.eye(3), np.array([0.5, 0.0, 0.0]))
@@ -87,7 +97,12 @@ def test_a_listed_picture_that_is_missing(euroc: Path):
 
 @pytest.mark.parametrize(
     ("text", "says"),
-    [("# none\n", "nothing in"), ("123\n", "line 1"), ("a,a.png\n", "line 1.*not a time"), ("2,2.png\n1,1.png\n", "line 2.*not after")],
+    [
+        ("# none\n", "nothing in"),
+        ("123\n", "line 1"),
+        ("a,a.png\n", "line 1.*not a time"),
+        ("2,2.png\n1,1.png\n", "line 2.*not after"),
+    ],
 )
 def test_bad_lists(euroc: Path, text: str, says: str):
     (euroc / "mav0" / "cam0" / "data.csv").write_text(text)
@@ -106,8 +121,9 @@ def test_fisheye_and_other_styles_of_yaml(tmp_path: Path):
     path.write_text(sensor_yaml(BODY_FROM_CAM[0], "equidistant"))
     assert read_sensor(path).camera.model == "OPENCV_FISHEYE"
     path.write_text(
-        "T_BS:\n- [1.0, 0.0, 0.0, 0.5]\n- [0.0, 1.0, 0.0, 0.25]\n- [0.0, 0.0, 1.0, 1e-1]\n- [0.0, 0.0, 0.0, 1.0]\n"
-        "resolution:\n- 512\n- 512\nintrinsics: [190., 191, 254.5, 255]\ndistortion_model: none\n"
+        "T_BS:\n- [1.0, 0.0, 0.0, 0.5]\n- [0.0, 1.0, 0.0, 0.25]\n- [0.0, 0.0, 1.0, 1e-1]\n- [0.0,"
+        " 0.0, 0.0, 1.0]\nresolution:\n- 512\n- 512\nintrinsics: [190., 191, 254.5,"
+        " 255]\ndistortion_model: none\n"
     )
     sensor = read_sensor(path)
     assert sensor.camera == Camera.pinhole(512, 512, 190.0, 191.0, 254.5, 255.0)
@@ -150,6 +166,15 @@ def test_real_recording(shared: Path):
     frame = sequence[0]
     assert frame.t_ns == 1403715273262142976
     assert frame.image.shape == frame.right.shape == (480, 752)
-    assert frame.camera.params == (458.654, 457.296, 367.215, 248.375, -0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)
+    assert frame.camera.params == (
+        458.654,
+        457.296,
+        367.215,
+        248.375,
+        -0.28340811,
+        0.07395907,
+        0.00019359,
+        1.76187114e-05,
+    )
     assert frame.rig.baseline == pytest.approx(0.11007, abs=1e-4)
     assert frame.rig.right_from_left.translation[0] < -0.1

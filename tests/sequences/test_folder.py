@@ -19,13 +19,21 @@ def test_pictures_alone_in_natural_order(plain: Plain):
     assert sequence.t_ns == [0, 100_000_000, 200_000_000]
     frame = sequence[2]
     np.testing.assert_array_equal(frame.image, picture(10))
-    assert (frame.camera, frame.right, frame.rig, frame.depth, frame.world_from_cam) == (None, None, None, None, None)
+    assert (frame.camera, frame.right, frame.rig, frame.depth, frame.world_from_cam) == (
+        None,
+        None,
+        None,
+        None,
+        None,
+    )
 
 
 def test_one_picture(plain: Plain):
     folder = plain("")
     assert [frame.name for frame in open_sequence(folder / "view2.png")] == ["view2.png"]
-    assert open_sequence(plain("", baseline=0.1) / "view2.png")[0].camera == Camera.from_json(CAMERA)
+    assert open_sequence(plain("", baseline=0.1) / "view2.png")[0].camera == Camera.from_json(
+        CAMERA
+    )
 
 
 def test_pictures_one_folder_down_with_times_and_truth(plain: Plain):
@@ -61,7 +69,9 @@ def test_rgbd(plain: Plain, colour: str):
     np.testing.assert_array_equal(frame.depth.cam_from_depth.matrix(), np.eye(4))
 
 
-@pytest.mark.parametrize(("names", "key"), [(("left", "right"), "baseline"), (("rgb", "depth"), "depth_factor")])
+@pytest.mark.parametrize(
+    ("names", "key"), [(("left", "right"), "baseline"), (("rgb", "depth"), "depth_factor")]
+)
 def test_what_camera_json_must_say(plain: Plain, names: tuple[str, str], key: str):
     with pytest.raises(CalibrationError, match=r"camera\.json.*" + key):
         open_sequence(plain(*names))
@@ -72,7 +82,9 @@ def test_what_camera_json_must_say(plain: Plain, names: tuple[str, str], key: st
             open_sequence(plain(*names, **{key: value}))
 
 
-@pytest.mark.parametrize("text", ["{", "[]", '{"width": 3}', '{"model": "LENS", "width": 3, "height": 3}'])
+@pytest.mark.parametrize(
+    "text", ["{", "[]", '{"width": 3}', '{"model": "LENS", "width": 3, "height": 3}']
+)
 def test_bad_camera_json(plain: Plain, text: str):
     folder = plain("")
     (folder / "camera.json").write_text(text)
@@ -89,7 +101,9 @@ def test_unequal_counts(plain: Plain):
 
 def test_another_size_than_the_camera(plain: Plain):
     folder = plain("", width=64)
-    with pytest.raises(UnreadableImageError, match=r"view1\.png: 32x24 pixels, but its camera is of 64x24"):
+    with pytest.raises(
+        UnreadableImageError, match=r"view1\.png: 32x24 pixels, but its camera is of 64x24"
+    ):
         open_sequence(folder)[0]
 
 

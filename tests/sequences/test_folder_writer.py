@@ -21,11 +21,17 @@ CAMERA = Camera.pinhole(32, 24, 40.0, 41.0, 15.5, 11.5)
 DISTORTED = Camera("OPENCV", 32, 24, (40.0, 41.0, 15.0, 11.0, -0.1, 0.01, 0.001, 0.002))
 RIGS = {
     "rectified": StereoRig.rectified(CAMERA, 0.12),
-    "distorted": StereoRig(DISTORTED, CAMERA, Rigid3(exp_so3(np.array([0.0, 0.02, 0.0])), np.array([-0.12, 0.001, 0.0]))),
+    "distorted": StereoRig(
+        DISTORTED,
+        CAMERA,
+        Rigid3(exp_so3(np.array([0.0, 0.02, 0.0])), np.array([-0.12, 0.001, 0.0])),
+    ),
 }
 
 
-def frame(index: int, rig: StereoRig | None = None, with_depth: bool = False, with_pose: bool = True) -> StereoFrame:
+def frame(
+    index: int, rig: StereoRig | None = None, with_depth: bool = False, with_pose: bool = True
+) -> StereoFrame:
     rng = np.random.default_rng(index)
     left, right = (rng.integers(0, 256, (24, 32, 3), dtype=np.uint8) for _ in range(2))
     camera = CAMERA if rig is None else rig.left
@@ -72,7 +78,9 @@ def test_depth_comes_back(tmp_path: Path):
     for one, its in zip(frames, list_of(open_sequence(tmp_path / "out")), strict=True):
         assert its.depth is not None
         assert one.depth is not None
-        np.testing.assert_allclose(its.depth.depth, one.depth.depth, atol=0.0021)  # half a step; NaN where it is unknown
+        np.testing.assert_allclose(
+            its.depth.depth, one.depth.depth, atol=0.0021
+        )  # half a step; NaN where it is unknown
         assert its.world_from_cam is None
 
 
@@ -99,7 +107,9 @@ def test_what_is_there_is_never_overwritten(tmp_path: Path):
         FolderWriter(tmp_path / "no/such/folder")
 
 
-def test_a_frame_that_fails_leaves_nothing_of_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_frame_that_fails_leaves_nothing_of_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     from topoloc.sequences.capture import folder_writer
 
     written, write_bytes = [], folder_writer.write_bytes

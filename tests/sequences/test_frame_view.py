@@ -29,19 +29,28 @@ def test_a_rectified_pair_is_taken_as_it_is(tiny_recording: Path):
 
 def test_a_turned_pair_is_rectified_and_says_how_it_turned():
     panels, world_from_left = tiny_world.room(), tiny_world.path_pose(2)
-    right_from_left = Rigid3(exp_so3(np.array([0.01, 0.03, -0.02])), np.array([-0.12, 0.004, 0.003]))
+    right_from_left = Rigid3(
+        exp_so3(np.array([0.01, 0.03, -0.02])), np.array([-0.12, 0.004, 0.003])
+    )
     world_from_right = world_from_left @ right_from_left.inverse()
     camera = Camera("OPENCV", 320, 240, (*tiny_world.CAMERA.params, -0.1, 0.02, 0.0, 0.0))
-    left, right = (tiny_world.render(panels, pose, camera)[0] for pose in (world_from_left, world_from_right))
+    left, right = (
+        tiny_world.render(panels, pose, camera)[0] for pose in (world_from_left, world_from_right)
+    )
     rig = StereoRig(camera, camera, right_from_left)
     frame = StereoFrame("a", 0, left, camera, right=right, rig=rig)
     view = frame_view(frame)
     assert view.rig is not None
     assert view.rig.is_rectified
     assert view.right_grey is not None
-    np.testing.assert_array_equal(frame_view(replace(frame, right=None), with_depth=False).grey, view.grey)
+    np.testing.assert_array_equal(
+        frame_view(replace(frame, right=None), with_depth=False).grey, view.grey
+    )
     world_from_view = world_from_left @ view.view_from_cam.inverse()
-    for seen, pose in ((view.grey, world_from_view), (view.right_grey, world_from_view @ view.rig.right_from_left.inverse())):
+    for seen, pose in (
+        (view.grey, world_from_view),
+        (view.right_grey, world_from_view @ view.rig.right_from_left.inverse()),
+    ):
         expected, _ = tiny_world.render(panels, pose, view.camera)
         assert np.median(np.abs(seen.astype(float) - expected)) < 3.0
 
@@ -59,11 +68,15 @@ DEPTH_CAMERA = Camera.pinhole(160, 120, 140.0, 140.0, 79.5, 59.5)
 
 def test_registered_depth_is_what_the_other_camera_would_measure():
     panels, world_from_depth = tiny_world.room(), tiny_world.path_pose(1)
-    cam_from_depth = Rigid3(exp_so3(np.array([0.01, -0.02, 0.005])), np.array([-0.03, 0.002, 0.004]))
+    cam_from_depth = Rigid3(
+        exp_so3(np.array([0.01, -0.02, 0.005])), np.array([-0.03, 0.002, 0.004])
+    )
     camera = Camera.pinhole(150, 110, 135.0, 134.0, 74.0, 55.0)
     _, depth = tiny_world.render(panels, world_from_depth, DEPTH_CAMERA)
     _, expected = tiny_world.render(panels, world_from_depth @ cam_from_depth.inverse(), camera)
-    registered = registered_depth(DepthImage(depth.astype(np.float32), DEPTH_CAMERA, cam_from_depth), camera)
+    registered = registered_depth(
+        DepthImage(depth.astype(np.float32), DEPTH_CAMERA, cam_from_depth), camera
+    )
     known = np.isfinite(registered) & np.isfinite(expected)
     assert known.mean() > 0.85
     error = np.abs(registered - expected)[known]

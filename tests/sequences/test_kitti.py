@@ -113,7 +113,12 @@ def test_bad_calibrations(kitti: Path, calib: str, says: str):
 
 
 @pytest.mark.parametrize(
-    ("times", "says"), [("0\n0.1\n", "2 times for 3"), ("0\n0.2\n0.1\n", "line 3.*not after"), ("0\nx\n1\n", "line 2.*not a time")]
+    ("times", "says"),
+    [
+        ("0\n0.1\n", "2 times for 3"),
+        ("0\n0.2\n0.1\n", "line 3.*not after"),
+        ("0\nx\n1\n", "line 2.*not a time"),
+    ],
 )
 def test_bad_times(kitti: Path, times: str, says: str):
     (kitti / "times.txt").write_text(times)
@@ -151,7 +156,9 @@ def test_streets(shared: Path):
         assert frame.rig.is_rectified
         assert frame.image.ndim == frame.right.ndim == 2
         path = np.array([found.translation for found in sequence.poses])
-        assert np.linalg.norm(np.diff(path, axis=0), axis=1).sum() == pytest.approx({"street1": 60, "street2": 52}[name], abs=1.5)
+        assert np.linalg.norm(np.diff(path, axis=0), axis=1).sum() == pytest.approx(
+            {"street1": 60, "street2": 52}[name], abs=1.5
+        )
         # Forward in the camera frame is z.
         assert (sequence.poses[0].inverse() @ sequence.poses[1]).translation[2] > 0.5
 

@@ -35,7 +35,10 @@ def test_a_unit_in_metres(texts: tuple[str, ...], scale: float):
 @pytest.mark.parametrize(
     ("texts", "said"),
     [
-        (("a/IMG_1.jpg,a/IMG_2.jpg=1m", "IMG_1,IMG_3=2.2m"), "do not agree: a/IMG_1.jpg,a/IMG_2.jpg=1m makes a unit 0.5 m"),
+        (
+            ("a/IMG_1.jpg,a/IMG_2.jpg=1m", "IMG_1,IMG_3=2.2m"),
+            "do not agree: a/IMG_1.jpg,a/IMG_2.jpg=1m makes a unit 0.5 m",
+        ),
         (("IMG_1,IMG_9=2m",), "no picture is named IMG_9"),
         (("IMG_1,IMG_2=2m",), "2 pictures are named IMG_2"),
         (("IMG_1,IMG_4=2m",), "IMG_4 has no pose"),

@@ -1,4 +1,5 @@
-"""Live sources: a stream over HTTP from this machine, a video file taken for one; old pictures are dropped, ends and stalls are said."""
+"""Live sources: a stream over HTTP from this machine, a video file taken for one; old pictures are
+dropped, ends and stalls are said."""
 
 from __future__ import annotations
 
@@ -55,12 +56,15 @@ def test_every_picture_of_a_source_that_may_wait(tmp_path: Path):
     with LiveSource(str(grey_film(tmp_path / "a.avi", 8)), keep_all=True) as source:
         pictures = list(source)
     assert [picture.number for picture in pictures] == list(range(8))
-    assert [int(picture.image[20, 20, 0]) for picture in pictures] == pytest.approx([10 * index for index in range(8)], abs=2)
+    assert [int(picture.image[20, 20, 0]) for picture in pictures] == pytest.approx(
+        [10 * index for index in range(8)], abs=2
+    )
     assert (np.diff([picture.t_ns for picture in pictures]) > 0).all()
 
 
 def test_the_newest_picture_of_a_stream_over_http():
-    """Who takes longer than the camera's period gets pictures that are new all the same, and the last one."""
+    """Who takes longer than the camera's period gets pictures that are new all the same, and the
+    last one."""
     with mjpeg_camera(greys(20), 0.02) as url, LiveSource(url) as source:
         taken = []
         for picture in source:
@@ -89,14 +93,18 @@ def test_stopped_from_outside():
         assert source.num_read < 900
 
 
-@pytest.mark.parametrize("source", ["rtsp://127.0.0.1:9/none", "http://127.0.0.1:9/none.mjpg", "/dev/video99", "997"])
+@pytest.mark.parametrize(
+    "source", ["rtsp://127.0.0.1:9/none", "http://127.0.0.1:9/none.mjpg", "/dev/video99", "997"]
+)
 def test_what_does_not_answer(source: str, capfd: pytest.CaptureFixture[str]):
     with pytest.raises(RecordingError, match="does not answer"):
         LiveSource(source, stall_s=2.0)
     assert capfd.readouterr().err == ""
 
 
-@pytest.mark.skipif(cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER), reason="this OpenCV has GStreamer")
+@pytest.mark.skipif(
+    cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER), reason="this OpenCV has GStreamer"
+)
 def test_pipelines_need_gstreamer():
     with pytest.raises(RecordingError, match="without GStreamer"):
         LiveSource("videotestsrc ! videoconvert ! appsink")

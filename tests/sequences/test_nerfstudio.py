@@ -1,4 +1,5 @@
-"""transforms.json as nerfstudio documents it, written by hand here: its converters' shape, Polycam's, and what is hostile."""
+"""transforms.json as nerfstudio documents it, written by hand here: its converters' shape,
+Polycam's, and what is hostile."""
 
 from __future__ import annotations
 
@@ -25,19 +26,32 @@ Make = Callable[..., Path]
 def capture(tmp_path: Path) -> Make:
     """Makes a folder of three frames; `change` may alter what its transforms.json says."""
 
-    def make(change: Callable[[dict[str, Any]], None] | None = None, depth_scale: float | None = 0.001) -> Path:
+    def make(
+        change: Callable[[dict[str, Any]], None] | None = None, depth_scale: float | None = 0.001
+    ) -> Path:
         folder = tmp_path / "capture"
         frames = []
         for index in (10, 2, 1):  # as converters list them: in no order that means anything
             write(folder / "images" / f"frame_{index}.png", picture(index, 3))
-            frame = {"file_path": f"./images/frame_{index}.png", "transform_matrix": (pose(index).matrix() @ GL).tolist()}
+            frame = {
+                "file_path": f"./images/frame_{index}.png",
+                "transform_matrix": (pose(index).matrix() @ GL).tolist(),
+            }
             if depth_scale is not None:
                 units = np.full((HEIGHT // 2, WIDTH // 2), 1000 * index, np.uint16)
                 units[0, 0] = 0
                 write(folder / "depth" / f"frame_{index}.png", units)
                 frame["depth_file_path"] = f"./depth/frame_{index}.png"
             frames.append(frame)
-        data = {"camera_model": "OPENCV", **LENS, "k1": 0.1, "k2": -0.02, "p1": 0.001, "p2": 0.0, "frames": frames}
+        data = {
+            "camera_model": "OPENCV",
+            **LENS,
+            "k1": 0.1,
+            "k2": -0.02,
+            "p1": 0.001,
+            "p2": 0.0,
+            "frames": frames,
+        }
         if change is not None:
             change(data)
         (folder / "transforms.json").write_text(json.dumps(data))
@@ -55,8 +69,11 @@ def test_axes_camera_order_and_depth(capture: Make):
     for found, index in zip(sequence.poses, (1, 2, 10), strict=True):
         assert_same_pose(found, pose(index))
     frame = sequence[2]
-    # nerfstudio counts pixels as COLMAP does, from the corner of the first one; here they count from its centre
-    assert frame.camera == Camera("OPENCV", WIDTH, HEIGHT, (40.0, 41.0, 15.5, 11.5, 0.1, -0.02, 0.001, 0.0))
+    # nerfstudio counts pixels as COLMAP does, from the corner of the first one; here they count
+    # from its centre
+    assert frame.camera == Camera(
+        "OPENCV", WIDTH, HEIGHT, (40.0, 41.0, 15.5, 11.5, 0.1, -0.02, 0.001, 0.0)
+    )
     assert frame.depth is not None
     assert frame.depth.camera == frame.camera
     assert frame.depth.depth.shape == (HEIGHT, WIDTH)
@@ -65,11 +82,19 @@ def test_axes_camera_order_and_depth(capture: Make):
 
 
 def test_a_point_in_front_of_the_camera_is_where_the_matrix_says(capture: Make):
-    folder = capture(lambda data: data["frames"].__setitem__(0, data["frames"][0] | {"transform_matrix": np.eye(4).tolist()}))
+    folder = capture(
+        lambda data: data["frames"].__setitem__(
+            0, data["frames"][0] | {"transform_matrix": np.eye(4).tolist()}
+        )
+    )
     world_from_cam = open_sequence(folder).poses[2]
     assert world_from_cam is not None
     # OpenGL's camera in the origin looks along -z of the world, with y up
-    np.testing.assert_allclose(world_from_cam.apply(np.array([[0.0, 0.0, 2.0], [0.0, 1.0, 0.0]])), [[0, 0, -2], [0, -1, 0]], atol=1e-12)
+    np.testing.assert_allclose(
+        world_from_cam.apply(np.array([[0.0, 0.0, 2.0], [0.0, 1.0, 0.0]])),
+        [[0, 0, -2], [0, -1, 0]],
+        atol=1e-12,
+    )
 
 
 def test_the_unit_of_depth_and_an_applied_scale(capture: Make):
@@ -93,12 +118,20 @@ def test_cameras_of_each_frame_as_polycam_has_them(capture: Make):
 
     sequence = open_sequence(capture(per_frame, depth_scale=None))
     cameras = [sequence[index].camera for index in range(3)]
-    assert [camera and (camera.model, camera.fx) for camera in cameras] == [("PINHOLE", 42.0), ("PINHOLE", 41.0), ("PINHOLE", 40.0)]
+    assert [camera and (camera.model, camera.fx) for camera in cameras] == [
+        ("PINHOLE", 42.0),
+        ("PINHOLE", 41.0),
+        ("PINHOLE", 40.0),
+    ]
     assert sequence[0].depth is None
 
 
 def test_depth_of_numpy(capture: Make):
-    folder = capture(lambda data: [frame.update(depth_file_path=f"depth/{k}.npy") for k, frame in enumerate(data["frames"])])
+    folder = capture(
+        lambda data: [
+            frame.update(depth_file_path=f"depth/{k}.npy") for k, frame in enumerate(data["frames"])
+        ]
+    )
     for k in range(3):
         np.save(folder / "depth" / f"{k}.npy", np.full((HEIGHT, WIDTH, 1), 1500.0, np.float32))
     depth = open_sequence(folder)[0].depth
@@ -107,8 +140,12 @@ def test_depth_of_numpy(capture: Make):
 
 
 def test_fisheye(capture: Make):
-    camera = open_sequence(capture(lambda data: data.update(camera_model="OPENCV_FISHEYE", k3=0.01)))[0].camera
-    assert camera == Camera("OPENCV_FISHEYE", WIDTH, HEIGHT, (40.0, 41.0, 15.5, 11.5, 0.1, -0.02, 0.01, 0.0))
+    camera = open_sequence(
+        capture(lambda data: data.update(camera_model="OPENCV_FISHEYE", k3=0.01))
+    )[0].camera
+    assert camera == Camera(
+        "OPENCV_FISHEYE", WIDTH, HEIGHT, (40.0, 41.0, 15.5, 11.5, 0.1, -0.02, 0.01, 0.0)
+    )
 
 
 def _matrix(value: Any) -> Callable[[dict[str, Any]], None]:
@@ -120,36 +157,89 @@ def _matrix(value: Any) -> Callable[[dict[str, Any]], None]:
     [
         (lambda data: data.update(frames=[]), RecordingError, "no list of frames"),
         (lambda data: data.update(frames=[1]), RecordingError, "no list of frames"),
-        (lambda data: data.update(camera_model="EQUIRECTANGULAR"), CalibrationError, "'EQUIRECTANGULAR' is not known"),
+        (
+            lambda data: data.update(camera_model="EQUIRECTANGULAR"),
+            CalibrationError,
+            "'EQUIRECTANGULAR' is not known",
+        ),
         (lambda data: data.pop("cx"), CalibrationError, "cx is missing"),
-        (lambda data: data.update(fl_x="wide"), CalibrationError, "fl_x: a finite number is expected"),
-        (lambda data: data.update(fl_x=float("inf")), CalibrationError, "fl_x: a finite number is expected"),
-        (lambda data: data.update(fl_x=10**400), CalibrationError, "fl_x: a finite number is expected"),
+        (
+            lambda data: data.update(fl_x="wide"),
+            CalibrationError,
+            "fl_x: a finite number is expected",
+        ),
+        (
+            lambda data: data.update(fl_x=float("inf")),
+            CalibrationError,
+            "fl_x: a finite number is expected",
+        ),
+        (
+            lambda data: data.update(fl_x=10**400),
+            CalibrationError,
+            "fl_x: a finite number is expected",
+        ),
         (lambda data: data.update(k4=0.1), CalibrationError, "fourth radial coefficient"),
-        (lambda data: data.update(applied_scale=0), RecordingError, "applied_scale must be a positive number"),
-        (lambda data: data.update(depth_unit_scale_factor=-1), RecordingError, "depth_unit_scale_factor must be a positive number"),
-        (lambda data: data["frames"][1].pop("depth_file_path"), RecordingError, "3 frames but 2 with a depth_file_path"),
-        (lambda data: data["frames"][1].pop("transform_matrix"), TrajectoryError, "frame_2.png: no transform_matrix"),
+        (
+            lambda data: data.update(applied_scale=0),
+            RecordingError,
+            "applied_scale must be a positive number",
+        ),
+        (
+            lambda data: data.update(depth_unit_scale_factor=-1),
+            RecordingError,
+            "depth_unit_scale_factor must be a positive number",
+        ),
+        (
+            lambda data: data["frames"][1].pop("depth_file_path"),
+            RecordingError,
+            "3 frames but 2 with a depth_file_path",
+        ),
+        (
+            lambda data: data["frames"][1].pop("transform_matrix"),
+            TrajectoryError,
+            "frame_2.png: no transform_matrix",
+        ),
         (_matrix([[float("nan")] * 4] * 4), TrajectoryError, "16 finite numbers are expected"),
         (_matrix([[1, 2], [3]]), TrajectoryError, "finite numbers are expected"),
         (_matrix("eye"), TrajectoryError, "finite numbers are expected"),
         (_matrix((2 * np.eye(4)).tolist()), TrajectoryError, "the last row of a pose is 0 0 0 1"),
         (_matrix(np.diag([2, 2, 2, 1]).tolist()), TrajectoryError, "no rotation"),
         (_matrix((pose(1).matrix().T).tolist()), TrajectoryError, "is this matrix transposed"),
-        (lambda data: data["frames"][1].update(file_path="/etc/passwd"), RecordingError, "'/etc/passwd' is no picture below this folder"),
-        (lambda data: data["frames"][1].update(file_path="../other.png"), RecordingError, "is no picture below this folder"),
-        (lambda data: data["frames"][1].update(depth_file_path="a\0b"), RecordingError, "depth_file_path: .* is no picture below"),
-        (lambda data: data["frames"][1].update(file_path=7), RecordingError, "'7' is no picture below this folder"),
+        (
+            lambda data: data["frames"][1].update(file_path="/etc/passwd"),
+            RecordingError,
+            "'/etc/passwd' is no picture below this folder",
+        ),
+        (
+            lambda data: data["frames"][1].update(file_path="../other.png"),
+            RecordingError,
+            "is no picture below this folder",
+        ),
+        (
+            lambda data: data["frames"][1].update(depth_file_path="a\0b"),
+            RecordingError,
+            "depth_file_path: .* is no picture below",
+        ),
+        (
+            lambda data: data["frames"][1].update(file_path=7),
+            RecordingError,
+            "'7' is no picture below this folder",
+        ),
     ],
 )
-def test_what_is_refused(capture: Make, change: Callable[[dict[str, Any]], None], error: type[TopolocError], says: str):
+def test_what_is_refused(
+    capture: Make, change: Callable[[dict[str, Any]], None], error: type[TopolocError], says: str
+):
     with pytest.raises(error, match=says) as raised:
         open_sequence(capture(change))
     assert "transforms.json" in str(raised.value)
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("text", ["[" * 100_000, '{"frames": ' + "[" * 100_000, "{", '{"w": ' + "9" * 5000 + "}", "[]", "\0"])
+@pytest.mark.parametrize(
+    "text",
+    ["[" * 100_000, '{"frames": ' + "[" * 100_000, "{", '{"w": ' + "9" * 5000 + "}", "[]", "\0"],
+)
 def test_files_that_are_no_json(tmp_path: Path, text: str):
     (tmp_path / "transforms.json").write_text(text)
     with pytest.raises(RecordingError, match=r"transforms\.json"):
@@ -157,7 +247,9 @@ def test_files_that_are_no_json(tmp_path: Path, text: str):
 
 
 def test_a_picture_with_a_name_that_no_disk_holds_is_missing(capture: Make):
-    folder = capture(lambda data: data["frames"][1].update(file_path="images/" + "9" * 5000), depth_scale=None)
+    folder = capture(
+        lambda data: data["frames"][1].update(file_path="images/" + "9" * 5000), depth_scale=None
+    )
     sequence = open_sequence(folder)
     with pytest.raises(TopolocError, match="999"):
         sequence[next(k for k, name in enumerate(sequence.names) if "999" in name)]
@@ -175,5 +267,8 @@ def test_missing_pictures_and_depth_of_another_shape(capture: Make):
 
 
 def test_a_unit_of_depth_that_no_camera_has(capture: Make):
-    with pytest.raises(RecordingError, match=r"a median depth of 1000 m is that of no camera; 1000 times the depth_factor"):
+    with pytest.raises(
+        RecordingError,
+        match=r"a median depth of 1000 m is that of no camera; 1000 times the depth_factor",
+    ):
         open_sequence(capture(lambda data: data.update(depth_unit_scale_factor=1.0)))[0]

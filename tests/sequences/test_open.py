@@ -9,17 +9,34 @@ from topoloc.errors import RecordingError, UnknownFormatError, UnreadableImageEr
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.frame_view import frame_view
 from topoloc.sequences.open import FORMATS, open_sequence
-from topoloc.sequences.recording import Recording, SequenceView, left_frame, natural_key, parse_selection, sequence_subset
+from topoloc.sequences.recording import (
+    Recording,
+    SequenceView,
+    left_frame,
+    natural_key,
+    parse_selection,
+    sequence_subset,
+)
 
 
 @pytest.mark.parametrize("name", ["kitti", "euroc", "tum", "seven_scenes"])
 def test_every_format_is_recognised_by_itself_alone(name: str, request: pytest.FixtureRequest):
     path = request.getfixturevalue(name)
-    assert [known for known, candidate in FORMATS.items() if candidate.recognises(path) and known != "folder"] == [name]
+    assert [
+        known
+        for known, candidate in FORMATS.items()
+        if candidate.recognises(path) and known != "folder"
+    ] == [name]
     sequence, named = open_sequence(str(path)), open_sequence(path, format=name)
     assert isinstance(sequence, StereoSequence)
     assert sequence.names == named.names
-    assert len(sequence) == len(sequence.names) == len(sequence.t_ns) == len(sequence.poses) == len(list(sequence))
+    assert (
+        len(sequence)
+        == len(sequence.names)
+        == len(sequence.t_ns)
+        == len(sequence.poses)
+        == len(list(sequence))
+    )
 
 
 def test_opening_reads_no_picture(kitti: Path, euroc: Path, tum: Path, seven_scenes: Path):
@@ -76,7 +93,9 @@ def test_selections(text: str, chosen: list[int]):
     assert parse_selection(text, 10) == chosen
 
 
-@pytest.mark.parametrize("text", ["", "a", "1:2:0", "1:2:-1", "0-5", "0-5/0", "10", "-11", "1:2;3:4"])
+@pytest.mark.parametrize(
+    "text", ["", "a", "1:2:0", "1:2:-1", "0-5", "0-5/0", "10", "-11", "1:2;3:4"]
+)
 def test_bad_selections(text: str):
     with pytest.raises(RecordingError):
         parse_selection(text, 10)
@@ -102,7 +121,9 @@ def test_a_folder_with_an_at_sign_in_its_name(tmp_path: Path):
 
 
 @pytest.mark.parametrize("name", ["kitti", "tum", "seven_scenes"])
-def test_a_left_frame_is_described_as_the_whole_one_and_its_other_picture_not_read(name: str, request: pytest.FixtureRequest):
+def test_a_left_frame_is_described_as_the_whole_one_and_its_other_picture_not_read(
+    name: str, request: pytest.FixtureRequest
+):
     recording = sequence_subset(open_sequence(request.getfixturevalue(name)), [1])
     whole = frame_view(recording[0], with_depth=False)
     assert isinstance(recording, SequenceView)
@@ -136,4 +157,10 @@ def test_a_subset_keeps_its_order_and_its_bounds(plain: Callable[..., Path]):
 
 def test_names_are_sorted_by_their_numbers_however_long():
     names = ["frame10.png", "frame9.png", "frame" + "9" * 5000 + ".png", "frame010b.png", "1.png"]
-    assert sorted(names, key=natural_key) == ["1.png", "frame9.png", "frame10.png", "frame010b.png", "frame" + "9" * 5000 + ".png"]
+    assert sorted(names, key=natural_key) == [
+        "1.png",
+        "frame9.png",
+        "frame10.png",
+        "frame010b.png",
+        "frame" + "9" * 5000 + ".png",
+    ]

@@ -21,10 +21,17 @@ def smooth(channels: int) -> np.ndarray:
 
 def png(width: int, height: int, colour_type: int, raw: bytes) -> bytes:
     def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
 
     header = struct.pack(">IIBBBBB", width, height, 8, colour_type, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(raw)) + chunk(b"IEND", b"")
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + chunk(b"IDAT", zlib.compress(raw))
+        + chunk(b"IEND", b"")
+    )
 
 
 @pytest.mark.parametrize("suffix", ["png", "bmp", "tiff", "pgm"])
@@ -55,7 +62,9 @@ def test_alpha_is_dropped(tmp_path: Path):
 
 def test_sixteen_bits_become_eight(tmp_path: Path):
     levels = np.arange(0, 65536, 257, dtype=np.uint16).reshape(16, 16)
-    np.testing.assert_array_equal(read_image(write(tmp_path / "a.png", levels)), np.arange(256).reshape(16, 16))
+    np.testing.assert_array_equal(
+        read_image(write(tmp_path / "a.png", levels)), np.arange(256).reshape(16, 16)
+    )
 
 
 def test_grey_of_colour_and_of_grey():
@@ -73,15 +82,21 @@ def test_exif_orientation_is_obeyed(tmp_path: Path):
     path = tmp_path / "turned.jpg"
     path.write_bytes(jpeg[:2] + exif + jpeg[2:])
     assert image_size(path) == (240, 320)
-    upright = cv2.cvtColor(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
-    np.testing.assert_allclose(read_image(path).astype(int), np.rot90(upright, -1).astype(int), atol=2)
+    upright = cv2.cvtColor(
+        cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB
+    )
+    np.testing.assert_allclose(
+        read_image(path).astype(int), np.rot90(upright, -1).astype(int), atol=2
+    )
 
 
 def test_heic_is_read_where_its_decoder_is(tmp_path: Path):
     pytest.importorskip("pi_heif", reason="the extra heic is not installed")
     y, x = np.mgrid[:48, :64]
     path = Path(__file__).parent / "pictures" / "ramp.heic"
-    np.testing.assert_allclose(read_image(path), np.stack([4 * x, 5 * y, np.full_like(x, 90)], axis=2), atol=12)
+    np.testing.assert_allclose(
+        read_image(path), np.stack([4 * x, 5 * y, np.full_like(x, 90)], axis=2), atol=12
+    )
     assert image_size(path) == (64, 48)
     (tmp_path / "cut.heic").write_bytes(path.read_bytes()[:300])
     with pytest.raises(UnreadableImageError, match=r"cut\.heic"):
@@ -109,7 +124,9 @@ def test_truncated_is_refused(tmp_path: Path, suffix: str, kept: float):
 def test_truncated_jpeg_with_a_thumbnail_is_refused(tmp_path: Path):
     jpeg = cv2.imencode(".jpg", smooth(3))[1].tobytes()
     thumbnail = cv2.imencode(".jpg", picture(0, 3))[1].tobytes()
-    with_thumbnail = jpeg[:2] + b"\xff\xe1" + struct.pack(">H", 2 + len(thumbnail)) + thumbnail + jpeg[2:]
+    with_thumbnail = (
+        jpeg[:2] + b"\xff\xe1" + struct.pack(">H", 2 + len(thumbnail)) + thumbnail + jpeg[2:]
+    )
     path = tmp_path / "cut.jpg"
     path.write_bytes(with_thumbnail)
     assert read_image(path).shape == (240, 320, 3)
@@ -133,7 +150,14 @@ def test_one_wrong_byte_in_a_png_is_found(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    "data", [b"hello world" * 50, b"\x89PNG\r\n\x1a\n" + b"x" * 99, b"\xff\xd8\xff", b"BM" + b"x" * 99, b"II*\0" + b"q" * 99]
+    "data",
+    [
+        b"hello world" * 50,
+        b"\x89PNG\r\n\x1a\n" + b"x" * 99,
+        b"\xff\xd8\xff",
+        b"BM" + b"x" * 99,
+        b"II*\0" + b"q" * 99,
+    ],
 )
 def test_what_is_no_picture_is_refused(tmp_path: Path, data: bytes):
     (tmp_path / "a.png").write_bytes(data)
@@ -185,7 +209,10 @@ def test_a_pipe_and_odd_names_are_refused(tmp_path: Path):
         read_image(tmp_path / "a\0b.png")
 
 
-@pytest.mark.parametrize("header", [b"P5" + b" " * 41, b"P5\n" + b"9" * 5000 + b" 1 255\n", b"P5 0 0 255\n", b"P6 9 9 70000\n"])
+@pytest.mark.parametrize(
+    "header",
+    [b"P5" + b" " * 41, b"P5\n" + b"9" * 5000 + b" 1 255\n", b"P5 0 0 255\n", b"P6 9 9 70000\n"],
+)
 def test_odd_pnm_headers_are_refused_at_once(tmp_path: Path, header: bytes):
     (tmp_path / "a.pgm").write_bytes(header)
     with pytest.raises(UnreadableImageError, match=r"a\.pgm"):
@@ -193,7 +220,9 @@ def test_odd_pnm_headers_are_refused_at_once(tmp_path: Path, header: bytes):
 
 
 @pytest.mark.parametrize("suffix", ["tiff", "webp", "png"])
-def test_size_is_known_before_decoding(tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch):
+def test_size_is_known_before_decoding(
+    tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
+):
     path = tmp_path / f"large.{suffix}"
     path.write_bytes(cv2.imencode(f".{suffix}", smooth(3))[1].tobytes())
     monkeypatch.setattr("topoloc.sequences.pictures.MAX_PIXELS", 1000)
@@ -204,4 +233,6 @@ def test_size_is_known_before_decoding(tmp_path: Path, suffix: str, monkeypatch:
 
 def test_sixteen_bits_of_colour_become_eight(tmp_path: Path):
     levels = np.linspace(0, 65535, 24 * 32 * 3).astype(np.uint16).reshape(24, 32, 3)
-    np.testing.assert_allclose(read_image(write(tmp_path / "a.png", levels)), levels[:, :, ::-1] / 257.0, atol=1.0)
+    np.testing.assert_allclose(
+        read_image(write(tmp_path / "a.png", levels)), levels[:, :, ::-1] / 257.0, atol=1.0
+    )

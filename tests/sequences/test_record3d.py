@@ -13,13 +13,22 @@ import numpy as np
 import pytest
 from tiny_recordings import HEIGHT, WIDTH, assert_same_pose, picture, pose, write
 
-from topoloc.errors import CalibrationError, MissingExtraError, RecordingError, TopolocError, TrajectoryError, UnreadableImageError
+from topoloc.errors import (
+    CalibrationError,
+    MissingExtraError,
+    RecordingError,
+    TopolocError,
+    TrajectoryError,
+    UnreadableImageError,
+)
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.open import find_format, open_sequence
 
 Make = Callable[..., Path]
-needs_exr = pytest.mark.skipif(importlib.util.find_spec("OpenEXR") is None, reason="OpenEXR is not installed")
+needs_exr = pytest.mark.skipif(
+    importlib.util.find_spec("OpenEXR") is None, reason="OpenEXR is not installed"
+)
 
 
 def _arkit_row(world_from_cam: Rigid3) -> list[float]:
@@ -79,7 +88,9 @@ def test_poses_times_and_camera(export: Make):
 
 def test_intrinsics_of_each_frame_and_finer_pictures(export: Make):
     per_frame = [[20.0 + index, 20.0, 7.5, 5.5] for index in range(3)]
-    sequence = open_sequence(export(w=WIDTH // 2, h=HEIGHT // 2, perFrameIntrinsicCoeffs=per_frame, frameTimestamps=None))
+    sequence = open_sequence(
+        export(w=WIDTH // 2, h=HEIGHT // 2, perFrameIntrinsicCoeffs=per_frame, frameTimestamps=None)
+    )
     camera = sequence[2].camera
     assert camera == Camera.pinhole(WIDTH, HEIGHT, 44.0, 40.0, 15.5, 11.5)
     assert sequence.t_ns[1] == 33_333_333
@@ -99,7 +110,14 @@ def test_damaged_depth(export: Make):
     folder = _with_depth(export())
     file = folder / "EXR_RGBD" / "depth" / "0.exr"
     whole = file.read_bytes()
-    for data in (b"", b"v/1\x01", whole[:100], whole[: len(whole) // 2], b"\xff" * 500, picture(0).tobytes()):
+    for data in (
+        b"",
+        b"v/1\x01",
+        whole[:100],
+        whole[: len(whole) // 2],
+        b"\xff" * 500,
+        picture(0).tobytes(),
+    ):
         file.write_bytes(data)
         with pytest.raises(UnreadableImageError, match=r"0\.exr"):
             open_sequence(folder)[0]
@@ -117,17 +135,27 @@ def test_without_the_extra(export: Make, monkeypatch: pytest.MonkeyPatch):
     ("changes", "error", "says"),
     [
         ({"poses": []}, RecordingError, "0 poses for 3 pictures"),
-        ({"poses": [[0, 0, 0, 0, 1, 2, 3]] * 3}, TrajectoryError, "pose 0: qx qy qz qw is no rotation"),
+        (
+            {"poses": [[0, 0, 0, 0, 1, 2, 3]] * 3},
+            TrajectoryError,
+            "pose 0: qx qy qz qw is no rotation",
+        ),
         ({"poses": [[0, 0, 0, 1, 1, 2]] * 3}, TrajectoryError, "7 finite numbers"),
         ({"poses": [[0, 0, 0, 1, 1, 2, float("nan")]] * 3}, TrajectoryError, "7 finite numbers"),
         ({"K": None}, CalibrationError, "K: 9 finite numbers"),
         ({"K": [0] * 9}, CalibrationError, "focal length"),
-        ({"perFrameIntrinsicCoeffs": [[1, 2, 3, 4]]}, CalibrationError, "1 perFrameIntrinsicCoeffs for 3 pictures"),
+        (
+            {"perFrameIntrinsicCoeffs": [[1, 2, 3, 4]]},
+            CalibrationError,
+            "1 perFrameIntrinsicCoeffs for 3 pictures",
+        ),
         ({"w": 100}, CalibrationError, "of 100x24, but 0.jpg is 32x24"),
         ({"frameTimestamps": [1.0, 0.5, 2.0]}, RecordingError, "do not increase"),
         ({"frameTimestamps": [1.0]}, RecordingError, "3 finite numbers"),
     ],
 )
-def test_what_is_refused(export: Make, changes: dict[str, Any], error: type[TopolocError], says: str):
+def test_what_is_refused(
+    export: Make, changes: dict[str, Any], error: type[TopolocError], says: str
+):
     with pytest.raises(error, match=says):
         open_sequence(export(**changes))

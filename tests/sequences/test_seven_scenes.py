@@ -32,7 +32,9 @@ def test_the_poses_are_the_depth_cameras(seven_scenes: Path):
 def test_the_colour_camera_is_to_the_right():
     point_depth = np.array([0.0, 0.0, 2.0])
     assert COLOUR_FROM_DEPTH.translation[0] == -0.02556
-    assert COLOUR_FROM_DEPTH.apply(point_depth)[0] == pytest.approx(-0.02556 - 0.00789 * 2.0, abs=1e-3)
+    assert COLOUR_FROM_DEPTH.apply(point_depth)[0] == pytest.approx(
+        -0.02556 - 0.00789 * 2.0, abs=1e-3
+    )
 
 
 def test_frames_without_a_pose_or_all_without_depth(seven_scenes: Path):
@@ -82,8 +84,12 @@ def test_kitchen(shared: Path):
     frame = sequence[1]
     assert frame.name == "frame-000002.color.jpg"
     assert frame.t_ns == 66_666_666
-    written = np.loadtxt(shared / "data" / "seven_scenes" / "kitchen" / "seq-01" / "frame-000002.pose.txt")
-    assert_same_pose(frame.world_from_cam @ frame.depth.cam_from_depth, Rigid3.from_matrix(written), 1e-6)
+    written = np.loadtxt(
+        shared / "data" / "seven_scenes" / "kitchen" / "seq-01" / "frame-000002.pose.txt"
+    )
+    assert_same_pose(
+        frame.world_from_cam @ frame.depth.cam_from_depth, Rigid3.from_matrix(written), 1e-6
+    )
 
 
 def test_kitchen_depth_edges_fall_on_colour_edges(shared: Path):
@@ -92,7 +98,10 @@ def test_kitchen_depth_edges_fall_on_colour_edges(shared: Path):
     frames = [sequence[index] for index in range(0, 350, 25)]
 
     def mean_edge(cam_from_depth: Rigid3, focal: float) -> float:
-        found = [edge_strength_at_depth_edges(frame.image, frame.depth.depth, cam_from_depth, focal) for frame in frames]
+        found = [
+            edge_strength_at_depth_edges(frame.image, frame.depth.depth, cam_from_depth, focal)
+            for frame in frames
+        ]
         return float(np.nanmean(np.concatenate(found)))
 
     aligned = mean_edge(COLOUR_FROM_DEPTH, 525.0)
@@ -100,7 +109,9 @@ def test_kitchen_depth_edges_fall_on_colour_edges(shared: Path):
     assert aligned > 1.1 * mean_edge(Rigid3.identity(), 585.0)
 
 
-def edge_strength_at_depth_edges(image: np.ndarray, depth: np.ndarray, cam_from_depth: Rigid3, focal: float) -> np.ndarray:
+def edge_strength_at_depth_edges(
+    image: np.ndarray, depth: np.ndarray, cam_from_depth: Rigid3, focal: float
+) -> np.ndarray:
     grey = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (0, 0), 1.0)
     strength = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
     known = np.nan_to_num(depth, nan=0.0)
@@ -108,7 +119,11 @@ def edge_strength_at_depth_edges(image: np.ndarray, depth: np.ndarray, cam_from_
     jump[:4], jump[-4:], jump[:, :4], jump[:, -4:] = False, False, False, False
     v, u = np.nonzero(jump & (known > 0))
     z = known[v, u].astype(np.float64)
-    points_cam = cam_from_depth.apply(np.column_stack([(u - 320) / 585 * z, (v - 240) / 585 * z, z]))
+    points_cam = cam_from_depth.apply(
+        np.column_stack([(u - 320) / 585 * z, (v - 240) / 585 * z, z])
+    )
     pixels = (points_cam[:, :2] / points_cam[:, 2:] * focal + [320, 240]).astype(np.float32)
-    found = cv2.remap(strength, pixels[None, :, 0], pixels[None, :, 1], cv2.INTER_LINEAR, borderValue=np.nan)
+    found = cv2.remap(
+        strength, pixels[None, :, 0], pixels[None, :, 1], cv2.INTER_LINEAR, borderValue=np.nan
+    )
     return found[0] / strength.mean()

@@ -1,4 +1,5 @@
-"""SVO files: what is said without Stereolabs' SDK, and the calls of it that are made, on a stand-in of its names."""
+"""SVO files: what is said without Stereolabs' SDK, and the calls of it that are made, on a stand-in
+of its names."""
 
 from __future__ import annotations
 
@@ -26,7 +27,11 @@ class StandInCamera:
     position = 0
 
     def open(self, settings: Any) -> str:
-        return "SUCCESS" if not settings.path or settings.path.endswith("/walk.svo2") else "INVALID SVO FILE"
+        return (
+            "SUCCESS"
+            if not settings.path or settings.path.endswith("/walk.svo2")
+            else "INVALID SVO FILE"
+        )
 
     def close(self) -> None:
         self.position = -1
@@ -51,7 +56,11 @@ class StandInCamera:
         left = SimpleNamespace(fx=260.0, fy=260.0, cx=336.0, cy=188.0)
         calibration = SimpleNamespace(left_cam=left, get_camera_baseline=lambda: 0.12)
         size = SimpleNamespace(width=672, height=376)
-        return SimpleNamespace(camera_configuration=SimpleNamespace(calibration_parameters=calibration, resolution=size))
+        return SimpleNamespace(
+            camera_configuration=SimpleNamespace(
+                calibration_parameters=calibration, resolution=size
+            )
+        )
 
 
 class Settings:
@@ -64,10 +73,20 @@ class Settings:
 @pytest.fixture
 def sdk(monkeypatch: pytest.MonkeyPatch) -> None:
     sl = ModuleType("pyzed.sl")
-    names = {"ERROR_CODE": ["SUCCESS"], "VIEW": ["LEFT", "RIGHT"], "DEPTH_MODE": ["NONE"], "UNIT": ["METER"], "TIME_REFERENCE": ["IMAGE"]}
+    names = {
+        "ERROR_CODE": ["SUCCESS"],
+        "VIEW": ["LEFT", "RIGHT"],
+        "DEPTH_MODE": ["NONE"],
+        "UNIT": ["METER"],
+        "TIME_REFERENCE": ["IMAGE"],
+    }
     for name, members in names.items():
         setattr(sl, name, SimpleNamespace(**{member: member for member in members}))
-    for name, kind in (("Camera", StandInCamera), ("InitParameters", Settings), ("Mat", SimpleNamespace)):
+    for name, kind in (
+        ("Camera", StandInCamera),
+        ("InitParameters", Settings),
+        ("Mat", SimpleNamespace),
+    ):
         setattr(sl, name, kind)
     package = ModuleType("pyzed")
     package.sl = sl  # pyright: ignore[reportAttributeAccessIssue]
@@ -80,7 +99,13 @@ def test_without_the_sdk_it_is_said_how_to_export(tmp_path: Path, monkeypatch: p
     path = tmp_path / "walk.svo2"
     path.write_bytes(b"svo")
     assert find_format(path) == "zed"
-    with pytest.raises(MissingExtraError, match=r"pyzed of Stereolabs' ZED SDK; without it export .* left/ and right/ with a camera\.json"):
+    with pytest.raises(
+        MissingExtraError,
+        match=(
+            r"pyzed of Stereolabs' ZED SDK; without it export .* left/ and right/ with a"
+            r" camera\.json"
+        ),
+    ):
         open_sequence(path)
 
 

@@ -21,7 +21,9 @@ def test_frames(tum: Path):
     assert_same_pose(frame.world_from_cam, pose(2))
 
 
-@pytest.mark.parametrize(("number", "fx", "k3"), [("1", 517.3, 1.1633), ("2", 520.9, 0.9172), ("3", 535.4, 0.0)])
+@pytest.mark.parametrize(
+    ("number", "fx", "k3"), [("1", 517.3, 1.1633), ("2", 520.9, 0.9172), ("3", 535.4, 0.0)]
+)
 def test_the_three_cameras(tum: Path, number: str, fx: float, k3: float):
     camera = open_tum(tum.rename(tum.with_name(f"rgbd_dataset_freiburg{number}_desk"))).camera
     assert camera.fx == fx
@@ -32,7 +34,10 @@ def test_other_recordings_need_a_camera(tum: Path):
     other = tum.rename(tum.with_name("my_desk"))
     with pytest.raises(CalibrationError, match=r"camera\.json"):
         open_tum(other)
-    (other / "camera.json").write_text('{"width": 640, "height": 480, "fx": 600, "fy": 600, "cx": 320, "cy": 240, "depth_factor": 1000}')
+    (other / "camera.json").write_text(
+        '{"width": 640, "height": 480, "fx": 600, "fy": 600, "cx": 320, "cy": 240, "depth_factor":'
+        " 1000}"
+    )
     frame = open_tum(other)[0]
     assert frame.camera.fx == 600
     assert frame.depth.depth[0, 0] == 5.0
@@ -51,9 +56,16 @@ def test_truth_of_another_day(tum: Path):
 
 @pytest.mark.parametrize(
     ("text", "says"),
-    [("# none\n", "nothing in"), ("1.0\n", "line 1"), ("2 a.png\n1 b.png\n", "line 2.*not after"), ("1 a.png\n", "")],
+    [
+        ("# none\n", "nothing in"),
+        ("1.0\n", "line 1"),
+        ("2 a.png\n1 b.png\n", "line 2.*not after"),
+        ("1 a.png\n", ""),
+    ],
 )
 def test_bad_lists(tum: Path, text: str, says: str):
     (tum / "depth.txt").write_text(text)
-    with pytest.raises(RecordingError, match=says or "none of 3 colour pictures has one of 1 depth"):
+    with pytest.raises(
+        RecordingError, match=says or "none of 3 colour pictures has one of 1 depth"
+    ):
         open_tum(tum)

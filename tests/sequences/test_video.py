@@ -34,13 +34,21 @@ def film(tmp_path: Path) -> Path:
     return write_video(tmp_path / "walk.mp4", [20 * number for number in range(NUM_FRAMES)])
 
 
-@pytest.mark.parametrize(("suffix", "codec"), [(".mp4", "mp4v"), (".avi", "MJPG"), (".mkv", "mp4v"), (".MP4", "mp4v")])
-def test_frames_come_in_order_with_the_times_of_the_container(tmp_path: Path, suffix: str, codec: str):
-    path = write_video(tmp_path / f"walk{suffix}", [20 * number for number in range(NUM_FRAMES)], codec)
+@pytest.mark.parametrize(
+    ("suffix", "codec"), [(".mp4", "mp4v"), (".avi", "MJPG"), (".mkv", "mp4v"), (".MP4", "mp4v")]
+)
+def test_frames_come_in_order_with_the_times_of_the_container(
+    tmp_path: Path, suffix: str, codec: str
+):
+    path = write_video(
+        tmp_path / f"walk{suffix}", [20 * number for number in range(NUM_FRAMES)], codec
+    )
     assert find_format(path) == "video"
     sequence = open_sequence(path)
     assert len(sequence) == NUM_FRAMES
-    np.testing.assert_allclose(np.array(sequence.t_ns) / 1e9, np.arange(NUM_FRAMES) / 25.0, atol=2e-3)
+    np.testing.assert_allclose(
+        np.array(sequence.t_ns) / 1e9, np.arange(NUM_FRAMES) / 25.0, atol=2e-3
+    )
     for number in range(NUM_FRAMES):
         frame = sequence[number]
         assert frame.image.shape == (48, 64, 3)
@@ -72,13 +80,19 @@ def test_calibration_and_truth_lie_beside_it(film: Path):
 
 
 def test_a_camera_of_another_size_is_refused(film: Path):
-    (film.parent / "camera.json").write_text(json.dumps(Camera.pinhole(640, 480, 500.0, 500.0, 320.0, 240.0).to_json()))
+    (film.parent / "camera.json").write_text(
+        json.dumps(Camera.pinhole(640, 480, 500.0, 500.0, 320.0, 240.0).to_json())
+    )
     with pytest.raises(CalibrationError, match=r"640x480.*64x48"):
         open_sequence(film)
 
 
-@pytest.mark.parametrize("content", [b"", b"no video at all", b"\x00\x00\x00\x18ftypmp42" + bytes(200)])
-def test_what_is_no_video_is_one_line(tmp_path: Path, content: bytes, capfd: pytest.CaptureFixture[str]):
+@pytest.mark.parametrize(
+    "content", [b"", b"no video at all", b"\x00\x00\x00\x18ftypmp42" + bytes(200)]
+)
+def test_what_is_no_video_is_one_line(
+    tmp_path: Path, content: bytes, capfd: pytest.CaptureFixture[str]
+):
     path = tmp_path / "broken.mp4"
     path.write_bytes(content)
     with pytest.raises(RecordingError, match=r"broken\.mp4"):
@@ -118,9 +132,13 @@ class _Clock:
 
 
 @pytest.mark.parametrize("milliseconds", [[0.0, 40.0, 20.0], [0.0, 40.0, 40.0]])
-def test_a_clock_that_does_not_advance_is_an_error_with_the_frame(film: Path, milliseconds: list[float], monkeypatch: pytest.MonkeyPatch):
+def test_a_clock_that_does_not_advance_is_an_error_with_the_frame(
+    film: Path, milliseconds: list[float], monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setattr(video, "_open", lambda _: _Clock(milliseconds))
-    with pytest.raises(RecordingError, match=r"frame 2: at 0\.0\d0 s, but the frame before is at 0\.040 s"):
+    with pytest.raises(
+        RecordingError, match=r"frame 2: at 0\.0\d0 s, but the frame before is at 0\.040 s"
+    ):
         video._times(film, 25.0)
 
 
@@ -132,7 +150,9 @@ def test_a_container_without_times_goes_by_its_rate(film: Path, monkeypatch: pyt
         video._times(film, 0.0)
 
 
-def test_a_frame_of_another_resolution_is_unreadable_alone(film: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_frame_of_another_resolution_is_unreadable_alone(
+    film: Path, monkeypatch: pytest.MonkeyPatch
+):
     sequence = video.open_video(film)
 
     class Larger:
@@ -150,5 +170,7 @@ def test_a_frame_of_another_resolution_is_unreadable_alone(film: Path, monkeypat
 
     monkeypatch.setattr(video, "_open", lambda _: Larger())
     assert sequence[1].image.shape == (48, 64, 3)
-    with pytest.raises(UnreadableImageError, match=r"128x96 pixels, but the first frame is of 64x48"):
+    with pytest.raises(
+        UnreadableImageError, match=r"128x96 pixels, but the first frame is of 64x48"
+    ):
         sequence[2]

@@ -1,4 +1,5 @@
-"""Side-by-side video with Stereolabs' calibration: halves, resolutions, rectification as Stereolabs' own, and what is wrong with it."""
+"""Side-by-side video with Stereolabs' calibration: halves, resolutions, rectification as
+Stereolabs' own, and what is wrong with it."""
 
 from __future__ import annotations
 
@@ -20,8 +21,8 @@ from topoloc.sequences.zed import RESOLUTIONS, read_conf
 VGA = (672, 376)
 LEFT = "fx=350.1\nfy=350.2\ncx=331.0\ncy=189.7\nk1=-0.17\nk2=0.027\np1=0.0004\np2=-0.0003\nk3=0\n"
 RIGHT = "fx=349.6\nfy=349.5\ncx=335.3\ncy=189.5\nk1=-0.175\nk2=0.0269\np1=0\np2=0.0002\nk3=0\n"
-STEREO = "[STEREO]\nBaseline=119.97\nTY=9\nTY_VGA=0.31\nTZ_VGA=-0.42\nCV_VGA=0.0028\nRX_VGA=0.0032\nRZ_VGA=-0.0003\n"
-CONF = f"[LEFT_CAM_VGA]\n{LEFT}\n[RIGHT_CAM_VGA]\n{RIGHT}\n[LEFT_CAM_HD]\n{LEFT}\n{STEREO}\n[MISC]\nSensor_ID=1\n"
+STEREO = "[STEREO]\nBaseline=119.97\nTY=9\nTY_VGA=0.31\nTZ_VGA=-0.42\nCV_VGA=0.0028\nRX_VGA=0.0032\nRZ_VGA=-0.0003\n"  # noqa: E501
+CONF = f"[LEFT_CAM_VGA]\n{LEFT}\n[RIGHT_CAM_VGA]\n{RIGHT}\n[LEFT_CAM_HD]\n{LEFT}\n{STEREO}\n[MISC]\nSensor_ID=1\n"  # noqa: E501
 
 
 def write_side_by_side(path: Path, pairs: list[tuple[np.ndarray, np.ndarray]]) -> Path:
@@ -31,7 +32,9 @@ def write_side_by_side(path: Path, pairs: list[tuple[np.ndarray, np.ndarray]]) -
     assert writer.isOpened()
     for left, right in pairs:
         frame = np.hstack([left, right])
-        writer.write(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR if frame.ndim == 2 else cv2.COLOR_RGB2BGR))
+        writer.write(
+            cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR if frame.ndim == 2 else cv2.COLOR_RGB2BGR)
+        )
     writer.release()
     return path
 
@@ -40,7 +43,10 @@ def write_side_by_side(path: Path, pairs: list[tuple[np.ndarray, np.ndarray]]) -
 def film(tmp_path: Path) -> Path:
     """Three pairs of VGA, with their calibration beside them."""
     rng = np.random.default_rng(5)
-    pairs = [tuple(np.full((376, 672, 3), int(grey), np.uint8) for grey in rng.integers(0, 256, 2)) for _ in range(3)]
+    pairs = [
+        tuple(np.full((376, 672, 3), int(grey), np.uint8) for grey in rng.integers(0, 256, 2))
+        for _ in range(3)
+    ]
     (tmp_path / "SN10028.conf").write_text(CONF)
     return write_side_by_side(tmp_path / "walk.avi", pairs)  # pyright: ignore[reportArgumentType]
 
@@ -65,15 +71,20 @@ def test_a_real_recording_side_by_side(shared: Path, tmp_path: Path):
     """Rectified pairs with a calibration that says so; poses beside the video, at its times."""
     lab = open_sequence(shared / "data/zed_lab/session1@0:60:20")
     frames = [lab[index] for index in range(3)]
-    path = write_side_by_side(tmp_path / "lab.avi", [(frame.image, frame.right) for frame in frames if frame.right is not None])
+    path = write_side_by_side(
+        tmp_path / "lab.avi",
+        [(frame.image, frame.right) for frame in frames if frame.right is not None],
+    )
     camera, rig = frames[0].camera, frames[0].rig
     assert camera is not None
     assert rig is not None
     numbers = f"fx={camera.fx!r}\nfy={camera.fy!r}\ncx={camera.cx!r}\ncy={camera.cy!r}\n"
-    conf = f"[LEFT_CAM_VGA]\n{numbers}[RIGHT_CAM_VGA]\n{numbers}[STEREO]\nBaseline={1000 * rig.baseline!r}\n"
+    conf = f"[LEFT_CAM_VGA]\n{numbers}[RIGHT_CAM_VGA]\n{numbers}[STEREO]\nBaseline={1000 * rig.baseline!r}\n"  # noqa: E501
     (tmp_path / "SN7.conf").write_text(conf)
     t_ns = open_sequence(path).t_ns
-    write_tum(tmp_path / "lab.tum", Trajectory([pose for pose in lab.poses if pose is not None], t_ns))
+    write_tum(
+        tmp_path / "lab.tum", Trajectory([pose for pose in lab.poses if pose is not None], t_ns)
+    )
     sequence = open_sequence(path)
     for index, frame in enumerate(frames):
         read = sequence[index]
@@ -82,19 +93,35 @@ def test_a_real_recording_side_by_side(shared: Path, tmp_path: Path):
         assert read.rig.baseline == pytest.approx(rig.baseline)
         assert read.camera is not None
         np.testing.assert_allclose(read.camera.matrix(), camera.matrix())
-        np.testing.assert_array_equal(read.image if frame.image.ndim == 3 else read.image[..., 0], frame.image)
+        np.testing.assert_array_equal(
+            read.image if frame.image.ndim == 3 else read.image[..., 0], frame.image
+        )
         assert read.world_from_cam is not None
         assert frame.world_from_cam is not None
-        np.testing.assert_allclose(read.world_from_cam.matrix(), frame.world_from_cam.matrix(), atol=1e-9)
+        np.testing.assert_allclose(
+            read.world_from_cam.matrix(), frame.world_from_cam.matrix(), atol=1e-9
+        )
 
 
 def test_rectified_as_stereolabs_do(tmp_path: Path):
-    """Their samples give OpenCV's stereoRectify the rotation (RX, CV, RZ) and the translation (Baseline, TY, TZ)."""
+    """Their samples give OpenCV's stereoRectify the rotation (RX, CV, RZ) and the translation
+    (Baseline, TY, TZ)."""
     (tmp_path / "SN1.conf").write_text(CONF)
     rig = read_conf(tmp_path / "SN1.conf", VGA)
-    rotation, translation = exp_so3(np.array([0.0032, 0.0028, -0.0003])), np.array([[119.97], [0.31], [-0.42]])
+    rotation, translation = (
+        exp_so3(np.array([0.0032, 0.0028, -0.0003])),
+        np.array([[119.97], [0.31], [-0.42]]),
+    )
     left, right = rig.left, rig.right
-    r_left, *_ = cv2.stereoRectify(left.matrix(), left.distortion(), right.matrix(), right.distortion(), VGA, rotation, translation)
+    r_left, *_ = cv2.stereoRectify(
+        left.matrix(),
+        left.distortion(),
+        right.matrix(),
+        right.distortion(),
+        VGA,
+        rotation,
+        translation,
+    )
     np.testing.assert_allclose(rectify(rig).rectified_from_left.rotation, r_left, atol=1e-9)
     assert rig.baseline == pytest.approx(np.linalg.norm(translation) / 1000.0)
     np.testing.assert_allclose(left.distortion()[:4], [-0.17, 0.027, 0.0004, -0.0003])
@@ -104,11 +131,17 @@ def test_rectified_as_stereolabs_do(tmp_path: Path):
 def test_the_section_goes_by_the_size_of_the_picture(size: tuple[int, int], tmp_path: Path):
     path, name = tmp_path / "SN1.conf", RESOLUTIONS[size]
     path.write_text(
-        "\n".join(f"[{side}_CAM_{name}]\nfx=400\nfy=400\ncx=300\ncy=200" for side in ("LEFT", "RIGHT")) + "\n[STEREO]\nBaseline=63\n"
+        "\n".join(
+            f"[{side}_CAM_{name}]\nfx=400\nfy=400\ncx=300\ncy=200" for side in ("LEFT", "RIGHT")
+        )
+        + "\n[STEREO]\nBaseline=63\n"
     )
     assert read_conf(path, size).left.width == size[0]
     other = next(its for its in RESOLUTIONS if its != size)
-    with pytest.raises(CalibrationError, match=rf"no calibration of {RESOLUTIONS[other]} \({other[0]}x{other[1]}\).* it has {name}$"):
+    with pytest.raises(
+        CalibrationError,
+        match=rf"no calibration of {RESOLUTIONS[other]} \({other[0]}x{other[1]}\).* it has {name}$",
+    ):
         read_conf(path, other)
     with pytest.raises(CalibrationError, match="a ZED has no pictures of 640x480"):
         read_conf(path, (640, 480))
@@ -116,12 +149,20 @@ def test_the_section_goes_by_the_size_of_the_picture(size: tuple[int, int], tmp_
 
 def test_a_rectified_video_with_a_camera_json(film: Path, tmp_path: Path):
     elsewhere = tmp_path / "half.json"
-    elsewhere.write_text('{"width": 672, "height": 376, "fx": 260, "fy": 260, "cx": 336, "cy": 188, "baseline": 0.12}')
+    elsewhere.write_text(
+        '{"width": 672, "height": 376, "fx": 260, "fy": 260, "cx": 336, "cy": 188, "baseline":'
+        " 0.12}"
+    )
     rig = open_sequence(film, "zed", camera=elsewhere)[0].rig
     assert rig is not None
     assert rig.is_rectified
-    elsewhere.write_text('{"width": 640, "height": 376, "fx": 260, "fy": 260, "cx": 336, "cy": 188, "baseline": 0.12}')
-    with pytest.raises(CalibrationError, match=r"of 640x376, but each half of walk\.avi is 672x376"):
+    elsewhere.write_text(
+        '{"width": 640, "height": 376, "fx": 260, "fy": 260, "cx": 336, "cy": 188, "baseline":'
+        " 0.12}"
+    )
+    with pytest.raises(
+        CalibrationError, match=r"of 640x376, but each half of walk\.avi is 672x376"
+    ):
         open_sequence(film, "zed", camera=elsewhere)
 
 
@@ -139,7 +180,10 @@ def test_a_calibration_that_is_named(film: Path, tmp_path: Path):
 
 def test_several_calibrations(film: Path, tmp_path: Path, complaint: Callable[..., str]):
     (tmp_path / "sn2.conf").write_text(CONF)
-    assert "several calibrations beside it (SN10028.conf, sn2.conf); --camera names one" in complaint("slam", film, tmp_path / "o.tum")
+    assert (
+        "several calibrations beside it (SN10028.conf, sn2.conf); --camera names one"
+        in complaint("slam", film, tmp_path / "o.tum")
+    )
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,10 @@ def write(path: Path, pixels: np.ndarray) -> Path:
 
 
 def pose(index: int) -> Rigid3:
-    return Rigid3(exp_so3(np.array([0.01, 0.1, -0.05]) * (index + 1)), np.array([1.0 + index, -0.5 * index, 2.0]))
+    return Rigid3(
+        exp_so3(np.array([0.01, 0.1, -0.05]) * (index + 1)),
+        np.array([1.0 + index, -0.5 * index, 2.0]),
+    )
 
 
 def kitti_row(rigid: Rigid3) -> str:
@@ -55,17 +58,29 @@ CALIB = "\n".join(
 
 
 EUROC_TIMES = [1403715273262142976 + 50_000_000 * index for index in range(4)]
-BODY_FROM_CAM = (Rigid3(exp_so3(np.array([0.0, 0.0, 1.5])), np.array([0.1, 0.2, 0.3])), Rigid3(np.eye(3), np.array([0.2, 0.2, 0.3])))
+BODY_FROM_CAM = (
+    Rigid3(exp_so3(np.array([0.0, 0.0, 1.5])), np.array([0.1, 0.2, 0.3])),
+    Rigid3(np.eye(3), np.array([0.2, 0.2, 0.3])),
+)
 
 
 def sensor_yaml(body_from_cam: Rigid3, distortion: str = "radial-tangential") -> str:
     data = ", ".join(f"{value:.15g}" for value in body_from_cam.matrix().ravel())
     return (
-        "%YAML:1.0\n# a sensor\nsensor_type: camera\ncomment: VI-Sensor cam0 (MT9M034)\n\n"
-        f"T_BS:\n  cols: 4\n  rows: 4\n  data: [{data}]\n\nrate_hz: 20\nresolution: [{WIDTH}, {HEIGHT}]\ncamera_model: pinhole\n"
-        f"intrinsics: [45.5, 45.25, 16.5, 12.5] #fu, fv, cu, cv\ndistortion_model: {distortion}\n"
-        "distortion_coefficients: [-0.28, 0.07,\n   0.0002, 1.7e-05]\n"
+        "%YAML:1.0\n# a sensor\nsensor_type: camera\ncomment: VI-Sensor cam0 (MT9M034)\n\nT_BS:\n "
+        f" cols: 4\n  rows: 4\n  data: [{data}]\n\nrate_hz: 20\nresolution: [{WIDTH},"
+        f" {HEIGHT}]\ncamera_model: pinhole\nintrinsics: [45.5, 45.25, 16.5, 12.5] #fu, fv, cu,"
+        f" cv\ndistortion_model: {distortion}\ndistortion_coefficients: [-0.28, 0.07,\n   0.0002,"
+        " 1.7e-05]\n"
     )
 
 
-CAMERA = {"model": "PINHOLE", "width": WIDTH, "height": HEIGHT, "fx": 40.0, "fy": 41.0, "cx": 15.5, "cy": 11.5}
+CAMERA = {
+    "model": "PINHOLE",
+    "width": WIDTH,
+    "height": HEIGHT,
+    "fx": 40.0,
+    "fy": 41.0,
+    "cx": 15.5,
+    "cy": 11.5,
+}

@@ -21,7 +21,8 @@ from topoloc.map.topomap import TopoMetricMap
 
 @pytest.fixture(scope="session")
 def maps(room_map: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of maps: `room`; `earth`, which knows its place on earth; `damaged`, whose nodes cannot be read."""
+    """A folder of maps: `room`; `earth`, which knows its place on earth; `damaged`, whose nodes
+    cannot be read."""
     folder = tmp_path_factory.mktemp("maps")
     shutil.copy(room_map, folder / "room.topo")
     shutil.copy(room_map, folder / "damaged.topo")
@@ -30,7 +31,9 @@ def maps(room_map: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         database.commit()
     with TopoMetricMap.load(room_map) as topomap:
         turned = Rigid3(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.zeros(3))
-        replace(topomap, georeference=Georeference(GeoPoint(50.87, 4.70, 30.0), turned, "origin")).save(folder / "earth.topo")
+        replace(
+            topomap, georeference=Georeference(GeoPoint(50.87, 4.70, 30.0), turned, "origin")
+        ).save(folder / "earth.topo")
     return folder
 
 

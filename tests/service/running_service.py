@@ -1,4 +1,5 @@
-"""A service as its users meet it: `topoloc serve` in a process of its own on 127.0.0.1, asked over HTTP."""
+"""A service as its users meet it: `topoloc serve` in a process of its own on 127.0.0.1, asked over
+HTTP."""
 
 from __future__ import annotations
 
@@ -17,7 +18,10 @@ import httpx
 
 ROOT = Path(__file__).parents[2]
 TOKEN = "a-token-of-some-length"
-LIMITS = "[serve]\nmax_upload_mb = 3.0\nmax_megapixels = 4.0\nupload_s = 4.0\nmax_sessions = 3\nsession_idle_s = 4.0\n"
+LIMITS = (
+    "[serve]\nmax_upload_mb = 3.0\nmax_megapixels = 4.0\nupload_s = 4.0\nmax_sessions ="
+    " 3\nsession_idle_s = 4.0\n"
+)
 
 
 @dataclass

@@ -23,13 +23,21 @@ LOCALIZE = "/v1/maps/room/localize"
 
 
 def _png_of(width: int, height: int) -> bytes:
-    """A small file that claims to be a picture of this size, of zeros: a decompression bomb where it is large."""
+    """A small file that claims to be a picture of this size, of zeros: a decompression bomb where
+    it is large."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
 
     header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(bytes(10_000_000), 9)) + chunk(b"IEND", b"")
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + chunk(b"IDAT", zlib.compress(bytes(10_000_000), 9))
+        + chunk(b"IEND", b"")
+    )
 
 
 def _jpeg_of(width: int, height: int) -> bytes:
@@ -53,7 +61,17 @@ def _pictures(view: Path) -> dict[str, tuple[bytes, int]]:
     }
 
 
-KINDS = ["empty", "truncated", "too many pixels", "100 megapixels", "bomb", "svg", "pdf", "noise", "too many bytes"]
+KINDS = [
+    "empty",
+    "truncated",
+    "too many pixels",
+    "100 megapixels",
+    "bomb",
+    "svg",
+    "pdf",
+    "noise",
+    "too many bytes",
+]
 
 
 def _check(answer: httpx.Response, status: int) -> str:
@@ -73,11 +91,13 @@ def test_pictures_that_are_none(client: httpx.Client, view: Path, kind: str):
 
 
 def test_who_sends_too_much_slowly_reads_why_all_the_same(service: Running):
-    """A connection that is closed while its client sends is reset, and with it what the client has not read yet."""
+    """A connection that is closed while its client sends is reset, and with it what the client has
+    not read yet."""
     address, part = urlsplit(service.url), bytes(32_000)
     with socket.create_connection((address.hostname, address.port or 80), 20.0) as sending:
         head = (
-            f"POST {LOCALIZE} HTTP/1.1\r\nHost: {address.netloc}\r\nContent-Type: image/jpeg\r\nContent-Length: {100 * len(part)}\r\n\r\n"
+            f"POST {LOCALIZE} HTTP/1.1\r\nHost: {address.netloc}\r\nContent-Type:"
+            f" image/jpeg\r\nContent-Length: {100 * len(part)}\r\n\r\n"
         )
         sending.sendall(head.encode())
         for _ in range(100):
@@ -103,7 +123,10 @@ def test_who_sends_too_much_slowly_reads_why_all_the_same(service: Running):
         '{"model": "PINHOLE", "params": [0, 0, 2, 3]}',
         '{"model": "FISHEYE_OF_MINE", "params": [1]}',
         '{"model": "PINHOLE", "params": ["a", 1, 2, 3]}',
-        '{"model": "PINHOLE", "width": 640, "height": 480, "fx": 260, "fy": 260, "cx": 319, "cy": 239}',
+        (
+            '{"model": "PINHOLE", "width": 640, "height": 480, "fx": 260, "fy": 260, "cx": 319,'
+            ' "cy": 239}'
+        ),
         '{"model": "PINHOLE", "width": 1e400, "height": 480, "params": [260, 260, 319, 239]}',
         f'{{"fx": {"9" * 4000}}}',
         "[" * 15_000,
@@ -128,22 +151,40 @@ def test_cameras_that_are_none(client: httpx.Client, view: Path, camera: str):
 )
 def test_what_makes_no_sense_is_refused(client: httpx.Client, view: Path, said: dict[str, str]):
     _check(client.post(LOCALIZE, files={"image": view.open("rb")}, data=said), 422)
-    _check(client.post(LOCALIZE, params=said, content=view.read_bytes(), headers={"content-type": "image/png"}), 422)
+    _check(
+        client.post(
+            LOCALIZE, params=said, content=view.read_bytes(), headers={"content-type": "image/png"}
+        ),
+        422,
+    )
 
 
 def test_forms_that_are_none(client: httpx.Client, view: Path):
     _check(client.post(LOCALIZE, files={"picture": view.open("rb")}), 400)
     _check(client.post(LOCALIZE, data={"image": "text"}), 415)
-    _check(client.post(LOCALIZE, content=b"x", headers={"content-type": "multipart/form-data"}), 400)
-    half = b'--b\r\nContent-Disposition: form-data; name="image"; filename="a.png"\r\n\r\n' + view.read_bytes()[:500]
-    _check(client.post(LOCALIZE, content=half, headers={"content-type": "multipart/form-data; boundary=b"}), 400)
+    _check(
+        client.post(LOCALIZE, content=b"x", headers={"content-type": "multipart/form-data"}), 400
+    )
+    half = (
+        b'--b\r\nContent-Disposition: form-data; name="image"; filename="a.png"\r\n\r\n'
+        + view.read_bytes()[:500]
+    )
+    _check(
+        client.post(
+            LOCALIZE, content=half, headers={"content-type": "multipart/form-data; boundary=b"}
+        ),
+        400,
+    )
     many = {f"field{number}": (None, "x") for number in range(50)}
     _check(client.post(LOCALIZE, files=many), 400)
 
 
 def test_what_is_not_there(client: httpx.Client, view: Path):
     _check(client.post("/v1/maps/nowhere/localize", files={"image": view.open("rb")}), 404)
-    _check(client.post("/v1/maps/..%2F..%2Fetc%2Fpasswd/localize", files={"image": view.open("rb")}), 404)
+    _check(
+        client.post("/v1/maps/..%2F..%2Fetc%2Fpasswd/localize", files={"image": view.open("rb")}),
+        404,
+    )
     _check(client.get("/v1/elsewhere"), 404)
     _check(client.put("/v1/maps"), 405)
     _check(client.get("/v1/maps/" + "a" * 300), 422)
@@ -152,22 +193,36 @@ def test_what_is_not_there(client: httpx.Client, view: Path):
 def test_other_sites_and_other_names_are_not_answered(client: httpx.Client):
     _check(client.get("/v1/maps", headers={"origin": "https://elsewhere.example"}), 403)
     _check(client.get("/v1/maps", headers={"host": "elsewhere.example"}), 421)
-    assert client.get("/v1/maps", headers={"origin": str(client.base_url).rstrip("/")}).status_code == 200
+    assert (
+        client.get("/v1/maps", headers={"origin": str(client.base_url).rstrip("/")}).status_code
+        == 200
+    )
     assert "access-control-allow-origin" not in client.get("/v1/maps").headers
 
 
-def test_a_client_that_sends_slowly_is_ended_and_blocks_nobody(service: Running, client: httpx.Client, view: Path, camera: str):
+def test_a_client_that_sends_slowly_is_ended_and_blocks_nobody(
+    service: Running, client: httpx.Client, view: Path, camera: str
+):
     address = urlsplit(service.url)
     assert address.hostname
-    head = f"POST {LOCALIZE} HTTP/1.1\r\nHost: {address.netloc}\r\nContent-Type: image/png\r\nContent-Length: 100000\r\n\r\n"
-    slow = [socket.create_connection((address.hostname, address.port or 80), 20.0) for _ in range(20)]
+    head = (
+        f"POST {LOCALIZE} HTTP/1.1\r\nHost: {address.netloc}\r\nContent-Type:"
+        " image/png\r\nContent-Length: 100000\r\n\r\n"
+    )
+    slow = [
+        socket.create_connection((address.hostname, address.port or 80), 20.0) for _ in range(20)
+    ]
     try:
         begun = time.monotonic()
         for one in slow:
             one.sendall(head.encode() + b"abc")
-        assert client.post(LOCALIZE, files={"image": view.open("rb")}, data={"camera": camera}).json()["localized"]
+        assert client.post(
+            LOCALIZE, files={"image": view.open("rb")}, data={"camera": camera}
+        ).json()["localized"]
         ended = select.select(slow, [], [], 0.0)[0]
-        assert ended == [] or time.monotonic() - begun > 3.9, "they are waited for, while others are answered"
+        assert ended == [] or time.monotonic() - begun > 3.9, (
+            "they are waited for, while others are answered"
+        )
         assert all(b" 408 " in one.recv(1000) for one in slow)
     finally:
         for one in slow:
@@ -178,13 +233,16 @@ def test_a_client_that_goes_away_harms_nobody(service: Running, client: httpx.Cl
     address = urlsplit(service.url)
     assert address.hostname
     with socket.create_connection((address.hostname, address.port or 80), 10.0) as gone:
-        gone.sendall(f"POST {LOCALIZE} HTTP/1.1\r\nHost: {address.netloc}\r\nContent-Length: 1000\r\n\r\nabc".encode())
+        gone.sendall(
+            f"POST {LOCALIZE} HTTP/1.1\r\nHost: {address.netloc}\r\nContent-Length: 1000\r\n\r\nabc".encode()  # noqa: E501
+        )
     assert client.get("/healthz").json()["status"] == "ok"
     assert not any('"level": "error"' in line for line in service.log)
 
 
 def test_too_many_at_a_time_are_told_when_to_come_again(service: Running, view: Path, camera: str):
-    """34 may be answered or wait; of 60 at once some are told to come again, and all others get their pose."""
+    """34 may be answered or wait; of 60 at once some are told to come again, and all others get
+    their pose."""
     data = view.read_bytes()
     answers = list[httpx.Response]()
 

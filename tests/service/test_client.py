@@ -25,12 +25,23 @@ def test_results_are_those_of_a_localizer(service: Running, maps: Path, view: Pa
         for picture in (view, view.read_bytes(), image):
             result = client.localize("room", picture, calibration, prior=None, max_ms=10_000.0)
             assert isinstance(result, Localization)
-            assert result.world_from_cam.translation.tolist() == own.world_from_cam.translation.tolist()
-            assert np.allclose(result.world_from_cam.rotation, own.world_from_cam.rotation, atol=1e-12)
-            assert (result.num_inliers, result.probability, result.provenance) == (own.num_inliers, own.probability, own.provenance)
+            assert (
+                result.world_from_cam.translation.tolist()
+                == own.world_from_cam.translation.tolist()
+            )
+            assert np.allclose(
+                result.world_from_cam.rotation, own.world_from_cam.rotation, atol=1e-12
+            )
+            assert (result.num_inliers, result.probability, result.provenance) == (
+                own.num_inliers,
+                own.probability,
+                own.provenance,
+            )
         near = client.localize("room", view, "map", prior=own.world_from_cam)
         assert isinstance(near, Localization)
-        assert np.allclose(near.world_from_cam.translation, own.world_from_cam.translation, atol=0.02)
+        assert np.allclose(
+            near.world_from_cam.translation, own.world_from_cam.translation, atol=0.02
+        )
         assert client.explain("room", view, calibration)["tried"]
 
 
@@ -51,7 +62,9 @@ def test_the_same_in_an_event_loop(service: Running, view: Path, camera: str):
         async with AsyncClient(service.url) as client:
             assert await client.maps() == ["damaged", "earth", "room"]
             calibration = Camera.from_json(json.loads(camera))
-            results = await asyncio.gather(*(client.localize("room", view, calibration) for _ in range(5)))
+            results = await asyncio.gather(
+                *(client.localize("room", view, calibration) for _ in range(5))
+            )
             return [result.localized for result in results]
 
     assert asyncio.run(ask()) == [True] * 5
@@ -66,5 +79,8 @@ def test_what_goes_wrong_is_one_line(service: Running, view: Path):
             client.localize("room", b"no picture")
         with pytest.raises(ServiceError, match=r"missing\.png"):
             client.localize("room", "missing.png")
-    with Client("http://127.0.0.1:9", timeout_s=5.0) as nobody, pytest.raises(ServiceError, match="no answer"):
+    with (
+        Client("http://127.0.0.1:9", timeout_s=5.0) as nobody,
+        pytest.raises(ServiceError, match="no answer"),
+    ):
         nobody.maps()

@@ -1,4 +1,5 @@
-"""The files of deploy/ say what the program and its image are: options, port, user, paths. Schemas: docs/service.md."""
+"""The files of deploy/ say what the program and its image are: options, port, user, paths. Schemas:
+docs/service.md."""
 
 from __future__ import annotations
 
@@ -35,7 +36,9 @@ def test_kubernetes():
     mounts = {mount["mountPath"]: mount for mount in container["volumeMounts"]}
     assert {"/maps", "/run/token", "/tmp"} == set(mounts)
     assert mounts["/maps"]["readOnly"]
-    assert {mount["name"] for mount in mounts.values()} == {volume["name"] for volume in pod["volumes"]}
+    assert {mount["name"] for mount in mounts.values()} == {
+        volume["name"] for volume in pod["volumes"]
+    }
     port = next(port for port in container["ports"] if port["name"] == "http")["containerPort"]
     assert f"EXPOSE {port}" in DOCKERFILE
     assert port == Command().port
@@ -48,8 +51,15 @@ def test_kubernetes():
     assert not container["securityContext"]["allowPrivilegeEscalation"]
     assert set(container["resources"]) == {"requests", "limits"}
     labels = documents["Deployment"]["spec"]["template"]["metadata"]["labels"]
-    assert documents["Service"]["spec"]["selector"] == labels == documents["PodDisruptionBudget"]["spec"]["selector"]["matchLabels"]
-    assert documents["HorizontalPodAutoscaler"]["spec"]["scaleTargetRef"]["name"] == documents["Deployment"]["metadata"]["name"]
+    assert (
+        documents["Service"]["spec"]["selector"]
+        == labels
+        == documents["PodDisruptionBudget"]["spec"]["selector"]["matchLabels"]
+    )
+    assert (
+        documents["HorizontalPodAutoscaler"]["spec"]["scaleTargetRef"]["name"]
+        == documents["Deployment"]["metadata"]["name"]
+    )
 
 
 def test_compose():
@@ -60,6 +70,8 @@ def test_compose():
     assert f"USER {service['user']}" in DOCKERFILE
     assert [f"EXPOSE {port}" in DOCKERFILE for port in service["expose"]] == [True]
     assert f":{service['expose'][0]}/healthz" in service["healthcheck"]["test"][-1]
-    assert f"dynamic a topoloc {service['expose'][0]}" in document["configs"]["caddyfile"]["content"]
+    assert (
+        f"dynamic a topoloc {service['expose'][0]}" in document["configs"]["caddyfile"]["content"]
+    )
     assert set(service["secrets"]) == set(document["secrets"])
     assert (ROOT / "deploy" / service["build"]["context"] / "Dockerfile").is_file()

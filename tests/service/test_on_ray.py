@@ -27,15 +27,21 @@ def test_what_makes_no_sense(maps: Path, complaint: Complaint):
     assert "--replicas belongs to --ray" in complaint("serve", maps, "--replicas", 2, status=2)
     assert "--port 0" in complaint("serve", maps, "--ray", "local", "--port", 0, status=2)
     for replicas in ("many", "3-", "4-2", "0"):
-        assert "--replicas" in complaint("serve", maps, "--ray", "local", "--replicas", replicas, status=2)
+        assert "--replicas" in complaint(
+            "serve", maps, "--ray", "local", "--replicas", replicas, status=2
+        )
 
 
 def test_replicas_come_and_go_between_the_least_and_the_most():
-    serve = pytest.importorskip("ray.serve", reason="Ray Serve is not installed (the extra cluster)")
+    serve = pytest.importorskip(
+        "ray.serve", reason="Ray Serve is not installed (the extra cluster)"
+    )
     front = Front("127.0.0.1", 8571, num_answered=2, num_waiting=30)
     fixed = _deployment(serve, front, ReplicasConfig(least=3, most=3))
     assert (fixed.num_replicas, fixed.max_ongoing_requests) == (3, 32)
-    scaled = _deployment(serve, front, ReplicasConfig(least=1, most=4, busy=1.5))._deployment_config.autoscaling_config
+    scaled = _deployment(
+        serve, front, ReplicasConfig(least=1, most=4, busy=1.5)
+    )._deployment_config.autoscaling_config
     assert (scaled.min_replicas, scaled.max_replicas, scaled.target_ongoing_requests) == (1, 4, 3.0)
 
 
@@ -44,7 +50,17 @@ def _on_ray(*args: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """`topoloc serve --ray local` with these arguments, and its address."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-    command = [sys.executable, "-m", "topoloc", "serve", *map(str, args), "--ray", "local", "--port", str(port)]
+    command = [
+        sys.executable,
+        "-m",
+        "topoloc",
+        "serve",
+        *map(str, args),
+        "--ray",
+        "local",
+        "--port",
+        str(port),
+    ]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     try:
         assert process.stderr is not None
@@ -57,7 +73,9 @@ def _on_ray(*args: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
 
 
 @pytest.mark.slow
-def test_replicas_answer_as_one_process_does(maps: Path, client: httpx.Client, view: Path, camera: str, tmp_path: Path):
+def test_replicas_answer_as_one_process_does(
+    maps: Path, client: httpx.Client, view: Path, camera: str, tmp_path: Path
+):
     pytest.importorskip("ray.serve", reason="Ray Serve is not installed (the extra cluster)")
     token = tmp_path / "token"
     token.write_text(TOKEN)
@@ -70,8 +88,12 @@ def test_replicas_answer_as_one_process_does(maps: Path, client: httpx.Client, v
         headers = {"Authorization": f"Bearer {TOKEN}"}
         with httpx.Client(base_url=url, timeout=60.0, headers=headers) as one:
             for _ in range(4):
-                assert without_times(one.post("/v1/maps/room/localize", **asked).text) == without_times(alone)
-            assert one.post("/v1/maps/room/localize", files={"image": b"no picture"}).status_code in (400, 415)
+                assert without_times(
+                    one.post("/v1/maps/room/localize", **asked).text
+                ) == without_times(alone)
+            assert one.post(
+                "/v1/maps/room/localize", files={"image": b"no picture"}
+            ).status_code in (400, 415)
         address = url.replace("http", "ws") + "/v1/maps/room/sessions"
         with connect(address, additional_headers=headers) as stream:
             stream.send(json.dumps({"camera": json.loads(camera)}))
@@ -84,7 +106,20 @@ def test_replicas_answer_as_one_process_does(maps: Path, client: httpx.Client, v
 @pytest.mark.slow
 def test_why_no_replica_begins(tmp_path: Path):
     pytest.importorskip("ray.serve", reason="Ray Serve is not installed (the extra cluster)")
-    command = [sys.executable, "-m", "topoloc", "serve", str(tmp_path / "nothing.topo"), "--ray", "local", "--port", "8579"]
+    command = [
+        sys.executable,
+        "-m",
+        "topoloc",
+        "serve",
+        str(tmp_path / "nothing.topo"),
+        "--ray",
+        "local",
+        "--port",
+        "8579",
+    ]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert ended.returncode == 1
-    assert ended.stderr.splitlines()[-1] == f"error: no replica of the service began: {tmp_path}/nothing.topo: no such map"
+    assert (
+        ended.stderr.splitlines()[-1]
+        == f"error: no replica of the service began: {tmp_path}/nothing.topo: no such map"
+    )

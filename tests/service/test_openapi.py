@@ -1,4 +1,5 @@
-"""What OpenAPI says of the service holds: its examples are accepted, its schemas are those of the answers."""
+"""What OpenAPI says of the service holds: its examples are accepted, its schemas are those of the
+answers."""
 
 from __future__ import annotations
 
@@ -19,7 +20,14 @@ def document(client: httpx.Client) -> dict[str, Any]:
 
 
 def test_every_route_says_what_it_answers_and_refuses(document: dict[str, Any]):
-    assert {"/v1/maps", "/v1/maps/{map}/localize", "/v1/localize", "/localize/geopose", "/healthz", "/metrics"} <= set(document["paths"])
+    assert {
+        "/v1/maps",
+        "/v1/maps/{map}/localize",
+        "/v1/localize",
+        "/localize/geopose",
+        "/healthz",
+        "/metrics",
+    } <= set(document["paths"])
     for path, methods in document["paths"].items():
         for method, facts in methods.items():
             assert facts["description"], (path, method)
@@ -28,7 +36,9 @@ def test_every_route_says_what_it_answers_and_refuses(document: dict[str, Any]):
 
 
 @pytest.mark.parametrize("number", range(3))
-def test_the_examples_of_cameras_are_accepted(client: httpx.Client, document: dict[str, Any], tmp_path: Path, number: int):
+def test_the_examples_of_cameras_are_accepted(
+    client: httpx.Client, document: dict[str, Any], tmp_path: Path, number: int
+):
     from PIL import Image
 
     Image.new("L", (640, 400), 90).save(tmp_path / "grey.png")
@@ -36,7 +46,12 @@ def test_the_examples_of_cameras_are_accepted(client: httpx.Client, document: di
     prior = Said.model_json_schema()["properties"]["prior"]["examples"][0]
     said = {"camera": examples[number], "prior": prior, "max_ms": "100"}
     picture = (tmp_path / "grey.png").read_bytes()
-    answer = client.post("/v1/maps/room/localize", params=said, content=picture, headers={"content-type": "image/png"})
+    answer = client.post(
+        "/v1/maps/room/localize",
+        params=said,
+        content=picture,
+        headers={"content-type": "image/png"},
+    )
     assert answer.status_code == 200, answer.text
     responses = document["paths"]["/v1/maps/{map}/localize"]["post"]["responses"]
     schema = responses["200"]["content"]["application/json"]["schema"]

@@ -1,4 +1,5 @@
-"""The page at `/`, in a real browser, of a service in a process of its own: a picture of the demo's world is dropped, pasted, chosen."""
+"""The page at `/`, in a real browser, of a service in a process of its own: a picture of the demo's
+world is dropped, pasted, chosen."""
 
 from __future__ import annotations
 
@@ -19,7 +20,9 @@ from topoloc.localization.map_facts.building import build_map
 from topoloc.map.build import BuildConfig
 from topoloc.sequences.open import open_sequence
 
-pytestmark = pytest.mark.skipif(bool(missing_recordings(SHIPPED)), reason="the demo's recordings are not in this checkout")
+pytestmark = pytest.mark.skipif(
+    bool(missing_recordings(SHIPPED)), reason="the demo's recordings are not in this checkout"
+)
 ANSWERED = "#answer h2.good, #answer h2.bad"
 # As if a picture were dropped on the page, or pasted.
 BROUGHT = """([how, name, base64]) => {
@@ -51,7 +54,9 @@ def browser() -> Iterator[Any]:
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
     folder = tmp_path_factory.mktemp("lab")
-    build_map(open_sequence(f"{SHIPPED / 'map_lap1'}@4:10"), BuildConfig(other_kinds=())).save(folder / "lab.topo")
+    build_map(open_sequence(f"{SHIPPED / 'map_lap1'}@4:10"), BuildConfig(other_kinds=())).save(
+        folder / "lab.topo"
+    )
     (folder / "token").write_text(TOKEN)
     day = open_sequence(SHIPPED / "day")
     camera, pose = day[4].camera, day.poses[4]
@@ -63,14 +68,17 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
 
 
 def _bring(page: Any, lab: Lab, how: str) -> None:
-    """The picture comes to the page in this way, with its calibration; returns when there is an answer."""
+    """The picture comes to the page in this way, with its calibration; returns when there is an
+    answer."""
     page.wait_for_selector("#scene canvas")
     page.locator("#camera-field summary").click()
     page.get_by_label("fx, fy, cx, cy in pixels").last.fill(lab.camera)
     if how == "choose":
         page.set_input_files("#file", lab.picture)
     else:
-        page.evaluate(BROUGHT, [how, lab.picture.name, base64.b64encode(lab.picture.read_bytes()).decode()])
+        page.evaluate(
+            BROUGHT, [how, lab.picture.name, base64.b64encode(lab.picture.read_bytes()).decode()]
+        )
     page.wait_for_selector(ANSWERED, timeout=60_000)
 
 
@@ -78,7 +86,7 @@ def _frustum(page: Any) -> np.ndarray:
     """The centre of the camera that is drawn, metres."""
     centres = page.evaluate(
         """() => { const all = []; document.getElementById("scene").viewer.chosen.traverse((one) => {
-        if (one.userData.kind === "answer") all.push([...one.geometry.attributes.position.array.slice(0, 3)]); }); return all; }"""
+        if (one.userData.kind === "answer") all.push([...one.geometry.attributes.position.array.slice(0, 3)]); }); return all; }"""  # noqa: E501
     )
     assert len(centres) == 1
     return np.array(centres[0])
@@ -112,7 +120,9 @@ def test_it_can_be_read_and_named(browser: Any, lab: Lab, width: int, dark: bool
 def test_a_picture_of_nothing_is_refused_with_advice(browser: Any, lab: Lab):
     with opened(browser, f"{lab.service.url}/", 1300) as page:
         page.wait_for_selector("#scene canvas")
-        nothing = next((SHIPPED / "pictures_of_nothing").rglob("*.jpg"), None) or next((SHIPPED / "pictures_of_nothing").rglob("*.png"))
+        nothing = next((SHIPPED / "pictures_of_nothing").rglob("*.jpg"), None) or next(
+            (SHIPPED / "pictures_of_nothing").rglob("*.png")
+        )
         page.set_input_files("#file", nothing)
         page.wait_for_selector("#answer h2.bad", timeout=60_000)
         assert page.inner_text("#answer h2").startswith("Not localized.")
@@ -125,7 +135,12 @@ def test_it_is_worked_by_keyboard(browser: Any, lab: Lab):
         reached = set[str]()
         for _ in range(30):
             page.keyboard.press("Tab")
-            reached.add(page.evaluate("document.activeElement.id || document.activeElement.dataset.part || document.activeElement.tagName"))
+            reached.add(
+                page.evaluate(
+                    "document.activeElement.id || document.activeElement.dataset.part ||"
+                    " document.activeElement.tagName"
+                )
+            )
         assert {"choose", "webcam", "SUMMARY", "canvas", "home", "list"} <= reached
         with page.expect_file_chooser():
             page.locator("#choose").focus()
@@ -144,14 +159,17 @@ def test_a_live_stream_draws_the_way(lab: Lab, browser: Any):
               const canvas = Object.assign(document.createElement("canvas"), { width: image.width, height: image.height });
               setInterval(() => canvas.getContext("2d").drawImage(image, 0, 0), 50);
               navigator.mediaDevices.getUserMedia = async () => canvas.captureStream(20);
-            }""",
+            }""",  # noqa: E501
             base64.b64encode(lab.picture.read_bytes()).decode(),
         )
         page.locator("#camera-field summary").click()
         page.get_by_label("fx, fy, cx, cy in pixels").last.fill(lab.camera)
         page.get_by_text("Use the webcam").click()
         page.get_by_text("Follow live").click()
-        track = "document.getElementById('scene').viewer.live.children.flatMap((group) => group.children).length"
+        track = (
+            "document.getElementById('scene').viewer.live.children.flatMap((group) =>"
+            " group.children).length"
+        )
         for _ in range(300):  # `wait_for_function` would be barred by the page's policy
             if page.evaluate(track) > 0:
                 break
@@ -194,6 +212,8 @@ def test_the_scene_is_that_of_the_file_that_is_there_now(room_map: Path, lab: La
     with running(tmp_path) as service, service.client() as client:
         before = client.get("/v1/maps/a/scene").json()
         assert before == client.get("/v1/maps/a/scene").json()
-        build_map(open_sequence(f"{SHIPPED / 'map_lap1'}@4:6"), BuildConfig(other_kinds=())).save(tmp_path / "a.topo")
+        build_map(open_sequence(f"{SHIPPED / 'map_lap1'}@4:6"), BuildConfig(other_kinds=())).save(
+            tmp_path / "a.topo"
+        )
         assert client.get("/v1/maps/a/scene").json()["map"]["id"] != before["map"]["id"]
         assert client.get("/v1/maps/b/scene").status_code == 404

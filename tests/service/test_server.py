@@ -18,12 +18,16 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 
-def test_elsewhere_only_with_a_token_and_tls_or_a_proxy(complaint: Callable[..., str], maps: Path, tmp_path: Path):
+def test_elsewhere_only_with_a_token_and_tls_or_a_proxy(
+    complaint: Callable[..., str], maps: Path, tmp_path: Path
+):
     token = tmp_path / "token"
     token.write_text(TOKEN)
     assert "--token-file" in complaint("serve", maps, "--host", "0.0.0.0", status=2)
     assert "--token-file" in complaint("serve", maps, "--behind-proxy", status=2)
-    assert "--tls-cert" in complaint("serve", maps, "--host", "0.0.0.0", "--token-file", token, status=2)
+    assert "--tls-cert" in complaint(
+        "serve", maps, "--host", "0.0.0.0", "--token-file", token, status=2
+    )
     assert "--tls-key" in complaint("serve", maps, "--tls-cert", token, status=2)
     assert "at least one map" in complaint("serve", status=2)
     assert "no such map" in complaint("serve", tmp_path / "nothing.topo")
@@ -38,13 +42,28 @@ def test_a_port_in_use_is_said_in_one_line(complaint: Callable[..., str], maps: 
 
 def test_only_those_with_the_token_are_answered(maps: Path, view: Path, tmp_path: Path):
     (tmp_path / "token").write_text(TOKEN + "\n")
-    with running(maps / "room.topo", "--token-file", tmp_path / "token") as service, service.client() as client:
-        for shown in ({}, {"authorization": "Bearer"}, {"authorization": f"Bearer {TOKEN}x"}, {"authorization": f"Basic {TOKEN}"}):
+    with (
+        running(maps / "room.topo", "--token-file", tmp_path / "token") as service,
+        service.client() as client,
+    ):
+        for shown in (
+            {},
+            {"authorization": "Bearer"},
+            {"authorization": f"Bearer {TOKEN}x"},
+            {"authorization": f"Basic {TOKEN}"},
+        ):
             answer = client.get("/v1/maps", headers=shown)
             assert answer.status_code == 401
             assert answer.headers["www-authenticate"] == "Bearer"
-            assert client.post("/v1/maps/room/localize", files={"image": view.open("rb")}, headers=shown).status_code == 401
-        assert client.get("/v1/maps", headers={"authorization": f"Bearer {TOKEN}"}).json() == {"maps": ["room"]}
+            assert (
+                client.post(
+                    "/v1/maps/room/localize", files={"image": view.open("rb")}, headers=shown
+                ).status_code
+                == 401
+            )
+        assert client.get("/v1/maps", headers={"authorization": f"Bearer {TOKEN}"}).json() == {
+            "maps": ["room"]
+        }
         assert client.get("/healthz").status_code == 200
         address = service.url.replace("http", "ws") + "/v1/maps/room/sessions"
         with pytest.raises(InvalidStatus) as refused, connect(address):
@@ -55,11 +74,18 @@ def test_only_those_with_the_token_are_answered(maps: Path, view: Path, tmp_path
         assert TOKEN not in "".join(service.log)
 
 
-def test_requests_in_progress_are_finished_when_it_is_told_to_end(maps: Path, queries: Path, camera: str):
-    """Sixteen wait when the signal comes; each gets its answer, and the process ends with status 0."""
+def test_requests_in_progress_are_finished_when_it_is_told_to_end(
+    maps: Path, queries: Path, camera: str
+):
+    """Sixteen wait when the signal comes; each gets its answer, and the process ends with status
+    0."""
     asked = {"files": {"image": (queries / "view02.png").read_bytes()}, "data": {"camera": camera}}
     statuses, together, until = list[int](), threading.Barrier(16), time.monotonic() + 60.0
-    with running(maps / "room.topo", "--workers", 1, "--max-queue", 100) as service, service.client() as client, ExitStack() as stack:
+    with (
+        running(maps / "room.topo", "--workers", 1, "--max-queue", 100) as service,
+        service.client() as client,
+        ExitStack() as stack,
+    ):
         client.post("/v1/maps/room/localize", **asked)
         clients = [stack.enter_context(service.client()) for _ in range(16)]
 

@@ -30,12 +30,21 @@ def test_a_stream_by_requests(client: httpx.Client, tiny_recording: Path):
     states = list[str]()
     for number, picture in enumerate(_pictures(tiny_recording)):
         params = {"t_ns": str(100_000_000 * number), "name": str(number)}
-        answer = client.post(f"{address}/pictures", params=params, content=picture, headers={"content-type": "image/png"}).json()
+        answer = client.post(
+            f"{address}/pictures",
+            params=params,
+            content=picture,
+            headers={"content-type": "image/png"},
+        ).json()
         states.append(answer["state"])
         assert answer["t_ns"] == 100_000_000 * number
     assert states[0] == "localized"
     assert set(states) <= {"localized", "tracked"}
-    backwards = client.post(f"{address}/pictures?t_ns=5", content=_pictures(tiny_recording)[0], headers={"content-type": "image/png"})
+    backwards = client.post(
+        f"{address}/pictures?t_ns=5",
+        content=_pictures(tiny_recording)[0],
+        headers={"content-type": "image/png"},
+    )
     assert backwards.status_code == 422
     assert client.delete(address).status_code == 204
     assert client.delete(address).status_code == 404
@@ -67,15 +76,23 @@ def test_messages_that_make_no_sense_end_the_stream(service: Running):
 
 
 def test_a_websocket_is_refused_with_a_status(service: Running):
-    with pytest.raises(InvalidStatus) as refused, connect(_socket_address(service).replace("room", "nowhere")):
+    with (
+        pytest.raises(InvalidStatus) as refused,
+        connect(_socket_address(service).replace("room", "nowhere")),
+    ):
         pass
     assert refused.value.response.status_code == 404
-    with pytest.raises(InvalidStatus) as refused, connect(_socket_address(service), origin="https://elsewhere.example"):  # pyright: ignore[reportArgumentType]
+    with (
+        pytest.raises(InvalidStatus) as refused,
+        connect(_socket_address(service), origin="https://elsewhere.example"),
+    ):  # pyright: ignore[reportArgumentType]
         pass
     assert refused.value.response.status_code == 403
 
 
-def test_streams_end_when_nobody_uses_them_and_there_are_not_too_many(service: Running, client: httpx.Client):
+def test_streams_end_when_nobody_uses_them_and_there_are_not_too_many(
+    service: Running, client: httpx.Client
+):
     sockets = [connect(_socket_address(service)) for _ in range(3)]
     try:
         assert client.post(SESSIONS).status_code == 429
@@ -92,7 +109,11 @@ def test_streams_end_when_nobody_uses_them_and_there_are_not_too_many(service: R
 
 def test_a_camera_must_be_known(client: httpx.Client, tiny_recording: Path):
     session = client.post(SESSIONS).json()["session"]
-    answer = client.post(f"{SESSIONS}/{session}/pictures", content=_pictures(tiny_recording)[0], headers={"content-type": "image/png"})
+    answer = client.post(
+        f"{SESSIONS}/{session}/pictures",
+        content=_pictures(tiny_recording)[0],
+        headers={"content-type": "image/png"},
+    )
     assert answer.status_code == 422
     assert "calibrated" in answer.json()["error"]
     client.delete(f"{SESSIONS}/{session}")

@@ -1,7 +1,8 @@
-"""A wall of equal panels a metre apart, walked along by a stereo camera that looks at it: what SLAM is to survive without frames.
+"""A wall of equal panels a metre apart, walked along by a stereo camera that looks at it: what SLAM
+is to survive without frames.
 
-The wall runs along the world's +x, 1.6 m before the camera. Its texture repeats exactly; boards, each another one, hang where a test
-wants them.
+The wall runs along the world's +x, 1.6 m before the camera. Its texture repeats exactly; boards,
+each another one, hang where a test wants them.
 """
 
 from __future__ import annotations
@@ -29,26 +30,62 @@ _WALL, _UP_DOWN, _RIGHT = 1.6, np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0
 def wall(boards: tuple[float, ...] = ()) -> list[Panel]:
     """The wall from x = -3 m to 21 m, above a plain floor; boards are 0.6 m wide."""
     one = smooth_texture(7, (PERIOD / 2, 1.2))
-    panels = [Panel(np.array([_FROM + _HALF, _WALL, 0.0]), _RIGHT, _UP_DOWN, (float(_HALF), 1.2), np.tile(one, (1, 2 * _HALF)))]
+    panels = [
+        Panel(
+            np.array([_FROM + _HALF, _WALL, 0.0]),
+            _RIGHT,
+            _UP_DOWN,
+            (float(_HALF), 1.2),
+            np.tile(one, (1, 2 * _HALF)),
+        )
+    ]
     for number, x in enumerate(boards):
-        panels.append(Panel(np.array([x, _WALL - 0.05, 0.1]), _RIGHT, _UP_DOWN, (0.3, 0.5), smooth_texture(50 + number, (0.3, 0.5))))
+        panels.append(
+            Panel(
+                np.array([x, _WALL - 0.05, 0.1]),
+                _RIGHT,
+                _UP_DOWN,
+                (0.3, 0.5),
+                smooth_texture(50 + number, (0.3, 0.5)),
+            )
+        )
     return panels
 
 
 def pose_at(x: float) -> Rigid3:
     """world_from_cam of who walks along the wall, swaying a little."""
-    sway = exp_so3(np.array([0.0, 0.0, 0.02 * np.sin(2.1 * x)])) @ exp_so3(np.array([0.01 * np.cos(3.0 * x), 0.0, 0.0]))
-    return Rigid3(sway @ LEVEL_FROM_CAM, np.array([x, 0.02 * np.sin(3.0 * x), 0.01 * np.cos(5.0 * x)]))
+    sway = exp_so3(np.array([0.0, 0.0, 0.02 * np.sin(2.1 * x)])) @ exp_so3(
+        np.array([0.01 * np.cos(3.0 * x), 0.0, 0.0])
+    )
+    return Rigid3(
+        sway @ LEVEL_FROM_CAM, np.array([x, 0.02 * np.sin(3.0 * x), 0.01 * np.cos(5.0 * x)])
+    )
 
 
 @cache
 def _frame(x: float, boards: tuple[float, ...]) -> StereoFrame:
     pose, panels = pose_at(x), wall(boards)
-    left, right = (render(panels, p, CAMERA, noise_seed=round(1000 * x) + k)[0] for k, p in enumerate((pose, right_pose(pose))))
-    return StereoFrame(f"{x:.2f}", 0, left, CAMERA, right, StereoRig.rectified(CAMERA, BASELINE), world_from_cam=pose)
+    left, right = (
+        render(panels, p, CAMERA, noise_seed=round(1000 * x) + k)[0]
+        for k, p in enumerate((pose, right_pose(pose)))
+    )
+    return StereoFrame(
+        f"{x:.2f}",
+        0,
+        left,
+        CAMERA,
+        right,
+        StereoRig.rectified(CAMERA, BASELINE),
+        world_from_cam=pose,
+    )
 
 
-def walk_along(places: Sequence[float], times: Sequence[float], boards: tuple[float, ...] = ()) -> FrameList:
+def walk_along(
+    places: Sequence[float], times: Sequence[float], boards: tuple[float, ...] = ()
+) -> FrameList:
     """Frames at these places (metres along the wall) and times (seconds)."""
-    frames = [replace(_frame(float(x), boards), t_ns=round(t * 1e9)) for x, t in zip(places, times, strict=True)]
+    frames = [
+        replace(_frame(float(x), boards), t_ns=round(t * 1e9))
+        for x, t in zip(places, times, strict=True)
+    ]
     return FrameList(frames, "wall")

@@ -1,4 +1,5 @@
-"""Frames of the rendered room without files: a camera that goes wherever a test wants it, and is made to fail on the way."""
+"""Frames of the rendered room without files: a camera that goes wherever a test wants it, and is
+made to fail on the way."""
 
 from __future__ import annotations
 
@@ -47,9 +48,14 @@ def stereo_frame(place: float, seed: int = 0) -> StereoFrame:
     """The pair at this place of the path, with truth."""
     panels, pose = tiny_world.room(seed), tiny_world.path_pose(place)
     noise = round(1000 * place)
-    left, right = (tiny_world.render(panels, p, noise_seed=noise + k)[0] for k, p in enumerate((pose, tiny_world.right_pose(pose))))
+    left, right = (
+        tiny_world.render(panels, p, noise_seed=noise + k)[0]
+        for k, p in enumerate((pose, tiny_world.right_pose(pose)))
+    )
     t_ns = round(place * 1e9 / tiny_world.RATE_HZ)
-    return StereoFrame(f"{place:g}.png", t_ns, left, tiny_world.CAMERA, right, RIG, world_from_cam=pose)
+    return StereoFrame(
+        f"{place:g}.png", t_ns, left, tiny_world.CAMERA, right, RIG, world_from_cam=pose
+    )
 
 
 @cache
@@ -62,13 +68,18 @@ def depth_frame(place: float) -> StereoFrame:
 
 def walk(places: Sequence[float], seed: int = 0, name: str = "room") -> FrameList:
     """Frames at these places, a tenth of a second after each other."""
-    frames = [replace(stereo_frame(float(place), seed), t_ns=i * 100_000_000) for i, place in enumerate(places)]
+    frames = [
+        replace(stereo_frame(float(place), seed), t_ns=i * 100_000_000)
+        for i, place in enumerate(places)
+    ]
     return FrameList(frames, name)
 
 
 def changed(sequence: FrameList, frames: dict[int, StereoFrame]) -> FrameList:
     """The same recording with some frames replaced."""
-    return FrameList([frames.get(i, frame) for i, frame in enumerate(sequence.frames)], sequence.name)
+    return FrameList(
+        [frames.get(i, frame) for i, frame in enumerate(sequence.frames)], sequence.name
+    )
 
 
 def blackened(frame: StereoFrame) -> StereoFrame:

@@ -1,4 +1,5 @@
-"""SLAM along a wall of equal panels: frames that are missing never cost a whole panel in silence."""
+"""SLAM along a wall of equal panels: frames that are missing never cost a whole panel in
+silence."""
 
 from __future__ import annotations
 
@@ -13,8 +14,11 @@ from topoloc.slam.slam import SlamResult, run_slam
 GONE = range(10, 14)
 
 
-def kept(num: int, gone: Sequence[int] = GONE, jump: float = 0.0) -> tuple[list[float], list[float]]:
-    """Places and times of a walk without some frames, after which the camera is `jump` metres further than it walked."""
+def kept(
+    num: int, gone: Sequence[int] = GONE, jump: float = 0.0
+) -> tuple[list[float], list[float]]:
+    """Places and times of a walk without some frames, after which the camera is `jump` metres
+    further than it walked."""
     rows = [k for k in range(num) if k not in gone]
     return [STEP * k + (jump if k > gone[-1] else 0.0) for k in rows], [0.1 * k for k in rows]
 
@@ -26,7 +30,9 @@ def along_the_wall(sequence: FrameList, result: SlamResult) -> np.ndarray:
     errors = []
     for true, pose in zip(sequence.poses, result.poses[0], strict=True):
         assert true is not None
-        errors.append(np.nan if pose is None else (first @ pose).translation[0] - true.translation[0])
+        errors.append(
+            np.nan if pose is None else (first @ pose).translation[0] - true.translation[0]
+        )
     return np.array(errors)
 
 
@@ -46,7 +52,8 @@ def test_eight_frames_lost_are_bridged_although_another_panel_is_nearer():
 
 
 def test_what_the_motion_cannot_decide_is_a_submap_of_its_own():
-    """Half a panel further than expected, one panel is as likely as the other: none of them is claimed."""
+    """Half a panel further than expected, one panel is as likely as the other: none of them is
+    claimed."""
     walked = walk_along(*kept(20, jump=0.5 * PERIOD))
     result = run_slam(walked)
     assert (result.num_submaps, result.num_joined) == (2, 1)
@@ -57,10 +64,13 @@ def test_what_the_motion_cannot_decide_is_a_submap_of_its_own():
 
 
 def test_a_submap_is_joined_by_what_is_unique_and_by_no_panel():
-    """There and back: the gap was too long for the motion, and a board before it is seen again on the way back."""
+    """There and back: the gap was too long for the motion, and a board before it is seen again on
+    the way back."""
     there, times = kept(24, jump=0.5)
     back = list(np.arange(there[-1] - STEP, 0.3, -STEP))
-    walked = walk_along([*there, *back], [*times, *(times[-1] + 0.1 * np.arange(1, len(back) + 1))], boards=(0.6,))
+    walked = walk_along(
+        [*there, *back], [*times, *(times[-1] + 0.1 * np.arange(1, len(back) + 1))], boards=(0.6,)
+    )
     result = run_slam(walked)
     assert result.num_submaps == result.num_joined == 2
     assert result.num_loops > 0
@@ -76,7 +86,8 @@ def test_who_turns_back_before_the_wall_is_not_taken_for_lost():
 
 
 def test_where_boards_hang_on_the_panels_a_jump_is_followed():
-    """What does not repeat itself needs no motion to be told apart; between the boards the wall still repeats itself."""
+    """What does not repeat itself needs no motion to be told apart; between the boards the wall
+    still repeats itself."""
     walked = walk_along(*kept(18, jump=0.5), boards=tuple(np.arange(-2.0, 5.0, 0.65)))
     result = run_slam(walked)
     assert result.num_submaps == 1

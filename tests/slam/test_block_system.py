@@ -43,18 +43,29 @@ def test_the_solution_is_that_of_a_dense_matrix(pairs: list[tuple[int, int]]):
     num = 12
     dense, pattern = dense_of(num, pairs), BlockPattern.of(num, pairs)
     rights = np.random.default_rng(1).normal(size=(2, num, 6))
-    solved = solve_blocks(pattern, blocks_of(dense, pattern, pairs), rights[:, np.argsort(pattern.ranks)])[:, pattern.ranks]
+    solved = solve_blocks(
+        pattern, blocks_of(dense, pattern, pairs), rights[:, np.argsort(pattern.ranks)]
+    )[:, pattern.ranks]
     expected = np.linalg.solve(dense, rights.reshape(2, -1).T).T.reshape(2, num, 6)
     np.testing.assert_allclose(solved, expected, rtol=1e-8, atol=1e-10)
 
 
 def test_a_walk_of_several_laps_has_a_factor_that_grows_with_its_length():
-    """Each pose is tied to the six before it, and on every later lap to those that stood there before."""
+    """Each pose is tied to the six before it, and on every later lap to those that stood there
+    before."""
 
     def laps(length: int, num_laps: int) -> list[tuple[int, int]]:
         num = length * num_laps
-        return [(i, i - back) for i in range(num) for back in (*range(1, 7), *range(length - 2, length + 3)) if back <= i]
+        return [
+            (i, i - back)
+            for i in range(num)
+            for back in (*range(1, 7), *range(length - 2, length + 3))
+            if back <= i
+        ]
 
-    short, long = (len(BlockPattern.of(3 * length, laps(length, 3)).rows) / (3 * length) for length in (100, 400))
+    short, long = (
+        len(BlockPattern.of(3 * length, laps(length, 3)).rows) / (3 * length)
+        for length in (100, 400)
+    )
     assert long < 1.5 * short
     assert long < 60

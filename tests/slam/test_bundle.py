@@ -14,18 +14,29 @@ STEREO = StereoCamera(Camera.pinhole(640, 400, 380.0, 380.0, 319.5, 199.5), 45.0
 NOISE_PX = 0.2
 
 
-def world(num: int = 5, bias_px: float = 0.0) -> tuple[list[KeyFrame], Landmarks, list[Rigid3], np.ndarray]:
-    """Key frames going sideways and ahead past a cloud of points, all seen by all; their poses and points are wrong at first."""
+def world(
+    num: int = 5, bias_px: float = 0.0
+) -> tuple[list[KeyFrame], Landmarks, list[Rigid3], np.ndarray]:
+    """Key frames going sideways and ahead past a cloud of points, all seen by all; their poses and
+    points are wrong at first."""
     rng = np.random.default_rng(4)
-    points = np.column_stack([rng.uniform(-3, 4, 150), rng.uniform(-1.5, 1.5, 150), rng.uniform(3, 12, 150)])
+    points = np.column_stack(
+        [rng.uniform(-3, 4, 150), rng.uniform(-1.5, 1.5, 150), rng.uniform(3, 12, 150)]
+    )
     landmarks = Landmarks()
     ids = landmarks.add(points + rng.normal(0, 0.1, points.shape))
     bias = DisparityBias(0.0, 1.0) if bias_px else DisparityBias()
     keyframes, poses = [], []
     for k in range(num):
         pose = Rigid3.exp(np.array([-0.3 * k, 0.02 * k, -0.2 * k, 0.01 * k, 0.03 * k, 0.0]))
-        measured = STEREO.project(pose.apply(points)) + rng.normal(0, NOISE_PX, (len(points), 3)) + [0.0, 0.0, bias_px]
-        seen = Observations(ids, measured, np.full((len(points), 3), 1.0 / NOISE_PX), np.ones(len(points), np.bool_))
+        measured = (
+            STEREO.project(pose.apply(points))
+            + rng.normal(0, NOISE_PX, (len(points), 3))
+            + [0.0, 0.0, bias_px]
+        )
+        seen = Observations(
+            ids, measured, np.full((len(points), 3), 1.0 / NOISE_PX), np.ones(len(points), np.bool_)
+        )
         wrong = Rigid3.exp(rng.normal(0, 0.02, 6)) @ pose if k else pose
         keyframes.append(KeyFrame(0, k, 100_000_000 * k, 0, STEREO, wrong, seen, bias))
         poses.append(pose)
@@ -33,7 +44,12 @@ def world(num: int = 5, bias_px: float = 0.0) -> tuple[list[KeyFrame], Landmarks
 
 
 def pose_errors(keyframes: list[KeyFrame], poses: list[Rigid3]) -> np.ndarray:
-    return np.array([np.linalg.norm((k.cam_from_world @ pose.inverse()).log()) for k, pose in zip(keyframes, poses, strict=True)])
+    return np.array(
+        [
+            np.linalg.norm((k.cam_from_world @ pose.inverse()).log())
+            for k, pose in zip(keyframes, poses, strict=True)
+        ]
+    )
 
 
 def test_wrong_poses_and_points_are_put_right_and_the_first_stays():
@@ -83,23 +99,44 @@ def test_unknown_disparities_do_no_harm():
 
 
 def walk_around(num: int, num_new: int) -> tuple[list[KeyFrame], Landmarks, list[Rigid3]]:
-    """Twice around a ring; each key frame sees what lies before it and the two before it. The poses drift at first."""
+    """Twice around a ring; each key frame sees what lies before it and the two before it. The poses
+    drift at first."""
     rng = np.random.default_rng(7)
     step = Rigid3.exp(np.array([0.0, 0.0, -0.3, 0.0, 4.0 * np.pi / num, 0.0]))
     poses = [Rigid3.exp(np.zeros(6))]
     while len(poses) < num:
         poses.append(step @ poses[-1])
     lap = num // 2
-    ahead = np.stack([rng.uniform(-2, 2, (lap, num_new)), rng.uniform(-1, 1, (lap, num_new)), rng.uniform(3, 6, (lap, num_new))], -1)
-    points = np.array([pose.inverse().apply(group) for pose, group in zip(poses[:lap], ahead, strict=True)])
+    ahead = np.stack(
+        [
+            rng.uniform(-2, 2, (lap, num_new)),
+            rng.uniform(-1, 1, (lap, num_new)),
+            rng.uniform(3, 6, (lap, num_new)),
+        ],
+        -1,
+    )
+    points = np.array(
+        [pose.inverse().apply(group) for pose, group in zip(poses[:lap], ahead, strict=True)]
+    )
     landmarks, keyframes, drift = Landmarks(), [], Rigid3.identity()
-    ids = landmarks.add((points + rng.normal(0, 0.02, points.shape)).reshape(-1, 3)).reshape(lap, num_new)
+    ids = landmarks.add((points + rng.normal(0, 0.02, points.shape)).reshape(-1, 3)).reshape(
+        lap, num_new
+    )
     for k, pose in enumerate(poses):
         groups = [(k - back) % lap for back in range(3) if k >= back]
-        measured = STEREO.project(pose.apply(points[groups].reshape(-1, 3))) + rng.normal(0, NOISE_PX, (len(groups) * num_new, 3))
-        seen = Observations(ids[groups].ravel(), measured, np.full(measured.shape, 1.0 / NOISE_PX), np.ones(len(measured), np.bool_))
+        measured = STEREO.project(pose.apply(points[groups].reshape(-1, 3))) + rng.normal(
+            0, NOISE_PX, (len(groups) * num_new, 3)
+        )
+        seen = Observations(
+            ids[groups].ravel(),
+            measured,
+            np.full(measured.shape, 1.0 / NOISE_PX),
+            np.ones(len(measured), np.bool_),
+        )
         drift = Rigid3.exp(rng.normal(0, 0.002, 6)) @ drift if k else drift
-        keyframes.append(KeyFrame(0, k, 100_000_000 * k, 0, STEREO, drift @ pose, seen, DisparityBias(0.0, 1.0)))
+        keyframes.append(
+            KeyFrame(0, k, 100_000_000 * k, 0, STEREO, drift @ pose, seen, DisparityBias(0.0, 1.0))
+        )
     return keyframes, landmarks, poses
 
 
@@ -113,7 +150,9 @@ def test_part_by_part_is_the_same_as_all_at_once():
         np.testing.assert_allclose(a.cam_from_world.matrix(), b.cam_from_world.matrix(), atol=1e-9)
         np.testing.assert_array_equal(a.observations.active, b.observations.active)
         assert not a.observations.active[0]
-    np.testing.assert_allclose(whole[1].positions[: whole[1].num], parts[1].positions[: parts[1].num], atol=1e-7)
+    np.testing.assert_allclose(
+        whole[1].positions[: whole[1].num], parts[1].positions[: parts[1].num], atol=1e-7
+    )
 
 
 @pytest.mark.slow
@@ -145,4 +184,6 @@ def test_what_a_long_walk_remembers_is_kept_small():
     for _ in range(200):
         landmarks.add(points)
     assert len(landmarks.positions) <= 1.25 * landmarks.num + len(points)
-    np.testing.assert_array_equal(landmarks.positions[landmarks.num - len(points) : landmarks.num], points)
+    np.testing.assert_array_equal(
+        landmarks.positions[landmarks.num - len(points) : landmarks.num], points
+    )

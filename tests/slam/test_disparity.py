@@ -40,8 +40,12 @@ def test_a_guess_that_is_far_off_finds_nothing_right():
 def test_depth_answers_as_a_stereo_pair_would():
     measured = measured_view(depth_frame(2.0))
     corners = find_corners(measured.view.grey, np.zeros((0, 2)), TrackingConfig())
-    disparities, sigmas = measure_disparities(measured, corners, np.full(len(corners), np.nan), DisparityConfig())
+    disparities, sigmas = measure_disparities(
+        measured, corners, np.full(len(corners), np.nan), DisparityConfig()
+    )
     known = np.isfinite(disparities)
     assert known.mean() > 0.5
-    np.testing.assert_allclose((measured.stereo.bf / disparities)[known], true_depths(corners)[known], rtol=0.03)
+    np.testing.assert_allclose(
+        (measured.stereo.bf / disparities)[known], true_depths(corners)[known], rtol=0.03
+    )
     assert (sigmas[known] > 0.0).all()

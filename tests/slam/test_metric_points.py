@@ -14,7 +14,12 @@ from topoloc.features.features import Features
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.frame_view import FrameView
-from topoloc.slam.metric_points import MetricPoints, MetricPointsConfig, keypoint_sigmas, locate_points
+from topoloc.slam.metric_points import (
+    MetricPoints,
+    MetricPointsConfig,
+    keypoint_sigmas,
+    locate_points,
+)
 
 CONFIG = MetricPointsConfig()
 
@@ -23,7 +28,10 @@ CONFIG = MetricPointsConfig()
 def room_view() -> tuple[FrameView, np.ndarray]:
     """Left and right picture of the room, and the exact depth."""
     panels, pose = tiny_world.room(), tiny_world.path_pose(4)
-    (left, depth), (right, _) = (tiny_world.render(panels, p, noise_seed=k) for k, p in enumerate((pose, tiny_world.right_pose(pose))))
+    (left, depth), (right, _) = (
+        tiny_world.render(panels, p, noise_seed=k)
+        for k, p in enumerate((pose, tiny_world.right_pose(pose)))
+    )
     rig = StereoRig.rectified(tiny_world.CAMERA, tiny_world.BASELINE)
     return FrameView(left, left, tiny_world.CAMERA, Rigid3.identity(), right, rig), depth
 
@@ -63,13 +71,17 @@ def test_depth_points_lie_where_they_are_seen(room_view: tuple[FrameView, np.nda
     assert np.quantile(np.abs(errors), 0.95) < 2.0
 
 
-def test_covariances_are_positive_definite_and_largest_along_the_ray(room_view: tuple[FrameView, np.ndarray]):
+def test_covariances_are_positive_definite_and_largest_along_the_ray(
+    room_view: tuple[FrameView, np.ndarray],
+):
     view, _ = room_view
     located = locate_points(extract_features(view.grey, FeatureConfig()), view, CONFIG)
     values, vectors = np.linalg.eigh(located.covariances[located.valid])
     assert (values > 0).all()
     rays = located.points_cam[located.valid]
-    along = np.abs(np.einsum("ni,ni->n", vectors[:, :, 2], rays / np.linalg.norm(rays, axis=1, keepdims=True)))
+    along = np.abs(
+        np.einsum("ni,ni->n", vectors[:, :, 2], rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    )
     assert np.median(along) > 0.99
 
 
@@ -80,21 +92,40 @@ def test_uncertain_depth_is_dropped(room_view: tuple[FrameView, np.ndarray]):
     strict = locate_points(features, view, replace(CONFIG, max_relative_sigma=0.015))
     loose = locate_points(features, view, CONFIG)
     assert 0 < strict.valid.sum() < loose.valid.sum()
-    assert np.sqrt(strict.covariances[strict.valid, 2, 2]).max() < 0.015 * strict.points_cam[strict.valid, 2].max()
+    assert (
+        np.sqrt(strict.covariances[strict.valid, 2, 2]).max()
+        < 0.015 * strict.points_cam[strict.valid, 2].max()
+    )
     assert np.isnan(strict.points_cam[~strict.valid]).all()
 
 
 def points_at(points_img: list[tuple[float, float]]) -> Features:
     n = len(points_img)
     same = np.full(n, 20.0, np.float32)
-    return Features(np.array(points_img, np.float32).reshape(n, 2), same, 0 * same, same, np.ones((n, 64), np.float32))
+    return Features(
+        np.array(points_img, np.float32).reshape(n, 2),
+        same,
+        0 * same,
+        same,
+        np.ones((n, 64), np.float32),
+    )
 
 
 def test_depth_beside_a_jump_or_unknown_is_dropped(room_view: tuple[FrameView, np.ndarray]):
     depth = np.full((240, 320), 2.0)
     depth[:, 160:] = 3.0
     depth[100:140, 40:80] = np.nan
-    features = points_at([(100.2, 50.7), (158.6, 50.0), (161.0, 50.0), (200.0, 50.0), (60.0, 120.0), (0.0, 0.0), (319.0, 239.0)])
+    features = points_at(
+        [
+            (100.2, 50.7),
+            (158.6, 50.0),
+            (161.0, 50.0),
+            (200.0, 50.0),
+            (60.0, 120.0),
+            (0.0, 0.0),
+            (319.0, 239.0),
+        ]
+    )
     located = locate_points(features, depth_view(room_view[0], depth), CONFIG)
     assert located.valid.tolist() == [True, False, False, True, False, True, True]
     assert located.points_cam[0, 2] == pytest.approx(2.0)

@@ -34,7 +34,9 @@ def predicted(history: MotionHistory, frames: float) -> Prediction:
 def test_a_steady_walk_goes_on():
     history = walked([0.1 * k for k in range(10)])
     for frames in (1, 5):
-        assert -predicted(history, frames).cam_from_world.translation[0] == pytest.approx(0.9 + 0.1 * frames)
+        assert -predicted(history, frames).cam_from_world.translation[0] == pytest.approx(
+            0.9 + 0.1 * frames
+        )
     assert not predicted(history, 1).is_gap
     assert predicted(history, 5).is_gap
     assert predicted(history, 5).sigma == pytest.approx(CONFIG.way_share * 0.5, rel=0.01)
@@ -49,7 +51,8 @@ def test_an_unsteady_walk_is_trusted_less_and_less_as_time_goes():
 
 
 def test_sigma_covers_what_acceleration_does():
-    """Walks whose acceleration is noise: how far they are from the prediction four frames later, in sigma."""
+    """Walks whose acceleration is noise: how far they are from the prediction four frames later, in
+    sigma."""
     rng = np.random.default_rng(0)
     distances = []
     for _ in range(200):

@@ -17,7 +17,10 @@ from topoloc.slam.measured_steps import MeasuredStep, MeasuredStepsConfig, measu
 from topoloc.slam.pose_checks import check_gaps, check_poses, judge_poses
 
 BODY_FROM_CAM = Rigid3(exp_so3(np.array([1.2, -1.1, 0.7])), np.array([0.3, -0.1, 0.5]))
-FLIP, FLU = np.diag([1.0, -1.0, -1.0]), np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+FLIP, FLU = (
+    np.diag([1.0, -1.0, -1.0]),
+    np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
+)
 
 
 def w_first(pose: Rigid3) -> Rigid3:
@@ -29,7 +32,10 @@ def w_first(pose: Rigid3) -> Rigid3:
 WRONG: dict[str, tuple[Callable[[Rigid3], Rigid3], tuple[str, ...]]] = {
     "inverse": (Rigid3.inverse, ("inverse",)),
     "opengl": (lambda pose: Rigid3(pose.rotation @ FLIP, pose.translation), ("opengl",)),
-    "inverse opengl": (lambda pose: Rigid3(pose.rotation @ FLIP, pose.translation).inverse(), ("inverse", "opengl")),
+    "inverse opengl": (
+        lambda pose: Rigid3(pose.rotation @ FLIP, pose.translation).inverse(),
+        ("inverse", "opengl"),
+    ),
     "wxyz": (w_first, ("wxyz",)),
     "transposed": (lambda pose: Rigid3(pose.rotation.T.copy(), pose.translation), ("transposed",)),
     "flu": (lambda pose: Rigid3(pose.rotation @ FLU.T, pose.translation), ("flu",)),
@@ -41,7 +47,9 @@ def walk(num_frames: int) -> list[Rigid3]:
     """A camera carried by hand: it goes on, sways, and looks around."""
     k = np.arange(num_frames)
     ways = np.column_stack([np.sin(0.13 * k), 0.1 * np.sin(0.31 * k), 0.08 * k])
-    turns = np.column_stack([0.15 * np.sin(0.23 * k), 0.5 * np.sin(0.09 * k + 1.0), 0.1 * np.cos(0.17 * k)])
+    turns = np.column_stack(
+        [0.15 * np.sin(0.23 * k), 0.5 * np.sin(0.09 * k + 1.0), 0.1 * np.cos(0.17 * k)]
+    )
     world = Rigid3(exp_so3(np.array([0.3, -0.5, 0.9])), np.array([3.0, 2.0, 1.0]))
     return [world @ Rigid3(exp_so3(turn), way) for turn, way in zip(turns, ways, strict=True)]
 
@@ -50,11 +58,14 @@ POSES, T_NS = walk(120), [100_000_000 * k for k in range(120)]
 
 
 def steps_of(poses: list[Rigid3], seed: int) -> list[MeasuredStep]:
-    """Steps as pictures would give them: a few millimetres and a fifth of a degree off, one of them wrong."""
+    """Steps as pictures would give them: a few millimetres and a fifth of a degree off, one of them
+    wrong."""
     rng, steps = np.random.default_rng(seed), []
     for first in range(0, 105, 7):
         noise = Rigid3(exp_so3(rng.normal(0.0, 0.003, 3)), rng.normal(0.0, 0.005, 3))
-        steps.append(MeasuredStep(first, first + 10, poses[first].inverse() @ poses[first + 10] @ noise, 3.0))
+        steps.append(
+            MeasuredStep(first, first + 10, poses[first].inverse() @ poses[first + 10] @ noise, 3.0)
+        )
     return [*steps[:-1], replace(steps[-1], first_from_last=Rigid3.exp(np.full(6, 0.5)))]
 
 
@@ -76,8 +87,14 @@ def test_a_wrong_convention_is_named(name: str):
 def without_metres(steps: list[MeasuredStep]) -> list[MeasuredStep]:
     """The same steps as a single camera gives them."""
     ways = [step.first_from_last.translation for step in steps]
-    units = [Rigid3(step.first_from_last.rotation, way / np.linalg.norm(way)) for step, way in zip(steps, ways, strict=True)]
-    return [replace(step, first_from_last=unit, median_depth=0.0, has_scale=False) for step, unit in zip(steps, units, strict=True)]
+    units = [
+        Rigid3(step.first_from_last.rotation, way / np.linalg.norm(way))
+        for step, way in zip(steps, ways, strict=True)
+    ]
+    return [
+        replace(step, first_from_last=unit, median_depth=0.0, has_scale=False)
+        for step, unit in zip(steps, units, strict=True)
+    ]
 
 
 @pytest.mark.parametrize("name", WRONG)
@@ -96,7 +113,9 @@ def test_of_a_single_camera_poses_that_do_not_move_are_not_believed():
 
 
 def test_the_mounting_on_a_body_is_found():
-    verdict = judge_poses(steps_of(POSES, 0), [pose @ BODY_FROM_CAM.inverse() for pose in POSES], T_NS)
+    verdict = judge_poses(
+        steps_of(POSES, 0), [pose @ BODY_FROM_CAM.inverse() for pose in POSES], T_NS
+    )
     (convention,) = verdict.conventions
     mended = PoseReading.of(convention).mend(Rigid3.identity())
     assert np.linalg.norm(mended.translation - BODY_FROM_CAM.translation) < 0.05
@@ -111,7 +130,9 @@ def test_a_shifted_clock_is_found():
 
 def test_poses_of_another_place_are_not_explained():
     rng = np.random.default_rng(1)
-    verdict = judge_poses(steps_of(POSES, 0), [Rigid3.exp(rng.normal(0.0, 1.0, 6)) for _ in POSES], T_NS)
+    verdict = judge_poses(
+        steps_of(POSES, 0), [Rigid3.exp(rng.normal(0.0, 1.0, 6)) for _ in POSES], T_NS
+    )
     assert not verdict.is_believed
     assert verdict.conventions == ()
 

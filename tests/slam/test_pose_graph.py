@@ -28,7 +28,12 @@ def loop(true: list[Rigid3], first: int, second: int) -> Edge:
 
 
 def errors(poses: list[Rigid3], true: list[Rigid3]) -> np.ndarray:
-    return np.array([np.linalg.norm(p.inverse().translation - t.inverse().translation) for p, t in zip(poses, true, strict=True)])
+    return np.array(
+        [
+            np.linalg.norm(p.inverse().translation - t.inverse().translation)
+            for p, t in zip(poses, true, strict=True)
+        ]
+    )
 
 
 def test_a_loop_takes_most_of_the_drift_away():

@@ -1,4 +1,5 @@
-"""Odometry of a single camera: the motion is found in a unit of its own, and a camera that only turns has none."""
+"""Odometry of a single camera: the motion is found in a unit of its own, and a camera that only
+turns has none."""
 
 from __future__ import annotations
 
@@ -26,13 +27,20 @@ def test_the_motion_is_found_but_for_its_unit():
     assert list(stretch) == list(range(len(truth)))
     own_from_world = stretch[0] @ truth[0].inverse()
     own = np.array([stretch[k].translation - stretch[0].translation for k in stretch])
-    true = np.array([(pose.translation - truth[0].translation) @ own_from_world.rotation.T for pose in truth])
+    true = np.array(
+        [(pose.translation - truth[0].translation) @ own_from_world.rotation.T for pose in truth]
+    )
     unit = np.sum(own * true) / np.sum(own * own)
     assert np.linalg.norm(unit * own - true, axis=1).max() < 0.02
-    assert max((stretch[k].inverse() @ own_from_world @ truth[k]).angle() for k in stretch) < np.deg2rad(0.5)
+    assert max(
+        (stretch[k].inverse() @ own_from_world @ truth[k]).angle() for k in stretch
+    ) < np.deg2rad(0.5)
 
 
 def test_a_camera_that_only_turns_has_no_odometry():
     here = path_pose(4.0)
-    turns = [Rigid3(here.rotation @ exp_so3(np.array([0.0, 0.03 * number, 0.0])), here.translation) for number in range(10)]
+    turns = [
+        Rigid3(here.rotation @ exp_so3(np.array([0.0, 0.03 * number, 0.0])), here.translation)
+        for number in range(10)
+    ]
     assert _stretches(turns) == []

@@ -1,4 +1,5 @@
-"""SLAM as a whole, on a rendered room with exact truth and on short pieces of real recordings, in good light and in bad."""
+"""SLAM as a whole, on a rendered room with exact truth and on short pieces of real recordings, in
+good light and in bad."""
 
 from __future__ import annotations
 
@@ -27,7 +28,11 @@ def walked() -> SlamResult:
 
 
 def errors(sequence: StereoSequence, poses: list[Rigid3 | None]) -> np.ndarray:
-    both = [(true, pose) for true, pose in zip(sequence.poses, poses, strict=True) if true is not None and pose is not None]
+    both = [
+        (true, pose)
+        for true, pose in zip(sequence.poses, poses, strict=True)
+        if true is not None and pose is not None
+    ]
     return absolute_trajectory_errors([true for true, _ in both], [pose for _, pose in both])
 
 
@@ -51,16 +56,23 @@ def test_twice_the_same_recording_is_twice_the_same_trajectory(walked: SlamResul
 
 
 def test_depth_images_do_as_well():
-    sequence = FrameList([replace(depth_frame(float(p)), t_ns=i * 100_000_000) for i, p in enumerate(PLACES[:12])])
+    sequence = FrameList(
+        [replace(depth_frame(float(p)), t_ns=i * 100_000_000) for i, p in enumerate(PLACES[:12])]
+    )
     result = run_slam(sequence)
     assert result.num_lost == 0
     assert errors(sequence, result.poses[0]).max() < 0.01
 
 
 def test_a_wrong_angle_between_the_cameras_is_found_by_moving():
-    """All disparities are one pixel too large; without the bias everything would be near by a share that grows with depth."""
+    """All disparities are one pixel too large; without the bias everything would be near by a share
+    that grows with depth."""
     sequence = walk(PLACES)
-    shifted = [replace(f, right=np.roll(f.right, -1, axis=1)) for f in sequence.frames if f.right is not None]
+    shifted = [
+        replace(f, right=np.roll(f.right, -1, axis=1))
+        for f in sequence.frames
+        if f.right is not None
+    ]
     result = run_slam(FrameList(shifted))
     assert result.disparity_bias_px[0] == pytest.approx(1.0, abs=0.3)
     assert errors(sequence, result.poses[0]).max() < 0.03
@@ -131,7 +143,9 @@ def test_a_camera_that_stands_still_makes_one_keyframe():
 
 def test_left_and_right_swapped_are_noticed():
     sequence = walk(PLACES[:3])
-    swapped = [replace(f, image=f.right, right=f.image) for f in sequence.frames if f.right is not None]
+    swapped = [
+        replace(f, image=f.right, right=f.image) for f in sequence.frames if f.right is not None
+    ]
     with pytest.raises(RecordingError, match="room: left and right pictures are swapped"):
         run_slam(FrameList(swapped))
 
@@ -144,7 +158,10 @@ def test_a_baseline_in_millimetres_is_noticed():
 
 def test_pairs_of_different_moments_are_noticed():
     sequence = walk(PLACES)
-    late = [replace(a, right=b.right) for a, b in zip(sequence.frames, sequence.frames[2:], strict=False)]
+    late = [
+        replace(a, right=b.right)
+        for a, b in zip(sequence.frames, sequence.frames[2:], strict=False)
+    ]
     with pytest.raises(RecordingError, match="room: left and right pictures are no pairs"):
         run_slam(FrameList(late))
 

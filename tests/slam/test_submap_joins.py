@@ -1,4 +1,5 @@
-"""Sub-maps joined across a gap by what many weak pairs of pictures say together; and not joined by one thing that hangs in two rooms."""
+"""Sub-maps joined across a gap by what many weak pairs of pictures say together; and not joined by
+one thing that hangs in two rooms."""
 
 from __future__ import annotations
 
@@ -26,20 +27,31 @@ from topoloc.slam.submap_joins import JoinConfig, find_joins, group_submaps
 
 HERE, BEYOND = np.arange(0.0, 4.8, 0.4), np.arange(6.0, 10.8, 0.4)
 GAP_S = 2.0
-AROUND = 0.8  # radians by which the camera has turned in the gap: a strip at the edge is in both parts
+AROUND = (
+    0.8  # radians by which the camera has turned in the gap: a strip at the edge is in both parts
+)
 STRICT = PlaceMatchingConfig(min_inliers=120)  # no single pair of pictures is believed
 
 
-def frames(places: np.ndarray, panels: list[tiny_world.Panel], turn: float = 0.0, start_s: float = 0.0) -> list[StereoFrame]:
+def frames(
+    places: np.ndarray, panels: list[tiny_world.Panel], turn: float = 0.0, start_s: float = 0.0
+) -> list[StereoFrame]:
     """A tenth of a second after each other, the camera turned to the left by `turn` radians."""
     made = []
     for i, place in enumerate(places):
         path = tiny_world.path_pose(float(place))
         pose = Rigid3(exp_so3(np.array([0.0, 0.0, turn])) @ path.rotation, path.translation)
         noise = 10 * round(1000 * start_s) + 2 * i
-        left, right = (tiny_world.render(panels, p, noise_seed=noise + k)[0] for k, p in enumerate((pose, tiny_world.right_pose(pose))))
+        left, right = (
+            tiny_world.render(panels, p, noise_seed=noise + k)[0]
+            for k, p in enumerate((pose, tiny_world.right_pose(pose)))
+        )
         t_ns = round(1e9 * start_s) + i * 100_000_000
-        made.append(StereoFrame(f"{t_ns}.png", t_ns, left, tiny_world.CAMERA, right, RIG, world_from_cam=pose))
+        made.append(
+            StereoFrame(
+                f"{t_ns}.png", t_ns, left, tiny_world.CAMERA, right, RIG, world_from_cam=pose
+            )
+        )
     return made
 
 
@@ -48,7 +60,13 @@ def tracked(*recordings: FrameList) -> tuple[list[KeyFrame], list[FramePose]]:
     keyframes: list[KeyFrame] = []
     landmarks, poses = Landmarks(), []
     for number, recording in enumerate(recordings):
-        odometry = Odometry(number, keyframes, landmarks, InputChecks(recording.name, InputCheckConfig()), OdometryConfig())
+        odometry = Odometry(
+            number,
+            keyframes,
+            landmarks,
+            InputChecks(recording.name, InputCheckConfig()),
+            OdometryConfig(),
+        )
         for i, frame in enumerate(recording.frames):
             poses += odometry.process(i, frame, measured_view(frame))
         poses += odometry.finish()
@@ -57,7 +75,9 @@ def tracked(*recordings: FrameList) -> tuple[list[KeyFrame], list[FramePose]]:
 
 def looking_at(*recordings: StereoSequence):
     def look(keyframe: KeyFrame) -> PlaceView:
-        return place_view(frame_view(recordings[keyframe.recording][keyframe.frame_idx]), PlaceMatchingConfig())
+        return place_view(
+            frame_view(recordings[keyframe.recording][keyframe.frame_idx]), PlaceMatchingConfig()
+        )
 
     return look
 
@@ -65,18 +85,26 @@ def looking_at(*recordings: StereoSequence):
 def test_what_both_sides_of_a_gap_see_at_their_edges_joins_them_and_no_frame_is_lost():
     room = tiny_world.room()
     walked = FrameList([*frames(HERE, room), *frames(BEYOND, room, AROUND, GAP_S)])
-    result = run_slam(walked, SlamConfig(odometry=OdometryConfig(places=STRICT), loops=LoopConfig(matching=STRICT)))
+    result = run_slam(
+        walked,
+        SlamConfig(odometry=OdometryConfig(places=STRICT), loops=LoopConfig(matching=STRICT)),
+    )
     assert (result.num_submaps, result.num_joined, result.num_lost) == (2, 2, 0)
     found = [pose for pose in result.poses[0] if pose is not None]
     assert len(found) == len(walked)
-    assert absolute_trajectory_errors([pose for pose in walked.poses if pose is not None], found).max() < 0.02
+    assert (
+        absolute_trajectory_errors([pose for pose in walked.poses if pose is not None], found).max()
+        < 0.02
+    )
 
 
 @pytest.fixture(scope="module")
 def two_rooms() -> tuple[FrameList, FrameList]:
     """All is another in the second room but one board, which hangs where it hangs in the first."""
     here, there = tiny_world.room(), tiny_world.room(3)
-    return FrameList(frames(HERE, here)), FrameList(frames(HERE + 0.1, [*there[:3], here[3], there[4]], start_s=10.0))
+    return FrameList(frames(HERE, here)), FrameList(
+        frames(HERE + 0.1, [*there[:3], here[3], there[4]], start_s=10.0)
+    )
 
 
 def test_a_board_that_hangs_in_two_rooms_joins_them_not(two_rooms: tuple[FrameList, FrameList]):

@@ -1,4 +1,5 @@
-"""A localizer of a wall of equal panels, a metre apart, without pictures or a map: what it answers is told to it."""
+"""A localizer of a wall of equal panels, a metre apart, without pictures or a map: what it answers
+is told to it."""
 
 from __future__ import annotations
 
@@ -28,8 +29,8 @@ def at(x: float) -> Rigid3:
 
 
 class PanelWall(Localizer):
-    """`xs` are where the next picture may have been taken, the likeliest first; who looks near a pose finds one within
-    half a panel. `probability` is that of a single one."""
+    """`xs` are where the next picture may have been taken, the likeliest first; who looks near a
+    pose finds one within half a panel. `probability` is that of a single one."""
 
     def __init__(self) -> None:
         self.xs: list[float] = []
@@ -37,12 +38,20 @@ class PanelWall(Localizer):
         self.topomap, self.map_id = TopoMetricMap([], [], [], [], {}), ""
 
     def localize_near(
-        self, image: np.ndarray, camera: Camera | RoughCamera, prior: Rigid3 | None, max_ms: float | None = None, trace: Trace | None = None
+        self,
+        image: np.ndarray,
+        camera: Camera | RoughCamera,
+        prior: Rigid3 | None,
+        max_ms: float | None = None,
+        trace: Trace | None = None,
     ) -> tuple[Localization | NotLocalized, list[Answered]]:
         self.num_asked += 1
         xs = self.xs
         if prior is not None:
-            xs = sorted((x for x in xs if abs(x - prior.translation[0]) < 0.5), key=lambda x: abs(x - prior.translation[0]))[:1]
+            xs = sorted(
+                (x for x in xs if abs(x - prior.translation[0]) < 0.5),
+                key=lambda x: abs(x - prior.translation[0]),
+            )[:1]
         if not xs:
             return NotLocalized("not_in_map"), []
         if len(xs) == 1:
@@ -50,7 +59,9 @@ class PanelWall(Localizer):
             return named[0], [named]
         shares = [0.9 * (len(xs) - number) / sum(range(len(xs) + 1)) for number in range(len(xs))]
         alternatives = tuple(Alternative(at(x), p, int(x)) for x, p in zip(xs, shares, strict=True))
-        return NotLocalized("ambiguous", alternatives=alternatives), [_answered(x, p) for x, p in zip(xs, shares, strict=True)]
+        return NotLocalized("ambiguous", alternatives=alternatives), [
+            _answered(x, p) for x, p in zip(xs, shares, strict=True)
+        ]
 
 
 def _answered(x: float, probability: float) -> Answered:
@@ -61,11 +72,16 @@ def _answered(x: float, probability: float) -> Answered:
 def _points(x: float) -> SeenPoints:
     points_cam = np.array([[0.0, 0.0, 0.5], [0.1, 0.0, 0.5], [0.0, 0.1, 0.5], [0.1, 0.1, 0.5]])
     covariances = np.tile(1e-6 * np.eye(3), (4, 1, 1))
-    return SeenPoints(CAMERA.img_from_cam(points_cam).astype(np.float32), points_cam + np.array([x, 0.0, 0.0]), covariances)
+    return SeenPoints(
+        CAMERA.img_from_cam(points_cam).astype(np.float32),
+        points_cam + np.array([x, 0.0, 0.0]),
+        covariances,
+    )
 
 
 class Walk:
-    """A camera that goes along the wall, at x = 0.45 k in picture k; the odometry drifts by a hundredth."""
+    """A camera that goes along the wall, at x = 0.45 k in picture k; the odometry drifts by a
+    hundredth."""
 
     def __init__(self, has_odometry: bool = True) -> None:
         self.wall, self._has_odometry, self._number = PanelWall(), has_odometry, 0

@@ -1,4 +1,5 @@
-"""Streams along a wall of equal panels: alternatives are carried until motion, or something unique, decides between them."""
+"""Streams along a wall of equal panels: alternatives are carried until motion, or something unique,
+decides between them."""
 
 from __future__ import annotations
 
@@ -16,7 +17,13 @@ PANELS = (2.0, -1.0, 0.0, 1.0)
 def is_right(answer: StreamedPose, walk: Walk) -> bool:
     assert isinstance(answer.result, Localization)
     assert answer.smoothed is not None
-    return max(abs(pose.translation[0] - walk.x) for pose in (answer.result.world_from_cam, answer.smoothed)) < 0.1
+    return (
+        max(
+            abs(pose.translation[0] - walk.x)
+            for pose in (answer.result.world_from_cam, answer.smoothed)
+        )
+        < 0.1
+    )
 
 
 @pytest.mark.parametrize("has_odometry", [True, False])
@@ -110,7 +117,12 @@ def test_a_camera_that_was_carried_elsewhere_is_found():
     for _ in range(4):
         walk.see(0.0)
     answers = [walk.see(30.0) for _ in range(4)]
-    assert [answer.state for answer in answers] == ["predicted", "ambiguous", "localized", "localized"]
+    assert [answer.state for answer in answers] == [
+        "predicted",
+        "ambiguous",
+        "localized",
+        "localized",
+    ]
     assert answers[-1].smoothed is not None
     assert abs(answers[-1].smoothed.translation[0] - walk.x - 30.0) < 0.1
 

@@ -1,4 +1,5 @@
-"""Map points followed through the rendered room, where every pixel's depth and every pose is known."""
+"""Map points followed through the rendered room, where every pixel's depth and every pose is
+known."""
 
 from __future__ import annotations
 
@@ -22,7 +23,10 @@ def follower() -> PointFollower:
     corners = find_corners(grey, np.zeros((0, 2)), TrackingConfig())
     z = depth[np.rint(corners[:, 1]).astype(int), np.rint(corners[:, 0]).astype(int)]
     corners, z = corners[np.isfinite(z)], z[np.isfinite(z)]
-    points_cam = np.column_stack([CAMERA.normalized_from_img(corners.astype(np.float64)), np.ones(len(z))]) * z[:, None]
+    points_cam = (
+        np.column_stack([CAMERA.normalized_from_img(corners.astype(np.float64)), np.ones(len(z))])
+        * z[:, None]
+    )
     seen = SeenPoints(corners, pose.apply(points_cam), np.tile(1e-6 * np.eye(3), (len(z), 1, 1)))
     return PointFollower(grey, seen, pose.inverse(), CAMERA, FollowingConfig())
 
@@ -52,4 +56,9 @@ def test_another_picture_has_no_pose(follower: PointFollower):
 def test_points_are_spread_and_too_few_are_none():
     _, grey, pose = room_stream()[0]
     none = SeenPoints(np.zeros((0, 2), np.float32), np.zeros((0, 3)), np.zeros((0, 3, 3)))
-    assert PointFollower(grey, none, pose.inverse(), CAMERA, FollowingConfig()).follow(grey, pose.inverse()) is None
+    assert (
+        PointFollower(grey, none, pose.inverse(), CAMERA, FollowingConfig()).follow(
+            grey, pose.inverse()
+        )
+        is None
+    )

@@ -7,7 +7,14 @@ import pytest
 
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.tracking.motion import MotionConfig, MotionState, predict_motion, start_motion, surprise, update_motion
+from topoloc.tracking.motion import (
+    MotionConfig,
+    MotionState,
+    predict_motion,
+    start_motion,
+    surprise,
+    update_motion,
+)
 
 CONFIG = MotionConfig()
 STEP_NS = 50_000_000
@@ -17,7 +24,9 @@ SIGMA = np.diag(np.repeat([0.003**2, 0.002**2], 3))
 
 def pose_at(seconds: float) -> Rigid3:
     """A camera on an arc, far from the origin of the world."""
-    return Rigid3(exp_so3(np.array([0.3, -1.0, 0.2])), np.array([40.0, -7.0, 2.0])) @ Rigid3.exp(seconds * VELOCITY)
+    return Rigid3(exp_so3(np.array([0.3, -1.0, 0.2])), np.array([40.0, -7.0, 2.0])) @ Rigid3.exp(
+        seconds * VELOCITY
+    )
 
 
 def followed(num: int, noise: bool = False) -> MotionState:
@@ -43,7 +52,12 @@ def test_a_steady_motion_is_predicted():
 def test_a_wrong_velocity_is_forgotten_where_poses_are_exact_and_times_uneven():
     exact = np.diag(np.full(6, 1e-12))
     state = start_motion(0, pose_at(0.0), exact, CONFIG)
-    state = MotionState(0, state.world_from_cam, VELOCITY + np.array([2.0, 0.0, 0.0, 0.0, 0.0, 0.0]), np.diag(np.repeat([1e-12, 1.0], 6)))
+    state = MotionState(
+        0,
+        state.world_from_cam,
+        VELOCITY + np.array([2.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
+        np.diag(np.repeat([1e-12, 1.0], 6)),
+    )
     t_ns = 0
     for number in range(40):
         t_ns += (5 if number % 2 else 10) * STEP_NS
@@ -53,9 +67,15 @@ def test_a_wrong_velocity_is_forgotten_where_poses_are_exact_and_times_uneven():
 
 def test_an_unmeasured_camera_becomes_less_certain_and_stays_after_a_second():
     state = followed(20)
-    sigmas = [np.sqrt(np.trace(predict_motion(state, state.t_ns + k * STEP_NS, CONFIG).pose_covariance)) for k in range(1, 60)]
+    sigmas = [
+        np.sqrt(np.trace(predict_motion(state, state.t_ns + k * STEP_NS, CONFIG).pose_covariance))
+        for k in range(1, 60)
+    ]
     assert np.all(np.diff(sigmas) > 0)
-    one, three = (predict_motion(state, state.t_ns + seconds * 1_000_000_000, CONFIG).world_from_cam for seconds in (1, 3))
+    one, three = (
+        predict_motion(state, state.t_ns + seconds * 1_000_000_000, CONFIG).world_from_cam
+        for seconds in (1, 3)
+    )
     assert translation_error(one, three) < 1e-9
 
 
@@ -70,7 +90,9 @@ def test_surprise_tells_noise_from_a_jump_whatever_the_origin():
 
 def test_a_camera_seen_once_may_be_on_a_car():
     state = predict_motion(start_motion(0, pose_at(0.0), SIGMA, CONFIG), STEP_NS * 2, CONFIG)
-    assert surprise(state, pose_at(0.0) @ Rigid3(np.eye(3), np.array([0.0, 0.0, 2.0])), SIGMA) < 33.0
+    assert (
+        surprise(state, pose_at(0.0) @ Rigid3(np.eye(3), np.array([0.0, 0.0, 2.0])), SIGMA) < 33.0
+    )
 
 
 def test_noise_is_averaged():
@@ -97,4 +119,8 @@ def test_odometry_replaces_the_velocity(share: float):
     assert translation_error(predicted.world_from_cam, pose_at(2.0)) < 1e-9
     np.testing.assert_allclose(predicted.velocity, VELOCITY, atol=1e-9)
     sigma = np.sqrt(predicted.pose_covariance[2, 2])
-    assert share * np.linalg.norm(motion.translation) < sigma < 3 * share * np.linalg.norm(motion.translation)
+    assert (
+        share * np.linalg.norm(motion.translation)
+        < sigma
+        < 3 * share * np.linalg.norm(motion.translation)
+    )

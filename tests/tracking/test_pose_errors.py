@@ -1,4 +1,5 @@
-"""What a pose is wrong by: the part that another picture does not share, and the part that lasts."""
+"""What a pose is wrong by: the part that another picture does not share, and the part that
+lasts."""
 
 from __future__ import annotations
 
@@ -15,7 +16,16 @@ IN_CAMERA = np.diag([1e-4, 2e-4, 4e-4, 1e-5, 2e-5, 3e-5])
 
 def found(noise_share: float) -> Localization:
     adjoint = WORLD_FROM_CAM.adjoint()
-    return Localization(WORLD_FROM_CAM, adjoint @ IN_CAMERA @ adjoint.T, 0.9, 0, [], 100, 80, noise_share=noise_share)
+    return Localization(
+        WORLD_FROM_CAM,
+        adjoint @ IN_CAMERA @ adjoint.T,
+        0.9,
+        0,
+        [],
+        100,
+        80,
+        noise_share=noise_share,
+    )
 
 
 @pytest.mark.parametrize("noise_share", [1.0, 0.25, 0.002])
@@ -26,7 +36,9 @@ def test_the_parts_make_the_whole(noise_share: float):
 
 
 def test_noise_has_a_floor_that_grows_with_the_depth():
-    near, far = (np.sqrt(np.diag(errors_of(found(1e-9), depth, 0.002).noise)) for depth in (2.0, 20.0))
+    near, far = (
+        np.sqrt(np.diag(errors_of(found(1e-9), depth, 0.002).noise)) for depth in (2.0, 20.0)
+    )
     np.testing.assert_allclose(near, np.repeat([0.004, 0.002], 3), rtol=1e-2)
     np.testing.assert_allclose(far, np.repeat([0.04, 0.002], 3), rtol=1e-2)
 
@@ -38,4 +50,6 @@ def test_what_lasts_changes_with_the_view():
     np.testing.assert_allclose(lasting_change(errors, step, 2.0), 0.01 * errors.lasting, rtol=1e-2)
     np.testing.assert_allclose(lasting_change(errors, far, 2.0), 2.0 * errors.lasting, rtol=1e-6)
     turned = Rigid3(exp_so3(np.array([0.0, 0.01, 0.0])), np.zeros(3))
-    np.testing.assert_allclose(lasting_change(errors, turned, 2.0), lasting_change(errors, step, 2.0), rtol=1e-6)
+    np.testing.assert_allclose(
+        lasting_change(errors, turned, 2.0), lasting_change(errors, step, 2.0), rtol=1e-6
+    )

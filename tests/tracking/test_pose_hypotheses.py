@@ -20,10 +20,14 @@ def at(x: float, z: float = 0.0) -> Rigid3:
 
 def one_of(*poses: Rigid3, sum_: float = 0.98) -> list[Candidate]:
     """Candidates that are equally probable."""
-    return [Candidate(pose, SIGMA, sum_ / len(poses), node_id) for node_id, pose in enumerate(poses)]
+    return [
+        Candidate(pose, SIGMA, sum_ / len(poses), node_id) for node_id, pose in enumerate(poses)
+    ]
 
 
-def seen(hypotheses: PoseHypotheses, t_ns: int, *poses: Rigid3, odom_from_cam: Rigid3 | None = None) -> None:
+def seen(
+    hypotheses: PoseHypotheses, t_ns: int, *poses: Rigid3, odom_from_cam: Rigid3 | None = None
+) -> None:
     """A picture that may have been taken at any of these poses."""
     hypotheses.predict(t_ns, odom_from_cam)
     hypotheses.weigh(t_ns, one_of(*poses), odom_from_cam)
@@ -56,7 +60,9 @@ def test_nothing_is_predicted_before_the_first_pose_nor_long_after_the_last():
 
 
 @pytest.mark.parametrize(("share_new", "is_decided"), [(1.0, True), (0.05, False)])
-def test_a_pose_that_is_not_sure_is_believed_once_another_picture_says_so(share_new: float, is_decided: bool):
+def test_a_pose_that_is_not_sure_is_believed_once_another_picture_says_so(
+    share_new: float, is_decided: bool
+):
     hypotheses = PoseHypotheses(HypothesesConfig())
     hypotheses.weigh(0, one_of(at(0.0), sum_=0.8))
     assert not hypotheses.is_decided
@@ -95,7 +101,9 @@ def test_a_jump_is_believed_when_the_next_poses_agree_with_it():
     assert followed == [True, False, True]
     assert hypotheses.best is not None
     assert translation_error(hypotheses.best.world_from_cam, at(1.3, z=6.0)) < 0.02
-    assert abs(hypotheses.best.velocity[0] - 1.0) < 0.3, "what the rival has learnt of the velocity is kept"
+    assert abs(hypotheses.best.velocity[0] - 1.0) < 0.3, (
+        "what the rival has learnt of the velocity is kept"
+    )
 
 
 def test_wild_poses_that_do_not_agree_are_never_believed():
@@ -120,7 +128,10 @@ def test_the_motion_decides_between_alternatives_however_improbable_the_right_on
     for k in range(1, 5):
         x = 1.0 + 0.1 * k
         hypotheses.predict(SECOND + k * STEP_NS)
-        hypotheses.weigh(SECOND + k * STEP_NS, [Candidate(at(x + off), SIGMA, share, 0) for off, share in shares.items()])
+        hypotheses.weigh(
+            SECOND + k * STEP_NS,
+            [Candidate(at(x + off), SIGMA, share, 0) for off, share in shares.items()],
+        )
         assert hypotheses.is_decided
         assert hypotheses.taken == 1
         assert best_x(hypotheses) == pytest.approx(x, abs=0.02)
@@ -137,11 +148,18 @@ def test_answers_that_miss_the_true_pose_begin_a_doubt_and_no_more():
 def test_equal_panels_stay_ambiguous_until_something_unique_is_seen():
     hypotheses = PoseHypotheses(HypothesesConfig())
     for k in range(8):
-        seen(hypotheses, k * STEP_NS, *(at(0.1 * k + panel) for panel in range(4)), odom_from_cam=at(0.1 * k))
+        seen(
+            hypotheses,
+            k * STEP_NS,
+            *(at(0.1 * k + panel) for panel in range(4)),
+            odom_from_cam=at(0.1 * k),
+        )
         assert not hypotheses.is_decided
         alternatives = hypotheses.alternatives()
         assert len(alternatives) == 4
-        assert sorted(round(float(one.world_from_cam.translation[0] - 0.1 * k), 2) for one in alternatives) == [0.0, 1.0, 2.0, 3.0]
+        assert sorted(
+            round(float(one.world_from_cam.translation[0] - 0.1 * k), 2) for one in alternatives
+        ) == [0.0, 1.0, 2.0, 3.0]
         assert 0.9 < sum(one.probability for one in alternatives) <= 1.0
     seen(hypotheses, 8 * STEP_NS, at(2.8), odom_from_cam=at(0.8))
     assert hypotheses.is_decided
@@ -167,9 +185,13 @@ def test_followed_points_move_all_hypotheses():
     assert hypotheses.best is not None
     x = best_x(hypotheses)
     hypotheses.move(at(x + 0.3), SIGMA, None)
-    assert sorted(float(one.world_from_cam.translation[0]) for one in hypotheses.alternatives()) == pytest.approx([0.3, 5.3], abs=1e-3)
+    assert sorted(
+        float(one.world_from_cam.translation[0]) for one in hypotheses.alternatives()
+    ) == pytest.approx([0.3, 5.3], abs=1e-3)
     seen(hypotheses, 2 * STEP_NS, at(0.6), at(5.9))
-    assert best_x(hypotheses) == pytest.approx(0.6, abs=0.02), "the other one would have to go twice as fast"
+    assert best_x(hypotheses) == pytest.approx(0.6, abs=0.02), (
+        "the other one would have to go twice as fast"
+    )
 
 
 def test_the_number_is_bounded():

@@ -27,7 +27,11 @@ def test_noise_shrinks_with_the_number_of_pictures():
     for truth in truths(60):
         measured = Rigid3.exp(rng.multivariate_normal(np.zeros(6), MEASURED)) @ truth
         step = Rigid3.exp(rng.multivariate_normal(np.zeros(6), MOVED)) @ STEP
-        smoothed.append(translation_error(window.add(measured, MEASURED, step, MOVED)[0].inverse(), truth.inverse()))
+        smoothed.append(
+            translation_error(
+                window.add(measured, MEASURED, step, MOVED)[0].inverse(), truth.inverse()
+            )
+        )
         raw.append(translation_error(measured.inverse(), truth.inverse()))
     assert np.mean(smoothed[10:]) < 0.5 * np.mean(raw[10:])
 

@@ -28,14 +28,24 @@ STEP_NS = 100_000_000
 
 
 @pytest.fixture(scope="module")
-def rooms(tiny_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[StereoFrame]]:
+def rooms(
+    tiny_recording: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, list[StereoFrame]]:
     """An atlas of two rooms, and a walk through both."""
     folder = tmp_path_factory.mktemp("rooms")
-    other = write_stereo_recording(folder / "other", seed=1, indices=np.arange(0.0, 6.0, 0.5).tolist())
+    other = write_stereo_recording(
+        folder / "other", seed=1, indices=np.arange(0.0, 6.0, 0.5).tolist()
+    )
     for name, recording in (("room", tiny_recording), ("other", other)):
-        build_map(open_sequence(str(recording)), BuildConfig(other_kinds=())).save(folder / f"{name}.topo")
-    create_atlas(str(folder / "campus"), new_tiles([str(folder / "room.topo"), str(folder / "other.topo")]))
-    walk = [open_sequence(str(tiny_recording))[k] for k in range(5)] + [open_sequence(str(other))[k] for k in range(5)]
+        build_map(open_sequence(str(recording)), BuildConfig(other_kinds=())).save(
+            folder / f"{name}.topo"
+        )
+    create_atlas(
+        str(folder / "campus"), new_tiles([str(folder / "room.topo"), str(folder / "other.topo")])
+    )
+    walk = [open_sequence(str(tiny_recording))[k] for k in range(5)] + [
+        open_sequence(str(other))[k] for k in range(5)
+    ]
     return folder / "campus", walk
 
 
@@ -44,7 +54,9 @@ def tracker(rooms: tuple[Path, list[StereoFrame]]) -> TileTracker:
     return TileTracker(AtlasLocalizer(Atlas.open(str(rooms[0])), Maps([], Localizer, 512_000_000)))
 
 
-def test_a_walk_is_followed_from_tile_to_tile(rooms: tuple[Path, list[StereoFrame]], tracker: TileTracker):
+def test_a_walk_is_followed_from_tile_to_tile(
+    rooms: tuple[Path, list[StereoFrame]], tracker: TileTracker
+):
     walk = rooms[1]
     nothing = np.random.default_rng(3).integers(0, 255, walk[0].image.shape, dtype=np.uint8)
     lost = tracker.process(nothing, walk[0].camera, 0)
@@ -65,15 +77,25 @@ def test_a_walk_is_followed_from_tile_to_tile(rooms: tuple[Path, list[StereoFram
         tracker.process(walk[0].image, walk[0].camera, t_ns)
 
 
-def test_the_atlas_is_not_asked_again_at_once(rooms: tuple[Path, list[StereoFrame]], tracker: TileTracker, monkeypatch: pytest.MonkeyPatch):
+def test_the_atlas_is_not_asked_again_at_once(
+    rooms: tuple[Path, list[StereoFrame]], tracker: TileTracker, monkeypatch: pytest.MonkeyPatch
+):
     """A refusal by an atlas costs far more than a tracked picture."""
     walk, asked = rooms[1], []
     localize = AtlasLocalizer.localize
-    monkeypatch.setattr(AtlasLocalizer, "localize", lambda *args, **kwargs: asked.append(1) or localize(*args, **kwargs))
+    monkeypatch.setattr(
+        AtlasLocalizer,
+        "localize",
+        lambda *args, **kwargs: asked.append(1) or localize(*args, **kwargs),
+    )
     nothing = np.random.default_rng(3).integers(0, 255, walk[0].image.shape, dtype=np.uint8)
     tracker.process(walk[0].image, walk[0].camera, 0)
     states = [
-        tracker.process(nothing if k % 2 else nothing.T.copy().reshape(nothing.shape), walk[0].camera, k * STEP_NS).state
+        tracker.process(
+            nothing if k % 2 else nothing.T.copy().reshape(nothing.shape),
+            walk[0].camera,
+            k * STEP_NS,
+        ).state
         for k in range(1, 15)
     ]
     assert "localized" not in states
@@ -90,7 +112,9 @@ def test_the_map_is_let_go_of(rooms: tuple[Path, list[StereoFrame]], tracker: Ti
     assert opened.num_users == 0
 
 
-def test_follow_takes_an_atlas(rooms: tuple[Path, list[StereoFrame]], tiny_recording: Path, capsys: pytest.CaptureFixture[str]):
+def test_follow_takes_an_atlas(
+    rooms: tuple[Path, list[StereoFrame]], tiny_recording: Path, capsys: pytest.CaptureFixture[str]
+):
     assert main(["follow", str(rooms[0]), f"{tiny_recording}@0:3"]) == 0
     answers = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert {(answer["tile"], answer["localized"]) for answer in answers} == {("room", True)}

@@ -1,4 +1,5 @@
-"""Streams of the rendered room: the good one, and those that stop, freeze, jump or lie about the time."""
+"""Streams of the rendered room: the good one, and those that stop, freeze, jump or lie about the
+time."""
 
 from __future__ import annotations
 
@@ -38,7 +39,10 @@ def answers(localizer: Localizer) -> list[StreamedPose]:
 
 
 def _stream(tracker: Tracker, first: int, last: int, delay_ns: int = 0) -> list[StreamedPose]:
-    return [tracker.process(grey, CAMERA, t_ns + delay_ns) for t_ns, grey, _ in room_stream()[first:last]]
+    return [
+        tracker.process(grey, CAMERA, t_ns + delay_ns)
+        for t_ns, grey, _ in room_stream()[first:last]
+    ]
 
 
 def _raw(answer: StreamedPose) -> Rigid3:
@@ -61,7 +65,9 @@ def _jitter(poses: list[Rigid3]) -> float:
     return float(np.sqrt(np.mean(np.sum(np.square(steps), axis=1))))
 
 
-def test_every_picture_of_a_good_stream_has_a_pose_and_most_are_tracked(answers: list[StreamedPose]):
+def test_every_picture_of_a_good_stream_has_a_pose_and_most_are_tracked(
+    answers: list[StreamedPose],
+):
     states = [answer.state for answer in answers]
     assert states[0] == "localized"
     assert set(states) == {"localized", "tracked"}
@@ -78,16 +84,22 @@ def test_tracked_poses_are_not_copies(answers: list[StreamedPose]):
     assert min(steps) > 0.01, "the camera moves two centimetres a picture"
 
 
-def test_smoothing_halves_the_jitter_of_single_pictures(localizer: Localizer, answers: list[StreamedPose]):
+def test_smoothing_halves_the_jitter_of_single_pictures(
+    localizer: Localizer, answers: list[StreamedPose]
+):
     singles = [localizer.localize(grey, CAMERA) for _, grey, _ in room_stream()]
-    alone = _jitter([single.world_from_cam for single in singles if isinstance(single, Localization)])
+    alone = _jitter(
+        [single.world_from_cam for single in singles if isinstance(single, Localization)]
+    )
     assert _jitter([_smoothed(answer) for answer in answers]) < 0.5 * alone
 
 
 def test_no_coarse_search_while_tracked(localizer: Localizer, monkeypatch: pytest.MonkeyPatch):
     tracker = Tracker(localizer)
     _stream(tracker, 0, 3)
-    monkeypatch.setattr(localizer.map.coarse, "rank", lambda *_: pytest.fail("the coarse localizer was asked"))
+    monkeypatch.setattr(
+        localizer.map.coarse, "rank", lambda *_: pytest.fail("the coarse localizer was asked")
+    )
     assert {answer.state for answer in _stream(tracker, 3, 25)} == {"localized", "tracked"}
 
 
@@ -99,7 +111,8 @@ def test_the_smoothed_covariance_is_of_the_size_of_the_error(answers: list[Strea
 
 
 def test_what_the_map_is_wrong_by_is_no_noise(tiny_recording: Path, answers: list[StreamedPose]):
-    """A map that says more of its own errors is followed as closely, and the answers say as much more."""
+    """A map that says more of its own errors is followed as closely, and the answers say as much
+    more."""
     topomap = built_room(tiny_recording)
     assert topomap.shared_errors is not None
     doubtful = Localizer(replace(topomap, shared_errors=replace(topomap.shared_errors, rho=0.5)))
@@ -127,7 +140,12 @@ def test_what_cannot_be_seen_is_predicted_and_said_to_be_then_lost_then_found(lo
     assert "world_from_cam" not in line
     seen_again = tracker.process(room_stream()[14][1], CAMERA, room_stream()[14][0])
     assert seen_again.state in ("localized", "tracked")
-    lost = [tracker.process(np.roll(NOTHING, k, axis=1), CAMERA, room_stream()[14][0] + k * SECOND * 6 // 10) for k in (1, 2)]
+    lost = [
+        tracker.process(
+            np.roll(NOTHING, k, axis=1), CAMERA, room_stream()[14][0] + k * SECOND * 6 // 10
+        )
+        for k in (1, 2)
+    ]
     assert [answer.state for answer in lost] == ["predicted", "lost"]
     assert lost[1].smoothed is None
     assert lost[1].to_json("")["smoothed"] is None
@@ -146,7 +164,10 @@ def test_after_a_stop_the_stream_goes_on_elsewhere(localizer: Localizer):
 def test_a_jump_is_refused_until_others_agree_with_it(localizer: Localizer):
     tracker = Tracker(localizer)
     last = _stream(tracker, 0, 10)[-1]
-    jumped = [tracker.process(picture, CAMERA, last.t_ns + (k + 1) * INTERVAL_NS) for k, (picture, _) in enumerate(far_away())]
+    jumped = [
+        tracker.process(picture, CAMERA, last.t_ns + (k + 1) * INTERVAL_NS)
+        for k, (picture, _) in enumerate(far_away())
+    ]
     assert [answer.state for answer in jumped[:3]] == ["predicted", "ambiguous", "localized"]
     assert [answer.to_json("")["reason"] for answer in jumped[:2]] == ["jump", "ambiguous"]
     for answer, (_, truth) in zip(jumped[2:], far_away()[2:], strict=True):
@@ -185,7 +206,9 @@ def test_a_camera_that_reads_into_the_same_memory_is_no_frozen_one(localizer: Lo
         assert not tracker.process(memory, CAMERA, t_ns).is_repeated
 
 
-@pytest.mark.parametrize(("t_ns", "words"), [(0, "goes backwards"), (7 * INTERVAL_NS, "stands still")])
+@pytest.mark.parametrize(
+    ("t_ns", "words"), [(0, "goes backwards"), (7 * INTERVAL_NS, "stands still")]
+)
 def test_clocks_that_do_not_advance_are_refused(localizer: Localizer, t_ns: int, words: str):
     tracker = Tracker(localizer)
     _stream(tracker, 0, 8)
@@ -229,7 +252,9 @@ def test_a_picture_that_cannot_be_read_is_predicted(localizer: Localizer):
 
 
 def test_odometry_bridges_what_the_map_does_not_show(localizer: Localizer):
-    odom_from_world = Rigid3.from_quat_wxyz(np.array([0.7, 0.1, -0.5, 0.2]), np.array([9.0, 1.0, -4.0]))
+    odom_from_world = Rigid3.from_quat_wxyz(
+        np.array([0.7, 0.1, -0.5, 0.2]), np.array([9.0, 1.0, -4.0])
+    )
     tracker = Tracker(localizer)
     for t_ns, grey, truth in room_stream()[:6]:
         tracker.process(grey, CAMERA, t_ns, odom_from_world @ truth)
@@ -260,4 +285,6 @@ def test_two_runs_give_the_same_bytes(localizer: Localizer, answers: list[Stream
 
 def test_a_camera_of_another_size_is_refused(localizer: Localizer):
     with pytest.raises(QueryError, match="320x240"):
-        Tracker(localizer).process(room_stream()[0][1], Camera.pinhole(640, 480, 500.0, 500.0, 320.0, 240.0), 0)
+        Tracker(localizer).process(
+            room_stream()[0][1], Camera.pinhole(640, 480, 500.0, 500.0, 320.0, 240.0), 0
+        )

@@ -1,4 +1,5 @@
-"""After warming up nothing is left to compile for a query; a localizer that several threads share answers as it does alone."""
+"""After warming up nothing is left to compile for a query; a localizer that several threads share
+answers as it does alone."""
 
 from __future__ import annotations
 
@@ -27,7 +28,7 @@ def bytes_of(result):
     if isinstance(result, Localization):
         return result.world_from_cam.rotation.tobytes() + result.world_from_cam.translation.tobytes() + result.covariance.tobytes()
     return result.reason.encode()
-"""
+"""  # noqa: E501
 _WARM = """
 from topoloc import warm_up
 answers, localize = [], Localizer.localize
@@ -56,19 +57,24 @@ print(sum(len(answer) > 100 for answer in alone), together == alone * 3)
 
 @pytest.fixture(scope="module")
 def asked(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str, str]:
-    """A map with side nodes, pictures of it, of its way back and of elsewhere, and their cameras."""
+    """A map with side nodes, pictures of it, of its way back and of elsewhere, and their
+    cameras."""
     folder = tmp_path_factory.mktemp("asked")
     pictures = {f"ahead{k}": picture for k, (picture, _) in enumerate(seen_ahead()[:2])}
     pictures |= {f"back{k}": picture for k, (picture, _) in enumerate(seen_on_the_way_back()[:2])}
     pictures |= {f"elsewhere{k}": picture for k, (picture, _) in enumerate(unseen_views()[:1])}
-    cameras = {name: (CAMERA if name.startswith("elsewhere") else WIDE).to_json() for name in pictures}
+    cameras = {
+        name: (CAMERA if name.startswith("elsewhere") else WIDE).to_json() for name in pictures
+    }
     built_corridor().save(folder / "corridor.topo")
     np.savez(folder / "pictures.npz", **pictures)
     return str(folder / "corridor.topo"), str(folder / "pictures.npz"), json.dumps(cameras)
 
 
 def _in_a_process_of_its_own(code: str, asked: tuple[str, str, str]) -> str:
-    done = subprocess.run([sys.executable, "-c", _BOTH + code, *asked], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", _BOTH + code, *asked], capture_output=True, text=True, check=False
+    )
     assert (done.returncode, done.stderr) == (0, "")
     return done.stdout.strip()
 

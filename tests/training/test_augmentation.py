@@ -1,4 +1,5 @@
-"""Variation of training pictures: switched off it changes nothing; on, it stays in range and is the same for the same seed."""
+"""Variation of training pictures: switched off it changes nothing; on, it stays in range and is the
+same for the same seed."""
 
 from __future__ import annotations
 
@@ -15,7 +16,9 @@ OFF = AugmentationConfig(**{item.name: 0.0 for item in fields(AugmentationConfig
 
 
 def pictures() -> torch.Tensor:
-    return torch.randint(20, 235, (4, 24, 32, 3), generator=torch.Generator().manual_seed(1), dtype=torch.uint8)
+    return torch.randint(
+        20, 235, (4, 24, 32, 3), generator=torch.Generator().manual_seed(1), dtype=torch.uint8
+    )
 
 
 def varied(config: AugmentationConfig, seed: int = 0) -> torch.Tensor:
@@ -28,7 +31,9 @@ def test_switched_off_nothing_changes():
 
 @pytest.mark.parametrize("kind", [item.name for item in fields(AugmentationConfig)])
 def test_each_kind_changes_the_pictures_alone(kind: str):
-    config = replace(OFF, **{kind: 1.0 if kind in ("blur", "occlusion") else getattr(AugmentationConfig(), kind)})
+    config = replace(
+        OFF, **{kind: 1.0 if kind in ("blur", "occlusion") else getattr(AugmentationConfig(), kind)}
+    )
     assert (varied(config) - varied(OFF)).abs().amax(dim=(1, 2, 3)).min() > 0.02
 
 
@@ -39,6 +44,9 @@ def test_the_same_seed_gives_the_same_pictures_and_another_others():
 
 def test_colours_stay_colours():
     images = varied(AugmentationConfig(brightness=2.0, contrast=2.0, gamma=2.0))
-    darkest, brightest = normalize_pictures(torch.zeros(1, 1, 1, 3)), normalize_pictures(torch.full((1, 1, 1, 3), 255.0))
+    darkest, brightest = (
+        normalize_pictures(torch.zeros(1, 1, 1, 3)),
+        normalize_pictures(torch.full((1, 1, 1, 3), 255.0)),
+    )
     assert (images >= darkest - 1e-4).all()
     assert (images <= brightest + 1e-4).all()

@@ -28,8 +28,12 @@ TINY = PictureConfig(64, 48)
 
 
 def config(num_epochs: int, **settings: float) -> CnnFcConfig:
-    how = TrainingConfig(max_epochs=num_epochs, patience=num_epochs, batch_size=7, held_out=0.0, num_threads=1)
-    return CnnFcConfig(TINY, replace(how, **settings), AugmentationConfig(occlusion=0.0), label_spread=0.0)
+    how = TrainingConfig(
+        max_epochs=num_epochs, patience=num_epochs, batch_size=7, held_out=0.0, num_threads=1
+    )
+    return CnnFcConfig(
+        TINY, replace(how, **settings), AugmentationConfig(occlusion=0.0), label_spread=0.0
+    )
 
 
 def train(room_set: TrainingSet, how: CnnFcConfig, checkpoint: Path | None = None) -> CoarseModel:
@@ -46,14 +50,18 @@ def test_from_nothing_it_learns_the_room(room_set: TrainingSet):
     probabilities = localizer.probabilities([unseen_views()[0][0]])
     assert probabilities.sum() == pytest.approx(1.0, abs=1e-5)
     ranking = localizer.rank(unseen_views()[0][0], NO_FEATURES, 3)
-    assert [score.score for score in ranking] == sorted((float(p) for p in probabilities[0]), reverse=True)[:3]
+    assert [score.score for score in ranking] == sorted(
+        (float(p) for p in probabilities[0]), reverse=True
+    )[:3]
 
 
 def same(first: CoarseModel, second: CoarseModel) -> bool:
     return all(np.array_equal(first.arrays[key], second.arrays[key]) for key in first.arrays)
 
 
-def test_an_interrupted_training_goes_on_to_the_same_bytes(room_set: TrainingSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_an_interrupted_training_goes_on_to_the_same_bytes(
+    room_set: TrainingSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     whole = train(room_set, config(4))
     assert same(whole, train(room_set, config(4)))
     assert not same(whole, train(room_set, config(4, seed=1)))
@@ -76,7 +84,9 @@ def test_an_interrupted_training_goes_on_to_the_same_bytes(room_set: TrainingSet
     assert resumed.settings["trained"] == whole.settings["trained"]
 
 
-def test_a_checkpoint_of_another_training_or_a_broken_one_is_refused(room_set: TrainingSet, tmp_path: Path):
+def test_a_checkpoint_of_another_training_or_a_broken_one_is_refused(
+    room_set: TrainingSet, tmp_path: Path
+):
     path = tmp_path / "training.ckpt"
     train(room_set, config(1), path)
     with pytest.raises(TrainingError, match="is of another training"):
@@ -86,7 +96,9 @@ def test_a_checkpoint_of_another_training_or_a_broken_one_is_refused(room_set: T
         train(room_set, config(1), path)
 
 
-def test_a_loss_that_is_not_finite_ends_with_the_last_good_state(room_set: TrainingSet, monkeypatch: pytest.MonkeyPatch):
+def test_a_loss_that_is_not_finite_ends_with_the_last_good_state(
+    room_set: TrainingSet, monkeypatch: pytest.MonkeyPatch
+):
     augment = frozen_maps.augment
     calls = 0
 
@@ -107,8 +119,12 @@ def test_a_loss_that_is_not_finite_ends_with_the_last_good_state(room_set: Train
 
 def test_one_node_and_nodes_with_one_image(two_images: TrainingSet, room_set: TrainingSet):
     localizer = open_coarse(train(two_images, config(1)))
-    assert [(s.node_id, s.score) for s in localizer.rank(unseen_views()[0][0], NO_FEATURES, 5)] == [(0, 1.0)]
-    rows = [int(np.flatnonzero(room_set.node_ids == node)[0]) for node in np.unique(room_set.node_ids)]
+    assert [(s.node_id, s.score) for s in localizer.rank(unseen_views()[0][0], NO_FEATURES, 5)] == [
+        (0, 1.0)
+    ]
+    rows = [
+        int(np.flatnonzero(room_set.node_ids == node)[0]) for node in np.unique(room_set.node_ids)
+    ]
     lonely = replace(
         room_set,
         jpegs=[room_set.jpegs[row] for row in rows],
@@ -133,7 +149,13 @@ def test_weights_from_elsewhere_are_where_it_begins(two_images: TrainingSet, ran
 def learned(model: CoarseModel, weights: Weights) -> set[int]:
     """Layers of the backbone whose weights are no longer those of the file."""
     names = [name for name in weights.tensors if name.startswith("features.")]
-    changed = [name for name in names if not np.array_equal(model.arrays[f"network.backbone.{name}"], weights.tensors[name].half().numpy())]
+    changed = [
+        name
+        for name in names
+        if not np.array_equal(
+            model.arrays[f"network.backbone.{name}"], weights.tensors[name].half().numpy()
+        )
+    ]
     return {int(name.split(".")[1]) for name in changed}
 
 
@@ -142,13 +164,29 @@ def test_the_last_layers_learn_and_those_before_keep_their_weights(
 ):
     weights = read_weights(random_file, "squeezenet1_1")
     few = replace(config(1), num_tuned=2, num_copies=3)
-    assert learned(cnn_fc.train(room_set, "squeezenet1_1", weights, few, silent), weights) == {11, 12}
-    assert learned(cnn_fc.train(room_set, "squeezenet1_1", weights, replace(few, num_tuned=0), silent), weights) == set()
-    monkeypatch.setattr(frozen_maps, "MAX_BYTES", 0)  # no room for a single copy: varied anew whenever shown
-    assert learned(cnn_fc.train(room_set, "squeezenet1_1", weights, few, silent), weights) == {11, 12}
+    assert learned(cnn_fc.train(room_set, "squeezenet1_1", weights, few, silent), weights) == {
+        11,
+        12,
+    }
+    assert (
+        learned(
+            cnn_fc.train(room_set, "squeezenet1_1", weights, replace(few, num_tuned=0), silent),
+            weights,
+        )
+        == set()
+    )
+    monkeypatch.setattr(
+        frozen_maps, "MAX_BYTES", 0
+    )  # no room for a single copy: varied anew whenever shown
+    assert learned(cnn_fc.train(room_set, "squeezenet1_1", weights, few, silent), weights) == {
+        11,
+        12,
+    }
 
 
-def test_copies_are_made_once_and_as_many_as_there_is_room_for(room_set: TrainingSet, random_file: Path, monkeypatch: pytest.MonkeyPatch):
+def test_copies_are_made_once_and_as_many_as_there_is_room_for(
+    room_set: TrainingSet, random_file: Path, monkeypatch: pytest.MonkeyPatch
+):
     weights, shown, made = read_weights(random_file, "squeezenet1_1"), 0, frozen_maps.augment
 
     def counted(pictures: torch.Tensor, *args: Any) -> torch.Tensor:
@@ -161,7 +199,8 @@ def test_copies_are_made_once_and_as_many_as_there_is_room_for(room_set: Trainin
     assert shown == 3 * len(room_set.jpegs)
     shown = 0
     one = frozen_maps.plain_maps(
-        torch.nn.Sequential(*list(Backbone("squeezenet1_1").features)[:11]), torch.zeros(1, 48, 64, 3, dtype=torch.uint8)
+        torch.nn.Sequential(*list(Backbone("squeezenet1_1").features)[:11]),
+        torch.zeros(1, 48, 64, 3, dtype=torch.uint8),
     ).nbytes
     monkeypatch.setattr(frozen_maps, "MAX_BYTES", int(2.5 * one * len(room_set.jpegs)))
     cnn_fc.train(room_set, "squeezenet1_1", weights, replace(config(4), num_copies=3), silent)

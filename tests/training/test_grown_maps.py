@@ -1,4 +1,5 @@
-"""A map that has grown: k-NN localizers learn new pictures by their vectors; cnn-fc is widened and goes on from what it knows."""
+"""A map that has grown: k-NN localizers learn new pictures by their vectors; cnn-fc is widened and
+goes on from what it knows."""
 
 from __future__ import annotations
 
@@ -19,13 +20,27 @@ from topoloc.places.coarse import CoarseModel, open_coarse
 from topoloc.places.network_config import PictureConfig
 from topoloc.places.network_pictures import decode_picture
 from topoloc_training import cnn_fc, cnn_nn
-from topoloc_training.classifier_config import AugmentationConfig, CnnFcConfig, CnnNnConfig, TrainingConfig
-from topoloc_training.coarse_training import CoarseTrainingConfig, in_ids, train_coarse, training_set_of
+from topoloc_training.classifier_config import (
+    AugmentationConfig,
+    CnnFcConfig,
+    CnnNnConfig,
+    TrainingConfig,
+)
+from topoloc_training.coarse_training import (
+    CoarseTrainingConfig,
+    in_ids,
+    train_coarse,
+    training_set_of,
+)
 from topoloc_training.training_set import TrainingSet
 
 TINY = PictureConfig(64, 48)
-HOW = TrainingConfig(max_epochs=60, patience=60, batch_size=7, held_out=0.0, num_threads=1, learning_rate=3e-3)
-CLASSIFIER = CnnFcConfig(TINY, HOW, AugmentationConfig(occlusion=0.0), label_spread=0.0, tuning_epochs=25)
+HOW = TrainingConfig(
+    max_epochs=60, patience=60, batch_size=7, held_out=0.0, num_threads=1, learning_rate=3e-3
+)
+CLASSIFIER = CnnFcConfig(
+    TINY, HOW, AugmentationConfig(occlusion=0.0), label_spread=0.0, tuning_epochs=25
+)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +66,10 @@ def half(grown: TopoMetricMap) -> TrainingSet:
 def _right(model: CoarseModel, grown: TopoMetricMap) -> np.ndarray:
     """Of each mapping picture, whether its node is named first."""
     localizer = open_coarse(model)
-    ranked = [localizer.rank(decode_picture(image.jpeg), NO_FEATURES, 1)[0].node_id for image in grown.place_images]
+    ranked = [
+        localizer.rank(decode_picture(image.jpeg), NO_FEATURES, 1)[0].node_id
+        for image in grown.place_images
+    ]
     return np.array(ranked) == [image.node_id for image in grown.place_images]
 
 
@@ -70,16 +88,25 @@ def test_vectors_of_new_pictures_join(grown: TopoMetricMap, half: TrainingSet):
 
 
 def test_a_classifier_is_widened_and_goes_on(grown: TopoMetricMap, half: TrainingSet):
-    known = in_ids(cnn_fc.train(half, "compact", None, CLASSIFIER, silent), list(range(half.num_nodes)))
+    known = in_ids(
+        cnn_fc.train(half, "compact", None, CLASSIFIER, silent), list(range(half.num_nodes))
+    )
     with_known = replace(grown, coarse_models={"cnn-fc": known})
     assert taught_places(with_known, {}, list(grown.place_images)).not_taught == ["cnn-fc"]
     config = CoarseTrainingConfig(cnn_fc=CLASSIFIER)
     widened = train_coarse(with_known, "cnn-fc", "compact", "map", config, silent)
     facts = widened.settings["trained"]
-    assert (facts["widened_from"], widened.settings["num_nodes"]) == (half.num_nodes, len(grown.summaries))
+    assert (facts["widened_from"], widened.settings["num_nodes"]) == (
+        half.num_nodes,
+        len(grown.summaries),
+    )
     assert facts["epochs"] == CLASSIFIER.tuning_epochs
     anew = train_coarse(
-        grown, "cnn-fc", "compact", "scratch", replace(config, cnn_fc=replace(CLASSIFIER, training=replace(HOW, max_epochs=25)))
+        grown,
+        "cnn-fc",
+        "compact",
+        "scratch",
+        replace(config, cnn_fc=replace(CLASSIFIER, training=replace(HOW, max_epochs=25))),
     )
     assert _right(widened, grown).mean() > 0.8  # 12 of 14 on some processors, 14 on others
     assert _right(widened, grown).mean() >= _right(anew, grown).mean()
@@ -87,7 +114,9 @@ def test_a_classifier_is_widened_and_goes_on(grown: TopoMetricMap, half: Trainin
         train_coarse(with_known, "cnn-fc", "squeezenet1_1", "map", config)
 
 
-def test_only_what_is_there_is_widened(room_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_only_what_is_there_is_widened(
+    room_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     path = shutil.copy(room_map, tmp_path / "room.topo")
     assert main(["train", str(path), "--coarse", "cnn-fc", "--weights", "map"]) == 1
     assert "has no cnn-fc to begin with" in capsys.readouterr().err

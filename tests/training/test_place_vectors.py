@@ -1,4 +1,5 @@
-"""cnn-nn and vlad-nn: trained on the rendered room, stored as the map stores them, asked for its own and for unseen pictures."""
+"""cnn-nn and vlad-nn: trained on the rendered room, stored as the map stores them, asked for its
+own and for unseen pictures."""
 
 from __future__ import annotations
 
@@ -25,7 +26,9 @@ from topoloc_training.vlad_nn import tune
 from topoloc_training.weights import read_weights
 
 SMALL = PictureConfig(112, 84)
-NO_FEATURES = Features(*(np.zeros(shape, np.float32) for shape in ((0, 2), (0,), (0,), (0,), (0, 64))))
+NO_FEATURES = Features(
+    *(np.zeros(shape, np.float32) for shape in ((0, 2), (0,), (0,), (0,), (0, 64)))
+)
 
 
 def silent(stage: str, done: int, total: int) -> None:
@@ -36,11 +39,15 @@ def learnt(name: str, room_set: TrainingSet, weights_file: Path) -> CoarseModel:
     weights = read_weights(weights_file, "squeezenet1_1")
     if name == "cnn-nn":
         return cnn_nn.train(room_set, "squeezenet1_1", weights, CnnNnConfig(picture=SMALL), silent)
-    return vlad_nn.train(room_set, "squeezenet1_1", weights, VladNnConfig(picture=SMALL, num_clusters=8), silent)
+    return vlad_nn.train(
+        room_set, "squeezenet1_1", weights, VladNnConfig(picture=SMALL, num_clusters=8), silent
+    )
 
 
 @pytest.mark.parametrize("name", ["cnn-nn", "vlad-nn"])
-def test_mapping_images_are_found_and_unseen_ones_lead_near(name: str, room_set: TrainingSet, squeezenet_file: Path):
+def test_mapping_images_are_found_and_unseen_ones_lead_near(
+    name: str, room_set: TrainingSet, squeezenet_file: Path
+):
     localizer = open_coarse(learnt(name, room_set, squeezenet_file))
     assert isinstance(localizer, VectorSearch)
     assert isinstance(localizer, CoarseLocalizer)
@@ -50,8 +57,14 @@ def test_mapping_images_are_found_and_unseen_ones_lead_near(name: str, room_set:
     assert min(ranking[0].score for ranking in rankings) > 0.95
     for image, world_from_cam in unseen_views():
         (best, *_) = localizer.rank(image, NO_FEATURES, 3)
-        node_images = [p for p, node in zip(room_set.world_from_cams, room_set.node_ids, strict=True) if node == best.node_id]
-        nearest = min(np.linalg.norm(p.translation - world_from_cam.translation) for p in node_images)
+        node_images = [
+            p
+            for p, node in zip(room_set.world_from_cams, room_set.node_ids, strict=True)
+            if node == best.node_id
+        ]
+        nearest = min(
+            np.linalg.norm(p.translation - world_from_cam.translation) for p in node_images
+        )
         assert nearest < 3 * room_set.d_thresh
 
 
@@ -60,7 +73,9 @@ def test_one_picture_and_a_batch_get_the_same_vectors(room_set: TrainingSet, ran
     assert isinstance(localizer, VectorSearch)
     images = [image for image, _ in unseen_views()][:3]
     single = np.concatenate([localizer.vectors([image]) for image in images])
-    np.testing.assert_allclose(single, localizer.vectors(images), atol=2e-3)  # frozen, its sums are in another order
+    np.testing.assert_allclose(
+        single, localizer.vectors(images), atol=2e-3
+    )  # frozen, its sums are in another order
 
 
 @pytest.mark.parametrize("name", ["cnn-nn", "vlad-nn"])
@@ -77,11 +92,18 @@ def test_a_map_with_one_node_answers_with_it(two_images: TrainingSet, random_fil
         assert [score.node_id for score in ranking] == [0]
 
 
-def test_colour_size_and_shape_of_the_query_matter_little(room_set: TrainingSet, squeezenet_file: Path):
+def test_colour_size_and_shape_of_the_query_matter_little(
+    room_set: TrainingSet, squeezenet_file: Path
+):
     localizer = open_coarse(learnt("cnn-nn", room_set, squeezenet_file))
     image = unseen_views()[3][0]
     wider = np.pad(image, ((0, 0), (40, 40)))
-    variants = [image, np.repeat(image[..., None], 3, axis=2), image.repeat(2, axis=0).repeat(2, axis=1), wider]
+    variants = [
+        image,
+        np.repeat(image[..., None], 3, axis=2),
+        image.repeat(2, axis=0).repeat(2, axis=1),
+        wider,
+    ]
     assert len({localizer.rank(variant, NO_FEATURES, 1)[0].node_id for variant in variants}) == 1
 
 
@@ -91,13 +113,21 @@ def test_a_model_whose_arrays_do_not_fit_is_damaged(room_set: TrainingSet, rando
     with pytest.raises(MapError, match=r"'cnn-nn' is damaged: .*features\.4"):
         open_coarse(replace(model, arrays=lacking))
     with pytest.raises(MapError, match="damaged"):
-        open_coarse(replace(model, settings={"backbone": "squeezenet1_1", "config": model.settings["config"]}))
+        open_coarse(
+            replace(
+                model, settings={"backbone": "squeezenet1_1", "config": model.settings["config"]}
+            )
+        )
 
 
-def test_netvlads_own_vocabulary_is_taken_from_its_checkpoint(two_images: TrainingSet, tmp_path: Path):
+def test_netvlads_own_vocabulary_is_taken_from_its_checkpoint(
+    two_images: TrainingSet, tmp_path: Path
+):
     torch.save({"state_dict": netvlad_tensors(num_clusters=3)}, tmp_path / "netvlad.pth")
     weights = read_weights(tmp_path / "netvlad.pth", "vgg16")
-    model = vlad_nn.train(two_images, "vgg16", weights, VladNnConfig(picture=PictureConfig(40, 32)), silent)
+    model = vlad_nn.train(
+        two_images, "vgg16", weights, VladNnConfig(picture=PictureConfig(40, 32)), silent
+    )
     assert model.arrays["network.pool.centroids"].shape == (3, 512)
     assert model.settings["weights"] == {"file": "netvlad.pth", "sha256": weights.sha256}
     assert open_coarse(model).rank(unseen_views()[0][0], NO_FEATURES, 1)[0].node_id == 0
@@ -107,7 +137,9 @@ def test_triplets_bring_near_images_together(room_set: TrainingSet):
     torch.manual_seed(0)
     tuning = TripletConfig(num_epochs=3, learning_rate=1e-3, near=3.0, far=4.0, margin=0.3)
     network = VladNetwork("squeezenet1_1", 5, 8)
-    pictures = np.stack([np.ascontiguousarray(decode_picture(jpeg)[:64, :64]) for jpeg in room_set.jpegs])
+    pictures = np.stack(
+        [np.ascontiguousarray(decode_picture(jpeg)[:64, :64]) for jpeg in room_set.jpegs]
+    )
     losses = tune(network, pictures, room_set, tuning, silent)
     assert losses[-1] < losses[0]
 
@@ -115,4 +147,6 @@ def test_triplets_bring_near_images_together(room_set: TrainingSet):
 def test_there_are_no_triplets_in_one_spot(two_images: TrainingSet, random_file: Path):
     config = VladNnConfig(picture=SMALL, num_clusters=2, tuning=TripletConfig(num_epochs=1))
     with pytest.raises(TrainingError, match="no triplets"):
-        vlad_nn.train(two_images, "squeezenet1_1", read_weights(random_file, "squeezenet1_1"), config, silent)
+        vlad_nn.train(
+            two_images, "squeezenet1_1", read_weights(random_file, "squeezenet1_1"), config, silent
+        )

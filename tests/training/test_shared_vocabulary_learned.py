@@ -1,4 +1,5 @@
-"""A shared vocabulary learned of a few pictures: places of what it was learned of are told apart, and the file holds it exactly."""
+"""A shared vocabulary learned of a few pictures: places of what it was learned of are told apart,
+and the file holds it exactly."""
 
 from __future__ import annotations
 
@@ -20,7 +21,10 @@ def _picture(seed: int, noise_seed: int) -> tuple[Features, int, int]:
 
 
 def test_places_are_told_apart():
-    recordings = {"a": [_picture(seed, seed) for seed in range(12)], "b": [_picture(seed, seed) for seed in range(12, 24)]}
+    recordings = {
+        "a": [_picture(seed, seed) for seed in range(12)],
+        "b": [_picture(seed, seed) for seed in range(12, 24)],
+    }
     vocabulary = learn_vocabulary("surf", recordings, num_words=8, dimension=16)
     assert vocabulary.about["recordings"] == {"a": 12, "b": 12}
     mapped = np.stack([vocabulary.vector(*_picture(seed, seed)) for seed in range(24)])
@@ -29,7 +33,9 @@ def test_places_are_told_apart():
 
 
 def test_the_file_holds_what_was_learned():
-    vocabulary = learn_vocabulary("surf", {"a": [_picture(seed, seed) for seed in range(8)]}, num_words=4, dimension=8)
+    vocabulary = learn_vocabulary(
+        "surf", {"a": [_picture(seed, seed) for seed in range(8)]}, num_words=4, dimension=8
+    )
     file = io.BytesIO()
     np.savez(file, **vocabulary.to_arrays())  # pyright: ignore[reportArgumentType]
     file.seek(0)

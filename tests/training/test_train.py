@@ -1,4 +1,5 @@
-"""`topoloc train`: a map gets a learned coarse localizer and is asked through it; what fails is said in one line."""
+"""`topoloc train`: a map gets a learned coarse localizer and is asked through it; what fails is
+said in one line."""
 
 from __future__ import annotations
 
@@ -50,24 +51,55 @@ def copied_map(room_map: Path, tmp_path: Path) -> Path:
 
 
 def test_a_map_learns_and_is_asked(
-    copied_map: Path, small: tuple[str, ...], queries: Path, weights_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    copied_map: Path,
+    small: tuple[str, ...],
+    queries: Path,
+    weights_file: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ):
     before = TopoMetricMap.load(copied_map)
     facts = tmp_path / "facts.json"
-    assert main(["train", str(copied_map), "--coarse", "cnn-nn", "--weights", str(weights_file), *small, "--json", str(facts)]) == 0
+    assert (
+        main(
+            [
+                "train",
+                str(copied_map),
+                "--coarse",
+                "cnn-nn",
+                "--weights",
+                str(weights_file),
+                *small,
+                "--json",
+                str(facts),
+            ]
+        )
+        == 0
+    )
     written = json.loads(facts.read_text())
     assert written["weights"]["file"] == "squeezenet.pth"
     after = TopoMetricMap.load(copied_map)
-    assert (sorted(after.coarse_models), after.default_coarse) == (["cnn-nn", "surf-vlad"], "surf-vlad")
+    assert (sorted(after.coarse_models), after.default_coarse) == (
+        ["cnn-nn", "surf-vlad"],
+        "surf-vlad",
+    )
     assert after.nodes[0].template_jpeg == before.nodes[0].template_jpeg
-    assert main(["evaluate", str(copied_map), str(queries), "--coarse", "cnn-nn", "--json", str(facts)]) == 0
+    assert (
+        main(
+            ["evaluate", str(copied_map), str(queries), "--coarse", "cnn-nn", "--json", str(facts)]
+        )
+        == 0
+    )
     evaluation = json.loads(facts.read_text())
     assert evaluation["num_localized"] >= 0.8 * evaluation["num_queries"]
     assert evaluation["topological_accuracy"] <= evaluation["neighbour_accuracy"] <= 1.0
     capsys.readouterr()
     assert main(["info", str(copied_map)]) == 0
     printed = capsys.readouterr().out
-    assert f"cnn-nn, squeezenet1_1 (squeezenet.pth, SHA-256 {written['weights']['sha256'][:12]})" in printed
+    assert (
+        f"cnn-nn, squeezenet1_1 (squeezenet.pth, SHA-256 {written['weights']['sha256'][:12]})"
+        in printed
+    )
     assert "surf-vlad (default)" in printed
 
 
@@ -80,26 +112,51 @@ def test_the_default_changes_when_asked_to_and_the_map_can_stay_as_it_is(
     assert copied_map.read_bytes() == data
     assert TopoMetricMap.load(out).default_coarse == "cnn-nn"
     size = out.stat().st_size
-    assert main(["train", str(out), "--coarse", "cnn-nn", "--weights", str(weights_file), *small]) == 0
+    assert (
+        main(["train", str(out), "--coarse", "cnn-nn", "--weights", str(weights_file), *small]) == 0
+    )
     assert abs(out.stat().st_size - size) < 20_000  # replaced, not added once more
     assert TopoMetricMap.load(out).default_coarse == "cnn-nn"
 
 
-def test_cnn_fc_needs_no_weights_and_says_what_that_costs(copied_map: Path, small: tuple[str, ...], capsys: pytest.CaptureFixture[str]):
-    assert main(["train", str(copied_map), "--coarse", "cnn-fc", "--backbone", "compact", "--weights", "scratch", *small]) == 0
+def test_cnn_fc_needs_no_weights_and_says_what_that_costs(
+    copied_map: Path, small: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+):
+    assert (
+        main(
+            [
+                "train",
+                str(copied_map),
+                "--coarse",
+                "cnn-fc",
+                "--backbone",
+                "compact",
+                "--weights",
+                "scratch",
+                *small,
+            ]
+        )
+        == 0
+    )
     assert "knows these images alone" in capsys.readouterr().err
     facts, *_ = list_coarse(copied_map)
     assert facts["trained"]["epochs"] == 1
     assert facts["weights"] is None
 
 
-def test_known_failures_are_one_line(copied_map: Path, weights_file: Path, queries: Path, complaint: Callable[..., str]):
+def test_known_failures_are_one_line(
+    copied_map: Path, weights_file: Path, queries: Path, complaint: Callable[..., str]
+):
     train = ("train", copied_map, "--coarse", "cnn-nn")
-    assert "looks like squeezenet1_1" in complaint(*train, "--backbone", "vgg16", "--weights", weights_file)
+    assert "looks like squeezenet1_1" in complaint(
+        *train, "--backbone", "vgg16", "--weights", weights_file
+    )
     assert "cannot read weights" in complaint(*train, "--weights", "none.pth")
     assert "--checkpoint is for cnn-fc" in complaint(*train, "--checkpoint", "x.ckpt", status=2)
     assert "is not a topoloc map" in complaint("train", weights_file, "--coarse", "cnn-nn")
-    assert "no coarse localizer 'vlad-nn' (it has: surf-vlad)" in complaint("localize", copied_map, queries, "--coarse", "vlad-nn")
+    assert "no coarse localizer 'vlad-nn' (it has: surf-vlad)" in complaint(
+        "localize", copied_map, queries, "--coarse", "vlad-nn"
+    )
 
 
 _WITHOUT_TORCH = """
@@ -116,30 +173,65 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-def test_without_torch_the_extra_is_named(copied_map: Path, queries: Path, small: tuple[str, ...], weights_file: Path):
-    assert main(["train", str(copied_map), "--coarse", "cnn-nn", "--weights", str(weights_file), *small]) == 0
-    command = [sys.executable, "-c", _WITHOUT_TORCH, "localize", str(copied_map), str(queries), "--coarse", "cnn-nn"]
-    answer = subprocess.run(command, capture_output=True, text=True, env=dict(os.environ), timeout=120, check=False)
-    assert answer.stderr == "error: the coarse localizer 'cnn-nn' needs PyTorch: pip install 'topoloc[deep]'\n"
+def test_without_torch_the_extra_is_named(
+    copied_map: Path, queries: Path, small: tuple[str, ...], weights_file: Path
+):
+    assert (
+        main(
+            ["train", str(copied_map), "--coarse", "cnn-nn", "--weights", str(weights_file), *small]
+        )
+        == 0
+    )
+    command = [
+        sys.executable,
+        "-c",
+        _WITHOUT_TORCH,
+        "localize",
+        str(copied_map),
+        str(queries),
+        "--coarse",
+        "cnn-nn",
+    ]
+    answer = subprocess.run(
+        command, capture_output=True, text=True, env=dict(os.environ), timeout=120, check=False
+    )
+    assert (
+        answer.stderr
+        == "error: the coarse localizer 'cnn-nn' needs PyTorch: pip install 'topoloc[deep]'\n"
+    )
     assert answer.returncode == 1
 
 
 def test_mapping_and_asking_surf_vlad_loads_no_torch(copied_map: Path, queries: Path):
-    code = "import sys; from topoloc.cli import main; main(sys.argv[1:]); print('torch' in sys.modules)"
+    code = (
+        "import sys; from topoloc.cli import main; main(sys.argv[1:]); print('torch' in"
+        " sys.modules)"
+    )
     command = [sys.executable, "-c", code, "localize", str(copied_map), str(queries)]
-    answer = subprocess.run(command, capture_output=True, text=True, env=dict(os.environ), timeout=120, check=False)
+    answer = subprocess.run(
+        command, capture_output=True, text=True, env=dict(os.environ), timeout=120, check=False
+    )
     assert answer.stdout.splitlines()[-1] == "False", answer.stderr
 
 
 def test_a_tile_of_an_atlas_learns_alone(
-    copied_map: Path, small: tuple[str, ...], weights_file: Path, tmp_path: Path, complaint: Callable[..., str]
+    copied_map: Path,
+    small: tuple[str, ...],
+    weights_file: Path,
+    tmp_path: Path,
+    complaint: Callable[..., str],
 ):
     campus = str(tmp_path / "campus")
     create_atlas(campus, [NewTile(name, copied_map, name) for name in ("room", "hall")])
     words = ("train", campus, "--coarse", "cnn-nn", "--weights", str(weights_file), *small)
     assert main([*words, "--tile", "hall"]) == 0
     atlas = Atlas.open(campus)
-    known = {tile.tile_id: sorted(TopoMetricMap.load(atlas.map_path(tile)).coarse_models) for tile in atlas.manifest.tiles}
+    known = {
+        tile.tile_id: sorted(TopoMetricMap.load(atlas.map_path(tile)).coarse_models)
+        for tile in atlas.manifest.tiles
+    }
     assert known == {"room": ["surf-vlad"], "hall": ["cnn-nn", "surf-vlad"]}
     assert "--tile says which" in complaint(*words, status=2)
-    assert "--out is of a map" in complaint(*words, "--tile", "hall", "--out", str(tmp_path / "out.topo"), status=2)
+    assert "--out is of a map" in complaint(
+        *words, "--tile", "hall", "--out", str(tmp_path / "out.topo"), status=2
+    )

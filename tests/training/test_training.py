@@ -11,7 +11,9 @@ from topoloc_training.classifier_config import TrainingConfig
 from topoloc_training.training import Task, fit, hold_out
 
 
-@given(st.lists(st.integers(0, 8), min_size=1, max_size=80), st.floats(0.0, 0.9), st.integers(0, 100))
+@given(
+    st.lists(st.integers(0, 8), min_size=1, max_size=80), st.floats(0.0, 0.9), st.integers(0, 100)
+)
 def test_no_node_loses_more_than_half_of_its_images(nodes: list[int], share: float, seed: int):
     node_ids = np.array(nodes)
     held_out = hold_out(node_ids, share, seed)
@@ -33,7 +35,15 @@ def test_it_stops_when_there_is_no_more_gain_and_keeps_the_best():
         return (network(torch.ones(len(rows), 1)) - 5.0).square().mean()
 
     config = TrainingConfig(max_epochs=6, patience=3, learning_rate=0.05)
-    done = fit(Task(network, loss, score, np.arange(8), np.ones(8), [], "line"), config, lambda stage, done, total: None)
-    assert (done.best_epoch, done.stopped_by, done.scores) == (2, "patience", [3.0, 1.0, 2.0, 2.0, 2.0])
+    done = fit(
+        Task(network, loss, score, np.arange(8), np.ones(8), [], "line"),
+        config,
+        lambda stage, done, total: None,
+    )
+    assert (done.best_epoch, done.stopped_by, done.scores) == (
+        2,
+        "patience",
+        [3.0, 1.0, 2.0, 2.0, 2.0],
+    )
     assert network.weight.item() == weights[1]
     assert done.losses[-1] < done.losses[0]

@@ -35,13 +35,17 @@ def test_the_layer_is_the_papers_formula():
     maps = rng.standard_normal((2, 8, 4, 3)).astype(np.float32)
     found = layer(torch.from_numpy(maps)).detach().numpy()
     for one, vector in zip(maps, found, strict=True):
-        expected = by_the_formula(one, layer.conv.weight.detach().numpy()[:, :, 0, 0], layer.centroids.detach().numpy())
+        expected = by_the_formula(
+            one, layer.conv.weight.detach().numpy()[:, :, 0, 0], layer.centroids.detach().numpy()
+        )
         np.testing.assert_allclose(vector, expected, atol=1e-5)
 
 
 def test_second_words_get_a_hundredth_of_the_first_ones_share():
     rng = np.random.default_rng(1)
-    features = unit(rng.standard_normal((6, 16)).repeat(100, axis=0) + 0.3 * rng.standard_normal((600, 16)))
+    features = unit(
+        rng.standard_normal((6, 16)).repeat(100, axis=0) + 0.3 * rng.standard_normal((600, 16))
+    )
     centroids, assignment = learn_words(features, 6, seed=0)
     assert tuple(centroids.shape) == (6, 16)
     scores = np.sort(features @ assignment.numpy()[:, :, 0, 0].T, axis=1)

@@ -22,8 +22,14 @@ def netvlad_tensors(num_clusters: int = 64) -> dict[str, torch.Tensor]:
     """The keys and shapes of the public NetVLAD of VGG-16, small numbers in them."""
     with torch.device("meta"):
         features = Backbone("vgg16", num_outputs=None).state_dict()
-    tensors = {name.replace("features.", "encoder."): torch.full(value.shape, 0.01) for name, value in features.items()}
-    return tensors | {"pool.conv.weight": torch.ones(num_clusters, 512, 1, 1), "pool.centroids": torch.zeros(num_clusters, 512)}
+    tensors = {
+        name.replace("features.", "encoder."): torch.full(value.shape, 0.01)
+        for name, value in features.items()
+    }
+    return tensors | {
+        "pool.conv.weight": torch.ones(num_clusters, 512, 1, 1),
+        "pool.centroids": torch.zeros(num_clusters, 512),
+    }
 
 
 def test_a_file_is_read_and_known_by_its_hash(random_file: Path):
@@ -31,15 +37,23 @@ def test_a_file_is_read_and_known_by_its_hash(random_file: Path):
     assert weights.sha256 == hashlib.sha256(random_file.read_bytes()).hexdigest()
     network = Backbone("squeezenet1_1", num_outputs=None, depth=5)
     load_features(network, weights)
-    assert torch.equal(network.state_dict()["features.4.squeeze.weight"], weights.tensors["features.4.squeeze.weight"])
+    assert torch.equal(
+        network.state_dict()["features.4.squeeze.weight"],
+        weights.tensors["features.4.squeeze.weight"],
+    )
 
 
 def test_features_alone_are_enough(squeezenet_file: Path):
-    assert not any("classifier" in name for name in read_weights(squeezenet_file, "squeezenet1_1").tensors)
+    assert not any(
+        "classifier" in name for name in read_weights(squeezenet_file, "squeezenet1_1").tensors
+    )
 
 
 def test_weights_of_another_network_are_named(random_file: Path):
-    with pytest.raises(WeightsError, match=r"not those of vgg16: features.0.weight is \(64, 3, 3, 3\)|looks like squeezenet1_1"):
+    with pytest.raises(
+        WeightsError,
+        match=r"not those of vgg16: features.0.weight is \(64, 3, 3, 3\)|looks like squeezenet1_1",
+    ):
         read_weights(random_file, "vgg16")
 
 
@@ -81,7 +95,15 @@ def test_code_in_a_file_is_not_run(tmp_path: Path):
 
 def test_the_public_netvlad_checkpoint_is_understood(tmp_path: Path):
     recalls = {1: np.float64(0.85)}  # such checkpoints hold NumPy numbers beside the weights
-    torch.save({"epoch": 7, "state_dict": netvlad_tensors(), "recalls": recalls, "best_score": np.float64(0.85)}, tmp_path / "netvlad.pth")
+    torch.save(
+        {
+            "epoch": 7,
+            "state_dict": netvlad_tensors(),
+            "recalls": recalls,
+            "best_score": np.float64(0.85),
+        },
+        tmp_path / "netvlad.pth",
+    )
     weights = read_weights(tmp_path / "netvlad.pth", "vgg16")
     assert weights.netvlad is not None
     assert tuple(weights.netvlad["centroids"].shape) == (64, 512)
@@ -94,22 +116,33 @@ def test_a_netvlad_layer_that_does_not_fit_is_told(tmp_path: Path):
     tensors = netvlad_tensors()
     tensors["pool.centroids"] = torch.zeros(32, 512)
     torch.save({"state_dict": tensors}, tmp_path / "bad.pth")
-    with pytest.raises(WeightsError, match=r"pool\.conv\.weight is \(64, 512, 1, 1\), pool\.centroids \(32, 512\)"):
+    with pytest.raises(
+        WeightsError, match=r"pool\.conv\.weight is \(64, 512, 1, 1\), pool\.centroids \(32, 512\)"
+    ):
         read_weights(tmp_path / "bad.pth", "vgg16")
 
 
-def test_offline_it_says_what_to_fetch_and_where_to_put_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_offline_it_says_what_to_fetch_and_where_to_put_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     def offline(*args: object, **kwargs: object):
         raise urllib.error.URLError("no route to host")
 
     monkeypatch.setenv("TOPOLOC_CACHE", str(tmp_path))
     monkeypatch.setattr(urllib.request, "urlopen", offline)
-    with pytest.raises(WeightsError, match=r"https://\S+vgg16-397923af\.pth cannot be fetched \(no route to host\); .* put it at") as told:
+    with pytest.raises(
+        WeightsError,
+        match=(
+            r"https://\S+vgg16-397923af\.pth cannot be fetched \(no route to host\); .* put it at"
+        ),
+    ) as told:
         find_weights("vgg16", None)
     assert str(tmp_path / "vgg16-397923af.pth") in str(told.value)
 
 
-def test_published_weights_are_fetched_once_and_their_hash_is_checked(random_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_published_weights_are_fetched_once_and_their_hash_is_checked(
+    random_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     data = random_file.read_bytes()
     monkeypatch.setenv("TOPOLOC_CACHE", str(tmp_path))
     monkeypatch.setattr(urllib.request, "urlopen", lambda *args, **kwargs: io.BytesIO(data))
@@ -132,7 +165,11 @@ def test_the_published_weights_load_and_tell_pictures_apart(squeezenet_file: Pat
     network = Backbone("squeezenet1_1", num_outputs=None).eval()
     network.load_state_dict(torch.load(squeezenet_file, weights_only=True))
     checks = (torch.arange(96)[:, None] // 8 + torch.arange(96)[None] // 8) % 2
-    pictures = torch.stack([checks * 200, torch.full((96, 96), 128)]).to(torch.uint8)[..., None].expand(2, 96, 96, 3)
+    pictures = (
+        torch.stack([checks * 200, torch.full((96, 96), 128)])
+        .to(torch.uint8)[..., None]
+        .expand(2, 96, 96, 3)
+    )
     with torch.inference_mode():
         checked, plain = network(normalize_pictures(pictures)).mean(dim=(2, 3))
     assert torch.nn.functional.cosine_similarity(checked, plain, dim=0) < 0.7

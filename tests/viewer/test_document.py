@@ -30,11 +30,18 @@ def test_points_and_nodes_stand_where_the_map_has_them(tiny_recording: Path):
     assert len(shown) == document["map"]["num_points_shown"] > 100
     away = np.linalg.norm(of_node[:, None] - shown[None, : len(of_node)], axis=2).min(axis=1)
     assert np.mean(away < 1e-4) > 0.5, "its well-known points are the first ones shown"
-    assert [one["id"] for one in document["nodes"]] == [summary.node_id for summary in topomap.summaries]
+    assert [one["id"] for one in document["nodes"]] == [
+        summary.node_id for summary in topomap.summaries
+    ]
     first = document["nodes"][0]
-    np.testing.assert_allclose(first["world_from_cam"]["translation"], node.summary.world_from_cam.translation, atol=1e-6)
+    np.testing.assert_allclose(
+        first["world_from_cam"]["translation"], node.summary.world_from_cam.translation, atol=1e-6
+    )
     assert first["camera"]["width"] == node.camera.width
-    assert cv2.imdecode(np.frombuffer(base64.b64decode(first["picture"]), np.uint8), cv2.IMREAD_COLOR) is not None
+    assert (
+        cv2.imdecode(np.frombuffer(base64.b64decode(first["picture"]), np.uint8), cv2.IMREAD_COLOR)
+        is not None
+    )
     colours = np.frombuffer(base64.b64decode(document["points"]["rgb"]), np.uint8).reshape(-1, 3)
     assert len(colours) == len(shown)
     assert colours.std() > 5
@@ -45,29 +52,46 @@ def test_points_and_nodes_stand_where_the_map_has_them(tiny_recording: Path):
 
 def test_a_budget_is_kept(tiny_recording: Path):
     topomap = built_room(tiny_recording)
-    small = document_of(topomap, "room", budget=SceneBudget(max_points=100, max_picture_bytes=20_000))
+    small = document_of(
+        topomap, "room", budget=SceneBudget(max_points=100, max_picture_bytes=20_000)
+    )
     assert 50 < len(_points(small)) <= 100
     pictures = [node["picture"] for node in small["nodes"] if node["picture"]]
     assert 0 < sum(map(len, pictures)) <= 20_000
     assert small["map"]["num_points"] == document_of(topomap, "room")["map"]["num_points"]
 
 
-@pytest.mark.parametrize("turn", [np.zeros(3), np.array([np.pi / 2, 0.0, 0.0])], ids=["y down", "turned"])
+@pytest.mark.parametrize(
+    "turn", [np.zeros(3), np.array([np.pi / 2, 0.0, 0.0])], ids=["y down", "turned"]
+)
 def test_up_is_where_the_cameras_have_it(tiny_recording: Path, turn: np.ndarray):
     topomap = built_room(tiny_recording)
     moved = Rigid3(exp_so3(turn), np.zeros(3))
-    summaries = [replace(summary, world_from_cam=moved @ summary.world_from_cam) for summary in topomap.summaries]
-    nodes = [replace(node, summary=summary) for node, summary in zip(topomap.nodes, summaries, strict=True)]
+    summaries = [
+        replace(summary, world_from_cam=moved @ summary.world_from_cam)
+        for summary in topomap.summaries
+    ]
+    nodes = [
+        replace(node, summary=summary)
+        for node, summary in zip(topomap.nodes, summaries, strict=True)
+    ]
     before = np.array(document_of(topomap, "room")["up"])
     np.testing.assert_allclose(
-        document_of(replace(topomap, summaries=summaries, nodes=nodes), "room")["up"], moved.rotation @ before, atol=0.1
+        document_of(replace(topomap, summaries=summaries, nodes=nodes), "room")["up"],
+        moved.rotation @ before,
+        atol=0.1,
     )
 
 
 def test_up_is_up_on_earth_where_that_is_known(tiny_recording: Path):
     enu_from_world = Rigid3(exp_so3(np.array([0.3, 0.2, 0.1])), np.zeros(3))
-    earth = replace(built_room(tiny_recording), georeference=Georeference(GeoPoint(50.0, 4.0, 0.0), enu_from_world, "origin"))
-    np.testing.assert_allclose(enu_from_world.rotation @ document_of(earth, "room")["up"], [0.0, 0.0, 1.0], atol=1e-5)
+    earth = replace(
+        built_room(tiny_recording),
+        georeference=Georeference(GeoPoint(50.0, 4.0, 0.0), enu_from_world, "origin"),
+    )
+    np.testing.assert_allclose(
+        enu_from_world.rotation @ document_of(earth, "room")["up"], [0.0, 0.0, 1.0], atol=1e-5
+    )
 
 
 def test_a_path_breaks_where_it_jumps(tiny_recording: Path):
@@ -80,7 +104,9 @@ def test_a_path_breaks_where_it_jumps(tiny_recording: Path):
 
 def test_text_within_a_page_cannot_end_its_script(tiny_recording: Path):
     document = document_of(
-        built_room(tiny_recording), "</script><b>&", [ResultSet("a", [{"query": "x", "localized": False, "ms": float("nan")}])]
+        built_room(tiny_recording),
+        "</script><b>&",
+        [ResultSet("a", [{"query": "x", "localized": False, "ms": float("nan")}])],
     )
     text = script_json(document)
     assert not set("<>&") & set(text)

@@ -1,4 +1,5 @@
-"""Files of results: each kind is known by what it holds, and what is none is named with its line."""
+"""Files of results: each kind is known by what it holds, and what is none is named with its
+line."""
 
 from __future__ import annotations
 
@@ -18,14 +19,35 @@ from topoloc.sequences.trajectory import Trajectory, write_tum
 from topoloc.tracking.stream_result import StreamedPose
 from topoloc.viewer.result_files import read_results
 
-FOUND = Localization(Rigid3(np.eye(3), np.array([1.0, 2.0, 3.0])), 1e-4 * np.eye(6), 0.9, 4, [], 50, 40, {"total": 9.0})
-OPEN = NotLocalized("ambiguous", alternatives=(Alternative(FOUND.world_from_cam, 0.5, 4), Alternative(Rigid3.identity(), 0.4, 0)))
+FOUND = Localization(
+    Rigid3(np.eye(3), np.array([1.0, 2.0, 3.0])),
+    1e-4 * np.eye(6),
+    0.9,
+    4,
+    [],
+    50,
+    40,
+    {"total": 9.0},
+)
+OPEN = NotLocalized(
+    "ambiguous",
+    alternatives=(
+        Alternative(FOUND.world_from_cam, 0.5, 4),
+        Alternative(Rigid3.identity(), 0.4, 0),
+    ),
+)
 
 
 def test_lines_of_results_and_of_streams(tmp_path: Path):
     streamed = StreamedPose(7, "tracked", FOUND, Rigid3(np.eye(3), np.array([1.0, 2.0, 3.5])))
     path = tmp_path / "night.jsonl"
-    path.write_text("\n".join(json.dumps(one.to_json(name)) for name, one in (("a", FOUND), ("b", OPEN), ("c", streamed))) + "\n")
+    path.write_text(
+        "\n".join(
+            json.dumps(one.to_json(name))
+            for name, one in (("a", FOUND), ("b", OPEN), ("c", streamed))
+        )
+        + "\n"
+    )
     (results,) = read_results(path)
     assert results.name == "night"
     a, b, c = results.answers
@@ -51,7 +73,9 @@ def test_an_evaluation_has_its_recordings_and_its_truth(tmp_path: Path):
 
 
 def test_a_trajectory_is_a_path(tmp_path: Path):
-    write_tum(tmp_path / "walk.tum", Trajectory([Rigid3.identity(), FOUND.world_from_cam], [0, 10**9]))
+    write_tum(
+        tmp_path / "walk.tum", Trajectory([Rigid3.identity(), FOUND.world_from_cam], [0, 10**9])
+    )
     (walk,) = read_results(tmp_path / "walk.tum")
     assert (walk.name, len(walk.answers)) == ("walk", 0)
     np.testing.assert_allclose(walk.path[1].translation, [1.0, 2.0, 3.0])
@@ -66,7 +90,10 @@ def _bad(**changes: Any) -> str:
     [
         (lambda: json.dumps(FOUND.to_json("a")) + "\n" + _bad(world_from_cam=None), "line 2"),
         (lambda: _bad(covariance=[[1.0]]), "covariance"),
-        (lambda: _bad(true_world_from_cam={"translation": [0, 0, float("nan")]}), "true_world_from_cam"),
+        (
+            lambda: _bad(true_world_from_cam={"translation": [0, 0, float("nan")]}),
+            "true_world_from_cam",
+        ),
         (lambda: json.dumps({"num_queries": 3}), "neither results nor an evaluation"),
         (lambda: "{" * 100_000, "line 1"),
         (lambda: "hello", "columns"),
@@ -81,6 +108,8 @@ def test_what_is_no_result_is_named(text: Callable[[], str], said: str, tmp_path
 
 
 def test_only_what_was_understood_goes_on(tmp_path: Path):
-    (tmp_path / "x.json").write_text(json.dumps(replace(FOUND, geopose=None).to_json("<b>") | {"evil": "</script>"}))
+    (tmp_path / "x.json").write_text(
+        json.dumps(replace(FOUND, geopose=None).to_json("<b>") | {"evil": "</script>"})
+    )
     (answer,) = read_results(tmp_path / "x.json")[0].answers
     assert "evil" not in answer

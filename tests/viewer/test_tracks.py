@@ -41,7 +41,12 @@ def test_points_of_several_nodes_become_one(tiny_recording: Path):
     pairs = np.column_stack([tracks.point_rows, owners])[shown]
     assert len(np.unique(pairs, axis=0)) == len(pairs), "two key points of one picture in one track"
     # a point that is joined lies where its nodes have it
-    own = np.concatenate([node.summary.world_from_cam.apply(node.points_cam.astype(np.float64)) for node in topomap.nodes])
+    own = np.concatenate(
+        [
+            node.summary.world_from_cam.apply(node.points_cam.astype(np.float64))
+            for node in topomap.nodes
+        ]
+    )
     away = np.linalg.norm(tracks.points_world[tracks.point_rows[shown]] - own[shown], axis=1)
     assert np.median(away) < 0.01
 
@@ -61,9 +66,17 @@ def test_pictures_of_one_name_are_told_apart(tiny_recording: Path):
     topomap = built_room(tiny_recording)
     twice: TopoMetricMap = replace(
         topomap,
-        nodes=[replace(node, summary=replace(node.summary, name="same.png", session_id=row)) for row, node in enumerate(topomap.nodes)],
-        summaries=[replace(summary, name="same.png", session_id=row) for row, summary in enumerate(topomap.summaries)],
+        nodes=[
+            replace(node, summary=replace(node.summary, name="same.png", session_id=row))
+            for row, node in enumerate(topomap.nodes)
+        ],
+        summaries=[
+            replace(summary, name="same.png", session_id=row)
+            for row, summary in enumerate(topomap.summaries)
+        ],
     )
     scene = scene_of_map(twice, "room", with_points=False)
     assert [view.name for view in scene.views][:2] == ["session0/same.png", "session1/same.png"]
-    assert [view.name for view in scene_of_map(twice, "room", session_id=1, with_points=False).views] == ["session1/same.png"]
+    assert [
+        view.name for view in scene_of_map(twice, "room", session_id=1, with_points=False).views
+    ] == ["session1/same.png"]

@@ -1,4 +1,5 @@
-"""The demo's recordings: rendered in their order, resumed where they were left, and pictures of nothing that are just that."""
+"""The demo's recordings: rendered in their order, resumed where they were left, and pictures of
+nothing that are just that."""
 
 from __future__ import annotations
 
@@ -27,7 +28,10 @@ def test_rendering_begins_where_it_was_left(tmp_path: Path, monkeypatch: pytest.
         replace(
             recording,
             config=replace(
-                recording.config, camera=small, route=replace(recording.config.route, num_frames=1), render=RenderConfig.draft()
+                recording.config,
+                camera=small,
+                route=replace(recording.config.route, num_frames=1),
+                render=RenderConfig.draft(),
             ),
         )
         for recording in (RECORDINGS[0], RECORDINGS[3])
@@ -37,8 +41,14 @@ def test_rendering_begins_where_it_was_left(tmp_path: Path, monkeypatch: pytest.
     told: list[tuple[str, int, int]] = []
     render_recordings(tmp_path, lambda *step: told.append(step))
     frames = [step for step in told if "light" not in step[0]]
-    assert frames == [(f"rendering {name}", done, 1) for name in ("map lap1", "night") for done in (0, 1)]
-    assert set(ROLES) - set(missing_recordings(tmp_path)) == {"map_lap1", "night", "pictures_of_nothing"}
+    assert frames == [
+        (f"rendering {name}", done, 1) for name in ("map lap1", "night") for done in (0, 1)
+    ]
+    assert set(ROLES) - set(missing_recordings(tmp_path)) == {
+        "map_lap1",
+        "night",
+        "pictures_of_nothing",
+    }
     pair, single = (open_sequence(tmp_path / recording.name)[0] for recording in tiny)
     assert pair.rig is not None
     assert single.right is None
@@ -52,8 +62,14 @@ def test_rendering_begins_where_it_was_left(tmp_path: Path, monkeypatch: pytest.
 def test_who_asks_walks_otherwise_than_who_mapped():
     """No query may be a mapping frame once more."""
     lab = find_world("lab")
-    walks = {r.name: frame_poses(plan_route(lab.loop, lab.camera_height, r.config.route)) for r in RECORDINGS if r.world == "lab"}
-    mapped = np.array([pose.translation for name in ("map_lap1", "map_lap2") for pose in walks[name]])
+    walks = {
+        r.name: frame_poses(plan_route(lab.loop, lab.camera_height, r.config.route))
+        for r in RECORDINGS
+        if r.world == "lab"
+    }
+    mapped = np.array(
+        [pose.translation for name in ("map_lap1", "map_lap2") for pose in walks[name]]
+    )
     for name in ("day", "night", "other_camera"):
         nearest = [np.linalg.norm(mapped - pose.translation, axis=1).min() for pose in walks[name]]
         assert np.median(nearest) > 0.02

@@ -23,7 +23,12 @@ SETTINGS: dict[str, object] = {"world": "box", "route": {"laps": 1.0, "seed": 0}
 
 def shot(index: int, stereo: bool) -> Shot:
     rng = np.random.default_rng(index)
-    left, right = (np.repeat(rng.integers(40, 200, (1, 1, 3)), 16 * 24, axis=0).reshape(16, 24, 3).astype(np.uint8) for _ in range(2))
+    left, right = (
+        np.repeat(rng.integers(40, 200, (1, 1, 3)), 16 * 24, axis=0)
+        .reshape(16, 24, 3)
+        .astype(np.uint8)
+        for _ in range(2)
+    )
     depth = np.full((16, 24), 1.25 + index, np.float32)
     depth[0, 0], depth[0, 1] = np.nan, 400.0
     return Shot(left, right if stereo else None, depth)
@@ -39,7 +44,9 @@ def write(layout: Layout, frames: tuple[int, ...] = (0, 1, 2), overwrite: bool =
 @pytest.mark.parametrize("jpeg", [None, 95])
 @pytest.mark.parametrize("depth_factor", [None, 1000.0])
 @pytest.mark.parametrize("baseline", [None, 0.12])
-def test_every_layout_opens_as_what_it_is(tmp_path: Path, baseline: float | None, depth_factor: float | None, jpeg: int | None, grey: bool):
+def test_every_layout_opens_as_what_it_is(
+    tmp_path: Path, baseline: float | None, depth_factor: float | None, jpeg: int | None, grey: bool
+):
     write(Layout(tmp_path, CAMERA, baseline, grey, jpeg, depth_factor))
     sequence = open_sequence(tmp_path)
     frame, taken = sequence[1], shot(1, baseline is not None)
@@ -50,14 +57,18 @@ def test_every_layout_opens_as_what_it_is(tmp_path: Path, baseline: float | None
     np.testing.assert_allclose(frame.world_from_cam.matrix(), POSES[1].matrix(), atol=1e-9)
     assert frame.image.ndim == (2 if grey else 3)
     if not grey:
-        np.testing.assert_allclose(frame.image.astype(int), taken.left, atol=0 if jpeg is None else 6)
+        np.testing.assert_allclose(
+            frame.image.astype(int), taken.left, atol=0 if jpeg is None else 6
+        )
     if baseline is not None:
         assert frame.rig is not None
         assert frame.rig.baseline == pytest.approx(baseline)
         assert taken.right is not None
         assert frame.right is not None
         if not grey:
-            np.testing.assert_allclose(frame.right.astype(int), taken.right, atol=0 if jpeg is None else 6)
+            np.testing.assert_allclose(
+                frame.right.astype(int), taken.right, atol=0 if jpeg is None else 6
+            )
     elif depth_factor is not None:
         assert frame.depth is not None
         assert np.isnan(frame.depth.depth[0, :2]).all(), "sky, and beyond 16 bits"
@@ -83,8 +94,12 @@ def test_other_settings_are_named_and_nothing_is_touched(tmp_path: Path):
     layout = Layout(tmp_path, CAMERA, 0.12)
     write(layout)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    with pytest.raises(TopolocError, match=r"other settings \(route\.seed was 0, now 4\); .*--overwrite"):
-        prepare(layout, {"world": "box", "route": {"laps": 1.0, "seed": 4}}, TRAJECTORY, overwrite=False)
+    with pytest.raises(
+        TopolocError, match=r"other settings \(route\.seed was 0, now 4\); .*--overwrite"
+    ):
+        prepare(
+            layout, {"world": "box", "route": {"laps": 1.0, "seed": 4}}, TRAJECTORY, overwrite=False
+        )
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 

@@ -24,12 +24,20 @@ pytest.importorskip("mitsuba", reason="Mitsuba is not installed")
 DAY = CONDITIONS["day"]
 SMALL = Camera.pinhole(64, 40, 38.0, 38.0, 31.5, 19.5)
 CONFIG = RecordConfig(
-    route=replace(BOX_WORLD.route(), num_frames=4, start=2.0), camera=SMALL, baseline=0.12, render=RenderConfig.draft(), depth=True
+    route=replace(BOX_WORLD.route(), num_frames=4, start=2.0),
+    camera=SMALL,
+    baseline=0.12,
+    render=RenderConfig.draft(),
+    depth=True,
 )
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
 
 
 @pytest.fixture(scope="session")
@@ -51,10 +59,14 @@ def test_a_recording_is_whole_and_says_how_it_was_made(recorded: Path):
     assert np.abs(frame.image.astype(int) - frame.right).mean() > 1
     settings = json.loads((recorded / "world.json").read_text())
     assert (settings["world"], settings["condition"], settings["num_frames"]) == ("box", "day", 4)
-    assert {"seed", "arrangement", "route", "camera", "render", "topoloc", "variant"} <= set(settings)
+    assert {"seed", "arrangement", "route", "camera", "render", "topoloc", "variant"} <= set(
+        settings
+    )
 
 
-def test_another_run_gives_the_same_bytes_whatever_the_number_of_processes(recorded: Path, tmp_path: Path):
+def test_another_run_gives_the_same_bytes_whatever_the_number_of_processes(
+    recorded: Path, tmp_path: Path
+):
     record(BOX_WORLD, DAY, tmp_path / "box", CONFIG, processes=2)
     assert files(tmp_path / "box") == files(recorded)
 
@@ -80,7 +92,9 @@ def test_interrupted_it_goes_on_where_it_stopped(recorded: Path, tmp_path: Path)
     assert files(out) == files(recorded)
 
 
-def test_a_whole_recording_is_not_rendered_again(recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_whole_recording_is_not_rendered_again(
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     out = Path(shutil.copytree(recorded, tmp_path / "box"))
     monkeypatch.setattr("topoloc_worlds.recorder.shoot", None)
     assert record(BOX_WORLD, DAY, out, CONFIG).num_rendered == 0
@@ -97,9 +111,13 @@ def test_other_settings_need_another_folder(recorded: Path, tmp_path: Path):
 
 
 def test_truth_agrees_with_the_rendered_geometry(recorded: Path):
-    """Points of one frame's depth, moved by truth.tum, are where another frame's depth has them: to a tenth of a pixel."""
+    """Points of one frame's depth, moved by truth.tum, are where another frame's depth has them: to
+    a tenth of a pixel."""
     poses = open_sequence(recorded).poses
-    depths = [cv2.imread(str(recorded / "depth_2" / f"{i:06d}.png"), cv2.IMREAD_UNCHANGED) / 5000.0 for i in range(4)]
+    depths = [
+        cv2.imread(str(recorded / "depth_2" / f"{i:06d}.png"), cv2.IMREAD_UNCHANGED) / 5000.0
+        for i in range(4)
+    ]
     grid = np.stack(np.meshgrid(np.arange(64.0), np.arange(40.0)), axis=-1).reshape(-1, 2)
     rays = np.column_stack([SMALL.normalized_from_img(grid), np.ones(len(grid))])
     first, last = poses[0], poses[3]
@@ -109,7 +127,9 @@ def test_truth_agrees_with_the_rendered_geometry(recorded: Path):
     assert np.linalg.norm(last_from_first.translation) > 0.15
     in_last = last_from_first.apply(rays * depths[0].reshape(-1, 1))
     at = SMALL.img_from_cam(in_last)
-    seen = cv2.remap(1.0 / depths[3], at[:, 0].astype(np.float32), at[:, 1].astype(np.float32), cv2.INTER_LINEAR).ravel()
+    seen = cv2.remap(
+        1.0 / depths[3], at[:, 0].astype(np.float32), at[:, 1].astype(np.float32), cv2.INTER_LINEAR
+    ).ravel()
     inside = np.all((at > 1) & (at < [62, 38]), axis=1)
     assert inside.mean() > 0.5
     surface = in_last[inside] / (seen * in_last[:, 2])[inside, None]
@@ -120,14 +140,22 @@ def test_truth_agrees_with_the_rendered_geometry(recorded: Path):
 def test_depth_tells_where_a_point_is_in_the_right_picture(tmp_path: Path):
     camera = Camera.pinhole(160, 100, 95.0, 95.0, 79.5, 49.5)
     quiet = SensorConfig(full_well=1e9, read_noise=0.0)
-    fine = replace(RenderConfig(), bake=CONFIG.render.bake)  # of the light that other tests have traced
-    config = replace(CONFIG, camera=camera, sensor=quiet, render=fine, route=replace(CONFIG.route, num_frames=1))
+    fine = replace(
+        RenderConfig(), bake=CONFIG.render.bake
+    )  # of the light that other tests have traced
+    config = replace(
+        CONFIG, camera=camera, sensor=quiet, render=fine, route=replace(CONFIG.route, num_frames=1)
+    )
     record(BOX_WORLD, DAY, tmp_path / "box", replace(config, grey=True))
     frame = open_sequence(tmp_path / "box")[0]
-    depth = cv2.imread(str(tmp_path / "box" / "depth_0" / "000000.png"), cv2.IMREAD_UNCHANGED) / 5000.0
+    depth = (
+        cv2.imread(str(tmp_path / "box" / "depth_0" / "000000.png"), cv2.IMREAD_UNCHANGED) / 5000.0
+    )
     assert frame.right is not None
     points = cv2.goodFeaturesToTrack(frame.image, 300, 0.02, 4)
-    found, status, _ = cv2.calcOpticalFlowPyrLK(frame.image, frame.right, points, points.copy(), winSize=(13, 13))
+    found, status, _ = cv2.calcOpticalFlowPyrLK(
+        frame.image, frame.right, points, points.copy(), winSize=(13, 13)
+    )
     start, end = points[status.ravel() == 1, 0], found[status.ravel() == 1, 0]
     assert len(start) > 40
     there = depth[np.rint(start[:, 1]).astype(int), np.rint(start[:, 0]).astype(int)]
@@ -139,14 +167,21 @@ def test_depth_tells_where_a_point_is_in_the_right_picture(tmp_path: Path):
 def test_a_recording_can_be_mapped(tmp_path: Path):
     camera = Camera.pinhole(160, 100, 95.0, 95.0, 79.5, 49.5)
     route = replace(CONFIG.route, num_frames=3, spacing=0.4)
-    record(BOX_WORLD, DAY, tmp_path / "box", replace(CONFIG, camera=camera, route=route, depth=False, jpeg=90))
+    record(
+        BOX_WORLD,
+        DAY,
+        tmp_path / "box",
+        replace(CONFIG, camera=camera, route=route, depth=False, jpeg=90),
+    )
     topomap = build_map([open_sequence(tmp_path / "box")])
     assert len(topomap.summaries) >= 2
     assert sum(summary.num_points for summary in topomap.summaries) > 30
 
 
 def test_night_is_darker_than_day_and_rain_falls(recorded: Path, tmp_path: Path):
-    one = replace(CONFIG, route=replace(CONFIG.route, num_frames=1), sensor=SensorConfig(max_gain=1.0))
+    one = replace(
+        CONFIG, route=replace(CONFIG.route, num_frames=1), sensor=SensorConfig(max_gain=1.0)
+    )
     brightness = {}
     for name in ("day", "night"):
         record(BOX_WORLD, CONDITIONS[name], tmp_path / name, one)
@@ -157,7 +192,10 @@ def test_night_is_darker_than_day_and_rain_falls(recorded: Path, tmp_path: Path)
     assert not np.array_equal(*(open_sequence(tmp_path / out)[0].image for out in ("dry", "wet")))
 
 
-@pytest.mark.parametrize("change", [{"baseline": 0.0}, {"camera": Camera("RADIAL", 64, 40, (38.0, 31.5, 19.5, 0.1, 0.0))}])
+@pytest.mark.parametrize(
+    "change",
+    [{"baseline": 0.0}, {"camera": Camera("RADIAL", 64, 40, (38.0, 31.5, 19.5, 0.1, 0.0))}],
+)
 def test_cameras_that_cannot_be_rendered(change: dict[str, object]):
     with pytest.raises(CalibrationError):
         replace(CONFIG, **change)  # type: ignore[arg-type]

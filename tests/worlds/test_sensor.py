@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 
 from topoloc_worlds.conditions import CONDITIONS
-from topoloc_worlds.sensor import Exposure, SensorConfig, choose_exposure, take_picture, white_balance_of
+from topoloc_worlds.sensor import (
+    Exposure,
+    SensorConfig,
+    choose_exposure,
+    take_picture,
+    white_balance_of,
+)
 
 CONFIG = SensorConfig(vignetting=0.0)
 NEUTRAL = np.ones(3)
@@ -14,8 +20,19 @@ def evenly(radiance: float, shape: tuple[int, int] = (64, 96)) -> np.ndarray:
     return np.full((*shape, 3), radiance, np.float32)
 
 
-def picture(light: np.ndarray, exposure: Exposure | None = None, config: SensorConfig = CONFIG, seed: int = 0) -> np.ndarray:
-    return take_picture(light, exposure or choose_exposure(light, config), config, np.random.default_rng(seed), NEUTRAL)
+def picture(
+    light: np.ndarray,
+    exposure: Exposure | None = None,
+    config: SensorConfig = CONFIG,
+    seed: int = 0,
+) -> np.ndarray:
+    return take_picture(
+        light,
+        exposure or choose_exposure(light, config),
+        config,
+        np.random.default_rng(seed),
+        NEUTRAL,
+    )
 
 
 @pytest.mark.parametrize("radiance", [0.02, 0.3, 2.0])
@@ -25,7 +42,9 @@ def test_exposure_makes_any_daylight_mid_grey(radiance: float):
 
 
 def test_where_light_fails_time_goes_first_then_gain_then_the_picture():
-    bright, dim, dark = (choose_exposure(evenly(radiance), CONFIG) for radiance in (1.0, 0.005, 1e-5))
+    bright, dim, dark = (
+        choose_exposure(evenly(radiance), CONFIG) for radiance in (1.0, 0.005, 1e-5)
+    )
     assert bright.gain == 1.0
     assert bright.time < CONFIG.max_time
     assert dim.time == CONFIG.max_time
@@ -48,7 +67,9 @@ def test_noise_has_the_variance_of_electrons():
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
     electrons = CONFIG.full_well / exposure.gain
     assert linear.mean() == pytest.approx(level, rel=0.01)
-    assert linear.std() == pytest.approx(np.sqrt(level * electrons + CONFIG.read_noise**2) / electrons, rel=0.05)
+    assert linear.std() == pytest.approx(
+        np.sqrt(level * electrons + CONFIG.read_noise**2) / electrons, rel=0.05
+    )
 
 
 def test_a_bright_window_saturates_and_the_room_stays_visible():
@@ -62,7 +83,9 @@ def test_a_bright_window_saturates_and_the_room_stays_visible():
 def test_no_more_than_the_allowed_share_is_white():
     light = evenly(1e-4)
     light[:, 40:] = 1.0
-    assert picture(light)[:, 40:].mean() < 254, "over half of the picture, so that it must keep its detail"
+    assert picture(light)[:, 40:].mean() < 254, (
+        "over half of the picture, so that it must keep its detail"
+    )
 
 
 def test_corners_are_darker_and_more_light_is_never_darker():
@@ -70,14 +93,20 @@ def test_corners_are_darker_and_more_light_is_never_darker():
     flat = picture(evenly(0.3), config=config)
     assert int(flat[32, 48, 0]) - int(flat[0, 0, 0]) > 10
     ramp = np.repeat(np.linspace(0.0, 5.0, 400, dtype=np.float32)[None, :, None], 3, axis=2)
-    values = picture(ramp, Exposure(1.0 / CONFIG.sensitivity, 1.0), SensorConfig(vignetting=0.0, full_well=1e9, read_noise=0.0))[0, :, 0]
+    values = picture(
+        ramp,
+        Exposure(1.0 / CONFIG.sensitivity, 1.0),
+        SensorConfig(vignetting=0.0, full_well=1e9, read_noise=0.0),
+    )[0, :, 0]
     assert np.all(np.diff(values.astype(int)) >= 0)
     assert values[0] == 0
     assert values[-1] == 255
 
 
 def test_white_balance_is_slightly_off_and_of_the_recording():
-    day, again, night = (white_balance_of(CONDITIONS[name], 3, SensorConfig()) for name in ("day", "day", "night"))
+    day, again, night = (
+        white_balance_of(CONDITIONS[name], 3, SensorConfig()) for name in ("day", "day", "night")
+    )
     assert np.array_equal(day, again)
     assert not np.array_equal(day, night)
     assert np.all(np.abs(np.log([day, night])) < 0.25)

@@ -18,7 +18,8 @@ QUIET = SensorConfig(full_well=1e12, read_noise=0.0, white_balance_error=0.0, vi
 
 
 class StripedWall(Renderer):
-    """A wall 2 m before the camera wherever it goes, with upright stripes fixed to the world's y axis; no Mitsuba."""
+    """A wall 2 m before the camera wherever it goes, with upright stripes fixed to the world's y
+    axis; no Mitsuba."""
 
     def __init__(self, brightness: float = 1.0) -> None:
         self.brightness = brightness
@@ -35,7 +36,11 @@ class StripedWall(Renderer):
 
 @pytest.fixture
 def shooting() -> Shooting:
-    route = plan_route(((0.0, 0.0), (9.0, 0.0), (9.0, 5.0), (0.0, 5.0)), 1.2, RouteConfig(start=4.0, wobble=0.0, look=np.pi / 2))
+    route = plan_route(
+        ((0.0, 0.0), (9.0, 0.0), (9.0, 5.0), (0.0, 5.0)),
+        1.2,
+        RouteConfig(start=4.0, wobble=0.0, look=np.pi / 2),
+    )
     return Shooting(StripedWall(), CONDITIONS["day"], route, CAMERA, baseline=0.12, sensor=QUIET)
 
 
@@ -46,7 +51,9 @@ def test_the_right_picture_is_seen_from_a_baseline_further_right(shooting: Shoot
     assert offset == 3.6
     ahead = np.arange(10, 80)
     left, right = (picture[32, :, 1].astype(float) for picture in (shot.left, shot.right))
-    np.testing.assert_allclose(np.interp(ahead + offset, np.arange(96), left), right[ahead], atol=1.5)
+    np.testing.assert_allclose(
+        np.interp(ahead + offset, np.arange(96), left), right[ahead], atol=1.5
+    )
     assert shot.depth.max() == 2.0
 
 
@@ -60,13 +67,13 @@ def test_frames_are_the_same_in_any_order_and_no_two_share_their_noise(shooting:
     assert len(set(noisy.renderer.seeds)) == 4, "two frames of two pictures"
     assert in_order[0].right is not None
     noise = [picture.astype(int) - quiet for picture, quiet in zip(
-        (in_order[0].left, in_order[0].right), (shoot(shooting, 2).left, shoot(shooting, 2).right), strict=True
+        (in_order[0].left, in_order[0].right), (shoot(shooting, 2).left, shoot(shooting, 2).right), strict=True  # noqa: E501
     )]  # fmt: skip
     assert abs(np.corrcoef(noise[0].ravel(), noise[1].ravel())[0, 1]) < 0.3
 
 
 def test_motion_blurs_along_the_way_in_the_dark_only(shooting: Shooting):
-    fast = replace(shooting, route=plan_route(((0.0, 0.0), (90.0, 0.0), (90.0, 50.0)), 1.2, RouteConfig(
+    fast = replace(shooting, route=plan_route(((0.0, 0.0), (90.0, 0.0), (90.0, 50.0)), 1.2, RouteConfig(  # noqa: E501
         start=40.0, speed=12.0, spacing=1.0, wobble=0.0, look=np.pi / 2
     )), baseline=None)  # fmt: skip
     for brightness, least, most in ((1.0, 0.98, 1.01), (0.003, 0.5, 0.97)):
@@ -85,5 +92,8 @@ def test_a_single_camera_has_no_right_picture_and_drops_stay_on_the_lens(shootin
     wet, dry = replace(shooting, baseline=None, lens_drops=5), replace(shooting, baseline=None)
     shots = [shoot(wet, index) for index in (1, 2)]
     assert shots[0].right is None
-    wetted = [np.abs(shot.left.astype(int) - shoot(dry, index).left).max(axis=2) > 8 for shot, index in zip(shots, (1, 2), strict=True)]
+    wetted = [
+        np.abs(shot.left.astype(int) - shoot(dry, index).left).max(axis=2) > 8
+        for shot, index in zip(shots, (1, 2), strict=True)
+    ]
     assert (wetted[0] & wetted[1]).sum() > 0.4 * (wetted[0] | wetted[1]).sum() > 0

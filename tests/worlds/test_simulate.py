@@ -43,7 +43,12 @@ def test_it_writes_a_recording_and_says_so(tmp_path: Path, capsys: pytest.Captur
     assert simulate("lab", out, "--num-frames", 3, "--json", facts) == 0
     assert capsys.readouterr().out.startswith(f"{out}: 3 stereo pairs, 0.")
     data = json.loads(facts.read_text())
-    assert (data["world"], data["condition"], data["num_frames"], data["num_rendered"]) == ("lab", "day", 3, 3)
+    assert (data["world"], data["condition"], data["num_frames"], data["num_rendered"]) == (
+        "lab",
+        "day",
+        3,
+        3,
+    )
     frame = open_sequence(out)[2]
     assert frame.rig is not None
     assert frame.camera is not None
@@ -54,16 +59,31 @@ def test_it_writes_a_recording_and_says_so(tmp_path: Path, capsys: pytest.Captur
 
 @pytest.mark.usefixtures("no_rendering")
 def test_settings_reach_the_recording(tmp_path: Path):
-    words = "--num-frames 2 --condition clear --seed 3 --take 4 --arrangement 5 --lateral 0.1 --reverse --look 90 --sway hand"
+    words = (
+        "--num-frames 2 --condition clear --seed 3 --take 4 --arrangement 5 --lateral 0.1 --reverse"
+        " --look 90 --sway hand"
+    )
     words += " --start 1 --spacing 0.3 --laps 0.5 --mono --depth --grey --motion-blur --draft"
     assert simulate("lab", tmp_path / "a", *words.split(), "--camera", "40,40,23.5,15.5") == 0
     settings = json.loads((tmp_path / "a" / "world.json").read_text())
-    assert [settings[name] for name in ("condition", "seed", "arrangement", "grey", "depth")] == ["day", 3, 5, True, True]
+    assert [settings[name] for name in ("condition", "seed", "arrangement", "grey", "depth")] == [
+        "day",
+        3,
+        5,
+        True,
+        True,
+    ]
     assert settings["baseline"] is None
     assert settings["num_renderings"] > 1
     assert settings["camera"]["fx"] == 40.0
     route = RouteConfig(**settings["route"])
-    assert (route.seed, route.lateral, route.reverse, route.wobble, route.shake) == (4, 0.1, True, 1.0, 1.0)
+    assert (route.seed, route.lateral, route.reverse, route.wobble, route.shake) == (
+        4,
+        0.1,
+        True,
+        1.0,
+        1.0,
+    )
     assert (route.start, route.spacing, route.laps) == (1.0, 0.3, 0.5)
     assert route.look == pytest.approx(np.pi / 2)
     assert open_sequence(tmp_path / "a")[0].depth is not None
@@ -72,8 +92,13 @@ def test_settings_reach_the_recording(tmp_path: Path):
 @pytest.mark.usefixtures("no_rendering")
 def test_a_camera_file_and_a_part_of_a_lap(tmp_path: Path):
     camera = tmp_path / "camera.json"
-    camera.write_text('{"model": "PINHOLE", "width": 48, "height": 32, "fx": 41, "fy": 41, "cx": 23, "cy": 15}')
-    assert simulate("corridor", tmp_path / "a", "--camera", camera, "--laps", 0.0125, "--sway", "none") == 0
+    camera.write_text(
+        '{"model": "PINHOLE", "width": 48, "height": 32, "fx": 41, "fy": 41, "cx": 23, "cy": 15}'
+    )
+    assert (
+        simulate("corridor", tmp_path / "a", "--camera", camera, "--laps", 0.0125, "--sway", "none")
+        == 0
+    )
     sequence = open_sequence(tmp_path / "a")
     assert sequence[0].camera is not None
     assert sequence[0].camera.fx == 41
@@ -84,7 +109,9 @@ def test_a_camera_file_and_a_part_of_a_lap(tmp_path: Path):
 
 
 @pytest.mark.usefixtures("no_rendering")
-def test_interrupted_it_says_how_to_go_on(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+def test_interrupted_it_says_how_to_go_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
     whole = recorder.shoot
 
     def interrupted(shooting: None, index: int) -> Shot:
@@ -95,7 +122,11 @@ def test_interrupted_it_says_how_to_go_on(tmp_path: Path, capsys: pytest.Capture
     monkeypatch.setattr(recorder, "shoot", interrupted)
     assert simulate("lab", tmp_path / "a", "--num-frames", 4) == 1
     error = capsys.readouterr().err
-    assert error == f"error: interrupted (2 of 4 frames are in {tmp_path / 'a'}; the same command goes on from there)\n"
+    assert (
+        error
+        == f"error: interrupted (2 of 4 frames are in {tmp_path / 'a'}; the same command goes on"
+        " from there)\n"
+    )
     monkeypatch.setattr(recorder, "shoot", whole)
     assert simulate("lab", tmp_path / "a", "--num-frames", 4) == 0
     assert "4 stereo pairs (2 of them were there)" in capsys.readouterr().out
@@ -103,7 +134,9 @@ def test_interrupted_it_says_how_to_go_on(tmp_path: Path, capsys: pytest.Capture
 
 def test_unknown_worlds_and_conditions_get_the_list(complaint: Complaint, tmp_path: Path):
     assert "lab, corridor, hospital, street" in complaint("simulate", "moon", tmp_path / "a")
-    assert "day, evening, night, cloudy, rain" in complaint("simulate", "lab", tmp_path / "a", "--condition", "fog")
+    assert "day, evening, night, cloudy, rain" in complaint(
+        "simulate", "lab", tmp_path / "a", "--condition", "fog"
+    )
 
 
 @pytest.mark.usefixtures("no_rendering")
@@ -112,7 +145,9 @@ def test_bad_settings_are_named_before_anything_is_written(complaint: Complaint,
     assert "--size" in complaint("simulate", "lab", out, "--size", "40", status=2)
     assert "--baseline" in complaint("simulate", "lab", out, "--mono", "--baseline", 0.1, status=2)
     assert "four numbers" in complaint("simulate", "lab", out, "--camera", "1,2,3")
-    assert "no such camera file" in complaint("simulate", "lab", out, "--camera", tmp_path / "none.json")
+    assert "no such camera file" in complaint(
+        "simulate", "lab", out, "--camera", tmp_path / "none.json"
+    )
     assert "spacing" in complaint("simulate", "lab", out, "--spacing", -1)
     assert "bends" in complaint("simulate", "lab", out, "--lateral", 40)
     assert "JPEG" in complaint("simulate", "lab", out, "--jpeg", 200)
@@ -126,11 +161,26 @@ def test_folders_of_others_and_other_settings_are_left_alone(complaint: Complain
     assert "holds other files" in complaint("simulate", "lab", mine)
     assert "cannot write" in complaint("simulate", "lab", mine / "thesis.tex" / "out")
     assert simulate("lab", tmp_path / "a", "--num-frames", 1) == 0
-    assert "condition was" in complaint("simulate", "lab", tmp_path / "a", "--num-frames", 1, "--condition", "night", "--size", "48x32")
-    assert simulate("lab", tmp_path / "a", "--num-frames", 1, "--condition", "night", "--overwrite") == 0
+    assert "condition was" in complaint(
+        "simulate",
+        "lab",
+        tmp_path / "a",
+        "--num-frames",
+        1,
+        "--condition",
+        "night",
+        "--size",
+        "48x32",
+    )
+    assert (
+        simulate("lab", tmp_path / "a", "--num-frames", 1, "--condition", "night", "--overwrite")
+        == 0
+    )
 
 
-def test_without_mitsuba_it_is_named(complaint: Complaint, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_without_mitsuba_it_is_named(
+    complaint: Complaint, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setitem(sys.modules, "mitsuba", None)
     assert "pip install mitsuba" in complaint("simulate", "lab", tmp_path / "a")
     with pytest.raises(MissingExtraError):

@@ -12,8 +12,14 @@ from topoloc_worlds.skies import sky_of
 def directions(sky: Sky) -> Float64[np.ndarray, "h w 3"]:
     """By the words of `Sky.radiance`, independently of the code that makes it."""
     height, width, _ = sky.radiance.shape
-    polar, azimuth = np.meshgrid((np.arange(height) + 0.5) / height * np.pi, np.arange(width) / width * 2 * np.pi, indexing="ij")
-    return np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1)
+    polar, azimuth = np.meshgrid(
+        (np.arange(height) + 0.5) / height * np.pi,
+        np.arange(width) / width * 2 * np.pi,
+        indexing="ij",
+    )
+    return np.stack(
+        [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1
+    )
 
 
 def brightness(sky: Sky) -> float:
@@ -25,11 +31,16 @@ def brightness(sky: Sky) -> float:
 def test_mean_radiance_is_the_daylight():
     for name, condition in CONDITIONS.items():
         if condition.daylight > 0:
-            assert brightness(sky_of(condition, 3)) == pytest.approx(condition.daylight, rel=1e-3), name
+            assert brightness(sky_of(condition, 3)) == pytest.approx(
+                condition.daylight, rel=1e-3
+            ), name
 
 
 def test_brightness_in_order():
-    levels = [brightness(sky_of(CONDITIONS[name], 0)) for name in ("day", "cloudy", "rain", "evening", "night")]
+    levels = [
+        brightness(sky_of(CONDITIONS[name], 0))
+        for name in ("day", "cloudy", "rain", "evening", "night")
+    ]
     assert levels == sorted(levels, reverse=True)
     assert 0.0 < levels[-1] < 1e-3
 
@@ -60,12 +71,16 @@ def test_dusk_glows_where_the_sun_went_down():
     sky = sky_of(CONDITIONS["evening"], 1)
     row = sky.radiance.shape[0] // 2 - 3
     reddest = int((sky.radiance[row, :, 0] / sky.radiance[row, :, 2]).argmax())
-    assert float(directions(sky)[row, reddest, :2] @ toward_sun[:2]) > 0.9 * float(np.linalg.norm(toward_sun[:2]))
+    assert float(directions(sky)[row, reddest, :2] @ toward_sun[:2]) > 0.9 * float(
+        np.linalg.norm(toward_sun[:2])
+    )
 
 
 def test_colours_of_the_sky():
     row = 20
-    day, cloudy = (sky_of(CONDITIONS[name], 2).radiance[row].mean(axis=0) for name in ("day", "cloudy"))
+    day, cloudy = (
+        sky_of(CONDITIONS[name], 2).radiance[row].mean(axis=0) for name in ("day", "cloudy")
+    )
     assert day[2] > 1.5 * day[0]
     assert cloudy[2] < 1.2 * cloudy[0]
 

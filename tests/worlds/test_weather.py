@@ -42,13 +42,17 @@ def test_drops_are_brighter_than_the_road_and_hidden_by_what_is_nearer():
     assert (rainy - street()).max() > 0.02
     behind = draw_rain(street(), np.full_like(WALL, 1.0), CAMERA, Rigid3.identity(), drops, 0.005)
     assert np.array_equal(behind, street())
-    before_sky = draw_rain(street(), np.full_like(WALL, np.nan), CAMERA, Rigid3.identity(), drops, 0.005)
+    before_sky = draw_rain(
+        street(), np.full_like(WALL, np.nan), CAMERA, Rigid3.identity(), drops, 0.005
+    )
     assert np.array_equal(before_sky, rainy)
 
 
 def test_near_drops_are_thicker_and_longer_exposures_longer():
     def touched(drops: Drops, time: float, axis: int) -> int:
-        change = np.abs(draw_rain(street(), WALL, CAMERA, Rigid3.identity(), drops, time) - street()).sum(axis=2)
+        change = np.abs(
+            draw_rain(street(), WALL, CAMERA, Rigid3.identity(), drops, time) - street()
+        ).sum(axis=2)
         return int(np.sum(np.any(change > 1e-3, axis=axis)))
 
     near, far = one_drop(0.0, 0.12, 0.6), one_drop(0.0, 1.2, 6.0)
@@ -57,7 +61,10 @@ def test_near_drops_are_thicker_and_longer_exposures_longer():
 
 
 def test_rain_falls_before_the_camera_and_comes_towards_a_moving_one():
-    still, driving = (falling_drops(500, CAMERA, LEVEL, np.array([v, 0.0, 0.0]), np.random.default_rng(0)) for v in (0.0, 10.0))
+    still, driving = (
+        falling_drops(500, CAMERA, LEVEL, np.array([v, 0.0, 0.0]), np.random.default_rng(0))
+        for v in (0.0, 10.0)
+    )
     in_picture = CAMERA.img_from_cam(still.position)
     assert np.all((in_picture > -1) & (in_picture < [320, 200]))
     assert np.all(still.velocity[:, 1] > 4.0), "down is +y"

@@ -1,4 +1,5 @@
-"""Queries asked, once: every way of answering gives the rows that all tables and figures are made of."""
+"""Queries asked, once: every way of answering gives the rows that all tables and figures are made
+of."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ WARM_UP = 3
 
 @dataclass(frozen=True)
 class Way:
-    """A way of answering: the map, the coarse localizer, the fine step. `knows_node` puts the truth in the coarse one's place."""
+    """A way of answering: the map, the coarse localizer, the fine step. `knows_node` puts the truth
+    in the coarse one's place."""
 
     kind: MapKind
     coarse: str = "surf-vlad"
@@ -36,7 +38,9 @@ class Way:
     def name(self) -> str:
         special = asdict(self.config) != asdict(LocalizerConfig())
         coarse = "known-node" if self.knows_node else self.coarse
-        return f"{self.kind.name}-{coarse}" + (f"-{digest_of(asdict(self.config))[:6]}" if special else "")
+        return f"{self.kind.name}-{coarse}" + (
+            f"-{digest_of(asdict(self.config))[:6]}" if special else ""
+        )
 
     @property
     def code(self) -> StageCode:
@@ -65,15 +69,32 @@ def asked(bench: Bench, dataset: Dataset, label: str, way: Way) -> Done:
         if way.knows_node:
             truths = [known @ pose for pose in sequence.poses if pose is not None]
             localizer = Localizer(topomap, config, KnownNodes(topomap, truths))
-        return rows_of(answer_queries(localizer, sequence, known, lambda _, done, total: bench.progress(told, done, total), label))
+        return rows_of(
+            answer_queries(
+                localizer,
+                sequence,
+                known,
+                lambda _, done, total: bench.progress(told, done, total),
+                label,
+            )
+        )
 
-    settings = {"map": digest, "config": asdict(way.config), "knows_node": way.knows_node, "queries": sequence_digest(sequence)}
-    return bench.store.get(f"answers-{dataset.name}-{label.replace(' ', '_')}-{way.name}", settings, ask, way.code)
+    settings = {
+        "map": digest,
+        "config": asdict(way.config),
+        "knows_node": way.knows_node,
+        "queries": sequence_digest(sequence),
+    }
+    return bench.store.get(
+        f"answers-{dataset.name}-{label.replace(' ', '_')}-{way.name}", settings, ask, way.code
+    )
 
 
 def answers(bench: Bench, dataset: Dataset, label: str, way: Way) -> list[Answer]:
     """The answers themselves, with their pictures at hand."""
-    return answers_of(asked(bench, dataset, label, way).result, label, queries_of(bench, dataset, label))
+    return answers_of(
+        asked(bench, dataset, label, way).result, label, queries_of(bench, dataset, label)
+    )
 
 
 def summary(bench: Bench, dataset: Dataset, label: str, way: Way) -> dict[str, Any]:
@@ -88,13 +109,20 @@ def queries_of(bench: Bench, dataset: Dataset, label: str) -> StereoSequence:
 
 
 def elsewhere_of(bench: Bench, dataset: Dataset) -> list[tuple[str, StereoSequence]]:
-    """Images that were not taken in the data set's place: of the other places of its kind, and pictures of nothing."""
+    """Images that were not taken in the data set's place: of the other places of its kind, and
+    pictures of nothing."""
     paths = [(path, path) for path in dataset.elsewhere]
     for other in (*bench.rendered, *bench.real):
         if other.name != dataset.name and (other.is_real == dataset.is_real):
             paths += [(f"{other.name} {label}", path) for label, path in other.queries.items()]
-    sequences = [(name, open_sequence(path)) for name, path in [*paths, ("nothing", str(SHIPPED / "pictures_of_nothing"))]]
-    return [(name, sequence_subset(s, evenly(len(s), bench.config.max_elsewhere))) for name, s in sequences]
+    sequences = [
+        (name, open_sequence(path))
+        for name, path in [*paths, ("nothing", str(SHIPPED / "pictures_of_nothing"))]
+    ]
+    return [
+        (name, sequence_subset(s, evenly(len(s), bench.config.max_elsewhere)))
+        for name, s in sequences
+    ]
 
 
 def false_accepts(bench: Bench, dataset: Dataset, way: Way) -> dict[str, int]:
@@ -104,8 +132,16 @@ def false_accepts(bench: Bench, dataset: Dataset, way: Way) -> dict[str, int]:
 
     def ask() -> dict[str, int]:
         localizer = Localizer(topomap, replace(way.config, coarse=way.coarse))
-        given = [a for name, sequence in others for a in answer_elsewhere(localizer, sequence, label=name)]
+        given = [
+            a
+            for name, sequence in others
+            for a in answer_elsewhere(localizer, sequence, label=name)
+        ]
         return {"num_elsewhere": len(given), "accepted": sum(a.result.localized for a in given)}
 
-    settings = {"map": digest, "config": asdict(way.config), "others": [sequence_digest(s) for _, s in others]}
+    settings = {
+        "map": digest,
+        "config": asdict(way.config),
+        "others": [sequence_digest(s) for _, s in others],
+    }
     return bench.store.get(f"elsewhere-{dataset.name}-{way.name}", settings, ask, way.code).result

@@ -1,4 +1,5 @@
-"""What `peer_colmap.py` has pycolmap do, in a process that loads nothing else of weight: ``python -m ... FOLDER``.
+"""What `peer_colmap.py` has pycolmap do, in a process that loads nothing else of weight: ``python
+-m ... FOLDER``.
 
 The folder holds the pictures and `job.json`; `answers.json` is written into it.
 """
@@ -41,11 +42,16 @@ class Worker:
         start = time.perf_counter()
         images = self._map()
         answers: dict[str, Any] = {"seconds_to_map": time.perf_counter() - start}
-        answers["map_bytes"] = sum(image.descriptors.shape[0] * (128 + 8) + image.points_world.nbytes // 2 for image in images.values())
+        answers["map_bytes"] = sum(
+            image.descriptors.shape[0] * (128 + 8) + image.points_world.nbytes // 2
+            for image in images.values()
+        )
         start = time.perf_counter()
         database = self._extract("queries", self.job["queries"])
         extraction_ms = 1e3 * (time.perf_counter() - start) / max(len(self.job["queries"]), 1)
-        answers["queries"] = [self._answer(query, database, images, extraction_ms) for query in self.job["queries"]]
+        answers["queries"] = [
+            self._answer(query, database, images, extraction_ms) for query in self.job["queries"]
+        ]
         database.close()
         (self.folder / "answers.json").write_text(json.dumps(answers))
 
@@ -53,33 +59,52 @@ class Worker:
         """A database with the features of these pictures, all of one camera where that is so."""
         path = self.folder / f"{name}.db"
         for camera in {json.dumps(row["camera"], sort_keys=True) for row in rows}:
-            names = [row["name"] for row in rows if json.dumps(row["camera"], sort_keys=True) == camera]
+            names = [
+                row["name"] for row in rows if json.dumps(row["camera"], sort_keys=True) == camera
+            ]
             reader, content = self.pycolmap.ImageReaderOptions(), json.loads(camera)
-            reader.camera_model, reader.camera_params = content["model"], ",".join(map(repr, content["params"]))
+            reader.camera_model, reader.camera_params = (
+                content["model"],
+                ",".join(map(repr, content["params"])),
+            )
             single, cpu = self.pycolmap.CameraMode.SINGLE, self.pycolmap.Device.cpu
-            self.pycolmap.extract_features(path, self.pictures, names, camera_mode=single, reader_options=reader, device=cpu)
+            self.pycolmap.extract_features(
+                path, self.pictures, names, camera_mode=single, reader_options=reader, device=cpu
+            )
         return self.pycolmap.Database.open(path)
 
     def _map(self) -> dict[int, MapImage]:
-        """Features, matches, and points triangulated under the known poses; the left picture of each node."""
+        """Features, matches, and points triangulated under the known poses; the left picture of
+        each node."""
         rows = self.job["map"]
         database = self._extract("map", rows)
         pairing = self.pycolmap.ImportedPairingOptions()
         pairing.match_list_path = str(self.folder / "pairs.txt")
         (self.folder / "pairs.txt").write_text("".join(f"{a} {b}\n" for a, b in self.job["pairs"]))
-        self.pycolmap.match_image_pairs(self.folder / "map.db", pairing_options=pairing, device=self.pycolmap.Device.cpu)
+        self.pycolmap.match_image_pairs(
+            self.folder / "map.db", pairing_options=pairing, device=self.pycolmap.Device.cpu
+        )
         known = self.pycolmap.Reconstruction()
         for camera in database.read_all_cameras():
             known.add_camera_with_trivial_rig(camera)
         ids = {row["name"]: database.read_image_with_name(row["name"]) for row in rows}
         for row in rows:
             image = ids[row["name"]]
-            bare = self.pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
-            known.add_image_with_trivial_frame(bare, self.pycolmap.Rigid3d(np.array(row["cam_from_world"])))
+            bare = self.pycolmap.Image(
+                name=image.name, camera_id=image.camera_id, image_id=image.image_id
+            )
+            known.add_image_with_trivial_frame(
+                bare, self.pycolmap.Rigid3d(np.array(row["cam_from_world"]))
+            )
         (self.folder / "model").mkdir()
-        model = self.pycolmap.triangulate_points(known, self.folder / "map.db", self.pictures, self.folder / "model")
+        model = self.pycolmap.triangulate_points(
+            known, self.folder / "map.db", self.pictures, self.folder / "model"
+        )
         first = {row["node"]: ids[row["name"]].image_id for row in reversed(rows)}
-        images = {node: MapImage(self._descriptors(database, image_id), _points(model, image_id)) for node, image_id in first.items()}
+        images = {
+            node: MapImage(self._descriptors(database, image_id), _points(model, image_id))
+            for node, image_id in first.items()
+        }
         database.close()
         return images
 
@@ -88,7 +113,13 @@ class Worker:
         data = np.asarray(database.read_descriptors(image_id).data, np.float32).reshape(-1, 128)
         return data / np.maximum(np.linalg.norm(data, axis=1, keepdims=True), 1e-6)
 
-    def _answer(self, query: dict[str, Any], database: Any, images: dict[int, MapImage], extraction_ms: float) -> dict[str, Any]:
+    def _answer(
+        self,
+        query: dict[str, Any],
+        database: Any,
+        images: dict[int, MapImage],
+        extraction_ms: float,
+    ) -> dict[str, Any]:
         start = time.perf_counter()
         image = database.read_image_with_name(query["name"])
         pixels = np.asarray(database.read_keypoints(image.image_id), np.float64)[:, :2]
@@ -112,8 +143,14 @@ class Worker:
         if len(pairs) < MIN_POINTS:
             return None
         camera = self.pycolmap.Camera(**query["camera"])
-        answer = self.pycolmap.estimate_and_refine_absolute_pose(pixels[pairs[:, 0].astype(int)], pairs[:, 1:], camera)
-        return None if answer is None else np.asarray(answer["cam_from_world"].matrix(), np.float64).tolist()
+        answer = self.pycolmap.estimate_and_refine_absolute_pose(
+            pixels[pairs[:, 0].astype(int)], pairs[:, 1:], camera
+        )
+        return (
+            None
+            if answer is None
+            else np.asarray(answer["cam_from_world"].matrix(), np.float64).tolist()
+        )
 
 
 def mutual_matches(
@@ -127,14 +164,18 @@ def mutual_matches(
     second = np.partition(products, -2, axis=1)[:, -2]
     first = products[np.arange(len(query)), best]
     distances = np.sqrt(np.maximum(2.0 - 2.0 * np.stack([first, second]), 0.0))
-    keeps = (distances[0] < ratio * distances[1]) & (products.argmax(axis=0)[best] == np.arange(len(query)))
+    keeps = (distances[0] < ratio * distances[1]) & (
+        products.argmax(axis=0)[best] == np.arange(len(query))
+    )
     return np.flatnonzero(keeps), best[keeps]
 
 
 def _points(model: Any, image_id: int) -> Float[np.ndarray, "n 3"]:
     """The 3-D point (metres, world) of each key point, NaN where it has none."""
     points = model.images[image_id].points2D
-    return np.array([model.points3D[p.point3D_id].xyz if p.has_point3D() else [np.nan] * 3 for p in points]).reshape(-1, 3)
+    return np.array(
+        [model.points3D[p.point3D_id].xyz if p.has_point3D() else [np.nan] * 3 for p in points]
+    ).reshape(-1, 3)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""The places of the benchmark: which recordings map them, which ask, and how the paper discretises them.
+"""The places of the benchmark: which recordings map them, which ask, and how the paper discretises
+them.
 
-Three kinds: the rendered counterparts of the paper's three (street for CARLA, corridor, lab), real recordings where a folder
-with them is named, and, for the quick run, what topoloc brings along.
+Three kinds: the rendered counterparts of the paper's three (street for CARLA, corridor, lab), real
+recordings where a folder with them is named, and, for the quick run, what topoloc brings along.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class PaperRecording:
-    """One rendered recording: `topoloc simulate WORLD NAME` with the settings of `words` gives the same pictures."""
+    """One rendered recording: `topoloc simulate WORLD NAME` with the settings of `words` gives the
+    same pictures."""
 
     name: str
     world: str
@@ -54,9 +56,17 @@ class PaperRecording:
 
     def config(self, draft: bool) -> RecordConfig:
         world = find_world(self.world)
-        route = replace(world.route(), laps=self.laps, spacing=self.spacing, lateral=self.lateral, seed=self.take)
+        route = replace(
+            world.route(),
+            laps=self.laps,
+            spacing=self.spacing,
+            lateral=self.lateral,
+            seed=self.take,
+        )
         render = RenderConfig.draft() if draft else RenderConfig()
-        return RecordConfig(route=route, baseline=None if self.mono else world.baseline, render=render)
+        return RecordConfig(
+            route=route, baseline=None if self.mono else world.baseline, render=render
+        )
 
 
 RENDERED = (
@@ -65,21 +75,29 @@ RENDERED = (
     PaperRecording("lab_night", "lab", "night", take=2, spacing=0.25, lateral=0.1, mono=True),
     PaperRecording("corridor_map", "corridor", laps=2.0, spacing=0.3),
     PaperRecording("corridor_day", "corridor", take=1, spacing=0.8, lateral=0.2, mono=True),
-    PaperRecording("corridor_evening", "corridor", "evening", take=2, spacing=0.8, lateral=0.2, mono=True),
-    PaperRecording("corridor_night", "corridor", "night", take=3, spacing=0.8, lateral=0.2, mono=True),
+    PaperRecording(
+        "corridor_evening", "corridor", "evening", take=2, spacing=0.8, lateral=0.2, mono=True
+    ),
+    PaperRecording(
+        "corridor_night", "corridor", "night", take=3, spacing=0.8, lateral=0.2, mono=True
+    ),
     PaperRecording("street_map", "street", spacing=1.25),
     PaperRecording("street_clear", "street", "clear", take=1, spacing=8.0, lateral=3.5, mono=True),
-    PaperRecording("street_cloudy", "street", "cloudy", take=2, spacing=8.0, lateral=3.5, mono=True),
+    PaperRecording(
+        "street_cloudy", "street", "cloudy", take=2, spacing=8.0, lateral=3.5, mono=True
+    ),
     PaperRecording("street_rain", "street", "rain", take=3, spacing=8.0, lateral=3.5, mono=True),
 )
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """A place: recordings that map it, recordings that ask (by what they are called), and Eq. 1 as the paper sets it.
+    """A place: recordings that map it, recordings that ask (by what they are called), and Eq. 1 as
+    the paper sets it.
 
-    `d_thresh` is in metres, `lambda_rot` in metres a radian; `sweep` are the D_thresh that the node sweep tries. `map_from_truth`
-    names a JSON file with the 4x4 matrix that takes the queries' world into the map's.
+    `d_thresh` is in metres, `lambda_rot` in metres a radian; `sweep` are the D_thresh that the node
+    sweep tries. `map_from_truth` names a JSON file with the 4x4 matrix that takes the queries'
+    world into the map's.
     """
 
     name: str
@@ -105,10 +123,16 @@ class Dataset:
             return Rigid3.identity()
         try:
             content = json.loads(Path(self.map_from_truth).read_text(encoding="utf-8"))
-            (matrix,) = [v for v in content.values() if isinstance(v, list)] if isinstance(content, dict) else [content]
+            (matrix,) = (
+                [v for v in content.values() if isinstance(v, list)]
+                if isinstance(content, dict)
+                else [content]
+            )
             return Rigid3.from_matrix(np.array(matrix, dtype=np.float64))
         except (OSError, ValueError, TypeError) as error:
-            raise TrajectoryError(f"{self.map_from_truth}: one 4x4 matrix as JSON is needed") from error
+            raise TrajectoryError(
+                f"{self.map_from_truth}: one 4x4 matrix as JSON is needed"
+            ) from error
 
 
 _STREET_SWEEP = (2.5, 5.0, 10.0, 20.0, 40.0, 80.0)
@@ -125,8 +149,17 @@ def rendered_datasets(folder: Path) -> list[Dataset]:
     street = {weather: path(f"street_{weather}") for weather in ("clear", "cloudy", "rain")}
     return [
         Dataset("lab", "Lab, 5 x 4 m", (path("lab_map"),), lab, 2.0),
-        Dataset("corridor", "Corridor, 25 x 18 m", (path("corridor_map"),), corridor, 2.0, sweep=(0.25, 0.5, 1.0, 2.0, 4.0, 8.0)),
-        Dataset("street", "Street, 333 x 81 m", (path("street_map"),), street, 20.0, sweep=_STREET_SWEEP),
+        Dataset(
+            "corridor",
+            "Corridor, 25 x 18 m",
+            (path("corridor_map"),),
+            corridor,
+            2.0,
+            sweep=(0.25, 0.5, 1.0, 2.0, 4.0, 8.0),
+        ),
+        Dataset(
+            "street", "Street, 333 x 81 m", (path("street_map"),), street, 20.0, sweep=_STREET_SWEEP
+        ),
     ]
 
 
@@ -135,15 +168,36 @@ def quick_datasets() -> list[Dataset]:
     mapping = (str(SHIPPED / "map_lap1"), str(SHIPPED / "map_lap2"))
     queries = {"day": str(SHIPPED / "day"), "night": str(SHIPPED / "night")}
     elsewhere = (str(SHIPPED / "corridor"), str(SHIPPED / "street"))
-    return [Dataset("lab", "Lab, 5 x 4 m (the recordings of the demo)", mapping, queries, 2.0, sweep=(0.5, 2.0), elsewhere=elsewhere)]
+    return [
+        Dataset(
+            "lab",
+            "Lab, 5 x 4 m (the recordings of the demo)",
+            mapping,
+            queries,
+            2.0,
+            sweep=(0.5, 2.0),
+            elsewhere=elsewhere,
+        )
+    ]
 
 
 def real_datasets(data: Path) -> list[Dataset]:
-    """The real recordings below `data` that are there: 7-Scenes kitchen, a lab by ZED 2, two streets of KITTI."""
-    kitchen, street = str(data / "seven_scenes" / "kitchen"), str(data / "kitti" / "sequences" / "street")
+    """The real recordings below `data` that are there: 7-Scenes kitchen, a lab by ZED 2, two
+    streets of KITTI."""
+    kitchen, street = (
+        str(data / "seven_scenes" / "kitchen"),
+        str(data / "kitti" / "sequences" / "street"),
+    )
     zed = data / "zed_lab"
     found = [
-        Dataset("kitchen", "7-Scenes kitchen, RGB-D", (f"{kitchen}@0-59/100",), {"later": f"{kitchen}@60-99/100"}, 0.5, is_real=True),
+        Dataset(
+            "kitchen",
+            "7-Scenes kitchen, RGB-D",
+            (f"{kitchen}@0-59/100",),
+            {"later": f"{kitchen}@60-99/100"},
+            0.5,
+            is_real=True,
+        ),
         Dataset(
             "zed-lab",
             "A lab by ZED 2, two sessions",
@@ -153,14 +207,33 @@ def real_datasets(data: Path) -> list[Dataset]:
             is_real=True,
             map_from_truth=str(zed / "session1_from_session2.json"),
         ),
-        Dataset("kitti-1", "KITTI, 60 m of street", (f"{street}1@0::2",), {"odd": f"{street}1@1::2"}, 5.0, is_real=True),
-        Dataset("kitti-2", "KITTI, 52 m of slip road", (f"{street}2@0::2",), {"odd": f"{street}2@1::2"}, 5.0, is_real=True),
+        Dataset(
+            "kitti-1",
+            "KITTI, 60 m of street",
+            (f"{street}1@0::2",),
+            {"odd": f"{street}1@1::2"},
+            5.0,
+            is_real=True,
+        ),
+        Dataset(
+            "kitti-2",
+            "KITTI, 52 m of slip road",
+            (f"{street}2@0::2",),
+            {"odd": f"{street}2@1::2"},
+            5.0,
+            is_real=True,
+        ),
     ]
-    return [dataset for dataset in found if all(Path(path.partition("@")[0]).exists() for path in dataset.mapping)]
+    return [
+        dataset
+        for dataset in found
+        if all(Path(path.partition("@")[0]).exists() for path in dataset.mapping)
+    ]
 
 
 def is_complete(recording: PaperRecording, folder: Path, draft: bool) -> bool:
-    """Whether all pictures of this very recording lie in `folder`; whether Mitsuba is there does not matter."""
+    """Whether all pictures of this very recording lie in `folder`; whether Mitsuba is there does
+    not matter."""
     config, world = recording.config(draft), find_world(recording.world)
     try:
         stored = json.loads((folder / SETTINGS).read_text(encoding="utf-8"))
@@ -195,14 +268,23 @@ def render_missing(folder: Path, names: Sequence[str], draft: bool, progress: Pr
         )
 
 
-def at_hand(datasets: Sequence[Dataset], folder: Path, draft: bool) -> tuple[list[Dataset], list[str]]:
-    """The rendered data sets less what is not complete, and the names of the recordings that are missing."""
-    missing = [recording.name for recording in RENDERED if not is_complete(recording, folder / recording.name, draft)]
+def at_hand(
+    datasets: Sequence[Dataset], folder: Path, draft: bool
+) -> tuple[list[Dataset], list[str]]:
+    """The rendered data sets less what is not complete, and the names of the recordings that are
+    missing."""
+    missing = [
+        recording.name
+        for recording in RENDERED
+        if not is_complete(recording, folder / recording.name, draft)
+    ]
     kept = []
     for dataset in datasets:
         if any(Path(path).name in missing for path in dataset.mapping):
             continue
-        queries = {label: path for label, path in dataset.queries.items() if Path(path).name not in missing}
+        queries = {
+            label: path for label, path in dataset.queries.items() if Path(path).name not in missing
+        }
         if queries:
             kept.append(replace(dataset, queries=queries))
     return kept, missing

@@ -22,4 +22,7 @@ class KnownNodes:
 
     def rank(self, image: Any, features: Any, num_candidates: int) -> list[NodeScore]:
         distances = node_distances(next(self._truths), self._nodes, self._lambda_rot)
-        return [NodeScore(int(i), -float(distances[i])) for i in np.argsort(distances, kind="stable")[:num_candidates]]
+        return [
+            NodeScore(int(i), -float(distances[i]))
+            for i in np.argsort(distances, kind="stable")[:num_candidates]
+        ]

@@ -1,4 +1,5 @@
-"""The maps of the benchmark: built once, given the learned coarse localizers once, and opened from their files."""
+"""The maps of the benchmark: built once, given the learned coarse localizers once, and opened from
+their files."""
 
 from __future__ import annotations
 
@@ -32,7 +33,8 @@ Normalization = Literal["none", "paper", "wide"]
 
 @dataclass(frozen=True)
 class MapKind:
-    """How a data set is mapped. `d_thresh` and `lambda_rot` None: topoloc's own defaults, by the scene's depth."""
+    """How a data set is mapped. `d_thresh` and `lambda_rot` None: topoloc's own defaults, by the
+    scene's depth."""
 
     d_thresh: float | None
     lambda_rot: float | None
@@ -75,22 +77,35 @@ def built(bench: Bench, dataset: Dataset, kind: MapKind) -> Done:
     sequences = dataset.open_mapping()
 
     def build() -> dict[str, Any]:
-        topomap = build_map(sequences, kind.config(), lambda stage, done, total: bench.progress(f"map {name}: {stage}", done, total))
+        topomap = build_map(
+            sequences,
+            kind.config(),
+            lambda stage, done, total: bench.progress(f"map {name}: {stage}", done, total),
+        )
         topomap.save(path)
-        facts = {"num_nodes": len(topomap.summaries), "num_images": len(topomap.place_images), "length_m": topomap.length_m}
+        facts = {
+            "num_nodes": len(topomap.summaries),
+            "num_images": len(topomap.place_images),
+            "length_m": topomap.length_m,
+        }
         place_bytes = sum(len(image.jpeg) for image in topomap.place_images)
         nodes = asdict(topomap.config.nodes)
         facts["images_digest"] = images_digest(topomap)
         return facts | {"bytes": path.stat().st_size, "place_bytes": place_bytes, "nodes": nodes}
 
-    settings = {"config": asdict(kind.config()), "recordings": [sequence_digest(sequence) for sequence in sequences]}
+    settings = {
+        "config": asdict(kind.config()),
+        "recordings": [sequence_digest(sequence) for sequence in sequences],
+    }
     return bench.store.get(f"map-{name}", settings, build, MAPPING, [path])
 
 
 def taught(bench: Bench, dataset: Dataset, kind: MapKind, method: str) -> Done:
-    """The facts of a learned coarse localizer: what it was trained from and for how long. `opened` gives the map with it.
+    """The facts of a learned coarse localizer: what it was trained from and for how long. `opened`
+    gives the map with it.
 
-    It learns from the mapping images and their nodes alone, so it is kept where only the map's points have changed.
+    It learns from the mapping images and their nodes alone, so it is kept where only the map's
+    points have changed.
 
     Raises:
         MissingExtraError: torch is not installed.
@@ -100,13 +115,28 @@ def taught(bench: Bench, dataset: Dataset, kind: MapKind, method: str) -> Done:
     target = _model_path(bench, dataset, kind, method)
     backbone, weights = bench.config.weights.choice(method)
     config = _training_config(bench, map_done.result["num_images"])
-    settings = {"images": map_done.result["images_digest"], "weights": bench.config.weights.digest(method), "config": asdict(config)}
+    settings = {
+        "images": map_done.result["images_digest"],
+        "weights": bench.config.weights.digest(method),
+        "config": asdict(config),
+    }
 
     def train() -> dict[str, Any]:
-        checkpoint = target.with_suffix(f".{digest_of(settings)}.checkpoint") if method == "cnn-fc" else None
-        topomap, label = TopoMetricMap.load(path_of(bench, dataset, kind)), f"{method} of {dataset.name}"
+        checkpoint = (
+            target.with_suffix(f".{digest_of(settings)}.checkpoint") if method == "cnn-fc" else None
+        )
+        topomap, label = (
+            TopoMetricMap.load(path_of(bench, dataset, kind)),
+            f"{method} of {dataset.name}",
+        )
         model = train_coarse(
-            topomap, method, backbone, weights, config, lambda stage, done, total: bench.progress(label, done, total), checkpoint
+            topomap,
+            method,
+            backbone,
+            weights,
+            config,
+            lambda stage, done, total: bench.progress(label, done, total),
+            checkpoint,
         )
         buffer = io.BytesIO()
         arrays: dict[str, Any] = dict(model.arrays)
@@ -116,11 +146,20 @@ def taught(bench: Bench, dataset: Dataset, kind: MapKind, method: str) -> Done:
             checkpoint.unlink(missing_ok=True)
         return {"settings": dict(model.settings), "bytes": target.stat().st_size}
 
-    return bench.store.get(f"coarse-{dataset.name}-{kind.name}-{method}", settings, train, learning(TEACHING_MODULES[method]), [target])
+    return bench.store.get(
+        f"coarse-{dataset.name}-{kind.name}-{method}",
+        settings,
+        train,
+        learning(TEACHING_MODULES[method]),
+        [target],
+    )
 
 
-def opened(bench: Bench, dataset: Dataset, kind: MapKind, method: str = "surf-vlad") -> tuple[TopoMetricMap, str]:
-    """The map with this coarse localizer as its default, and what stands for both (`Done.digest`). Raises as `taught` does."""
+def opened(
+    bench: Bench, dataset: Dataset, kind: MapKind, method: str = "surf-vlad"
+) -> tuple[TopoMetricMap, str]:
+    """The map with this coarse localizer as its default, and what stands for both (`Done.digest`).
+    Raises as `taught` does."""
     map_done = built(bench, dataset, kind)
     topomap = TopoMetricMap.load(path_of(bench, dataset, kind))
     if method not in LEARNED:
@@ -128,7 +167,9 @@ def opened(bench: Bench, dataset: Dataset, kind: MapKind, method: str = "surf-vl
     done = taught(bench, dataset, kind, method)
     with np.load(_model_path(bench, dataset, kind, method)) as arrays:
         model = CoarseModel(method, done.result["settings"], dict(arrays))
-    return replace(topomap, coarse_models={method: model}, default_coarse=method), digest_of([map_done.digest, done.digest])
+    return replace(topomap, coarse_models={method: model}, default_coarse=method), digest_of(
+        [map_done.digest, done.digest]
+    )
 
 
 def path_of(bench: Bench, dataset: Dataset, kind: MapKind) -> Path:
@@ -141,8 +182,12 @@ def _model_path(bench: Bench, dataset: Dataset, kind: MapKind, method: str) -> P
 
 
 def images_digest(topomap: TopoMetricMap) -> str:
-    """A short name for what classifiers learn from: the mapping images, their poses and their nodes."""
-    rows = [[hashlib.sha256(i.jpeg).hexdigest(), i.node_id, pose_json(i.world_from_cam)] for i in topomap.place_images]
+    """A short name for what classifiers learn from: the mapping images, their poses and their
+    nodes."""
+    rows = [
+        [hashlib.sha256(i.jpeg).hexdigest(), i.node_id, pose_json(i.world_from_cam)]
+        for i in topomap.place_images
+    ]
     return digest_of([rows, [pose_json(summary.world_from_cam) for summary in topomap.summaries]])
 
 
@@ -158,6 +203,8 @@ def why_not(bench: Bench, method: str) -> str | None:
 
 
 def _training_config(bench: Bench, num_images: int) -> CoarseTrainingConfig:
-    picture = PictureConfig(112, 84)  # a quarter of the work of the default; tables show what it costs
+    picture = PictureConfig(
+        112, 84
+    )  # a quarter of the work of the default; tables show what it costs
     training = bench.config.training(bench.config.epochs, num_images)
     return replace(CoarseTrainingConfig(), cnn_fc=CnnFcConfig(picture=picture, training=training))

@@ -1,4 +1,5 @@
-"""With and without patch normalisation: the paper claims about 20 % better accuracy with it, on data that is not simulated."""
+"""With and without patch normalisation: the paper claims about 20 % better accuracy with it, on
+data that is not simulated."""
 
 from __future__ import annotations
 
@@ -13,15 +14,40 @@ KINDS: tuple[Normalization, ...] = ("none", "paper", "wide")
 
 
 def rows(bench: Bench, datasets: list[Dataset]) -> list[dict[str, Any]]:
-    """Every recording asked of maps without normalisation, with the paper's 17x17 one, and with topoloc's; surf-vlad finds the nodes."""
-    return [row for dataset in datasets for label in dataset.queries for row in _rows(bench, dataset, label)]
+    """Every recording asked of maps without normalisation, with the paper's 17x17 one, and with
+    topoloc's; surf-vlad finds the nodes."""
+    return [
+        row
+        for dataset in datasets
+        for label in dataset.queries
+        for row in _rows(bench, dataset, label)
+    ]
 
 
 def _rows(bench: Bench, dataset: Dataset, label: str) -> list[dict[str, Any]]:
     found = []
     for kind in KINDS:
         result = summary(bench, dataset, label, Way(MapKind.as_paper(dataset, kind)))
-        row: dict[str, Any] = {"dataset": dataset.name, "queries": label, "normalization": kind, "real": dataset.is_real}
-        row |= {key: result[key] for key in ("num_queries", "num_localized", "median_translation_m", "median_rotation_deg")}
-        found.append(row | {"topological_accuracy": result["topological_accuracy"], "recall_25cm": result["recall"]["0.25m_2deg"]})
+        row: dict[str, Any] = {
+            "dataset": dataset.name,
+            "queries": label,
+            "normalization": kind,
+            "real": dataset.is_real,
+        }
+        row |= {
+            key: result[key]
+            for key in (
+                "num_queries",
+                "num_localized",
+                "median_translation_m",
+                "median_rotation_deg",
+            )
+        }
+        found.append(
+            row
+            | {
+                "topological_accuracy": result["topological_accuracy"],
+                "recall_25cm": result["recall"]["0.25m_2deg"],
+            }
+        )
     return found

@@ -1,4 +1,5 @@
-"""The benchmark as one page to show, and its figures as files: every table and figure of the paper, ours beside theirs."""
+"""The benchmark as one page to show, and its figures as files: every table and figure of the paper,
+ours beside theirs."""
 
 from __future__ import annotations
 
@@ -39,23 +40,36 @@ img.figure { display: block; width: 100%; height: auto; margin: 6px 0 22px; }
 """
 _EXPLANATIONS = {
     "accuracy": (
-        "Median errors over what was localized; in brackets how many of how many queries those are. PoseNet always answers. Each learned "
-        "network names its weights; topoloc's surf-vlad needs none. The paper's column is what it printed for its own recordings of such "
-        "a place, which are not ours."
+        "Median errors over what was localized; in brackets how many of how many queries those are."
+        " PoseNet always answers. Each learned network names its weights; topoloc's surf-vlad needs"
+        " none. The paper's column is what it printed for its own recordings of such a place, which"
+        " are not ours."
     ),
     "normalization": (
-        "The same maps and queries without patch normalisation, with the paper's and topoloc's. The paper claims about 20 % on real data."
+        "The same maps and queries without patch normalisation, with the paper's and topoloc's. The"
+        " paper claims about 20 % on real data."
     ),
-    "nodes": "Eq. 1's D_thresh from low to high: more nodes cost bytes and buy accuracy until the fine step is what limits it.",
+    "nodes": (
+        "Eq. 1's D_thresh from low to high: more nodes cost bytes and buy accuracy until the fine"
+        " step is what limits it."
+    ),
     "speed": (
-        "Medians; the whole query with its quartiles. All coarse localizers were asked each picture in turn. The paper's machine had a GPU."
+        "Medians; the whole query with its quartiles. All coarse localizers were asked each picture"
+        " in turn. The paper's machine had a GPU."
     ),
     "peers": (
-        "All have the same recordings, poses, retrieval and queries. A pose further off than 0.5 m or 10° counts as far off, one for an "
-        "image from another place as accepted from elsewhere. Installed is the distribution with all that it needs."
+        "All have the same recordings, poses, retrieval and queries. A pose further off than 0.5 m"
+        " or 10° counts as far off, one for an image from another place as accepted from elsewhere."
+        " Installed is the distribution with all that it needs."
     ),
-    "ablation": "One thing is changed at a time, everything else stays as it is: what moves the error is where it comes from.",
-    "targets": "What was asked for, the best that was reached with the paper's number of nodes, and what topoloc does by itself.",
+    "ablation": (
+        "One thing is changed at a time, everything else stays as it is: what moves the error is"
+        " where it comes from."
+    ),
+    "targets": (
+        "What was asked for, the best that was reached with the paper's number of nodes, and what"
+        " topoloc does by itself."
+    ),
 }
 
 
@@ -82,7 +96,10 @@ class _Files:
         return f'<img class="figure" src="data:image/jpeg;base64,{encoded}" alt="{escape(name)}">'
 
     def svg(self, name: str, text: str) -> str:
-        write_text(self._folder / f"{name}.svg", text.replace("<svg ", '<svg xmlns:svg="http://www.w3.org/2000/svg" ', 1))
+        write_text(
+            self._folder / f"{name}.svg",
+            text.replace("<svg ", '<svg xmlns:svg="http://www.w3.org/2000/svg" ', 1),
+        )
         return f'<div class="wide">{text}</div>'
 
     def _png(self, name: str, figure: Figure) -> None:
@@ -92,30 +109,57 @@ class _Files:
 
 
 def write_page(bench: Bench, results: Mapping[str, Any]) -> None:
-    """Write `report.html` and the folder `figures`. Raises TopolocError where they cannot be written."""
+    """Write `report.html` and the folder `figures`. Raises TopolocError where they cannot be
+    written."""
     files = _Files(bench)
     style = page_style() + _STYLE
     sections = [_section("What this is", "", f"<p>{escape(about(results)).replace('`', '')}</p>")]
-    sections += [_table_section(results, "targets"), _table_section(results, "accuracy", _accuracy_figures(files, results))]
-    sections += [_dataset_section(bench, files, dataset) for dataset in (*bench.rendered, *bench.real)]
+    sections += [
+        _table_section(results, "targets"),
+        _table_section(results, "accuracy", _accuracy_figures(files, results)),
+    ]
+    sections += [
+        _dataset_section(bench, files, dataset) for dataset in (*bench.rendered, *bench.real)
+    ]
     sections += [_against_posenet(bench, files), _light_section(bench, files, results)]
     sections.append(
-        _table_section(results, "nodes", files.drawn("nodes", draw_node_sweep(results["nodes"])) if results.get("nodes") else "")
+        _table_section(
+            results,
+            "nodes",
+            files.drawn("nodes", draw_node_sweep(results["nodes"])) if results.get("nodes") else "",
+        )
     )
     timed = [row for row in results.get("speed", []) if not row.get("missing")]
-    sections.append(_table_section(results, "speed", files.drawn("times", draw_stage_times(timed)) if timed else ""))
+    sections.append(
+        _table_section(
+            results, "speed", files.drawn("times", draw_stage_times(timed)) if timed else ""
+        )
+    )
     sections += [_table_section(results, "peers"), _table_section(results, "ablation")]
     title = "The paper's experiments, made again"
-    head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
-    subtitle = "Roussel et al., Deep-Geometric 6 DoF Localization from a Single Image in Topo-metric Maps"
-    body = "\n".join([_cards(results), *filter(None, sections), "<footer>Written by topoloc.</footer>"])
+    head = (
+        '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
+    )
+    subtitle = (
+        "Roussel et al., Deep-Geometric 6 DoF Localization from a Single Image in Topo-metric Maps"
+    )
+    body = "\n".join(
+        [_cards(results), *filter(None, sections), "<footer>Written by topoloc.</footer>"]
+    )
     header = f'<header><div class="page"><h1>{title}</h1><p>{subtitle}</p></div></header>'
-    page = f'<!DOCTYPE html>\n<html lang="en"><head>{head}\n<title>{title}</title>\n<style>\n{style}</style></head><body>\n{header}\n'
+    page = (
+        "<!DOCTYPE html>\n<html"
+        f' lang="en"><head>{head}\n<title>{title}</title>\n<style>\n{style}</style></head><body>\n{header}\n'  # noqa: E501
+    )
     write_text(bench.out / "report.html", f'{page}<div class="page">{body}</div></body></html>\n')
 
 
 def _section(title: str, explanation: str, content: str) -> str:
-    return f"<section><h2>{escape(title)}</h2>" + (f"<p>{escape(explanation)}</p>" if explanation else "") + f"{content}</section>"
+    return (
+        f"<section><h2>{escape(title)}</h2>"
+        + (f"<p>{escape(explanation)}</p>" if explanation else "")
+        + f"{content}</section>"
+    )
 
 
 def _table_section(results: Mapping[str, Any], name: str, figure: str = "") -> str:
@@ -131,11 +175,18 @@ def _cards(results: Mapping[str, Any]) -> str:
         reached = row["reached"] or row["reached_by_own_nodes"]
         best = row["best"] if row["reached"] or not reached else row["own_nodes"]
         value = (
-            f"{100 * best['median_translation_m']:.1f} cm" if best["median_translation_m"] < 1 else f"{best['median_translation_m']:.2f} m"
+            f"{100 * best['median_translation_m']:.1f} cm"
+            if best["median_translation_m"] < 1
+            else f"{best['median_translation_m']:.2f} m"
         )
-        asked = f"{100 * row['asked_m']:.1f} cm" if row["asked_m"] < 1 else f"{row['asked_m']:.2f} m"
+        asked = (
+            f"{100 * row['asked_m']:.1f} cm" if row["asked_m"] < 1 else f"{row['asked_m']:.2f} m"
+        )
         words = f"{row['dataset']}, {row['queries']}: median, asked for {asked}"
-        shown.append(f'<div class="card {"good" if reached else "bad"}"><b>{value}</b><span>{escape(words)}</span></div>')
+        shown.append(
+            '<div class="card'
+            f' {"good" if reached else "bad"}"><b>{value}</b><span>{escape(words)}</span></div>'
+        )
     return f'<div class="cards">{"".join(shown)}</div>'
 
 
@@ -143,7 +194,10 @@ def _accuracy_figures(files: _Files, results: Mapping[str, Any]) -> str:
     rows = [row for row in results["accuracy"] if row.get("topological_accuracy") is not None]
     if not rows:
         return ""
-    words = "<h3>Topological accuracy</h3><p>The nearest node named first; paler, it or a neighbour of it.</p>"
+    words = (
+        "<h3>Topological accuracy</h3><p>The nearest node named first; paler, it or a neighbour of"
+        " it.</p>"
+    )
     return words + files.drawn("topological_accuracy", draw_topological_accuracy(rows))
 
 
@@ -154,16 +208,23 @@ def _own_answers(bench: Bench, dataset: Dataset) -> list[Answer]:
 
 
 def _dataset_section(bench: Bench, files: _Files, dataset: Dataset) -> str:
-    """The place from above, its error curves, a typical query of each recording and the worst ones, with their matches."""
+    """The place from above, its error curves, a typical query of each recording and the worst ones,
+    with their matches."""
     found = _own_answers(bench, dataset)
     topomap = TopoMetricMap.load(path_of(bench, dataset, MapKind.as_topoloc()))
     parts = [files.svg(f"{dataset.name}_from_above", draw_map(found, topomap))]
     curves = draw_error_curves(found) if any(a.result.localized for a in found) else ()
     parts.append(f'<h3>Errors</h3><div class="halves">{"".join(curves)}</div>')
-    parts.append("<h3>A typical query of each recording</h3>" + gallery(typical_queries(found), topomap))
-    parts.append("<h3>The best and the worst queries</h3>" + gallery([*_best(found), *worst_queries(found, 3)], topomap))
+    parts.append(
+        "<h3>A typical query of each recording</h3>" + gallery(typical_queries(found), topomap)
+    )
+    parts.append(
+        "<h3>The best and the worst queries</h3>"
+        + gallery([*_best(found), *worst_queries(found, 3)], topomap)
+    )
     text = (
-        "Topoloc as it comes: own nodes, surf-vlad. Lines join what was matched: green what the pose (or the truth) explains, red what not."
+        "Topoloc as it comes: own nodes, surf-vlad. Lines join what was matched: green what the"
+        " pose (or the truth) explains, red what not."
     )
     return _section(dataset.title, text, "".join(parts))
 
@@ -176,17 +237,28 @@ def _best(found: Sequence[Answer]) -> list[Answer]:
 def _against_posenet(bench: Bench, files: _Files) -> str:
     figures = picture_figures.against_posenet(bench)
     content = "".join(files.drawn(f"posenet_{name}", figure) for name, figure in figures.items())
-    text = "Positions from above: the path that was taken, and what PoseNet and topoloc say of each picture."
+    text = (
+        "Positions from above: the path that was taken, and what PoseNet and topoloc say of each"
+        " picture."
+    )
     return _section("PoseNet and the deep-geometric localizer", text, content) if content else ""
 
 
 def _light_section(bench: Bench, files: _Files, results: Mapping[str, Any]) -> str:
-    parts = [files.photo(name, figure) for name, figure in picture_figures.conditions(bench).items()]
-    parts += [files.photo(name, figure) for name, figure in picture_figures.normalized_pairs(bench).items()]
+    parts = [
+        files.photo(name, figure) for name, figure in picture_figures.conditions(bench).items()
+    ]
+    parts += [
+        files.photo(name, figure)
+        for name, figure in picture_figures.normalized_pairs(bench).items()
+    ]
     if results.get("normalization"):
-        parts.append("<h3>With and without</h3>" + TABLES["normalization"][1](results["normalization"]).html())
+        parts.append(
+            "<h3>With and without</h3>"
+            + TABLES["normalization"][1](results["normalization"]).html()
+        )
     text = (
-        "The same places in other light and weather, and what patch normalisation makes of a pair of pictures. "
-        + _EXPLANATIONS["normalization"]
+        "The same places in other light and weather, and what patch normalisation makes of a pair"
+        " of pictures. " + _EXPLANATIONS["normalization"]
     )
     return _section("Light and weather", text, "".join(parts))

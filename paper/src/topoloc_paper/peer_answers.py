@@ -1,4 +1,5 @@
-"""What every peer gives: a pose or none for each query, and how long it took; judged as our own answers are."""
+"""What every peer gives: a pose or none for each query, and how long it took; judged as our own
+answers are."""
 
 from __future__ import annotations
 
@@ -34,22 +35,33 @@ class Peer(Protocol):
         ...
 
 
-def rows_of(frames: Sequence[StereoFrame], answers: Sequence[PeerAnswer], map_from_truth: Rigid3) -> list[dict[str, Any]]:
+def rows_of(
+    frames: Sequence[StereoFrame], answers: Sequence[PeerAnswer], map_from_truth: Rigid3
+) -> list[dict[str, Any]]:
     """Rows as JSON; frames without a pose are from elsewhere."""
     rows = []
     for frame, answer in zip(frames, answers, strict=True):
-        truth = None if frame.world_from_cam is None else pose_json(map_from_truth @ frame.world_from_cam)
+        truth = (
+            None
+            if frame.world_from_cam is None
+            else pose_json(map_from_truth @ frame.world_from_cam)
+        )
         pose = None if answer.world_from_cam is None else pose_json(answer.world_from_cam)
         rows.append({"query": frame.name, "pose": pose, "truth": truth, "ms": answer.ms})
     return rows
 
 
 def summarize_peer(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """As `metrics.summarize` counts: medians of what was localized; `far_off` and `accepted` (from elsewhere) are false accepts."""
+    """As `metrics.summarize` counts: medians of what was localized; `far_off` and `accepted` (from
+    elsewhere) are false accepts."""
     asked = [row for row in rows if row["truth"] is not None]
-    localized = [(pose_of(row["pose"]), pose_of(row["truth"])) for row in asked if row["pose"] is not None]
+    localized = [
+        (pose_of(row["pose"]), pose_of(row["truth"])) for row in asked if row["pose"] is not None
+    ]
     metres = np.array([translation_error(found, truth) for found, truth in localized])
-    degrees = np.array([float(np.rad2deg(rotation_error(found, truth))) for found, truth in localized])
+    degrees = np.array(
+        [float(np.rad2deg(rotation_error(found, truth))) for found, truth in localized]
+    )
     elsewhere = [row for row in rows if row["truth"] is None]
     return {
         "num_queries": len(asked),

@@ -1,9 +1,12 @@
-"""hloc's scheme in pycolmap: SIFT, triangulation with the known poses, retrieval, COLMAP's absolute pose.
+"""hloc's scheme in pycolmap: SIFT, triangulation with the known poses, retrieval, COLMAP's absolute
+pose.
 
-Left and right pictures of the map's nodes are matched with each other and with their neighbours, and their points triangulated under the
-recording's poses. A query is matched with the images of the five nodes that `surf-vlad` names, and gets COLMAP's absolute pose by its
-default settings; as in hloc every pose that comes out is believed. `colmap_worker.py` does the work in a process of its own:
-pycolmap and OpenCV bring two builds of the same compression library, and do not survive each other in one.
+Left and right pictures of the map's nodes are matched with each other and with their neighbours,
+and their points triangulated under the recording's poses. A query is matched with the images of the
+five nodes that `surf-vlad` names, and gets COLMAP's absolute pose by its default settings; as in
+hloc every pose that comes out is believed. `colmap_worker.py` does the work in a process of its
+own: pycolmap and OpenCV bring two builds of the same compression library, and do not survive each
+other in one.
 """
 
 from __future__ import annotations
@@ -37,19 +40,30 @@ NUM_RANKED = 10 * NUM_RETRIEVED
 
 
 class Colmap:
-    """pycolmap's map of the nodes' pictures; made anew, in a temporary folder, for each set of queries.
+    """pycolmap's map of the nodes' pictures; made anew, in a temporary folder, for each set of
+    queries.
 
     Raises:
         MissingExtraError: pycolmap is not installed.
     """
 
-    def __init__(self, topomap: TopoMetricMap, sequences: Sequence[StereoSequence], max_images: int, folder: Path) -> None:
+    def __init__(
+        self,
+        topomap: TopoMetricMap,
+        sequences: Sequence[StereoSequence],
+        max_images: int,
+        folder: Path,
+    ) -> None:
         if importlib.util.find_spec("pycolmap") is None:
             raise MissingExtraError("pycolmap is not installed: pip install pycolmap")
         self._topomap, self._folder = topomap, folder
         self._retrieval = Retrieval(topomap)
         self._kept = evenly(len(topomap.summaries), max_images)
-        self._frames = {(sequence.name, name): (sequence, i) for sequence in sequences for i, name in enumerate(sequence.names)}
+        self._frames = {
+            (sequence.name, name): (sequence, i)
+            for sequence in sequences
+            for i, name in enumerate(sequence.names)
+        }
         self.map_bytes = self._retrieval.map_bytes
         self.seconds_to_map = 0.0
 
@@ -77,7 +91,10 @@ class Colmap:
         self.map_bytes = self._retrieval.map_bytes + answers["map_bytes"]
         self.seconds_to_map = answers["seconds_to_map"]
         rows = zip(job["queries"], answers["queries"], strict=True)
-        return [PeerAnswer(_pose(answer["cam_from_world"]), query["retrieval_ms"] + answer["ms"]) for query, answer in rows]
+        return [
+            PeerAnswer(_pose(answer["cam_from_world"]), query["retrieval_ms"] + answer["ms"])
+            for query, answer in rows
+        ]
 
     def _write_map(self, folder: Path) -> list[dict[str, Any]]:
         """Left and, where there is one, right picture of every kept node, with camera and pose."""
@@ -89,20 +106,45 @@ class Colmap:
             assert frame.camera is not None
             assert frame.world_from_cam is not None
             cam_from_world = frame.world_from_cam.inverse()
-            rows.append(_map_row(folder, f"map/{node_id:05d}-0", node_id, frame.image, frame.camera, cam_from_world))
+            rows.append(
+                _map_row(
+                    folder,
+                    f"map/{node_id:05d}-0",
+                    node_id,
+                    frame.image,
+                    frame.camera,
+                    cam_from_world,
+                )
+            )
             if frame.right is not None and frame.rig is not None:
                 right_from_world = frame.rig.right_from_left @ cam_from_world
-                rows.append(_map_row(folder, f"map/{node_id:05d}-1", node_id, frame.right, frame.rig.right, right_from_world))
+                rows.append(
+                    _map_row(
+                        folder,
+                        f"map/{node_id:05d}-1",
+                        node_id,
+                        frame.right,
+                        frame.rig.right,
+                        right_from_world,
+                    )
+                )
         return rows
 
     def _write_query(self, folder: Path, number: int, frame: StereoFrame) -> dict[str, Any]:
         assert frame.camera is not None
         start = time.perf_counter()
         kept = set(self._kept)
-        ranked = [node_id for node_id in self._retrieval.nodes(frame.image, NUM_RANKED) if node_id in kept][:NUM_RETRIEVED]
+        ranked = [
+            node_id for node_id in self._retrieval.nodes(frame.image, NUM_RANKED) if node_id in kept
+        ][:NUM_RETRIEVED]
         retrieval_ms = 1e3 * (time.perf_counter() - start)
         name = _write(folder, f"queries/{number:05d}", frame.image)
-        return {"name": name, "camera": _colmap_camera(frame.camera), "nodes": ranked, "retrieval_ms": retrieval_ms}
+        return {
+            "name": name,
+            "camera": _colmap_camera(frame.camera),
+            "nodes": ranked,
+            "retrieval_ms": retrieval_ms,
+        }
 
     def _pairs(self, rows: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
         """Each left picture with its right one and with the left ones of the nearest nodes."""
@@ -113,14 +155,26 @@ class Colmap:
         stacked, lambda_rot = NodePoses.of(poses), self._topomap.config.lambda_rot
         pairs = [(both[0], both[1]) for both in names.values() if len(both) == 2]
         for node_id, pose in zip(self._kept, poses, strict=True):
-            nearest = np.argsort(node_distances(pose, stacked, lambda_rot), kind="stable")[1 : NUM_NEIGHBOURS + 1]
-            pairs += [(names[min(node_id, self._kept[k])][0], names[max(node_id, self._kept[k])][0]) for k in nearest]
+            nearest = np.argsort(node_distances(pose, stacked, lambda_rot), kind="stable")[
+                1 : NUM_NEIGHBOURS + 1
+            ]
+            pairs += [
+                (names[min(node_id, self._kept[k])][0], names[max(node_id, self._kept[k])][0])
+                for k in nearest
+            ]
         return sorted(set(pairs))
 
 
-def _map_row(folder: Path, name: str, node_id: int, image: Image, camera: Camera, cam_from_world: Rigid3) -> dict[str, Any]:
+def _map_row(
+    folder: Path, name: str, node_id: int, image: Image, camera: Camera, cam_from_world: Rigid3
+) -> dict[str, Any]:
     matrix = np.column_stack([cam_from_world.rotation, cam_from_world.translation]).tolist()
-    return {"name": _write(folder, name, image), "node": node_id, "camera": _colmap_camera(camera), "cam_from_world": matrix}
+    return {
+        "name": _write(folder, name, image),
+        "node": node_id,
+        "camera": _colmap_camera(camera),
+        "cam_from_world": matrix,
+    }
 
 
 def _write(folder: Path, name: str, image: Image) -> str:
@@ -137,7 +191,12 @@ def _colmap_camera(camera: Camera) -> dict[str, Any]:
     params = [float(value) for value in camera.params]
     first = 1 if camera.model.startswith("SIMPLE") or camera.model == "RADIAL" else 2
     params[first], params[first + 1] = params[first] + 0.5, params[first + 1] + 0.5
-    return {"model": content["model"], "width": camera.width, "height": camera.height, "params": params}
+    return {
+        "model": content["model"],
+        "width": camera.width,
+        "height": camera.height,
+        "params": params,
+    }
 
 
 def _pose(cam_from_world: list[list[float]] | None) -> Rigid3 | None:

@@ -1,9 +1,11 @@
 """The paper's fine step as it is written (section III-B), on OpenCV.
 
-The first node alone; patch normalisation in 17x17 windows; OpenCV's SURF where it is built in (it is not in the wheels), else its
-SIFT, with default settings; "a fast nearest neighbour-based matcher", FLANN's five KD-trees with Lowe's ratio of 0.7; then
-`solvePnPRansac` with its default settings, whose every answer is believed. Nodes, their 3-D positions' source and the coarse step
-(`surf-vlad`) are the ones of the map that topoloc is asked beside it, so that the fine step is all that differs.
+The first node alone; patch normalisation in 17x17 windows; OpenCV's SURF where it is built in (it
+is not in the wheels), else its SIFT, with default settings; "a fast nearest neighbour-based
+matcher", FLANN's five KD-trees with Lowe's ratio of 0.7; then `solvePnPRansac` with its default
+settings, whose every answer is believed. Nodes, their 3-D positions' source and the coarse step
+(`surf-vlad`) are the ones of the map that topoloc is asked beside it, so that the fine step is all
+that differs.
 """
 
 from __future__ import annotations
@@ -47,9 +49,19 @@ class PaperStep:
     def __init__(self, topomap: TopoMetricMap, sequences: Sequence[StereoSequence]) -> None:
         self._retrieval = Retrieval(topomap)
         self._detector, self.feature_name = _detector()
-        frames = {(sequence.name, name): (sequence, i) for sequence in sequences for i, name in enumerate(sequence.names)}
-        self._nodes = [self._node(*frames[summary.recording, summary.name]) for summary in topomap.summaries]
-        arrays = [array for node in self._nodes for array in (node.points_cam.astype(np.float32), node.descriptors)]
+        frames = {
+            (sequence.name, name): (sequence, i)
+            for sequence in sequences
+            for i, name in enumerate(sequence.names)
+        }
+        self._nodes = [
+            self._node(*frames[summary.recording, summary.name]) for summary in topomap.summaries
+        ]
+        arrays = [
+            array
+            for node in self._nodes
+            for array in (node.points_cam.astype(np.float32), node.descriptors)
+        ]
         self.map_bytes = sum(array.nbytes for array in arrays) + self._retrieval.map_bytes
 
     def localize(self, frames: Sequence[StereoFrame]) -> list[PeerAnswer]:
@@ -66,16 +78,32 @@ class PaperStep:
         view = frame_view(frame)
         points_img, sizes, descriptors = self._features(view.grey)
         zeros = np.zeros(len(points_img), np.float32)
-        located = locate_points(Features(points_img, sizes, zeros, zeros, descriptors), view, MetricPointsConfig())
-        return _Node(frame.world_from_cam @ view.view_from_cam.inverse(), located.points_cam[located.valid], descriptors[located.valid])
+        located = locate_points(
+            Features(points_img, sizes, zeros, zeros, descriptors), view, MetricPointsConfig()
+        )
+        return _Node(
+            frame.world_from_cam @ view.view_from_cam.inverse(),
+            located.points_cam[located.valid],
+            descriptors[located.valid],
+        )
 
-    def _features(self, grey: UInt8[np.ndarray, "h w"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _features(
+        self, grey: UInt8[np.ndarray, "h w"]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         normalized = patch_normalize(grey, PatchNormalizationConfig.paper())
         keypoints, descriptors = self._detector.detectAndCompute(normalized, None)
         if len(keypoints) == 0:
-            return np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros((0, 128), np.float32)
+            return (
+                np.zeros((0, 2), np.float32),
+                np.zeros(0, np.float32),
+                np.zeros((0, 128), np.float32),
+            )
         points_img = np.array([k.pt for k in keypoints], np.float32)
-        return points_img, np.array([k.size for k in keypoints], np.float32), descriptors.astype(np.float32)
+        return (
+            points_img,
+            np.array([k.size for k in keypoints], np.float32),
+            descriptors.astype(np.float32),
+        )
 
     def _pose(self, frame: StereoFrame) -> Rigid3 | None:
         assert frame.camera is not None
@@ -84,13 +112,19 @@ class PaperStep:
         points_img, _, descriptors = self._features(grey_image(frame.image))
         if len(points_img) < 2 or len(node.descriptors) < 2:
             return None
-        matcher = cv2.FlannBasedMatcher({"algorithm": _KDTREE, "trees": _TREES}, {"checks": _CHECKS})
-        pairs = [pair for pair in matcher.knnMatch(descriptors, node.descriptors, k=2) if len(pair) == 2]
+        matcher = cv2.FlannBasedMatcher(
+            {"algorithm": _KDTREE, "trees": _TREES}, {"checks": _CHECKS}
+        )
+        pairs = [
+            pair for pair in matcher.knnMatch(descriptors, node.descriptors, k=2) if len(pair) == 2
+        ]
         good = [first for first, second in pairs if first.distance < RATIO * second.distance]
         if len(good) < _MIN_MATCHES:
             return None
         pixels = points_img[[match.queryIdx for match in good]].astype(np.float64)
-        cam_from_node = solved(node.points_cam[[match.trainIdx for match in good]], pixels, frame.camera)
+        cam_from_node = solved(
+            node.points_cam[[match.trainIdx for match in good]], pixels, frame.camera
+        )
         return None if cam_from_node is None else node.world_from_cam @ cam_from_node.inverse()
 
 

@@ -1,7 +1,8 @@
 """Retrieval alone: the pose of the node that the coarse localizer names first.
 
-This is what place recognition by itself gives, and what pipelines that never say "not here" fall back to (hloc writes the pose
-of the nearest image where PnP fails). It shows what the fine step adds, and answers every query.
+This is what place recognition by itself gives, and what pipelines that never say "not here" fall
+back to (hloc writes the pose of the nearest image where PnP fails). It shows what the fine step
+adds, and answers every query.
 """
 
 from __future__ import annotations
@@ -29,12 +30,19 @@ class Retrieval:
 
     def nodes(self, image: Image, num: int) -> list[int]:
         """The `num` best nodes, best first."""
-        return [score.node_id for score in self._coarse.rank(image, extract_features(grey_image(image), self._features), num)]
+        return [
+            score.node_id
+            for score in self._coarse.rank(
+                image, extract_features(grey_image(image), self._features), num
+            )
+        ]
 
     def localize(self, frames: Sequence[StereoFrame]) -> list[PeerAnswer]:
         answers = []
         for frame in frames:
             start = time.perf_counter()
             (node_id,) = self.nodes(frame.image, 1)
-            answers.append(PeerAnswer(self._world_from_nodes[node_id], 1e3 * (time.perf_counter() - start)))
+            answers.append(
+                PeerAnswer(self._world_from_nodes[node_id], 1e3 * (time.perf_counter() - start))
+            )
         return answers

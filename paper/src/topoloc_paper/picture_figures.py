@@ -1,4 +1,5 @@
-"""Figures that need pictures or PoseNet's answers: conditions side by side, patch-normalised pairs, PoseNet's path beside ours."""
+"""Figures that need pictures or PoseNet's answers: conditions side by side, patch-normalised pairs,
+PoseNet's path beside ours."""
 
 from __future__ import annotations
 
@@ -21,7 +22,8 @@ NUM_PLACES = 3
 
 
 def against_posenet(bench: Bench) -> dict[str, Figure]:
-    """For the first recording of each place: PoseNet's positions and those of cnn-fc (as in the paper), or surf-vlad without torch."""
+    """For the first recording of each place: PoseNet's positions and those of cnn-fc (as in the
+    paper), or surf-vlad without torch."""
     if why_not(bench, "posenet"):
         return {}
     figures = {}
@@ -29,14 +31,19 @@ def against_posenet(bench: Bench) -> dict[str, Figure]:
         label = next(iter(dataset.queries))
         theirs = posenet_baseline.asked(bench, dataset, label)
         ours = answers(bench, dataset, label, Way(MapKind.as_paper(dataset), "cnn-fc"))
-        found = [a.result.world_from_cam.translation for a in ours if isinstance(a.result, Localization)]
+        found = [
+            a.result.world_from_cam.translation for a in ours if isinstance(a.result, Localization)
+        ]
         truths, posenet = np.array(theirs["truths"])[:, :3], np.array(theirs["poses"])[:, :3]
-        figures[dataset.name] = draw_against_posenet(truths, posenet, np.array(found).reshape(-1, 3), f"{dataset.name}, {label}")
+        figures[dataset.name] = draw_against_posenet(
+            truths, posenet, np.array(found).reshape(-1, 3), f"{dataset.name}, {label}"
+        )
     return figures
 
 
 def conditions(bench: Bench) -> dict[str, Figure]:
-    """Each place as it was mapped and under every condition in which it was asked, seen from about the same poses."""
+    """Each place as it was mapped and under every condition in which it was asked, seen from about
+    the same poses."""
     figures = {}
     for dataset in (d for d in bench.rendered if len(d.queries) > 1):
         columns = _same_places(bench, dataset)
@@ -47,7 +54,8 @@ def conditions(bench: Bench) -> dict[str, Figure]:
 
 
 def normalized_pairs(bench: Bench) -> dict[str, Figure]:
-    """A mapped picture and the last condition's of the same place, as they are, and normalised by the paper's and topoloc's windows."""
+    """A mapped picture and the last condition's of the same place, as they are, and normalised by
+    the paper's and topoloc's windows."""
     figures = {}
     for dataset in (d for d in bench.rendered if len(d.queries) > 1):
         columns = _same_places(bench, dataset)
@@ -56,7 +64,9 @@ def normalized_pairs(bench: Bench) -> dict[str, Figure]:
             if name in ("mapped", *list(dataset.queries)[-1:]):
                 grey = grey_image(column[0])
                 paper = patch_normalize(grey, PatchNormalizationConfig.paper())
-                rows.append([grey, paper, patch_normalize(grey, PatchNormalizationConfig(65, 24.0))])
+                rows.append(
+                    [grey, paper, patch_normalize(grey, PatchNormalizationConfig(65, 24.0))]
+                )
                 names.append(name)
         titles = ["as it is", "17x17, the paper's", "65x65, topoloc's"]
         figures[f"{dataset.name}_normalized"] = draw_pictures(rows, names, titles)
@@ -64,14 +74,23 @@ def normalized_pairs(bench: Bench) -> dict[str, Figure]:
 
 
 def _same_places(bench: Bench, dataset: Dataset) -> list[list[np.ndarray]]:
-    """For the mapping and each recording: `NUM_PLACES` pictures taken nearest to some of the first recording's queries."""
+    """For the mapping and each recording: `NUM_PLACES` pictures taken nearest to some of the first
+    recording's queries."""
     first = queries_of(bench, dataset, next(iter(dataset.queries)))
     posed = [pose for pose in first.poses if pose is not None]
     anchors = [posed[(2 * k + 1) * len(posed) // (2 * NUM_PLACES)] for k in range(NUM_PLACES)]
-    sequences = [dataset.open_mapping()[0], *(queries_of(bench, dataset, label) for label in dataset.queries)]
+    sequences = [
+        dataset.open_mapping()[0],
+        *(queries_of(bench, dataset, label) for label in dataset.queries),
+    ]
     found = []
     for sequence in sequences:
         poses = [pose if pose is not None else Rigid3.identity() for pose in sequence.poses]
         stacked = NodePoses.of(poses)
-        found.append([sequence[int(np.argmin(node_distances(anchor, stacked, 10.0)))].image for anchor in anchors])
+        found.append(
+            [
+                sequence[int(np.argmin(node_distances(anchor, stacked, 10.0)))].image
+                for anchor in anchors
+            ]
+        )
     return found

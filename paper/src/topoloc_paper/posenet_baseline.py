@@ -1,7 +1,9 @@
-"""The paper's baseline: PoseNet, trained on the very mapping images that our classifiers are trained on, and asked the same queries.
+"""The paper's baseline: PoseNet, trained on the very mapping images that our classifiers are
+trained on, and asked the same queries.
 
-Kendall, Grimes & Cipolla (2015) and Kendall & Cipolla (2017); `posenet.py` is the network. Each of the
-losses asked for is trained, and the one with the least mean D_total on the images held out is asked. It answers every query.
+Kendall, Grimes & Cipolla (2015) and Kendall & Cipolla (2017); `posenet.py` is the network. Each of
+the losses asked for is trained, and the one with the least mean D_total on the images held out is
+asked. It answers every query.
 """
 
 from __future__ import annotations
@@ -33,13 +35,19 @@ def trained(bench: Bench, dataset: Dataset) -> Done:
     """Which loss did best, and for how long each was trained; the network lies at `_network_path`.
 
     Raises:
-        WeightsError, TrainingError: see `train_posenet`; MissingExtraError where torch is not installed (`why_not` says so before).
+        WeightsError, TrainingError: see `train_posenet`; MissingExtraError where torch is not
+            installed (`why_not` says so before).
     """
     kind = MapKind.as_paper(dataset)
     map_done = built(bench, dataset, kind)
     target = _network_path(bench, dataset)
-    configs = [_config(bench, loss, map_done.result["num_images"]) for loss in bench.config.posenet_losses]
-    settings = {"images": map_done.result["images_digest"], "weights": bench.config.weights.digest("posenet")}
+    configs = [
+        _config(bench, loss, map_done.result["num_images"]) for loss in bench.config.posenet_losses
+    ]
+    settings = {
+        "images": map_done.result["images_digest"],
+        "weights": bench.config.weights.digest("posenet"),
+    }
     settings |= {"configs": [asdict(config) for config in configs]}
 
     def train() -> dict[str, Any]:
@@ -72,13 +80,18 @@ def trained(bench: Bench, dataset: Dataset) -> Done:
         best.save(target)
         for path in target.parent.glob(f"{target.stem}-*"):
             path.unlink()
-        return {"held_out_m": scores, "loss": best.config.loss, "epochs": best.config.training.max_epochs}
+        return {
+            "held_out_m": scores,
+            "loss": best.config.loss,
+            "epochs": best.config.training.max_epochs,
+        }
 
     return bench.store.get(f"posenet-{dataset.name}", settings, train, _CODE, [target])
 
 
 def asked(bench: Bench, dataset: Dataset, label: str) -> dict[str, Any]:
-    """The poses that PoseNet gives ("poses"), the true ones ("truths"), and medians as `summarize` names them."""
+    """The poses that PoseNet gives ("poses"), the true ones ("truths"), and medians as `summarize`
+    names them."""
     done = trained(bench, dataset)
     sequence = queries_of(bench, dataset, label)
 
@@ -90,10 +103,15 @@ def asked(bench: Bench, dataset: Dataset, label: str) -> dict[str, Any]:
         known = dataset.map_from_query_truth()
         truths = [known @ pose for pose in sequence.poses if pose is not None]
         found = network.localize([sequence[i].image for i in posed])
-        return {"poses": [pose_json(pose) for pose in found], "truths": [pose_json(pose) for pose in truths]}
+        return {
+            "poses": [pose_json(pose) for pose in found],
+            "truths": [pose_json(pose) for pose in truths],
+        }
 
     settings = {"posenet": done.digest, "queries": sequence_digest(sequence)}
-    rows = bench.store.get(f"posenet-answers-{dataset.name}-{label.replace(' ', '_')}", settings, ask, _CODE).result
+    rows = bench.store.get(
+        f"posenet-answers-{dataset.name}-{label.replace(' ', '_')}", settings, ask, _CODE
+    ).result
     pairs = [(pose_of(a), pose_of(b)) for a, b in zip(rows["poses"], rows["truths"], strict=True)]
     metres = [translation_error(a, b) for a, b in pairs]
     degrees = [float(np.rad2deg(rotation_error(a, b))) for a, b in pairs]

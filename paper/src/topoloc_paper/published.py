@@ -1,4 +1,5 @@
-"""The paper's own numbers, as they are printed in its tables I to III, and the figures that ours are held against."""
+"""The paper's own numbers, as they are printed in its tables I to III, and the figures that ours
+are held against."""
 
 from __future__ import annotations
 
@@ -35,18 +36,44 @@ TABLE_ONE: dict[str, dict[str, MedianErrors]] = {
     },
 }
 
-# Table II, of the street. Its first row is Table I's in another order; it stands here as it is printed.
+# Table II, of the street. Its first row is Table I's in another order; it stands here as it is
+# printed.
 TABLE_TWO: dict[str, dict[str, MedianErrors]] = {
-    "clear": {"cnn-fc": MedianErrors(1.845, 0.601), "cnn-nn": MedianErrors(1.842, 0.644), "vlad-nn": MedianErrors(1.822, 0.604)},
-    "cloudy": {"cnn-fc": MedianErrors(2.526, 0.806), "cnn-nn": MedianErrors(2.702, 0.745), "vlad-nn": MedianErrors(2.371, 0.811)},
-    "rain": {"cnn-fc": MedianErrors(2.982, 0.795), "cnn-nn": MedianErrors(2.817, 0.857), "vlad-nn": MedianErrors(2.812, 0.787)},
+    "clear": {
+        "cnn-fc": MedianErrors(1.845, 0.601),
+        "cnn-nn": MedianErrors(1.842, 0.644),
+        "vlad-nn": MedianErrors(1.822, 0.604),
+    },
+    "cloudy": {
+        "cnn-fc": MedianErrors(2.526, 0.806),
+        "cnn-nn": MedianErrors(2.702, 0.745),
+        "vlad-nn": MedianErrors(2.371, 0.811),
+    },
+    "rain": {
+        "cnn-fc": MedianErrors(2.982, 0.795),
+        "cnn-nn": MedianErrors(2.817, 0.857),
+        "vlad-nn": MedianErrors(2.812, 0.787),
+    },
 }
 
-# Table III: seconds a stage, on an i7-4770K with a GTX 1660. "nn" is missing for CNN-FC, which has none.
+# Table III: seconds a stage, on an i7-4770K with a GTX 1660. "nn" is missing for CNN-FC, which has
+# none.
 TABLE_THREE: dict[str, dict[str, float]] = {
     "cnn-fc": {"cnn": 0.0086, "patch_normalization": 0.0020, "surf_pnp": 0.0238, "total": 0.0553},
-    "cnn-nn": {"cnn": 0.0095, "nn": 0.198, "patch_normalization": 0.0020, "surf_pnp": 0.0228, "total": 0.256},
-    "vlad-nn": {"cnn": 0.0112, "nn": 0.267, "patch_normalization": 0.0020, "surf_pnp": 0.0238, "total": 0.324},
+    "cnn-nn": {
+        "cnn": 0.0095,
+        "nn": 0.198,
+        "patch_normalization": 0.0020,
+        "surf_pnp": 0.0228,
+        "total": 0.256,
+    },
+    "vlad-nn": {
+        "cnn": 0.0112,
+        "nn": 0.267,
+        "patch_normalization": 0.0020,
+        "surf_pnp": 0.0238,
+        "total": 0.324,
+    },
 }
 
 

@@ -1,4 +1,5 @@
-"""The table of the paper's experiments in docs/benchmarks.md: a block between two markers, generated from the results alone."""
+"""The table of the paper's experiments in docs/benchmarks.md: a block between two markers,
+generated from the results alone."""
 
 from __future__ import annotations
 
@@ -16,8 +17,13 @@ PEERS = ("the paper's step", "pycolmap, SIFT")
 
 
 def block_of(results: Mapping[str, Any]) -> str:
-    """The block with its markers: a line for each recording, its methods and the peers side by side, and the command that makes it."""
-    accuracy, peers, command = results.get("accuracy", []), results.get("peers", []), results["settings"]["command"]
+    """The block with its markers: a line for each recording, its methods and the peers side by
+    side, and the command that makes it."""
+    accuracy, peers, command = (
+        results.get("accuracy", []),
+        results.get("peers", []),
+        results["settings"]["command"],
+    )
     places = dict.fromkeys((row["dataset"], row["queries"]) for row in accuracy)
     lines = []
     for place in places:
@@ -25,8 +31,20 @@ def block_of(results: Mapping[str, Any]) -> str:
         others = [row for row in peers if (row["dataset"], row["queries"]) == place]
         lines.append([", ".join(place), *_cells(mine, others), _of_part(command, mine[0])])
     own = "surf-vlad (no weights)"
-    columns = ["place, queries", "the paper's best", "PoseNet", *LEARNED, own, f"{own}, own nodes, ms", *PEERS, "command"]
-    how = "All but the last of ours have the paper's D_thresh; in brackets how many queries were localized, where not all."
+    columns = [
+        "place, queries",
+        "the paper's best",
+        "PoseNet",
+        *LEARNED,
+        own,
+        f"{own}, own nodes, ms",
+        *PEERS,
+        "command",
+    ]
+    how = (
+        "All but the last of ours have the paper's D_thresh; in brackets how many queries were"
+        " localized, where not all."
+    )
     return f"{BEGIN}\n{about(results)} {how}\n\n{Table(columns, lines).markdown()}\n{END}"
 
 
@@ -48,13 +66,24 @@ def update_readme(path: Path, results: Mapping[str, Any]) -> None:
 
 
 def _cells(mine: Sequence[Row], others: Sequence[Row]) -> list[str]:
-    """The paper's best, then every method by the paper's D_thresh, surf-vlad on topoloc's own nodes, and the peers."""
+    """The paper's best, then every method by the paper's D_thresh, surf-vlad on topoloc's own
+    nodes, and the peers."""
     printed = [row for row in mine if row["paper_m"] is not None and row["method"] != "posenet"]
     cells = [paper_words(min(printed, key=lambda row: row["paper_m"])) if printed else MISSING]
     for method in ("posenet", *LEARNED, "surf-vlad"):
-        cells.append(_cell([row for row in mine if row["method"] == method and row["nodes"].startswith("D_thresh")]))
+        cells.append(
+            _cell(
+                [
+                    row
+                    for row in mine
+                    if row["method"] == method and row["nodes"].startswith("D_thresh")
+                ]
+            )
+        )
     own = [row for row in mine if not row["nodes"].startswith("D_thresh")]
-    cells.append(_cell(own) + (f", {own[0]['ms']:.0f} ms" if own and own[0].get("ms") is not None else ""))
+    cells.append(
+        _cell(own) + (f", {own[0]['ms']:.0f} ms" if own and own[0].get("ms") is not None else "")
+    )
     return cells + [_cell([row for row in others if row["peer"] == peer]) for peer in PEERS]
 
 

@@ -16,13 +16,17 @@ from topoloc_training.classifier_config import TrainingConfig
 
 Progress = Callable[[str, int, int], None]
 LEARNED = ("cnn-fc", "cnn-nn", "vlad-nn")
-BACKBONE_WORDS: dict[str, str] = {"squeezenet1_1": "SqueezeNet 1.1", "vgg11": "VGG-11", "vgg16": "VGG-16"}
+BACKBONE_WORDS: dict[str, str] = {
+    "squeezenet1_1": "SqueezeNet 1.1",
+    "vgg11": "VGG-11",
+    "vgg16": "VGG-16",
+}
 
 
 @dataclass(frozen=True)
 class WeightFiles:
-    """Files of weights, as far as they are at hand. The paper's networks are used where their file is there, else SqueezeNet;
-    without any file SqueezeNet begins at random."""
+    """Files of weights, as far as they are at hand. The paper's networks are used where their file
+    is there, else SqueezeNet; without any file SqueezeNet begins at random."""
 
     squeezenet: str | None = None
     vgg11: str | None = None
@@ -42,7 +46,9 @@ class WeightFiles:
             return "none needed"
         backbone, file = self.choice(method)
         if file == "scratch":
-            return f"{BACKBONE_WORDS[backbone]}, from scratch" + (" (random features)" if method in ("cnn-nn", "vlad-nn") else "")
+            return f"{BACKBONE_WORDS[backbone]}, from scratch" + (
+                " (random features)" if method in ("cnn-nn", "vlad-nn") else ""
+            )
         return f"{BACKBONE_WORDS[backbone]}, {Path(file).name}"
 
     def digest(self, method: str) -> list[str]:
@@ -61,10 +67,12 @@ class PaperConfig:
         weights: see `WeightFiles`.
         epochs: times that cnn-fc sees every image, at most.
         posenet_epochs: the same of PoseNet, for each of its losses.
-        max_shown: pictures that a training shows in all, about: places with many mapping images get fewer epochs.
+        max_shown: pictures that a training shows in all, about: places with many mapping images get
+            fewer epochs.
         posenet_losses: the one that does best on held-out images is asked.
         max_colmap_images: mapping images that pycolmap is given, evenly spread, at most.
-        max_elsewhere: images of other places that each map is asked about, at most, from each of them.
+        max_elsewhere: images of other places that each map is asked about, at most, from each of
+            them.
         max_queries: of each recording, evenly spread; None for all.
     """
 
@@ -81,7 +89,9 @@ class PaperConfig:
 
     def with_epochs(self, epochs: int | None, posenet_epochs: int | None) -> PaperConfig:
         """The same with these numbers of epochs, where they are given."""
-        return replace(self, epochs=epochs or self.epochs, posenet_epochs=posenet_epochs or self.posenet_epochs)
+        return replace(
+            self, epochs=epochs or self.epochs, posenet_epochs=posenet_epochs or self.posenet_epochs
+        )
 
     def training(self, epochs: int, num_images: int) -> TrainingConfig:
         """At most so many epochs, fewer where there are many images."""
@@ -91,7 +101,14 @@ class PaperConfig:
     @staticmethod
     def for_quick_run(weights: WeightFiles) -> PaperConfig:
         """Small enough for five minutes."""
-        return PaperConfig(quick=True, weights=weights, epochs=8, posenet_epochs=8, max_colmap_images=40, max_elsewhere=8)
+        return PaperConfig(
+            quick=True,
+            weights=weights,
+            epochs=8,
+            posenet_epochs=8,
+            max_colmap_images=40,
+            max_elsewhere=8,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +137,9 @@ class Bench:
 def sequence_digest(sequence: StereoSequence) -> str:
     """A short name for a recording: its frames' names and poses, and its first and last picture."""
     poses = [None if pose is None else pose_json(pose) for pose in sequence.poses]
-    pictures = [hashlib.sha256(sequence[i].image.tobytes()).hexdigest() for i in (0, len(sequence) - 1)]
+    pictures = [
+        hashlib.sha256(sequence[i].image.tobytes()).hexdigest() for i in (0, len(sequence) - 1)
+    ]
     return digest_of([list(sequence.names), poses, pictures])
 
 

@@ -1,8 +1,9 @@
-"""The code that a stage's result follows from: its own modules and all that these import, as far as it can change the result.
+"""The code that a stage's result follows from: its own modules and all that these import, as far as
+it can change the result.
 
-Comments and docstrings do not count, nor do modules whose results the stage's settings name already. So a change of localization alone
-asks all queries again, but builds no map, teaches no network and calls no peer. What is imported at run time, by a name in a string, is
-listed here.
+Comments and docstrings do not count, nor do modules whose results the stage's settings name
+already. So a change of localization alone asks all queries again, but builds no map, teaches no
+network and calls no peer. What is imported at run time, by a name in a string, is listed here.
 """
 
 from __future__ import annotations
@@ -16,7 +17,11 @@ from pathlib import Path
 import topoloc
 import topoloc_training
 
-_FILES = {"topoloc": topoloc.__file__, "topoloc_training": topoloc_training.__file__, "topoloc_paper": __file__}
+_FILES = {
+    "topoloc": topoloc.__file__,
+    "topoloc_training": topoloc_training.__file__,
+    "topoloc_paper": __file__,
+}
 # the folder that each package lies in
 ROOTS = {name: Path(path).parents[1] for name, path in _FILES.items() if path is not None}
 COARSE_MODULES = {
@@ -25,15 +30,23 @@ COARSE_MODULES = {
     "cnn-nn": "topoloc/places/cnn_nn.py",
     "vlad-nn": "topoloc/places/vlad_nn.py",
 }
-TEACHING_MODULES = {name: f"topoloc_training/{name.replace('-', '_')}.py" for name in COARSE_MODULES if name != "surf-vlad"}
+TEACHING_MODULES = {
+    name: f"topoloc_training/{name.replace('-', '_')}.py"
+    for name in COARSE_MODULES
+    if name != "surf-vlad"
+}
 _READING = "topoloc/sequences/open.py"
-_COUNTING = ("topoloc/evaluation/metrics.py", "topoloc_paper/settings.py")  # what is made of answers, and what is asked for
+_COUNTING = (
+    "topoloc/evaluation/metrics.py",
+    "topoloc_paper/settings.py",
+)  # what is made of answers, and what is asked for
 _NEVER = ("topoloc/errors.py",)  # a stage that fails leaves no result
 
 
 @dataclass(frozen=True)
 class StageCode:
-    """`modules` (paths from their package on) with all that they import, directly or not; `apart` are those that do not count."""
+    """`modules` (paths from their package on) with all that they import, directly or not; `apart`
+    are those that do not count."""
 
     modules: tuple[str, ...]
     apart: tuple[str, ...] = ()
@@ -43,39 +56,53 @@ class StageCode:
         found, waiting = set[str](), list(self.modules)
         while waiting:
             module = waiting.pop()
-            if module not in found and not any(module == name or module.startswith(f"{name}/") for name in (*_NEVER, *self.apart)):
+            if module not in found and not any(
+                module == name or module.startswith(f"{name}/") for name in (*_NEVER, *self.apart)
+            ):
                 found.add(module)
                 waiting += _imports(module)
         return tuple(sorted(found))
 
     def digest(self) -> str:
         """A short name for this code as it is now (another one under another version of Python)."""
-        return hashlib.sha256("".join(f"{module} {_meaning(module)}\n" for module in self.files()).encode()).hexdigest()[:16]
+        return hashlib.sha256(
+            "".join(f"{module} {_meaning(module)}\n" for module in self.files()).encode()
+        ).hexdigest()[:16]
 
 
 MAPPING = StageCode(("topoloc/map/build.py", _READING))
 
 
 def asking(coarse: str, *others: str) -> StageCode:
-    """Queries answered by a `Localizer` with this coarse localizer; `others` are modules that take part."""
+    """Queries answered by a `Localizer` with this coarse localizer; `others` are modules that take
+    part."""
     answering = ("topoloc/evaluation/experiments.py", "topoloc_paper/stored_answers.py", _READING)
     return StageCode((*answering, COARSE_MODULES[coarse], *others), _COUNTING)
 
 
 def answering(*modules: str) -> StageCode:
     """A peer, which may ask the map's own coarse localizer but not topoloc's fine step."""
-    return StageCode((*modules, COARSE_MODULES["surf-vlad"], _READING), (*_COUNTING, "topoloc/localization"))
+    return StageCode(
+        (*modules, COARSE_MODULES["surf-vlad"], _READING), (*_COUNTING, "topoloc/localization")
+    )
 
 
 def learning(*modules: str) -> StageCode:
-    """A network taught with the mapping images. These the stage's settings name, so how they are read and stored does not count."""
-    apart = ("topoloc/features", "topoloc/sequences", "topoloc/map/topomap.py", "topoloc/places/coarse.py")
+    """A network taught with the mapping images. These the stage's settings name, so how they are
+    read and stored does not count."""
+    apart = (
+        "topoloc/features",
+        "topoloc/sequences",
+        "topoloc/map/topomap.py",
+        "topoloc/places/coarse.py",
+    )
     return StageCode(("topoloc_training/coarse_training.py", *modules), apart)
 
 
 @cache
 def _imports(module: str) -> tuple[str, ...]:
-    """The modules of ours that a module imports, at any depth of it, but for those that only the type checker sees."""
+    """The modules of ours that a module imports, at any depth of it, but for those that only the
+    type checker sees."""
     tree = _Running().visit(ast.parse(_file(module).read_bytes()))
     names: set[str] = set()
     for node in ast.walk(tree):
@@ -83,7 +110,11 @@ def _imports(module: str) -> tuple[str, ...]:
             names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
         elif isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
-    paths = {name.replace(".", "/") + ".py" for name in names if name.partition(".")[0] in ROOTS and "." in name}
+    paths = {
+        name.replace(".", "/") + ".py"
+        for name in names
+        if name.partition(".")[0] in ROOTS and "." in name
+    }
     return tuple(sorted(path for path in paths if _file(path).is_file()))
 
 
@@ -99,10 +130,19 @@ def _meaning(module: str) -> str:
 
 
 class _Running(ast.NodeTransformer):
-    """Leaves out what does nothing when a program runs: docstrings, and imports for the type checker."""
+    """Leaves out what does nothing when a program runs: docstrings, and imports for the type
+    checker."""
 
     def visit_Expr(self, node: ast.Expr) -> ast.AST | None:
-        return None if isinstance(node.value, ast.Constant) and isinstance(node.value.value, str) else self.generic_visit(node)
+        return (
+            None
+            if isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+            else self.generic_visit(node)
+        )
 
     def visit_If(self, node: ast.If) -> ast.AST | None:
-        return None if isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING" else self.generic_visit(node)
+        return (
+            None
+            if isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
+            else self.generic_visit(node)
+        )

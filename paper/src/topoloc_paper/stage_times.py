@@ -22,17 +22,27 @@ STAGES = ("patch_normalization", "features", "coarse", "matching", "pnp", "total
 
 
 def rows(bench: Bench, datasets: list[Dataset]) -> list[dict[str, Any]]:
-    """A row for each data set and coarse localizer: median and quartiles (seconds) of every stage, over the first recording.
+    """A row for each data set and coarse localizer: median and quartiles (seconds) of every stage,
+    over the first recording.
 
-    Each picture is put to all of them in turn, so that whatever else the machine does slows all alike; "load" is what it had to do.
+    Each picture is put to all of them in turn, so that whatever else the machine does slows all
+    alike; "load" is what it had to do.
     """
     return [row for dataset in datasets for row in _rows(bench, dataset)]
 
 
 def machine() -> dict[str, Any]:
     """What the times were taken on."""
-    model = next((line.partition(":")[2].strip() for line in _cpu_lines() if line.startswith("model name")), platform.processor())
-    return {"cpu": model, "cores": os.cpu_count(), "system": platform.system(), "python": platform.python_version()}
+    model = next(
+        (line.partition(":")[2].strip() for line in _cpu_lines() if line.startswith("model name")),
+        platform.processor(),
+    )
+    return {
+        "cpu": model,
+        "cores": os.cpu_count(),
+        "system": platform.system(),
+        "python": platform.python_version(),
+    }
 
 
 def _rows(bench: Bench, dataset: Dataset) -> list[dict[str, Any]]:
@@ -41,7 +51,11 @@ def _rows(bench: Bench, dataset: Dataset) -> list[dict[str, Any]]:
     heads: dict[str, dict[str, Any]] = {}
     maps: dict[str, tuple[TopoMetricMap, str]] = {}
     for method in ("surf-vlad", *LEARNED):
-        heads[method] = {"dataset": dataset.name, "method": method, "weights": bench.config.weights.words(method)}
+        heads[method] = {
+            "dataset": dataset.name,
+            "method": method,
+            "weights": bench.config.weights.words(method),
+        }
         heads[method]["paper_s"] = TABLE_THREE.get(method, {}).get("total")
         if missing := why_not(bench, method):
             heads[method]["missing"] = missing
@@ -62,17 +76,38 @@ def _rows(bench: Bench, dataset: Dataset) -> list[dict[str, Any]]:
             bench.progress(f"times in {dataset.name}", i + 1, len(sequence))
         kept = {method: rows[min(WARM_UP, len(sequence)) :] for method, rows in times.items()}
         load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
-        return {"times": {method: _quartiles(rows) for method, rows in kept.items()}, "num_queries": len(sequence), "load": load}
+        return {
+            "times": {method: _quartiles(rows) for method, rows in kept.items()},
+            "num_queries": len(sequence),
+            "load": load,
+        }
 
-    settings = {"maps": {method: digest for method, (_, digest) in maps.items()}, "queries": sequence_digest(sequence)}
-    done = bench.store.get(f"times-{dataset.name}", settings, ask, asking("surf-vlad", *(COARSE_MODULES[method] for method in maps))).result
+    settings = {
+        "maps": {method: digest for method, (_, digest) in maps.items()},
+        "queries": sequence_digest(sequence),
+    }
+    done = bench.store.get(
+        f"times-{dataset.name}",
+        settings,
+        ask,
+        asking("surf-vlad", *(COARSE_MODULES[method] for method in maps)),
+    ).result
     facts = {"num_queries": done["num_queries"], "load": done["load"]}
-    return [head | ({"quartiles_s": done["times"][method]} | facts if method in maps else {}) for method, head in heads.items()]
+    return [
+        head | ({"quartiles_s": done["times"][method]} | facts if method in maps else {})
+        for method, head in heads.items()
+    ]
 
 
 def _quartiles(rows: list[dict[str, float]]) -> dict[str, list[float]]:
     """Seconds: lower quartile, median, upper quartile of each stage."""
-    return {stage: [float(q) for q in np.percentile([1e-3 * row.get(stage, 0.0) for row in rows], [25, 50, 75])] for stage in STAGES}
+    return {
+        stage: [
+            float(q)
+            for q in np.percentile([1e-3 * row.get(stage, 0.0) for row in rows], [25, 50, 75])
+        ]
+        for stage in STAGES
+    }
 
 
 def _cpu_lines() -> list[str]:

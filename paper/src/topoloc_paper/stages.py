@@ -1,7 +1,9 @@
-"""Stages whose results are kept: a run that was interrupted, or is asked again, goes on from what is there.
+"""Stages whose results are kept: a run that was interrupted, or is asked again, goes on from what
+is there.
 
-A stage is one JSON file, written when it is done, with all that its result follows from: its settings (which name the stages
-that it builds on) and the code that it runs (`stage_code.py`). Where either has changed it is done again.
+A stage is one JSON file, written when it is done, with all that its result follows from: its
+settings (which name the stages that it builds on) and the code that it runs (`stage_code.py`).
+Where either has changed it is done again.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ from topoloc_paper.stage_code import StageCode
 
 @dataclass(frozen=True)
 class Done:
-    """A stage's result; `digest` stands for all that it follows from; `seconds` is what it took when it was done."""
+    """A stage's result; `digest` stands for all that it follows from; `seconds` is what it took
+    when it was done."""
 
     result: Any
     digest: str
@@ -50,7 +53,8 @@ class StageStore:
         code: StageCode,
         files: Sequence[Path] = (),
     ) -> Done:
-        """The result of the stage `name`: the kept one if it follows from the same, else that of `compute`, as JSON gives it back.
+        """The result of the stage `name`: the kept one if it follows from the same, else that of
+        `compute`, as JSON gives it back.
 
         Args:
             files: what the stage writes beside its result; where one is missing it is done again.
@@ -58,13 +62,19 @@ class StageStore:
         path = self.folder / f"{name}.json"
         origin = json.loads(json.dumps({"settings": settings, "code": code.digest()}))
         kept = _read(path)
-        if kept is not None and kept.get("origin") == origin and all(file.exists() for file in files):
+        if (
+            kept is not None
+            and kept.get("origin") == origin
+            and all(file.exists() for file in files)
+        ):
             self.num_kept += 1
             return Done(kept["result"], digest_of(origin), kept["seconds"])
         start = time.perf_counter()
         result = json.loads(json.dumps(compute()))
         seconds = time.perf_counter() - start
-        write_text(path, json.dumps({"origin": origin, "seconds": seconds, "result": result}) + "\n")
+        write_text(
+            path, json.dumps({"origin": origin, "seconds": seconds, "result": result}) + "\n"
+        )
         self.num_done += 1
         return Done(result, digest_of(origin), seconds)
 
@@ -80,4 +90,6 @@ def _read(path: Path) -> dict[str, Any] | None:
         kept = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    return kept if isinstance(kept, dict) and {"origin", "result", "seconds"} <= kept.keys() else None
+    return (
+        kept if isinstance(kept, dict) and {"origin", "result", "seconds"} <= kept.keys() else None
+    )

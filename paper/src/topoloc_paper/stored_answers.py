@@ -20,8 +20,11 @@ def rows_of(answers: Sequence[Answer]) -> list[dict[str, Any]]:
     return [_row_of(answer) for answer in answers]
 
 
-def answers_of(rows: Sequence[dict[str, Any]], recording: str, sequence: StereoSequence | None = None) -> list[Answer]:
-    """The inverse of `rows_of`; pictures and cameras are read again from `sequence` when they are asked for."""
+def answers_of(
+    rows: Sequence[dict[str, Any]], recording: str, sequence: StereoSequence | None = None
+) -> list[Answer]:
+    """The inverse of `rows_of`; pictures and cameras are read again from `sequence` when they are
+    asked for."""
     cameras = _Pictures(sequence) if sequence is not None else None
     return [_answer_of(row, recording, cameras) for row in rows]
 
@@ -39,7 +42,9 @@ def pose_of(numbers: Sequence[float]) -> Rigid3:
 def _row_of(answer: Answer) -> dict[str, Any]:
     row = answer.result.to_json(answer.query)
     if isinstance(answer.result, Localization) and answer.result.evidence is not None:
-        row["evidence"] = {name: np.asarray(value).item() for name, value in asdict(answer.result.evidence).items()}
+        row["evidence"] = {
+            name: np.asarray(value).item() for name, value in asdict(answer.result.evidence).items()
+        }
     if answer.world_from_cam is not None:
         row["truth"] = pose_json(answer.world_from_cam)
     return row | {"nearest": answer.nearest_node_id, "neighbours": sorted(answer.neighbour_ids)}
@@ -49,7 +54,16 @@ def _answer_of(row: dict[str, Any], recording: str, pictures: _Pictures | None) 
     truth = pose_of(row["truth"]) if "truth" in row else None
     read_image = None if pictures is None else pictures.reader(row["query"])
     camera = None if pictures is None else pictures.camera
-    return Answer(row["query"], _result_of(row), truth, row["nearest"], recording, read_image, camera, frozenset(row["neighbours"]))
+    return Answer(
+        row["query"],
+        _result_of(row),
+        truth,
+        row["nearest"],
+        recording,
+        read_image,
+        camera,
+        frozenset(row["neighbours"]),
+    )
 
 
 def _result_of(row: dict[str, Any]) -> Localization | NotLocalized:

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from topoloc_paper import ablation, node_sweep, normalization, peers, stage_times, table_one, targets
+from topoloc_paper import (
+    ablation,
+    node_sweep,
+    normalization,
+    peers,
+    stage_times,
+    table_one,
+    targets,
+)
 from topoloc_paper.settings import LEARNED, Bench
 
 Part = Literal["paper", "conditions", "nodes", "speed", "peers", "recordings"]
@@ -20,15 +28,26 @@ TABLES: dict[Part, tuple[str, ...]] = {
 
 
 def tables_of(bench: Bench, part: Part) -> dict[str, Any]:
-    """The tables that the part is about; `recordings` takes the real recordings alone, all others but `paper` the rendered ones.
+    """The tables that the part is about; `recordings` takes the real recordings alone, all others
+    but `paper` the rendered ones.
 
     Raises:
         TopolocError: a stage could not be done; what was done before is kept.
     """
     rendered, real = list(bench.rendered), list(bench.real)
-    datasets = real if part == "recordings" else rendered + real if part in ("paper", "peers") else rendered
+    datasets = (
+        real
+        if part == "recordings"
+        else rendered + real
+        if part in ("paper", "peers")
+        else rendered
+    )
     wanted = TABLES[part]
-    results: dict[str, Any] = {"machine": stage_times.machine(), "settings": _settings(bench), "missing": list(bench.missing)}
+    results: dict[str, Any] = {
+        "machine": stage_times.machine(),
+        "settings": _settings(bench),
+        "missing": list(bench.missing),
+    }
     if "accuracy" in wanted:
         results["accuracy"] = table_one.all_rows(bench, datasets)
     if "normalization" in wanted:
@@ -42,17 +61,29 @@ def tables_of(bench: Bench, part: Part) -> dict[str, Any]:
     if "ablation" in wanted:
         results["ablation"] = ablation.rows(bench, rendered)
     if "targets" in wanted:
-        results["targets"] = targets.rows(results["accuracy"], results["ablation"], results["speed"])
+        results["targets"] = targets.rows(
+            results["accuracy"], results["ablation"], results["speed"]
+        )
     return results
 
 
 def _settings(bench: Bench) -> dict[str, Any]:
     c = bench.config
     weights = {method: c.weights.words(method) for method in ("posenet", *LEARNED)}
-    rendered = {dataset.name: {"mapping": list(dataset.mapping), "queries": list(dataset.queries)} for dataset in bench.rendered}
+    rendered = {
+        dataset.name: {"mapping": list(dataset.mapping), "queries": list(dataset.queries)}
+        for dataset in bench.rendered
+    }
     names = {name: [_last(path) for path in one["mapping"]] for name, one in rendered.items()}
     quality = "the demo's" if c.quick else "draft" if c.draft else "normal"
-    return {"command": bench.command, "quality": quality, "weights": weights, "mapping": names, "quick": c.quick, "epochs": c.epochs} | {
+    return {
+        "command": bench.command,
+        "quality": quality,
+        "weights": weights,
+        "mapping": names,
+        "quick": c.quick,
+        "epochs": c.epochs,
+    } | {
         "posenet_epochs": c.posenet_epochs,
         "posenet_losses": list(c.posenet_losses),
         "max_colmap_images": c.max_colmap_images,

@@ -1,4 +1,5 @@
-"""The tables for people: columns and cells, as Markdown (the file beside the JSON, the README) or as HTML (the report)."""
+"""The tables for people: columns and cells, as Markdown (the file beside the JSON, the README) or
+as HTML (the report)."""
 
 from __future__ import annotations
 
@@ -30,17 +31,26 @@ def about(results: Mapping[str, Any]) -> str:
     for method, words in s["weights"].items():
         of_words.setdefault(words, []).append(method)
     weights = "; ".join(f"{words} ({', '.join(methods)})" for words, methods in of_words.items())
-    missing = f" Recordings not there, and left out: {', '.join(results['missing'])}." if results["missing"] else ""
+    missing = (
+        f" Recordings not there, and left out: {', '.join(results['missing'])}."
+        if results["missing"]
+        else ""
+    )
     return (
-        f"`{s['command']}`, {quality_words(s)}, {m['cores']} cores of {m['cpu']}. Weights: {weights}; "
-        f"cnn-fc is trained for at most {s['epochs']} epochs, PoseNet for {s['posenet_epochs']}.{missing} "
-        "Errors are medians over the localized queries; the paper's numbers are from its own recordings, not from these."
+        f"`{s['command']}`, {quality_words(s)}, {m['cores']} cores of {m['cpu']}. Weights:"
+        f" {weights}; cnn-fc is trained for at most {s['epochs']} epochs, PoseNet for"
+        f" {s['posenet_epochs']}.{missing} Errors are medians over the localized queries; the"
+        " paper's numbers are from its own recordings, not from these."
     )
 
 
 def quality_words(settings: Mapping[str, Any]) -> str:
     """Which recordings were used."""
-    return "the demo's recordings" if settings["quick"] else f"recordings of {settings['quality']} quality"
+    return (
+        "the demo's recordings"
+        if settings["quick"]
+        else f"recordings of {settings['quality']} quality"
+    )
 
 
 @dataclass(frozen=True)
@@ -62,7 +72,10 @@ class Table:
             shown = "" if first == above else f"<b>{escape(first)}</b>"
             body += f"<tr><td>{shown}</td>" + "".join(_html_cell(cell) for cell in rest) + "</tr>"
             above = first
-        return f'<div class="wide"><table class="results"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+        return (
+            '<div class="wide"><table'
+            f' class="results"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+        )
 
 
 def _html_cell(cell: str) -> str:
@@ -77,12 +90,20 @@ def error_words(row: Row) -> str:
     if row.get("median_translation_m") is None:
         return f"none of {row['num_queries']} localized"
     found = f"{length_text(row['median_translation_m'])}, {row['median_rotation_deg']:.2f}°"
-    return found if row["num_localized"] == row["num_queries"] else f"{found} ({row['num_localized']} of {row['num_queries']})"
+    return (
+        found
+        if row["num_localized"] == row["num_queries"]
+        else f"{found} ({row['num_localized']} of {row['num_queries']})"
+    )
 
 
 def paper_words(row: Row) -> str:
     """What the paper printed for the like."""
-    return MISSING if row.get("paper_m") is None else f"{length_text(row['paper_m'])}, {row['paper_deg']:.2f}°"
+    return (
+        MISSING
+        if row.get("paper_m") is None
+        else f"{length_text(row['paper_m'])}, {row['paper_deg']:.2f}°"
+    )
 
 
 def percent(value: float | None) -> str:
@@ -93,10 +114,24 @@ def accuracy_table(rows: Sequence[Row]) -> Table:
     """Table I and II: a line for each method."""
     lines = []
     for row in rows:
-        near = f"{percent(row.get('topological_accuracy'))} / {percent(row.get('neighbour_accuracy'))}"
+        near = (
+            f"{percent(row.get('topological_accuracy'))} / {percent(row.get('neighbour_accuracy'))}"
+        )
         place = f"{row['dataset']}, {row['queries']}"
-        lines.append([place, f"{row['method']}, {row['nodes']}", error_words(row), paper_words(row), near, row["weights"]])
-    return Table(["place, queries", "method", "ours", "paper", "node right / or a neighbour", "weights"], lines)
+        lines.append(
+            [
+                place,
+                f"{row['method']}, {row['nodes']}",
+                error_words(row),
+                paper_words(row),
+                near,
+                row["weights"],
+            ]
+        )
+    return Table(
+        ["place, queries", "method", "ours", "paper", "node right / or a neighbour", "weights"],
+        lines,
+    )
 
 
 def normalization_table(rows: Sequence[Row]) -> Table:
@@ -104,13 +139,32 @@ def normalization_table(rows: Sequence[Row]) -> Table:
     places = dict.fromkeys((row["dataset"], row["queries"]) for row in rows)
     lines = []
     for place in places:
-        mine = {row["normalization"]: row for row in rows if (row["dataset"], row["queries"]) == place}
+        mine = {
+            row["normalization"]: row for row in rows if (row["dataset"], row["queries"]) == place
+        }
         paper, none = mine["paper"], mine["none"]
         gain = MISSING
         if paper["median_translation_m"] and none["median_translation_m"]:
-            gain = f"{100 * (1 - paper['median_translation_m'] / none['median_translation_m']):+.0f} %"
-        lines.append([", ".join(place), *(error_words(mine[kind]) for kind in ("none", "paper", "wide")), gain])
-    return Table(["place, queries", "none", "17x17 (the paper's)", "65x65 (topoloc's)", "error taken off by the paper's"], lines)
+            gain = (
+                f"{100 * (1 - paper['median_translation_m'] / none['median_translation_m']):+.0f} %"
+            )
+        lines.append(
+            [
+                ", ".join(place),
+                *(error_words(mine[kind]) for kind in ("none", "paper", "wide")),
+                gain,
+            ]
+        )
+    return Table(
+        [
+            "place, queries",
+            "none",
+            "17x17 (the paper's)",
+            "65x65 (topoloc's)",
+            "error taken off by the paper's",
+        ],
+        lines,
+    )
 
 
 def nodes_table(rows: Sequence[Row]) -> Table:
@@ -133,17 +187,39 @@ def speed_table(rows: Sequence[Row]) -> Table:
     lines = []
     for row in rows:
         if row.get("missing"):
-            lines.append([row["dataset"], row["method"], f"not run: {row['missing']}", "", "", "", "", ""])
+            lines.append(
+                [row["dataset"], row["method"], f"not run: {row['missing']}", "", "", "", "", ""]
+            )
             continue
-        q = {stage: [1e3 * value for value in values] for stage, values in row["quartiles_s"].items()}
+        q = {
+            stage: [1e3 * value for value in values] for stage, values in row["quartiles_s"].items()
+        }
         rest = [a + b for a, b in zip(q["features"], q["matching"], strict=True)]
         fine = [a + b for a, b in zip(rest, q["pnp"], strict=True)]
         total, paper = q["total"], row["paper_s"]
         cells = [f"{values[1]:.1f}" for values in (q["coarse"], q["patch_normalization"], fine)]
         spread = f"{total[1]:.0f} ({total[0]:.0f} to {total[2]:.0f})"
         load = MISSING if row.get("load") is None else f"{row['load']:.1f}"
-        lines.append([row["dataset"], row["method"], *cells, spread, f"{1e3 * paper:.0f}" if paper else MISSING, load])
-    columns = ["place", "coarse", "CNN + NN", "patch norm.", "SURF + PnP", "total (quartiles)", "paper's total", "load meanwhile"]
+        lines.append(
+            [
+                row["dataset"],
+                row["method"],
+                *cells,
+                spread,
+                f"{1e3 * paper:.0f}" if paper else MISSING,
+                load,
+            ]
+        )
+    columns = [
+        "place",
+        "coarse",
+        "CNN + NN",
+        "patch norm.",
+        "SURF + PnP",
+        "total (quartiles)",
+        "paper's total",
+        "load meanwhile",
+    ]
     return Table(columns, lines)
 
 
@@ -152,21 +228,62 @@ def peers_table(rows: Sequence[Row]) -> Table:
     lines = []
     for row in rows:
         name = f"{row['peer']}, {row['nodes']}"
-        size = MISSING if row["installed_bytes"] is None else f"{row['installed_bytes'] / 1e6:.0f} MB"
+        size = (
+            MISSING if row["installed_bytes"] is None else f"{row['installed_bytes'] / 1e6:.0f} MB"
+        )
         if row.get("missing"):
-            lines.append([f"{row['dataset']}, {row['queries']}", name, f"not run: {row['missing']}", "", "", "", "", size])
+            lines.append(
+                [
+                    f"{row['dataset']}, {row['queries']}",
+                    name,
+                    f"not run: {row['missing']}",
+                    "",
+                    "",
+                    "",
+                    "",
+                    size,
+                ]
+            )
             continue
         localized = f"{row['num_localized']} of {row['num_queries']}"
-        false = f"{row['far_off']} far off, {row['accepted']} of {row['num_elsewhere']} from elsewhere"
+        false = (
+            f"{row['far_off']} far off, {row['accepted']} of {row['num_elsewhere']} from elsewhere"
+        )
         ms, megabytes = f"{row['ms']:.0f}", f"{row['map_bytes'] / 1e6:.1f} MB"
         place = f"{row['dataset']}, {row['queries']}"
-        lines.append([place, name, error_words(row).partition(" (")[0], localized, false, ms, megabytes, size])
-    return Table(["place, queries", "peer", "median error", "localized", "false accepts", "ms", "map", "installed"], lines)
+        lines.append(
+            [
+                place,
+                name,
+                error_words(row).partition(" (")[0],
+                localized,
+                false,
+                ms,
+                megabytes,
+                size,
+            ]
+        )
+    return Table(
+        [
+            "place, queries",
+            "peer",
+            "median error",
+            "localized",
+            "false accepts",
+            "ms",
+            "map",
+            "installed",
+        ],
+        lines,
+    )
 
 
 def ablation_table(rows: Sequence[Row]) -> Table:
     """A line for each change."""
-    lines = [[f"{r['dataset']}, {r['queries']}", r["part"] or MISSING, r["change"], error_words(r)] for r in rows]
+    lines = [
+        [f"{r['dataset']}, {r['queries']}", r["part"] or MISSING, r["change"], error_words(r)]
+        for r in rows
+    ]
     return Table(["place, queries", "part", "change", "median error"], lines)
 
 
@@ -174,12 +291,40 @@ def targets_table(rows: Sequence[Row]) -> Table:
     """A line for each target."""
     lines = []
     for row in rows:
-        asked = length_text(row["asked_m"]) + (f", {row['asked_deg']:.2f}°" if row["asked_deg"] is not None else "")
-        verdict = "reached" if row["reached"] else "reached with topoloc's own nodes" if row["reached_by_own_nodes"] else "missed"
-        best, own = (f"{error_words(row[key])}, {row[key]['method']}" for key in ("best", "own_nodes"))
+        asked = length_text(row["asked_m"]) + (
+            f", {row['asked_deg']:.2f}°" if row["asked_deg"] is not None else ""
+        )
+        verdict = (
+            "reached"
+            if row["reached"]
+            else "reached with topoloc's own nodes"
+            if row["reached_by_own_nodes"]
+            else "missed"
+        )
+        best, own = (
+            f"{error_words(row[key])}, {row[key]['method']}" for key in ("best", "own_nodes")
+        )
         ms = "reached" if row["ms_reached"] else "missed: " + ", ".join(row["slow"])
-        lines.append([f"{row['dataset']}, {row['queries']}", asked, best, own, verdict, f"{row['asked_ms']:.0f} ms: {ms}", row["helps"]])
-    columns = ["place, queries", "asked for", "best by the paper's D_thresh", "own nodes", "verdict", "a query", "what would help most"]
+        lines.append(
+            [
+                f"{row['dataset']}, {row['queries']}",
+                asked,
+                best,
+                own,
+                verdict,
+                f"{row['asked_ms']:.0f} ms: {ms}",
+                row["helps"],
+            ]
+        )
+    columns = [
+        "place, queries",
+        "asked for",
+        "best by the paper's D_thresh",
+        "own nodes",
+        "verdict",
+        "a query",
+        "what would help most",
+    ]
     return Table(columns, lines)
 
 

@@ -1,4 +1,5 @@
-"""An atlas read: its manifest as it was at that moment, the files that it names, and the index over all its places."""
+"""An atlas read: its manifest as it was at that moment, the files that it names, and the index over
+all its places."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ from topoloc.errors import AtlasError
 
 
 def store_at(where: str) -> Store:
-    """The folder, or the object store, that an atlas lies in. Raises AtlasError, MissingExtraError."""
+    """The folder, or the object store, that an atlas lies in. Raises AtlasError,
+    MissingExtraError."""
     if "://" in where:
         from topoloc.atlas.object_store import ObjectStore
 
@@ -36,18 +38,22 @@ def whole_address(where: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Atlas:
-    """An atlas as its manifest said when it was read; later writes are not seen. Tiles keep their files while anybody may ask them."""
+    """An atlas as its manifest said when it was read; later writes are not seen. Tiles keep their
+    files while anybody may ask them."""
 
     store: Store
     manifest: Manifest
 
     @staticmethod
     def open(where: str) -> Atlas:
-        """Read the manifest of the atlas there. Raises AtlasError: there is none, or it is damaged."""
+        """Read the manifest of the atlas there. Raises AtlasError: there is none, or it is
+        damaged."""
         store = store_at(where)
         data = store.manifest()
         if data is None:
-            raise AtlasError(f"{where} is no atlas: it has no {MANIFEST}; `topoloc atlas create` makes one")
+            raise AtlasError(
+                f"{where} is no atlas: it has no {MANIFEST}; `topoloc atlas create` makes one"
+            )
         return Atlas(store, Manifest.from_bytes(data, f"{store.where}/{MANIFEST}"))
 
     def tile(self, tile_id: str) -> Tile:
@@ -55,7 +61,9 @@ class Atlas:
         tile = self.manifest.by_id.get(tile_id)
         if tile is None:
             known = ", ".join(list(self.manifest.by_id)[:8]) or "none"
-            raise AtlasError(f"the atlas {self.store.where} has no tile {tile_id[:80]!r} (it has: {known})")
+            raise AtlasError(
+                f"the atlas {self.store.where} has no tile {tile_id[:80]!r} (it has: {known})"
+            )
         return tile
 
     def map_path(self, tile: Tile) -> Path:
@@ -68,7 +76,9 @@ class Atlas:
 
     def places_of(self, tile: Tile) -> PlaceVectors:
         """The place vectors of a tile's nodes. Raises AtlasError."""
-        return read_vectors(self.store.local(tile.places.name, tile.places.sha256), tile.vocabularies)
+        return read_vectors(
+            self.store.local(tile.places.name, tile.places.sha256), tile.vocabularies
+        )
 
     @property
     def problems(self) -> dict[str, str]:
@@ -87,7 +97,8 @@ class Atlas:
 
 
 def tile_problem(atlas: Atlas, tile: Tile) -> str | None:
-    """What is wrong with the bytes of a tile's files; None where they are those that the manifest names."""
+    """What is wrong with the bytes of a tile's files; None where they are those that the manifest
+    names."""
     for stored in tile.files:
         try:
             path = atlas.store.local(stored.name, stored.sha256)

@@ -1,7 +1,8 @@
 """Tiles added to an atlas and removed from it, by several writers at once.
 
-Files are put first, under names made of their contents; only the manifest is contended for. A writer reads it, makes the next one, and
-commits that if the manifest is still what it read; else it begins anew with the new one. So of two writers neither loses a tile.
+Files are put first, under names made of their contents; only the manifest is contended for. A
+writer reads it, makes the next one, and commits that if the manifest is still what it read; else it
+begins anew with the new one. So of two writers neither loses a tile.
 """
 
 from __future__ import annotations
@@ -29,15 +30,18 @@ from topoloc.places.shared_vocabulary import shared_vocabulary
 from topoloc.sequences.atomic import scratch_file
 
 GRACE_S = 3600.0
-"""So long files stay that no manifest names any more: readers may have just read the manifest before."""
+"""So long files stay that no manifest names any more: readers may have just read the manifest
+before."""
 _MAX_TRIES = 1000
 Change = Callable[[Manifest, float], Manifest]
-"""From a manifest to the next one, at this time (seconds of Unix time). May be called several times."""
+"""From a manifest to the next one, at this time (seconds of Unix time). May be called several
+times."""
 
 
 @dataclass(frozen=True)
 class NewTile:
-    """A map that becomes a tile of this id, in this world; `recipe` is the digest of what it was made of, where that is known."""
+    """A map that becomes a tile of this id, in this world; `recipe` is the digest of what it was
+    made of, where that is known."""
 
     tile_id: str
     path: Path
@@ -45,17 +49,22 @@ class NewTile:
     recipe: str | None = None
 
 
-def new_tiles(paths: Sequence[str], tile_id: str | None = None, world: str | None = None) -> list[NewTile]:
+def new_tiles(
+    paths: Sequence[str], tile_id: str | None = None, world: str | None = None
+) -> list[NewTile]:
     """Maps by the ids that they get: the names of their files without .topo, or `tile_id`, of one.
 
     Args:
-        world: what the world is called that all of them, and tiles of the atlas, share; each has its own where this is None.
+        world: what the world is called that all of them, and tiles of the atlas, share; each has
+            its own where this is None.
 
     Raises:
         AtlasError: two get one id, or no tile can be called so.
     """
     ids = [tile_id or Path(path).name.removesuffix(".topo") for path in paths]
-    tiles = [NewTile(name, Path(path), world or name) for name, path in zip(ids, paths, strict=True)]
+    tiles = [
+        NewTile(name, Path(path), world or name) for name, path in zip(ids, paths, strict=True)
+    ]
     for tile in tiles:
         check_tile_id(tile.tile_id)
         check_tile_id(tile.world)
@@ -77,11 +86,18 @@ def create_atlas(where: str, new: Sequence[NewTile]) -> Manifest:
     return after
 
 
-def add_tiles(where: str, new: Sequence[NewTile], replaces: bool = False, grace_s: float = GRACE_S, creates: bool = False) -> Manifest:
+def add_tiles(
+    where: str,
+    new: Sequence[NewTile],
+    replaces: bool = False,
+    grace_s: float = GRACE_S,
+    creates: bool = False,
+) -> Manifest:
     """The manifest with these tiles, too.
 
     Args:
-        replaces: tiles of the same ids are replaced, else they are an error, unless they were made of the same.
+        replaces: tiles of the same ids are replaced, else they are an error, unless they were made
+            of the same.
         creates: where no atlas is there, it is made.
 
     Raises:
@@ -89,7 +105,9 @@ def add_tiles(where: str, new: Sequence[NewTile], replaces: bool = False, grace_
         MapError: a map is missing, damaged or empty.
     """
     store = store_at(where)
-    _check_free(_read(store, creates)[1], new, replaces)  # before the work begins, and again with each try
+    _check_free(
+        _read(store, creates)[1], new, replaces
+    )  # before the work begins, and again with each try
     added = {tile.tile_id: tile for tile in _put(store, new)}
 
     def with_added(manifest: Manifest, now: float) -> Manifest:
@@ -101,9 +119,12 @@ def add_tiles(where: str, new: Sequence[NewTile], replaces: bool = False, grace_
     return after
 
 
-def replace_tile(where: str, new: NewTile, before: Tile, grace_s: float = GRACE_S) -> Manifest | None:
-    """The manifest with a tile whose map was changed since it was `before`, but not its world: its joins stay, as they are by now. None
-    where the tile is gone or its map is another one by now; nothing is changed then.
+def replace_tile(
+    where: str, new: NewTile, before: Tile, grace_s: float = GRACE_S
+) -> Manifest | None:
+    """The manifest with a tile whose map was changed since it was `before`, but not its world: its
+    joins stay, as they are by now. None where the tile is gone or its map is another one by now;
+    nothing is changed then.
 
     Raises:
         AtlasError: no atlas is there, or it cannot be written.
@@ -128,42 +149,70 @@ def replace_tile(where: str, new: NewTile, before: Tile, grace_s: float = GRACE_
 
 
 def remove_tiles(where: str, tile_ids: Sequence[str], grace_s: float = GRACE_S) -> Manifest:
-    """The manifest without these tiles. Raises AtlasError: no atlas is there, it has no such tile, or cannot be written."""
+    """The manifest without these tiles. Raises AtlasError: no atlas is there, it has no such tile,
+    or cannot be written."""
     store = store_at(where)
 
     def without(manifest: Manifest, now: float) -> Manifest:
         missing = [tile_id for tile_id in tile_ids if tile_id not in manifest.by_id]
         if missing:
             raise AtlasError(f"the atlas {where} has no tile {missing[0][:80]!r}")
-        return manifest.with_tiles({tile_id: tile for tile_id, tile in manifest.by_id.items() if tile_id not in tile_ids}, now)
+        return manifest.with_tiles(
+            {tile_id: tile for tile_id, tile in manifest.by_id.items() if tile_id not in tile_ids},
+            now,
+        )
 
     return _changed(store, without, grace_s)
 
 
-def add_joins(where: str, joins: Sequence[Join], between: Mapping[str, Tile], grace_s: float = GRACE_S) -> Manifest:
-    """The manifest with these joins, too, which were found between these tiles; those of tiles are left out whose map is gone by now, or
-    another one. Raises AtlasError: no atlas is there, or it cannot be written."""
+def add_joins(
+    where: str, joins: Sequence[Join], between: Mapping[str, Tile], grace_s: float = GRACE_S
+) -> Manifest:
+    """The manifest with these joins, too, which were found between these tiles; those of tiles are
+    left out whose map is gone by now, or another one. Raises AtlasError: no atlas is there, or it
+    cannot be written."""
 
     def with_joins(manifest: Manifest, now: float) -> Manifest:
-        there = {name for name, tile in manifest.by_id.items() if name in between and between[name].map.sha256 == tile.map.sha256}
-        return manifest.with_tiles(manifest.by_id, now, [join for join in joins if there.issuperset(join.pair)])
+        there = {
+            name
+            for name, tile in manifest.by_id.items()
+            if name in between and between[name].map.sha256 == tile.map.sha256
+        }
+        return manifest.with_tiles(
+            manifest.by_id, now, [join for join in joins if there.issuperset(join.pair)]
+        )
 
     return _changed(store_at(where), with_joins, grace_s)
 
 
 def tile_of(new: NewTile, store: Store) -> Tile:
-    """What the manifest says of a map; its files are put into the store. Raises MapError, AtlasError."""
+    """What the manifest says of a map; its files are put into the store. Raises MapError,
+    AtlasError."""
     scratch = scratch_file(Path(tempfile.gettempdir()) / "topoloc-tile.places")
     with TopoMetricMap.load(new.path) as topomap, scratch as places:
         if len(topomap.summaries) == 0:
             raise EmptyMapError(f"map {new.path} has no nodes")
         vectors = place_vectors(topomap)
-        versions = {kind: vocabulary.version for kind in vectors if (vocabulary := shared_vocabulary(kind)) is not None}
+        versions = {
+            kind: vocabulary.version
+            for kind in vectors
+            if (vocabulary := shared_vocabulary(kind)) is not None
+        }
         write_vectors(places, vectors)
         tile = _described(new, topomap, versions)
         vectors = _stored(store, f"{new.tile_id}.places", places)
-    undo = _stored(store, f"{new.tile_id}.undo", path_of_log(new.path)) if undoable_edits(new.path) else None
-    return replace(tile, map=_stored(store, f"{new.tile_id}.topo", new.path), places=vectors, recipe=new.recipe, undo=undo)
+    undo = (
+        _stored(store, f"{new.tile_id}.undo", path_of_log(new.path))
+        if undoable_edits(new.path)
+        else None
+    )
+    return replace(
+        tile,
+        map=_stored(store, f"{new.tile_id}.topo", new.path),
+        places=vectors,
+        recipe=new.recipe,
+        undo=undo,
+    )
 
 
 def _stored(store: Store, name: str, path: Path) -> StoredFile:
@@ -180,7 +229,8 @@ def _put(store: Store, new: Sequence[NewTile]) -> list[Tile]:
 
 
 def _keep_files(store: Store, new: Sequence[NewTile], tiles: Sequence[Tile]) -> None:
-    """Put those again that were swept just before they were named: old files of the same contents."""
+    """Put those again that were swept just before they were named: old files of the same
+    contents."""
     names = set(store.ages())
     for one, tile in zip(new, tiles, strict=True):
         if not {stored.name for stored in tile.files} <= names:
@@ -197,7 +247,9 @@ _UNKNOWN = StoredFile("", "", 0)
 def _described(new: NewTile, topomap: TopoMetricMap, vocabularies: Mapping[str, str]) -> Tile:
     """All but the files."""
     centres = np.array([summary.world_from_cam.translation for summary in topomap.summaries])
-    first_rows = {summary.session_id: row for row, summary in reversed(list(enumerate(topomap.summaries)))}
+    first_rows = {
+        summary.session_id: row for row, summary in reversed(list(enumerate(topomap.summaries)))
+    }
     known = topomap.georeference
     return Tile(
         new.tile_id,
@@ -224,20 +276,31 @@ def _geo_box(known: Georeference, centres: np.ndarray) -> tuple[float, float, fl
 
 
 def _read(store: Store, creates: bool = False) -> tuple[bytes | None, Manifest]:
-    """The manifest, as bytes and as what they say; an empty one where there is none yet and it is to be made."""
+    """The manifest, as bytes and as what they say; an empty one where there is none yet and it is
+    to be made."""
     data = store.manifest()
     if data is None and creates:
         return None, Manifest()
     if data is None:
-        raise AtlasError(f"{store.where} is no atlas: it has no {MANIFEST}; `topoloc atlas create` makes one")
+        raise AtlasError(
+            f"{store.where} is no atlas: it has no {MANIFEST}; `topoloc atlas create` makes one"
+        )
     return data, Manifest.from_bytes(data, f"{store.where}/{MANIFEST}")
 
 
 def _check_free(manifest: Manifest, new: Sequence[NewTile], replaces: bool) -> None:
     there = manifest.by_id
-    taken = [tile.tile_id for tile in new if tile.tile_id in there and (tile.recipe is None or there[tile.tile_id].recipe != tile.recipe)]
+    taken = [
+        tile.tile_id
+        for tile in new
+        if tile.tile_id in there
+        and (tile.recipe is None or there[tile.tile_id].recipe != tile.recipe)
+    ]
     if taken and not replaces:
-        raise AtlasError(f"the atlas has a tile {taken[0]} already; --replace replaces it, --id gives the new one another id")
+        raise AtlasError(
+            f"the atlas has a tile {taken[0]} already; --replace replaces it, --id gives the new"
+            " one another id"
+        )
 
 
 def _changed(store: Store, change: Change, grace_s: float, creates: bool = False) -> Manifest:
@@ -246,11 +309,19 @@ def _changed(store: Store, change: Change, grace_s: float, creates: bool = False
         before, manifest = _read(store, creates)
         now, ages = time.time(), store.ages()
         after = change(manifest, now)
-        gone = [name for name, when in after.retired.items() if name not in ages or min(now - when, ages[name]) > grace_s]
-        after = replace(after, retired={name: when for name, when in after.retired.items() if name not in gone})
+        gone = [
+            name
+            for name, when in after.retired.items()
+            if name not in ages or min(now - when, ages[name]) > grace_s
+        ]
+        after = replace(
+            after, retired={name: when for name, when in after.retired.items() if name not in gone}
+        )
         if store.commit(before, after.to_bytes()):
             known = after.files | set(after.retired)
-            for name in (name for name, age in store.ages().items() if name not in known and age > grace_s):
+            for name in (
+                name for name, age in store.ages().items() if name not in known and age > grace_s
+            ):
                 store.remove(name)
             return after
     raise AtlasError(f"{store.where}: other writers came in between {_MAX_TRIES} times")

@@ -24,7 +24,8 @@ class Hearing:
     ranking: Ranking = field(default_factory=list)
     heard: dict[str, Heard] = field(default_factory=dict)
     begun: dict[str, tuple[OpenedMap, Asking]] = field(default_factory=dict)
-    """The questions that tiles were asked, each with the map as it was open then: one that was closed since is asked anew."""
+    """The questions that tiles were asked, each with the map as it was open then: one that was
+    closed since is asked anew."""
 
     @property
     def is_late(self) -> bool:
@@ -33,7 +34,11 @@ class Hearing:
     @property
     def left_ms(self) -> float | None:
         """Milliseconds that are left; None where there is no limit."""
-        return None if self.deadline == float("inf") else max(1.0, 1e3 * (self.deadline - time.perf_counter()))
+        return (
+            None
+            if self.deadline == float("inf")
+            else max(1.0, 1e3 * (self.deadline - time.perf_counter()))
+        )
 
     @property
     def is_settled(self) -> bool:
@@ -43,22 +48,33 @@ class Hearing:
     @property
     def answers(self) -> list[Heard]:
         """The tiles that vouch for a pose when they are asked by all means."""
-        return [one for one in self.heard.values() if one.is_full and isinstance(one.result, Localization)]
+        return [
+            one
+            for one in self.heard.values()
+            if one.is_full and isinstance(one.result, Localization)
+        ]
 
     def may_be_rival(self, asking: Asking) -> bool:
-        """May a further tile's pose come near one of the answers? Where it is known about where the camera is in that tile, it is asked."""
+        """May a further tile's pose come near one of the answers? Where it is known about where the
+        camera is in that tile, it is asked."""
         if asking.prior is not None:
             return True
-        evidence = asking.best_case(min(self.begun[one.tile.tile_id][1].least_inliers for one in self.answers))
+        evidence = asking.best_case(
+            min(self.begun[one.tile.tile_id][1].least_inliers for one in self.answers)
+        )
         poses = [one.result for one in self.answers if isinstance(one.result, Localization)]
-        return evidence is not None and not all(is_far_behind(evidence, asking.features, pose) for pose in poses)
+        return evidence is not None and not all(
+            is_far_behind(evidence, asking.features, pose) for pose in poses
+        )
 
     def was_asked(self, tile_id: str) -> bool:
         """By all means?"""
         return tile_id in self.heard and self.heard[tile_id].is_full
 
     def promise(self, ranked: tuple[str, float]) -> tuple[float, float]:
-        """Which of several tiles is asked first: the one with the likeliest pose at a glance, then the one that looks most like the
-        picture."""
+        """Which of several tiles is asked first: the one with the likeliest pose at a glance, then
+        the one that looks most like the picture."""
         known = self.heard.get(ranked[0])
-        return max((one.probability for one in known.named), default=0.0) if known else 0.0, ranked[1]
+        return max((one.probability for one in known.named), default=0.0) if known else 0.0, ranked[
+            1
+        ]

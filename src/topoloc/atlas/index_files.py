@@ -1,9 +1,11 @@
-"""The index of an atlas, made once: shards of places in the cache folder, used again as long as their tiles are the atlas's.
+"""The index of an atlas, made once: shards of places in the cache folder, used again as long as
+their tiles are the atlas's.
 
-A shard holds tiles by their ids and the checksums of their place vectors. Whoever opens an atlas takes the shards that are there, without
-reading the vectors of their tiles again. Tiles that came since are compared exactly while they are few, else they become a shard, together
-with the small ones. Tiles that were removed or replaced stay in their shard unseen, until they are a quarter of it. So an index is never
-older than the manifest, and the cache folder may be emptied at any time.
+A shard holds tiles by their ids and the checksums of their place vectors. Whoever opens an atlas
+takes the shards that are there, without reading the vectors of their tiles again. Tiles that came
+since are compared exactly while they are few, else they become a shard, together with the small
+ones. Tiles that were removed or replaced stay in their shard unseen, until they are a quarter of
+it. So an index is never older than the manifest, and the cache folder may be emptied at any time.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ from topoloc.features.network_files import cache_folder
 from topoloc.places.shared_vocabulary import shared_vocabulary
 
 MAX_EXACT_PLACES, SHARD_PLACES = 20_000, 1 << 20
-"""So many places that lie in no shard are compared one by one; so many places a shard holds, but for those of one tile."""
+"""So many places that lie in no shard are compared one by one; so many places a shard holds, but
+for those of one tile."""
 _MAX_UNSEEN, _UNUSED_S = 0.25, 86_400.0
 ReadPlaces = Callable[[Tile], PlaceVectors]
 _Rows = tuple[ShardTile, Float16[np.ndarray, "_ _"]]
@@ -53,7 +56,9 @@ class _Kept:
 
     @property
     def live(self) -> list[ShardTile]:
-        return [tile for tile, is_live in zip(self.shard.tiles, self.is_live, strict=True) if is_live]
+        return [
+            tile for tile, is_live in zip(self.shard.tiles, self.is_live, strict=True) if is_live
+        ]
 
     @property
     def num_live(self) -> int:
@@ -62,7 +67,11 @@ class _Kept:
     def rows(self) -> list[_Rows]:
         """The tiles that count, with their vectors."""
         bounds, tiles = self.shard.bounds, enumerate(self.shard.tiles)
-        return [(tile, self.shard.vectors[bounds[k] : bounds[k + 1]]) for k, tile in tiles if self.is_live[k]]
+        return [
+            (tile, self.shard.vectors[bounds[k] : bounds[k + 1]])
+            for k, tile in tiles
+            if self.is_live[k]
+        ]
 
 
 def index_folder(where: str) -> Path:
@@ -72,7 +81,8 @@ def index_folder(where: str) -> Path:
 
 
 def open_index(tiles: Sequence[Tile], read: ReadPlaces, folder: Path) -> OpenedIndex:
-    """The index over these tiles by what lies in `folder`; what is lacking there is made, and kept there where that can be written.
+    """The index over these tiles by what lies in `folder`; what is lacking there is made, and kept
+    there where that can be written.
 
     Args:
         read: the place vectors of a tile; raises AtlasError where they cannot be had.
@@ -94,11 +104,21 @@ def open_index(tiles: Sequence[Tile], read: ReadPlaces, folder: Path) -> OpenedI
             exact.setdefault(tile.tile_id, {})[kind] = rows.astype(np.float32)
     numbers = {tile_id: number for number, tile_id in enumerate(ids)}
     shards = [
-        (one.shard, [numbers[tile.tile_id] if live else -1 for tile, live in zip(one.shard.tiles, one.is_live, strict=True)])
+        (
+            one.shard,
+            [
+                numbers[tile.tile_id] if live else -1
+                for tile, live in zip(one.shard.tiles, one.is_live, strict=True)
+            ],
+        )
         for of_kind in kept.values()
         for one in of_kind
     ]
-    return OpenedIndex(AtlasIndex(ids, [exact.get(tile_id, {}) for tile_id in ids], shards), work.problems, work.notes)
+    return OpenedIndex(
+        AtlasIndex(ids, [exact.get(tile_id, {}) for tile_id in ids], shards),
+        work.problems,
+        work.notes,
+    )
 
 
 @dataclass(eq=False)
@@ -112,12 +132,19 @@ class _Opening:
 
     def __post_init__(self) -> None:
         self._checksums = {tile.tile_id: tile.places.sha256 for tile in self.tiles}
-        vocabularies = {kind: shared_vocabulary(kind) for tile in self.tiles for kind in tile.vocabularies}
-        self.versions = {kind: vocabulary.version for kind, vocabulary in sorted(vocabularies.items()) if vocabulary is not None}
+        vocabularies = {
+            kind: shared_vocabulary(kind) for tile in self.tiles for kind in tile.vocabularies
+        }
+        self.versions = {
+            kind: vocabulary.version
+            for kind, vocabulary in sorted(vocabularies.items())
+            if vocabulary is not None
+        }
 
     @cached_property
     def stored(self) -> list[PlaceShard]:
-        """The shards that lie in the folder, the largest first. One that is damaged is removed, and made anew where it is lacking."""
+        """The shards that lie in the folder, the largest first. One that is damaged is removed, and
+        made anew where it is lacking."""
         shards = list[PlaceShard]()
         for path in sorted(self.folder.glob("*.index")):
             try:
@@ -129,12 +156,16 @@ class _Opening:
         return sorted(shards, key=lambda shard: (-len(shard.vectors), shard.name))
 
     def kept(self, kind: str) -> list[_Kept]:
-        """The shards of this kind most of whose tiles are the atlas's, as they are now; a tile counts in the first one that has it."""
+        """The shards of this kind most of whose tiles are the atlas's, as they are now; a tile
+        counts in the first one that has it."""
         kept, seen = list[_Kept](), set[str]()
         for shard in self.stored:
             if (shard.kind, shard.vocabulary) != (kind, self.versions[kind]):
                 continue
-            is_live = [self._checksums.get(tile.tile_id) == tile.sha256 and tile.tile_id not in seen for tile in shard.tiles]
+            is_live = [
+                self._checksums.get(tile.tile_id) == tile.sha256 and tile.tile_id not in seen
+                for tile in shard.tiles
+            ]
             one = _Kept(shard, is_live)
             if one.num_live >= (1.0 - _MAX_UNSEEN) * len(shard.vectors):
                 kept.append(one)
@@ -142,24 +173,39 @@ class _Opening:
         return kept
 
     def read_rest(self, kept: dict[str, list[_Kept]], read: ReadPlaces) -> dict[str, list[_Rows]]:
-        """The place vectors, by kind, of tiles that lie in no shard of it; as soon as they fill one they are made one of those `kept`."""
-        known = {kind: {tile.tile_id for one in of_kind for tile in one.live} for kind, of_kind in kept.items()}
+        """The place vectors, by kind, of tiles that lie in no shard of it; as soon as they fill one
+        they are made one of those `kept`."""
+        known = {
+            kind: {tile.tile_id for one in of_kind for tile in one.live}
+            for kind, of_kind in kept.items()
+        }
         rest, num_rows = {kind: list[_Rows]() for kind in kept}, dict.fromkeys(kept, 0)
         for tile in self.tiles:
-            ours = [kind for kind, version in tile.vocabularies.items() if self.versions.get(kind) == version]
+            ours = [
+                kind
+                for kind, version in tile.vocabularies.items()
+                if self.versions.get(kind) == version
+            ]
             lacking = [kind for kind in ours if tile.tile_id not in known[kind]]
             if ours and not lacking:
                 continue
             try:
                 vectors = read(tile)
-            except StoreError:  # says nothing of the tile, and the next one would be waited for as long
+            except (
+                StoreError
+            ):  # says nothing of the tile, and the next one would be waited for as long
                 raise
             except AtlasError as error:
                 self.problems[tile.tile_id] = str(error)
                 continue
             for kind in lacking:
                 if len(rows := vectors.get(kind, np.zeros((0, 1)))) > 0:
-                    rest[kind].append((ShardTile(tile.tile_id, tile.places.sha256, len(rows)), rows.astype(np.float16)))
+                    rest[kind].append(
+                        (
+                            ShardTile(tile.tile_id, tile.places.sha256, len(rows)),
+                            rows.astype(np.float16),
+                        )
+                    )
                     num_rows[kind] += len(rows)
                 if num_rows[kind] >= SHARD_PLACES:
                     kept[kind].append(self._new_shard(kind, rest[kind]))
@@ -167,7 +213,8 @@ class _Opening:
         return rest
 
     def with_new_shards(self, kind: str, kept: Sequence[_Kept], rest: list[_Rows]) -> list[_Kept]:
-        """All of them in shards; those that are less than half full are made one with the rest, which is emptied."""
+        """All of them in shards; those that are less than half full are made one with the rest,
+        which is emptied."""
         full = [one for one in kept if one.num_live >= SHARD_PLACES // 2]
         pending = [row for one in kept if one not in full for row in one.rows()] + rest
         rest.clear()
@@ -176,7 +223,8 @@ class _Opening:
         return full
 
     def _new_shard(self, kind: str, pending: list[_Rows]) -> _Kept:
-        """A shard of the first of these tiles, as many as it holds, which are taken out of the list."""
+        """A shard of the first of these tiles, as many as it holds, which are taken out of the
+        list."""
         sizes = np.cumsum([tile.num_rows for tile, _ in pending])
         count = max(1, int(np.searchsorted(sizes, SHARD_PLACES, "right")))
         tiles = [tile for tile, _ in pending[:count]]
@@ -184,13 +232,16 @@ class _Opening:
         return _Kept(self._saved(shard), [True] * count)
 
     def _saved(self, shard: PlaceShard) -> PlaceShard:
-        """As it lies in its file, of which only pages that are asked come into memory; where that cannot be written, as it is."""
+        """As it lies in its file, of which only pages that are asked come into memory; where that
+        cannot be written, as it is."""
         try:
             return PlaceShard.open(shard.save(self.folder))
         except (OSError, AtlasError) as error:
             text = "the index stays in memory, and is made at each opening: cannot write"
             if not any(note.startswith(text) for note in self.notes):
-                self.notes.append(f"{text} {self.folder}: {getattr(error, 'strerror', None) or error}")
+                self.notes.append(
+                    f"{text} {self.folder}: {getattr(error, 'strerror', None) or error}"
+                )
             return shard
 
     def remove_unused(self, kept: dict[str, list[_Kept]]) -> None:
@@ -205,7 +256,8 @@ class _Opening:
 
 
 def _taken(pending: list[_Rows], count: int) -> Float16[np.ndarray, "n d"]:
-    """The vectors of the first tiles, which are let go of one by one: they are half of a gigabyte."""
+    """The vectors of the first tiles, which are let go of one by one: they are half of a
+    gigabyte."""
     num_rows = sum(tile.num_rows for tile, _ in pending[:count])
     stacked, first = np.empty((num_rows, pending[0][1].shape[1]), np.float16), 0
     for number in range(count):

@@ -1,4 +1,5 @@
-"""How two tiles lie to each other, as pictures of one that the other knows say it; and where a world lies among those joined with it."""
+"""How two tiles lie to each other, as pictures of one that the other knows say it; and where a
+world lies among those joined with it."""
 
 from __future__ import annotations
 
@@ -15,10 +16,12 @@ from topoloc.geometry.rigid import Rigid3, skew
 
 @dataclass(frozen=True, eq=False)
 class Join:
-    """Tile `second` lies so to tile `first`: `first_from_second` brings the world of its map into that of the other's.
+    """Tile `second` lies so to tile `first`: `first_from_second` brings the world of its map into
+    that of the other's.
 
-    `covariance` is that of the left perturbation (m, rad), as the pictures' answers have it; `num_agreeing` pictures of either tile say so.
-    `residual` is by how many sigma all joins together miss it; None of one that contradicts the others and is not used.
+    `covariance` is that of the left perturbation (m, rad), as the pictures' answers have it;
+    `num_agreeing` pictures of either tile say so. `residual` is by how many sigma all joins
+    together miss it; None of one that contradicts the others and is not used.
     """
 
     first: str
@@ -59,7 +62,8 @@ class Join:
 
 @dataclass(frozen=True, eq=False)
 class JointPose:
-    """Where a world lies in the one that it shares with others, which has the name, and the coordinates, of one of them.
+    """Where a world lies in the one that it shares with others, which has the name, and the
+    coordinates, of one of them.
 
     `covariance` is that of the left perturbation of `joint_from_world` (m, rad).
     """
@@ -70,7 +74,11 @@ class JointPose:
 
     def to_json(self) -> dict[str, Any]:
         pose = self.joint_from_world.matrix()[:3].tolist()
-        return {"world": self.joint, "joint_from_world": pose, "covariance": self.covariance.tolist()}
+        return {
+            "world": self.joint,
+            "joint_from_world": pose,
+            "covariance": self.covariance.tolist(),
+        }
 
     @staticmethod
     def from_json(row: Mapping[str, Any]) -> JointPose:
@@ -78,17 +86,24 @@ class JointPose:
         return JointPose(
             joint=matching(ID, row["world"], "a joint world"),
             joint_from_world=pose_of(row["joint_from_world"], "joint_from_world"),
-            covariance=covariance_of(row["covariance"], "a joint pose's covariance", is_definite=False),
+            covariance=covariance_of(
+                row["covariance"], "a joint pose's covariance", is_definite=False
+            ),
         )
 
 
-def sigmas_at(point_a: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "6 6"]) -> tuple[float, float]:
-    """One sigma of where a point (m, frame a) lies that a transform brings into a: metres, in the worst direction; and of its turn,
-    radians.
+def sigmas_at(
+    point_a: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "6 6"]
+) -> tuple[float, float]:
+    """One sigma of where a point (m, frame a) lies that a transform brings into a: metres, in the
+    worst direction; and of its turn, radians.
 
     Args:
         covariance: of the left perturbation of ``a_from_b`` (m, rad).
     """
     moved = np.hstack([np.eye(3), -skew(point_a)])
-    metres, radians = (np.linalg.eigvalsh(block)[-1] for block in (moved @ covariance @ moved.T, covariance[3:, 3:]))
+    metres, radians = (
+        np.linalg.eigvalsh(block)[-1]
+        for block in (moved @ covariance @ moved.T, covariance[3:, 3:])
+    )
     return float(np.sqrt(max(metres, 0.0))), float(np.sqrt(max(radians, 0.0)))

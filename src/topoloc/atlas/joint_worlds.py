@@ -1,7 +1,8 @@
 """Worlds that joins connect brought into one: a pose graph whose nodes are the worlds of tiles.
 
-Each join may be wrong, if seldom: one that contradicts those that more pictures speak for is left out. Of two worlds that both know their
-place on earth none is moved to another place by joins. One tile on earth puts there all that are joined with it.
+Each join may be wrong, if seldom: one that contradicts those that more pictures speak for is left
+out. Of two worlds that both know their place on earth none is moved to another place by joins. One
+tile on earth puts there all that are joined with it.
 """
 
 from __future__ import annotations
@@ -27,10 +28,17 @@ MAX_APART_M = 100.0
 """Two worlds whose places on earth are known are not joined to lie further from there than this."""
 
 
-def placed(tiles: Mapping[str, Tile], joins: Sequence[Join], origin: GeoPoint | None) -> tuple[tuple[Tile, ...], tuple[Join, ...]]:
-    """Tiles in the order of their ids with their places in joint worlds and in the atlas's, and all joins adjusted."""
+def placed(
+    tiles: Mapping[str, Tile], joins: Sequence[Join], origin: GeoPoint | None
+) -> tuple[tuple[Tile, ...], tuple[Join, ...]]:
+    """Tiles in the order of their ids with their places in joint worlds and in the atlas's, and all
+    joins adjusted."""
     ordered = [_on_earth(tiles[tile_id], origin) for tile_id in sorted(tiles)]
-    known = {tile.world: tile.atlas_from_world for tile in reversed(ordered) if tile.atlas_from_world is not None}
+    known = {
+        tile.world: tile.atlas_from_world
+        for tile in reversed(ordered)
+        if tile.atlas_from_world is not None
+    }
     all_adjusted = adjusted(joins, {tile.tile_id: tile.world for tile in ordered}, known)
     in_order: list[Tile] = []
     for tile in ordered:
@@ -38,44 +46,63 @@ def placed(tiles: Mapping[str, Tile], joins: Sequence[Join], origin: GeoPoint | 
         pose = tile.atlas_from_world or known.get(tile.world)
         if pose is None and joint is not None and joint.joint in known:
             pose = known[joint.joint] @ joint.joint_from_world
-        box = tile.geo_box if pose is None or tile.geo_box is not None or origin is None else _geo_box(origin, pose, tile.box_world)
+        box = (
+            tile.geo_box
+            if pose is None or tile.geo_box is not None or origin is None
+            else _geo_box(origin, pose, tile.box_world)
+        )
         in_order.append(replace(tile, joint=joint, atlas_from_world=pose, geo_box=box))
     return tuple(in_order), all_adjusted.joins
 
 
 def _on_earth(tile: Tile, origin: GeoPoint | None) -> Tile:
-    """A tile with what its own georeference says of its place in the atlas's world, which is east-north-up at `origin`, and no more."""
+    """A tile with what its own georeference says of its place in the atlas's world, which is
+    east-north-up at `origin`, and no more."""
     known = tile.georeference
     if known is None or origin is None:
         return replace(tile, atlas_from_world=None, geo_box=None)
     atlas_from_ecef = origin.ecef_from_enu().inverse()
-    return replace(tile, atlas_from_world=atlas_from_ecef @ known.origin.ecef_from_enu() @ known.enu_from_world)
+    return replace(
+        tile, atlas_from_world=atlas_from_ecef @ known.origin.ecef_from_enu() @ known.enu_from_world
+    )
 
 
-def _geo_box(origin: GeoPoint, atlas_from_world: Rigid3, box_world: Float[np.ndarray, "2 3"]) -> tuple[float, float, float, float]:
+def _geo_box(
+    origin: GeoPoint, atlas_from_world: Rigid3, box_world: Float[np.ndarray, "2 3"]
+) -> tuple[float, float, float, float]:
     """Least and largest latitude and longitude of a box's corners."""
     corners = np.array(list(product(*box_world.T)))
-    places = [GeoPoint.from_ecef(corner) for corner in (origin.ecef_from_enu() @ atlas_from_world).apply(corners)]
+    places = [
+        GeoPoint.from_ecef(corner)
+        for corner in (origin.ecef_from_enu() @ atlas_from_world).apply(corners)
+    ]
     lats, lons = [place.lat for place in places], [place.lon for place in places]
     return min(lats), min(lons), max(lats), max(lons)
 
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:
-    """Joins with what they are missed by, and where each world lies that they join with another one, by its name."""
+    """Joins with what they are missed by, and where each world lies that they join with another
+    one, by its name."""
 
     joins: tuple[Join, ...]
     places: Mapping[str, JointPose]
 
 
-def adjusted(joins: Sequence[Join], worlds: Mapping[str, str], atlas_from_worlds: Mapping[str, Rigid3]) -> Adjusted:
+def adjusted(
+    joins: Sequence[Join], worlds: Mapping[str, str], atlas_from_worlds: Mapping[str, Rigid3]
+) -> Adjusted:
     """All joins brought to agree, but for those that contradict others.
 
     Args:
         worlds: the name of each tile's world, by the tile's id.
-        atlas_from_worlds: of the worlds that know their place on earth; such a one is what its joint world is named after.
+        atlas_from_worlds: of the worlds that know their place on earth; such a one is what its
+            joint world is named after.
     """
-    config, kept = PoseGraphConfig(), sorted(joins, key=lambda join: (-join.num_agreeing, join.pair))
+    config, kept = (
+        PoseGraphConfig(),
+        sorted(joins, key=lambda join: (-join.num_agreeing, join.pair)),
+    )
     dropped: list[Join] = []
     while True:
         far = _first_far_apart(kept, worlds, atlas_from_worlds)
@@ -87,13 +114,18 @@ def adjusted(joins: Sequence[Join], worlds: Mapping[str, str], atlas_from_worlds
             far = kept[int(np.argmax(residuals))]
         kept.remove(far)
         dropped.append(replace(far, residual=None))
-    used = [replace(join, residual=residual) for join, residual in zip(kept, residuals, strict=True)]
+    used = [
+        replace(join, residual=residual) for join, residual in zip(kept, residuals, strict=True)
+    ]
     return Adjusted(tuple(sorted([*used, *dropped], key=lambda join: join.pair)), places)
 
 
-def _first_far_apart(joins: Iterable[Join], worlds: Mapping[str, str], atlas_from_worlds: Mapping[str, Rigid3]) -> Join | None:
-    """The first join that, with those before it, says of a world that it lies elsewhere than where on earth it is known to lie. Looked at
-    are those that bring worlds on earth together, for the ways between worlds do not change by further joins that fewer speak for."""
+def _first_far_apart(
+    joins: Iterable[Join], worlds: Mapping[str, str], atlas_from_worlds: Mapping[str, Rigid3]
+) -> Join | None:
+    """The first join that, with those before it, says of a world that it lies elsewhere than where
+    on earth it is known to lie. Looked at are those that bring worlds on earth together, for the
+    ways between worlds do not change by further joins that fewer speak for."""
     groups: dict[str, set[str]] = {}
     taken: list[Join] = []
     for join in joins:
@@ -102,19 +134,28 @@ def _first_far_apart(joins: Iterable[Join], worlds: Mapping[str, str], atlas_fro
         if one is other:
             continue
         both = one | other
-        if not (one.isdisjoint(atlas_from_worlds) or other.isdisjoint(atlas_from_worlds)) and _is_torn(
-            _groups([known for known in taken if worlds[known.first] in both], worlds, atlas_from_worlds), atlas_from_worlds
+        if not (
+            one.isdisjoint(atlas_from_worlds) or other.isdisjoint(atlas_from_worlds)
+        ) and _is_torn(
+            _groups(
+                [known for known in taken if worlds[known.first] in both], worlds, atlas_from_worlds
+            ),
+            atlas_from_worlds,
         ):
             return join
         groups |= dict.fromkeys(both, both)
     return None
 
 
-def _is_torn(groups: Mapping[str, Mapping[str, JointPose]], atlas_from_worlds: Mapping[str, Rigid3]) -> bool:
+def _is_torn(
+    groups: Mapping[str, Mapping[str, JointPose]], atlas_from_worlds: Mapping[str, Rigid3]
+) -> bool:
     """Does a world lie elsewhere by joins than it is known to?"""
     for anchor, group in groups.items():
         for name in group.keys() & atlas_from_worlds.keys():
-            apart = (atlas_from_worlds[anchor] @ group[name].joint_from_world).inverse() @ atlas_from_worlds[name]
+            apart = (
+                atlas_from_worlds[anchor] @ group[name].joint_from_world
+            ).inverse() @ atlas_from_worlds[name]
             if np.linalg.norm(apart.translation) > MAX_APART_M:
                 return True
     return False
@@ -130,14 +171,20 @@ class _Way:
     num_agreeing: int
 
 
-def _groups(joins: Sequence[Join], worlds: Mapping[str, str], anchored: Mapping[str, Rigid3]) -> dict[str, dict[str, JointPose]]:
-    """The worlds that joins connect, by the name of the one that gives them its coordinates; each lies where the ways lead that most
-    pictures speak for."""
+def _groups(
+    joins: Sequence[Join], worlds: Mapping[str, str], anchored: Mapping[str, Rigid3]
+) -> dict[str, dict[str, JointPose]]:
+    """The worlds that joins connect, by the name of the one that gives them its coordinates; each
+    lies where the ways lead that most pictures speak for."""
     ways: dict[str, list[_Way]] = {}
     for join in joins:
         one, other, pose = worlds[join.first], worlds[join.second], join.first_from_second
         ways.setdefault(one, []).append(_Way(other, pose, join.covariance, join.num_agreeing))
-        ways.setdefault(other, []).append(_Way(one, pose.inverse(), covariance_of_inverse(pose, join.covariance), join.num_agreeing))
+        ways.setdefault(other, []).append(
+            _Way(
+                one, pose.inverse(), covariance_of_inverse(pose, join.covariance), join.num_agreeing
+            )
+        )
     groups, seen = dict[str, dict[str, JointPose]](), set[str]()
     for anchor in sorted(ways, key=lambda name: (name not in anchored, name)):
         if anchor not in seen:
@@ -147,7 +194,8 @@ def _groups(joins: Sequence[Join], worlds: Mapping[str, str], anchored: Mapping[
 
 
 def _reached(anchor: str, ways: Mapping[str, Sequence[_Way]]) -> dict[str, JointPose]:
-    """Every world that joins lead to, each time by the join from what is reached that most pictures speak for."""
+    """Every world that joins lead to, each time by the join from what is reached that most pictures
+    speak for."""
     places = dict[str, JointPose]()
     queue = [(0, 0, anchor, JointPose(anchor, Rigid3.identity()))]
     count = 0
@@ -161,14 +209,26 @@ def _reached(anchor: str, ways: Mapping[str, Sequence[_Way]]) -> dict[str, Joint
             if way.to not in places:
                 covariance = place.covariance + adjoint @ way.covariance @ adjoint.T
                 count += 1
-                heapq.heappush(queue, (-way.num_agreeing, count, way.to, JointPose(anchor, place.joint_from_world @ way.pose, covariance)))
+                heapq.heappush(
+                    queue,
+                    (
+                        -way.num_agreeing,
+                        count,
+                        way.to,
+                        JointPose(anchor, place.joint_from_world @ way.pose, covariance),
+                    ),
+                )
     return places
 
 
 def _optimised(
-    joins: Sequence[Join], worlds: Mapping[str, str], anchored: Mapping[str, Rigid3], config: PoseGraphConfig
+    joins: Sequence[Join],
+    worlds: Mapping[str, str],
+    anchored: Mapping[str, Rigid3],
+    config: PoseGraphConfig,
 ) -> dict[str, JointPose]:
-    """Where each world lies, all joins adjusted; the covariance is that of one way alone, which is no less."""
+    """Where each world lies, all joins adjusted; the covariance is that of one way alone, which is
+    no less."""
     placed = dict[str, JointPose]()
     for anchor, group in _groups(joins, worlds, anchored).items():
         names = [anchor, *(name for name in group if name != anchor)]
@@ -182,10 +242,21 @@ def _optimised(
 
 
 def _edge(join: Join, worlds: Mapping[str, str], rows: Mapping[str, int]) -> Edge:
-    return Edge(rows[worlds[join.second]], rows[worlds[join.first]], join.first_from_second, join.covariance, is_loop=True)
+    return Edge(
+        rows[worlds[join.second]],
+        rows[worlds[join.first]],
+        join.first_from_second,
+        join.covariance,
+        is_loop=True,
+    )
 
 
-def _residuals(joins: Sequence[Join], worlds: Mapping[str, str], places: Mapping[str, JointPose]) -> list[float]:
+def _residuals(
+    joins: Sequence[Join], worlds: Mapping[str, str], places: Mapping[str, JointPose]
+) -> list[float]:
     names = list(places)
-    rows, poses = {name: row for row, name in enumerate(names)}, [places[name].joint_from_world.inverse() for name in names]
+    rows, poses = (
+        {name: row for row, name in enumerate(names)},
+        [places[name].joint_from_world.inverse() for name in names],
+    )
     return residuals_in_sigma(poses, [_edge(join, worlds, rows) for join in joins]).tolist()

@@ -15,7 +15,8 @@ from topoloc.places.coarse import Image
 
 @dataclass(frozen=True, eq=False)
 class JudgedTile:
-    """The whole atlas is asked; `topomap` is the tile's map, whose nodes the truth is compared with."""
+    """The whole atlas is asked; `topomap` is the tile's map, whose nodes the truth is compared
+    with."""
 
     localizer: AtlasLocalizer
     tile_id: str
@@ -24,15 +25,23 @@ class JudgedTile:
     @staticmethod
     def of(localizer: AtlasLocalizer, tile_id: str) -> JudgedTile:
         """Raises AtlasError: no such tile, or its map is missing; MapError: it is damaged."""
-        return JudgedTile(localizer, tile_id, TopoMetricMap.load(localizer.atlas.map_path(localizer.atlas.tile(tile_id))))
+        return JudgedTile(
+            localizer,
+            tile_id,
+            TopoMetricMap.load(localizer.atlas.map_path(localizer.atlas.tile(tile_id))),
+        )
 
-    def localize(self, image: Image, camera: Camera | RoughCamera | None, t_ns: int | None = None) -> Localization | NotLocalized:
+    def localize(
+        self, image: Image, camera: Camera | RoughCamera | None, t_ns: int | None = None
+    ) -> Localization | NotLocalized:
         """As `AtlasLocalizer.localize`."""
         return self.localizer.localize(image, camera, t_ns=t_ns)
 
-    def truth_in_world_of(self, result: Localization | NotLocalized, world_from_cam: Rigid3) -> Rigid3 | None:
-        """The true pose in the world of the tile that answered; None where the atlas does not know how that lies to this one, so that no
-        pose there is right."""
+    def truth_in_world_of(
+        self, result: Localization | NotLocalized, world_from_cam: Rigid3
+    ) -> Rigid3 | None:
+        """The true pose in the world of the tile that answered; None where the atlas does not know
+        how that lies to this one, so that no pose there is right."""
         tile, answered = self.localizer.atlas.tile(self.tile_id), result.provenance.tile
         other = tile if answered is None else self.localizer.atlas.tile(answered)
         other_from_world = other.from_world_of(tile)

@@ -1,7 +1,9 @@
-"""What an atlas says of itself in `atlas.json`: its tiles, and where each one's files lie. Data only, read back with every value checked.
+"""What an atlas says of itself in `atlas.json`: its tiles, and where each one's files lie. Data
+only, read back with every value checked.
 
-Tiles go by ids that never change. Their files have names made of their contents, so that a tile that is replaced is another file and
-whoever has read a manifest goes on with the files that it names. `serial` grows by one with each write.
+Tiles go by ids that never change. Their files have names made of their contents, so that a tile
+that is replaced is another file and whoever has read a manifest goes on with the files that it
+names. `serial` grows by one with each write.
 """
 
 from __future__ import annotations
@@ -45,15 +47,18 @@ class StoredFile:
 
 @dataclass(frozen=True, eq=False)
 class Tile:
-    """A map of the atlas. `places` are its place vectors (`place_vectors.py`), by vocabularies of these versions, by kind of features.
+    """A map of the atlas. `places` are its place vectors (`place_vectors.py`), by vocabularies of
+    these versions, by kind of features.
 
-    `box_world` holds the least and the largest coordinates of its nodes' cameras in the map's own world, metres; `focal_px` the focal
-    length of its finest camera. `georeference` is the map's, `geo_box` the least latitude, longitude and the largest ones, degrees;
-    both None of a map that knows no place on earth. Tiles of one `world` share their coordinates; it is the tile's own id where nobody said
-    so; `joint` says where that world lies among those that pictures join it with (`joins.py`), None where they join it with none.
-    `atlas_from_world` brings the map's world into the atlas's, where that is known, be it through other tiles. `recipe` is a digest of the
-    recording and settings that the map was made of, where it was made for this atlas. `undo` takes the map's last edits back
-    (`map/undo_log.py`), where that can be.
+    `box_world` holds the least and the largest coordinates of its nodes' cameras in the map's own
+    world, metres; `focal_px` the focal length of its finest camera. `georeference` is the map's,
+    `geo_box` the least latitude, longitude and the largest ones, degrees; both None of a map that
+    knows no place on earth. Tiles of one `world` share their coordinates; it is the tile's own id
+    where nobody said so; `joint` says where that world lies among those that pictures join it with
+    (`joins.py`), None where they join it with none. `atlas_from_world` brings the map's world into
+    the atlas's, where that is known, be it through other tiles. `recipe` is a digest of the
+    recording and settings that the map was made of, where it was made for this atlas. `undo` takes
+    the map's last edits back (`map/undo_log.py`), where that can be.
     """
 
     tile_id: str
@@ -82,11 +87,13 @@ class Tile:
 
     @property
     def in_joint_world(self) -> JointPose:
-        """Where the tile's world lies in the joint one; that is its own where no other is joined with it."""
+        """Where the tile's world lies in the joint one; that is its own where no other is joined
+        with it."""
         return self.joint or JointPose(self.world, Rigid3.identity())
 
     def from_world_of(self, other: Tile) -> Rigid3 | None:
-        """Brings the world of another tile's map into that of this one, where the atlas knows how they lie to each other."""
+        """Brings the world of another tile's map into that of this one, where the atlas knows how
+        they lie to each other."""
         if self.world == other.world:
             return Rigid3.identity()
         here, there = self.in_joint_world, other.in_joint_world
@@ -117,15 +124,20 @@ class Tile:
             "box_world": self.box_world.tolist(),
             "georeference": None if known is None else known.to_json(),
             "geo_box": None if self.geo_box is None else list(self.geo_box),
-            "atlas_from_world": None if self.atlas_from_world is None else self.atlas_from_world.matrix()[:3].tolist(),
+            "atlas_from_world": (
+                None
+                if self.atlas_from_world is None
+                else self.atlas_from_world.matrix()[:3].tolist()
+            ),
         }
 
 
 @dataclass(frozen=True, eq=False)
 class Manifest:
-    """All tiles in the order of their ids. `origin` is the place on earth at which the atlas's own world touches it (east, north, up), None
-    while no tile is georeferenced. `retired` are files that were named before, and when they were given up (seconds of Unix time). `joins`
-    say how tiles lie to each other, those that all together contradict among them."""
+    """All tiles in the order of their ids. `origin` is the place on earth at which the atlas's own
+    world touches it (east, north, up), None while no tile is georeferenced. `retired` are files
+    that were named before, and when they were given up (seconds of Unix time). `joins` say how
+    tiles lie to each other, those that all together contradict among them."""
 
     serial: int = 0
     tiles: tuple[Tile, ...] = ()
@@ -149,7 +161,8 @@ class Manifest:
         return np.array([tile.box_world for tile in self.tiles], np.float64).reshape(-1, 2, 3)
 
     def georeference_of(self, tile: Tile) -> Georeference | None:
-        """Where on earth a tile's world lies: its map's own word, else what follows from other tiles."""
+        """Where on earth a tile's world lies: its map's own word, else what follows from other
+        tiles."""
         if tile.georeference is not None or tile.atlas_from_world is None or self.origin is None:
             return tile.georeference
         return Georeference(self.origin, tile.atlas_from_world, "joined")
@@ -159,26 +172,47 @@ class Manifest:
         """Names of all files that the tiles consist of."""
         return {stored.name for tile in self.tiles for stored in tile.files}
 
-    def with_tiles(self, tiles: Mapping[str, Tile], now: float, joins: Sequence[Join] = ()) -> Manifest:
+    def with_tiles(
+        self, tiles: Mapping[str, Tile], now: float, joins: Sequence[Join] = ()
+    ) -> Manifest:
         """The next one, of these tiles; files that it does not name any more are retired at `now`.
 
         Args:
-            joins: further ones, of these tiles. Those that are there stay, but for those of tiles whose map is gone or another one.
+            joins: further ones, of these tiles. Those that are there stay, but for those of tiles
+                whose map is gone or another one.
         """
         origin = self.origin
         if origin is None:
-            origin = next((tile.georeference.origin for _, tile in sorted(tiles.items()) if tile.georeference is not None), None)
+            origin = next(
+                (
+                    tile.georeference.origin
+                    for _, tile in sorted(tiles.items())
+                    if tile.georeference is not None
+                ),
+                None,
+            )
         placed, adjusted_joins = placed_tiles(tiles, self._joins_of(tiles, joins), origin)
         after = Manifest(self.serial + 1, placed, origin, {}, adjusted_joins)
         retired = dict.fromkeys(self.files, now) | dict(self.retired)
-        return replace(after, retired={name: when for name, when in sorted(retired.items()) if name not in after.files})
+        return replace(
+            after,
+            retired={
+                name: when for name, when in sorted(retired.items()) if name not in after.files
+            },
+        )
 
     def _joins_of(self, tiles: Mapping[str, Tile], further: Sequence[Join]) -> list[Join]:
         """Joins between these tiles; of two between the same ones the last."""
-        same = {name for name, tile in tiles.items() if name in self.by_id and self.by_id[name].map.sha256 == tile.map.sha256}
+        same = {
+            name
+            for name, tile in tiles.items()
+            if name in self.by_id and self.by_id[name].map.sha256 == tile.map.sha256
+        }
         known = {join.pair: join for join in self.joins if same.issuperset(join.pair)}
         known |= {join.pair: join for join in further if tiles.keys() >= set(join.pair)}
-        return [join for join in known.values() if tiles[join.first].world != tiles[join.second].world]
+        return [
+            join for join in known.values() if tiles[join.first].world != tiles[join.second].world
+        ]
 
     def to_bytes(self) -> bytes:
         """As `atlas.json` holds it."""
@@ -187,7 +221,9 @@ class Manifest:
             "format": FORMAT,
             "version": FORMAT_VERSION,
             "serial": self.serial,
-            "origin": None if origin is None else {"lat": origin.lat, "lon": origin.lon, "h": origin.h},
+            "origin": (
+                None if origin is None else {"lat": origin.lat, "lon": origin.lon, "h": origin.h}
+            ),
             "tiles": [tile.to_json() for tile in self.tiles],
             "retired": dict(self.retired),
             **({"joins": [join.to_json() for join in self.joins]} if self.joins else {}),
@@ -196,25 +232,46 @@ class Manifest:
 
     @staticmethod
     def from_bytes(data: bytes, where: str) -> Manifest:
-        """The inverse of `to_bytes`. Raises AtlasError, which says `where`, whatever else the bytes are."""
+        """The inverse of `to_bytes`. Raises AtlasError, which says `where`, whatever else the bytes
+        are."""
         try:
             return _manifest_of(json.loads(data))
-        except (ValueError, TypeError, KeyError, RecursionError, OverflowError, GeoreferenceError, TrajectoryError) as error:
-            what = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else " ".join(str(error).split())[:200]
-            raise AtlasError(f"{where} is no manifest of an atlas, or a damaged one: {what}") from None
+        except (
+            ValueError,
+            TypeError,
+            KeyError,
+            RecursionError,
+            OverflowError,
+            GeoreferenceError,
+            TrajectoryError,
+        ) as error:
+            what = (
+                f"{error.args[0]!r} is missing"
+                if isinstance(error, KeyError)
+                else " ".join(str(error).split())[:200]
+            )
+            raise AtlasError(
+                f"{where} is no manifest of an atlas, or a damaged one: {what}"
+            ) from None
 
 
 def check_tile_id(tile_id: str) -> None:
     """Raises AtlasError where no tile can be called so."""
     if not ID.fullmatch(tile_id):
-        raise AtlasError(f"no tile can be called {tile_id[:80]!r}: at most 100 letters, digits, `_`, `-` and `.`, a letter or digit first")
+        raise AtlasError(
+            f"no tile can be called {tile_id[:80]!r}: at most 100 letters, digits, `_`, `-` and"
+            " `.`, a letter or digit first"
+        )
 
 
 def _manifest_of(data: Any) -> Manifest:
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         raise ValueError(f"'format' is not {FORMAT!r}")
     if data.get("version") != FORMAT_VERSION:
-        raise ValueError(f"version {str(data.get('version'))[:20]} of the format; this topoloc reads version {FORMAT_VERSION}")
+        raise ValueError(
+            f"version {str(data.get('version'))[:20]} of the format; this topoloc reads version"
+            f" {FORMAT_VERSION}"
+        )
     rows = of(list, data["tiles"], "tiles")
     tiles = [_tile_of(of(dict, row, "a tile")) for row in rows[: MAX_TILES + 1]]
     if len(tiles) > MAX_TILES or len({tile.tile_id for tile in tiles}) < len(tiles):
@@ -222,9 +279,15 @@ def _manifest_of(data: Any) -> Manifest:
     origin, retired = data["origin"], of(dict, data["retired"], "retired")
     for name in retired:
         matching(_FILE, name, "a retired file")
-    place = None if origin is None else GeoPoint(*(number(origin[name], name) for name in ("lat", "lon", "h")))
+    place = (
+        None
+        if origin is None
+        else GeoPoint(*(number(origin[name], name) for name in ("lat", "lon", "h")))
+    )
     ordered = tuple(sorted(tiles, key=lambda tile: tile.tile_id))
-    joins = [Join.from_json(of(dict, row, "a join")) for row in of(list, data.get("joins", []), "joins")]
+    joins = [
+        Join.from_json(of(dict, row, "a join")) for row in of(list, data.get("joins", []), "joins")
+    ]
     _check_joins(joins, {tile.tile_id for tile in tiles})
     given_up = {name: number(when, "retired") for name, when in retired.items()}
     return Manifest(count(data["serial"], "serial"), ordered, place, given_up, tuple(joins))
@@ -235,7 +298,9 @@ def _check_joins(joins: Sequence[Join], known: set[str]) -> None:
         if not known.issuperset(join.pair):
             raise ValueError(f"a join of {join.first} and {join.second}, which are not both tiles")
         if join.first >= join.second:
-            raise ValueError(f"a join of {join.first} and {join.second}, which are not two in their order")
+            raise ValueError(
+                f"a join of {join.first} and {join.second}, which are not two in their order"
+            )
     if len({join.pair for join in joins}) < len(joins):
         raise ValueError("two joins of the same tiles")
 
@@ -244,20 +309,31 @@ def _tile_of(row: dict[str, Any]) -> Tile:
     box = np.array(row["box_world"], np.float64)
     if box.shape != (2, 3) or not np.isfinite(box).all():
         raise ValueError("box_world is no two points")
-    geo_box, georeference, pose, recipe = row["geo_box"], row["georeference"], row["atlas_from_world"], row.get("recipe")
+    geo_box, georeference, pose, recipe = (
+        row["geo_box"],
+        row["georeference"],
+        row["atlas_from_world"],
+        row.get("recipe"),
+    )
     joint, undo = row.get("joint"), row.get("undo")
     focal = number(row["focal_px"], "focal_px")
     if focal <= 0.0:
         raise ValueError("focal_px is not above 0")
     vocabularies = of(dict, row["places"]["vocabularies"], "vocabularies")
-    corners = None if geo_box is None else [number(value, "geo_box") for value in of(list, geo_box, "geo_box")]
+    corners = (
+        None
+        if geo_box is None
+        else [number(value, "geo_box") for value in of(list, geo_box, "geo_box")]
+    )
     if corners is not None and len(corners) != 4:
         raise ValueError("geo_box is no four degrees")
     return Tile(
         tile_id=matching(ID, row["id"], "id"),
         map=_file_of(row["map"]),
         places=_file_of(row["places"]),
-        vocabularies={kind: of(str, version, "vocabularies") for kind, version in vocabularies.items()},
+        vocabularies={
+            kind: of(str, version, "vocabularies") for kind, version in vocabularies.items()
+        },
         map_id=matching(_MAP_ID, row["map_id"], "map_id"),
         map_version=count(row["map_version"], "map_version"),
         kinds=tuple(of(str, kind, "kinds") for kind in of(list, row["kinds"], "kinds")),

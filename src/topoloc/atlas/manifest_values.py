@@ -1,4 +1,5 @@
-"""Values of a manifest, checked: each raises ValueError, whose text says `what` it is that is wrong."""
+"""Values of a manifest, checked: each raises ValueError, whose text says `what` it is that is
+wrong."""
 
 from __future__ import annotations
 
@@ -56,13 +57,22 @@ def pose_of(rows: Any, what: str) -> Rigid3:
 
 
 def covariance_of(rows: Any, what: str, is_definite: bool) -> Float[np.ndarray, "6 6"]:
-    """A covariance (6x6) of a manifest, which is exactly symmetric afterwards. Raises ValueError."""
+    """A covariance (6x6) of a manifest, which is exactly symmetric afterwards. Raises
+    ValueError."""
     matrix = np.array(rows, np.float64)
-    if matrix.shape != (6, 6) or not np.isfinite(matrix).all() or np.abs(matrix).max() > _MAX_METRES**2:
+    if (
+        matrix.shape != (6, 6)
+        or not np.isfinite(matrix).all()
+        or np.abs(matrix).max() > _MAX_METRES**2
+    ):
         raise ValueError(f"{what} is no 6x6 matrix of finite numbers")
     symmetric = 0.5 * (matrix + matrix.T)
     values = np.linalg.eigvalsh(symmetric)
     slack = 1e-9 * max(float(values[-1]), 0.0)
-    if np.abs(matrix - symmetric).max() > slack or values[0] < -slack or (is_definite and values[0] <= 0.0):
+    if (
+        np.abs(matrix - symmetric).max() > slack
+        or values[0] < -slack
+        or (is_definite and values[0] <= 0.0)
+    ):
         raise ValueError(f"{what} is no covariance")
     return symmetric

@@ -15,12 +15,13 @@ from topoloc.errors import AtlasError
 
 
 def merge_atlases(sources: Sequence[str], where: str) -> Manifest:
-    """A new atlas at `where` of the tiles of all sources, atlases or map files. A map that two of them hold under one id is one tile.
-    Worlds of different sources are different ones, whatever they are called.
+    """A new atlas at `where` of the tiles of all sources, atlases or map files. A map that two of
+    them hold under one id is one tile. Worlds of different sources are different ones, whatever
+    they are called.
 
     Raises:
-        AtlasError: an atlas is there already; two tiles of one id hold different maps; a file of a tile is missing or another; nothing can
-            be written.
+        AtlasError: an atlas is there already; two tiles of one id hold different maps; a file of a
+            tile is missing or another; nothing can be written.
         MapError: a map is missing, damaged or empty.
     """
     store = store_at(where)
@@ -57,11 +58,15 @@ def _copy(atlas: Atlas, tile: Tile, store: Store) -> None:
 def _check_same(source: str, known: Mapping[str, Tile], added: Mapping[str, Tile]) -> None:
     for tile_id in known.keys() & added.keys():
         if known[tile_id].map.sha256 != added[tile_id].map.sha256:
-            raise AtlasError(f"{source} has a tile {tile_id} too, of another map; `topoloc atlas add --id` gives a map another id")
+            raise AtlasError(
+                f"{source} has a tile {tile_id} too, of another map; `topoloc atlas add --id` gives"
+                " a map another id"
+            )
 
 
 def _with_own_worlds(known: Mapping[str, Tile], added: Mapping[str, Tile]) -> dict[str, Tile]:
-    """Tiles whose worlds are called as none of those that are known; but for worlds that a tile of both lies in, which are the same."""
+    """Tiles whose worlds are called as none of those that are known; but for worlds that a tile of
+    both lies in, which are the same."""
     same = {added[tile_id].world: known[tile_id].world for tile_id in known.keys() & added.keys()}
     taken = {tile.world for tile in known.values()}
     names = dict[str, str]()

@@ -1,4 +1,5 @@
-"""Where a picture was taken, as far as somebody knows: tiles that are out of reach need not be asked."""
+"""Where a picture was taken, as far as somebody knows: tiles that are out of reach need not be
+asked."""
 
 from __future__ import annotations
 
@@ -16,8 +17,8 @@ from topoloc.geometry.rigid import Rigid3
 
 @dataclass(frozen=True)
 class NearPlace:
-    """Within `radius_m` metres of a latitude and longitude (degrees). Tiles that do not know where on earth they lie are never out of
-    reach.
+    """Within `radius_m` metres of a latitude and longitude (degrees). Tiles that do not know where
+    on earth they lie are never out of reach.
 
     Raises:
         AtlasError: no such place, or no radius.
@@ -40,7 +41,10 @@ class NearPlace:
         try:
             lat, lon, radius_m = (float(part) for part in text.split(","))
         except ValueError:
-            raise AtlasError(f"{text[:80]!r} is no latitude, longitude (degrees) and radius (metres), such as 50.8775,4.7043,200") from None
+            raise AtlasError(
+                f"{text[:80]!r} is no latitude, longitude (degrees) and radius (metres), such as"
+                " 50.8775,4.7043,200"
+            ) from None
         return NearPlace(lat, lon, radius_m)
 
     def __str__(self) -> str:
@@ -49,8 +53,8 @@ class NearPlace:
 
 @dataclass(frozen=True, eq=False)
 class NearPose:
-    """A camera within `radius_m` metres of this pose in the world of this name. Tiles of worlds that lie in no known way to it are out of
-    reach.
+    """A camera within `radius_m` metres of this pose in the world of this name. Tiles of worlds
+    that lie in no known way to it are out of reach.
 
     Raises:
         AtlasError: no radius.
@@ -71,8 +75,11 @@ class NearPose:
 Near = NearPlace | NearPose
 
 
-def tiles_in_reach(manifest: Manifest, near: Near | None, placed_only: bool = False) -> dict[str, Rigid3 | None]:
-    """The ids of the tiles whose nodes' box is in reach, each with the pose that is near in the tile's own world, where one is given.
+def tiles_in_reach(
+    manifest: Manifest, near: Near | None, placed_only: bool = False
+) -> dict[str, Rigid3 | None]:
+    """The ids of the tiles whose nodes' box is in reach, each with the pose that is near in the
+    tile's own world, where one is given.
 
     Args:
         placed_only: without tiles that do not know where on earth they lie.
@@ -90,10 +97,12 @@ def tiles_in_reach(manifest: Manifest, near: Near | None, placed_only: bool = Fa
 
 
 def metres_to_boxes(near: NearPlace, boxes: Float[np.ndarray, "t 4"]) -> Float[np.ndarray, " t"]:
-    """From a place to boxes of latitudes and longitudes (least latitude, longitude, then the largest; degrees), along the ground; 0 to what
-    is NaN."""
+    """From a place to boxes of latitudes and longitudes (least latitude, longitude, then the
+    largest; degrees), along the ground; 0 to what is NaN."""
     lat = np.clip(near.lat, boxes[:, 0], boxes[:, 2])
-    turned = near.lon + np.array([[-360.0], [0.0], [360.0]])  # the same meridian, on either side of 180 degrees
+    turned = near.lon + np.array(
+        [[-360.0], [0.0], [360.0]]
+    )  # the same meridian, on either side of 180 degrees
     lon = np.abs(np.clip(turned, boxes[:, 1], boxes[:, 3]) - turned).min(axis=0)
     up, across = np.sin(np.radians(lat - near.lat) / 2.0), np.sin(np.radians(lon) / 2.0)
     along = up**2 + np.cos(np.radians(lat)) * math.cos(math.radians(near.lat)) * across**2
@@ -103,7 +112,9 @@ def metres_to_boxes(near: NearPlace, boxes: Float[np.ndarray, "t 4"]) -> Float[n
 _EARTH_RADIUS_M = 6_371_000.0
 
 
-def _near_pose(manifest: Manifest, near: NearPose, may_be: Bool[np.ndarray, " t"]) -> dict[str, Rigid3 | None]:
+def _near_pose(
+    manifest: Manifest, near: NearPose, may_be: Bool[np.ndarray, " t"]
+) -> dict[str, Rigid3 | None]:
     of_world = np.array([tile.world == near.world for tile in manifest.tiles], bool)
     if not of_world.any():
         worlds = ", ".join(sorted({tile.world for tile in manifest.tiles})[:8])
@@ -111,9 +122,14 @@ def _near_pose(manifest: Manifest, near: NearPose, may_be: Bool[np.ndarray, " t"
     centre, boxes = near.world_from_cam.translation, manifest.world_boxes
     apart = np.linalg.norm(np.clip(centre, boxes[:, 0], boxes[:, 1]) - centre, axis=1)
     in_reach = np.flatnonzero(may_be & of_world & (apart <= near.radius_m))
-    reached: dict[str, Rigid3 | None] = {manifest.tiles[number].tile_id: near.world_from_cam for number in in_reach}
+    reached: dict[str, Rigid3 | None] = {
+        manifest.tiles[number].tile_id: near.world_from_cam for number in in_reach
+    }
     one = manifest.tiles[int(np.flatnonzero(of_world)[0])]
-    is_known = np.array([tile.atlas_from_world is not None or tile.joint is not None for tile in manifest.tiles], bool)
+    is_known = np.array(
+        [tile.atlas_from_world is not None or tile.joint is not None for tile in manifest.tiles],
+        bool,
+    )
     for number in np.flatnonzero(may_be & ~of_world & is_known):
         tile = manifest.tiles[number]
         world_from_one = tile.from_world_of(one)

@@ -1,9 +1,11 @@
 """An atlas in an object store, by fsspec: `s3://`, `gs://`, `memory://` and whatever else it knows.
 
-Object stores have no locks and no rename. So each manifest is an object of its own, `manifests/000000012.json`, which is created only if it
-is not there yet: of two writers that make number 12 one succeeds, and the other begins anew. The newest one counts. That holds where the
-store refuses to create what exists (`If-None-Match: *`: Amazon S3 and stores that follow it) and lists what was written. Where fsspec looks
-first and writes then, two writers in the same instant may lose one's tiles.
+Object stores have no locks and no rename. So each manifest is an object of its own,
+`manifests/000000012.json`, which is created only if it is not there yet: of two writers that make
+number 12 one succeeds, and the other begins anew. The newest one counts. That holds where the store
+refuses to create what exists (`If-None-Match: *`: Amazon S3 and stores that follow it) and lists
+what was written. Where fsspec looks first and writes then, two writers in the same instant may lose
+one's tiles.
 """
 
 from __future__ import annotations
@@ -23,12 +25,17 @@ from topoloc.features.network_files import cache_folder
 from topoloc.sequences.atomic import replaced_file
 
 _MANIFESTS, _KEPT = "manifests", 16
-S3_TRIES, S3_CLIENT = 2, {"connect_timeout": 5.0, "read_timeout": 15.0, "retries": {"total_max_attempts": 2}}
-"""Seconds that S3 is waited for, and how often it is asked again: a store that is silent is given up after a minute, not after minutes."""
+S3_TRIES, S3_CLIENT = (
+    2,
+    {"connect_timeout": 5.0, "read_timeout": 15.0, "retries": {"total_max_attempts": 2}},
+)
+"""Seconds that S3 is waited for, and how often it is asked again: a store that is silent is given
+up after a minute, not after minutes."""
 
 
 class ObjectStore:
-    """A prefix of an object store; its files are kept in the cache folder of this machine, by their checksums.
+    """A prefix of an object store; its files are kept in the cache folder of this machine, by their
+    checksums.
 
     Raises:
         MissingExtraError: fsspec, or what it needs for this kind of store, is not installed.
@@ -39,10 +46,14 @@ class ObjectStore:
         try:
             import fsspec
         except ModuleNotFoundError as error:
-            raise MissingExtraError(f"{where}: object stores need {error.name}: pip install 'topoloc[cluster]'") from error
+            raise MissingExtraError(
+                f"{where}: object stores need {error.name}: pip install 'topoloc[cluster]'"
+            ) from error
         self.where = where.rstrip("/")
         try:
-            self._files, self._root = fsspec.core.url_to_fs(self.where, use_listings_cache=False, **_options(fsspec, self.where))
+            self._files, self._root = fsspec.core.url_to_fs(
+                self.where, use_listings_cache=False, **_options(fsspec, self.where)
+            )
         except ImportError as error:
             raise MissingExtraError(f"{where}: {' '.join(str(error).split())[:200]}") from error
         except ValueError as error:
@@ -72,14 +83,16 @@ class ObjectStore:
         return True
 
     def _created(self, name: str, data: bytes) -> bool:
-        """Create an object; False where another writer was faster. One that holds these very bytes is ours: the client asks again where an
-        answer was lost."""
+        """Create an object; False where another writer was faster. One that holds these very bytes
+        is ours: the client asks again where an answer was lost."""
         try:
             self._files.pipe_file(name, data, mode="create")
         except FileExistsError:
             return self._files.cat_file(name) == data
         except OSError as error:
-            if "ConditionalRequestConflict" not in f"{error} {error.__cause__}":  # S3, while another one is writing
+            if (
+                "ConditionalRequestConflict" not in f"{error} {error.__cause__}"
+            ):  # S3, while another one is writing
                 raise
             return False
         return True
@@ -99,13 +112,17 @@ class ObjectStore:
             except FileNotFoundError:
                 raise AtlasError(f"{self.where}/{name} is missing") from None
             if sha256_of(temporary) != sha256:
-                raise AtlasError(f"{self.where}/{name} is not the file that was added: its checksum is another")
+                raise AtlasError(
+                    f"{self.where}/{name} is not the file that was added: its checksum is another"
+                )
         return path
 
     def kept(self, name: str, sha256: str) -> Path | None:
         path = _kept_at(name, sha256)
         try:
-            os.utime(path, ns=(time.time_ns(), path.stat().st_mtime_ns))  # when it was used last; it is the same file all along
+            os.utime(
+                path, ns=(time.time_ns(), path.stat().st_mtime_ns)
+            )  # when it was used last; it is the same file all along
         except OSError:
             return path if path.is_file() else None
         return path
@@ -113,14 +130,18 @@ class ObjectStore:
     def ages(self) -> dict[str, float]:
         now = time.time()
         with self._told():
-            return {f"{TILES}/{Path(entry['name']).name}": now - self._modified(entry) for entry in self._entries(TILES)}
+            return {
+                f"{TILES}/{Path(entry['name']).name}": now - self._modified(entry)
+                for entry in self._entries(TILES)
+            }
 
     def remove(self, name: str) -> None:
         with self._told(), suppress(FileNotFoundError):  # another writer was here
             self._files.rm_file(f"{self._root}/{name}")
 
     def _newest(self) -> tuple[list[str], bytes | None]:
-        """The names of all manifests, and what the newest holds. Old ones are removed, also between a listing and its reading."""
+        """The names of all manifests, and what the newest holds. Old ones are removed, also between
+        a listing and its reading."""
         for _ in range(3):
             names = self._manifests()
             with suppress(FileNotFoundError):
@@ -129,12 +150,18 @@ class ObjectStore:
 
     def _manifests(self) -> list[str]:
         names = [entry["name"] for entry in self._entries(_MANIFESTS)]
-        return sorted(name for name in names if Path(name).suffix == ".json" and Path(name).stem.isdecimal())
+        return sorted(
+            name for name in names if Path(name).suffix == ".json" and Path(name).stem.isdecimal()
+        )
 
     def _entries(self, folder: str) -> list[dict[str, Any]]:
         self._files.invalidate_cache()
         try:
-            return [entry for entry in self._files.ls(f"{self._root}/{folder}", detail=True) if entry.get("type") == "file"]
+            return [
+                entry
+                for entry in self._files.ls(f"{self._root}/{folder}", detail=True)
+                if entry.get("type") == "file"
+            ]
         except FileNotFoundError:
             return []
 
@@ -145,7 +172,8 @@ class ObjectStore:
 
     @contextmanager
     def _told(self) -> Iterator[None]:
-        """Whatever a store's client raises is one failure here: these have errors of their own each."""
+        """Whatever a store's client raises is one failure here: these have errors of their own
+        each."""
         try:
             yield
         except (AtlasError, FileExistsError):
@@ -175,7 +203,8 @@ def _is_s3(fsspec: Any, where: str) -> bool:
 
 
 def _options(fsspec: Any, where: str) -> dict[str, Any]:
-    """What the store's client is told; what the user's own configuration of fsspec says of it counts."""
+    """What the store's client is told; what the user's own configuration of fsspec says of it
+    counts."""
     if not _is_s3(fsspec, where):
         return {}
     said = fsspec.config.conf.get(fsspec.utils.get_protocol(where), {})

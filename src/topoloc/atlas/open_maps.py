@@ -1,9 +1,12 @@
-"""Maps by their names: opened when they are asked for, closed when there are too many, replaced when their file is.
+"""Maps by their names: opened when they are asked for, closed when there are too many, replaced
+when their file is.
 
-A map's name is that of its file without `.topo`; of an atlas's tile, its id. Tiles of object stores are files of this machine when they
-are opened; how they come here is said by who makes the `Maps`. A file is looked at before each request: another one in its
-place is opened, and the one before is let go of when the last request that uses it is answered. What is kept of nodes has a budget of its
-own (`map/memory.py`); here a map counts by the bytes of its file, which no open map exceeds apart from its nodes.
+A map's name is that of its file without `.topo`; of an atlas's tile, its id. Tiles of object stores
+are files of this machine when they are opened; how they come here is said by who makes the `Maps`.
+A file is looked at before each request: another one in its place is opened, and the one before is
+let go of when the last request that uses it is answered. What is kept of nodes has a budget of its
+own (`map/memory.py`); here a map counts by the bytes of its file, which no open map exceeds apart
+from its nodes.
 """
 
 from __future__ import annotations
@@ -26,12 +29,14 @@ from topoloc.map.topomap import TopoMetricMap
 SUFFIX = ".topo"
 OpenLocalizer = Callable[[TopoMetricMap], Localizer]
 TilePath = Callable[[Atlas, Tile], Path]
-"""The map file of a tile, on this machine; raises AtlasError, or whatever tells that it is not here yet."""
+"""The map file of a tile, on this machine; raises AtlasError, or whatever tells that it is not here
+yet."""
 
 
 @dataclass(eq=False)
 class OpenedMap:
-    """An open map, as it is shared by all who ask it; `stamp` is that of its file when it was opened."""
+    """An open map, as it is shared by all who ask it; `stamp` is that of its file when it was
+    opened."""
 
     name: str
     path: Path
@@ -47,7 +52,8 @@ class OpenedMap:
 
 @dataclass(eq=False)
 class _Place:
-    """Where one map stands; its lock is held while the map is opened, so that it is opened once and nobody else waits."""
+    """Where one map stands; its lock is held while the map is opened, so that it is opened once and
+    nobody else waits."""
 
     lock: threading.Lock = field(default_factory=threading.Lock)
     opened: OpenedMap | None = None
@@ -65,22 +71,32 @@ class Maps:
     """The maps of these files, folders and atlases, which may lie in object stores.
 
     Args:
-        max_bytes: open maps are closed, those used longest ago first, while they have more bytes than this. One in use is never closed.
-        tile_path: how tiles become files of this machine; by itself they are fetched while their caller waits.
+        max_bytes: open maps are closed, those used longest ago first, while they have more bytes
+            than this. One in use is never closed.
+        tile_path: how tiles become files of this machine; by itself they are fetched while their
+            caller waits.
 
     Raises:
         MapError: a path is missing, an atlas is damaged, or two files have one name.
         StoreError: the store of an atlas does not answer.
     """
 
-    def __init__(self, sources: Sequence[str], open_localizer: OpenLocalizer, max_bytes: int, tile_path: TilePath = Atlas.map_path) -> None:
+    def __init__(
+        self,
+        sources: Sequence[str],
+        open_localizer: OpenLocalizer,
+        max_bytes: int,
+        tile_path: TilePath = Atlas.map_path,
+    ) -> None:
         self._open_localizer, self._max_bytes, self.tile_path = open_localizer, max_bytes, tile_path
         self._lock = threading.Lock()
         self._places: OrderedDict[str, _Place] = OrderedDict()  # the one used last is the last
         for source in sources:
             if "://" not in source and not os.path.exists(source):
                 raise MapError(f"{source}: no such map")
-        self.atlases = [WatchedAtlas(source) for source in dict.fromkeys(sources) if is_atlas(source)]
+        self.atlases = [
+            WatchedAtlas(source) for source in dict.fromkeys(sources) if is_atlas(source)
+        ]
         self._files = [Path(source) for source in sources if not is_atlas(source)]
         self.names()
 
@@ -169,7 +185,9 @@ class Maps:
     def _path_of(self, name: str) -> Path:
         found = self._found().get(name)
         if found is None:
-            raise UnknownMapError(f"there is no map {name[:80]!r} here; GET /v1/maps names those that are")
+            raise UnknownMapError(
+                f"there is no map {name[:80]!r} here; GET /v1/maps names those that are"
+            )
         return Path(found.where) if found.tile is None else self.tile_path(*found.tile)
 
     def _opened(self, path: Path) -> Localizer:
@@ -208,7 +226,8 @@ class Maps:
 
 
 def _stamp_of(path: Path) -> tuple[int, ...]:
-    """Of a file as it is now: another one in its place has another stamp. Raises MapError where it is gone."""
+    """Of a file as it is now: another one in its place has another stamp. Raises MapError where it
+    is gone."""
     with suppress(OSError):
         status = path.stat()
         return status.st_mtime_ns, status.st_size, status.st_ino

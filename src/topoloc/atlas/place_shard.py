@@ -1,9 +1,11 @@
-"""A shard of an atlas's places: those of many tiles by one kind of features, found by codes of 32 bytes, compared by themselves.
+"""A shard of an atlas's places: those of many tiles by one kind of features, found by codes of 32
+bytes, compared by themselves.
 
-FAISS keeps of each place a product-quantised code (half a byte for two of its numbers) in the cell of its nearest centre. A query looks
-into the nearest eighth of the cells (96 at least), and the places that look nearest by their codes are compared by their vectors, half
-floats that stay on the disk: only pages that are asked come into memory, and processes share them. One file holds it all, with a checksum;
-it can be made anew at any time.
+FAISS keeps of each place a product-quantised code (half a byte for two of its numbers) in the cell
+of its nearest centre. A query looks into the nearest eighth of the cells (96 at least), and the
+places that look nearest by their codes are compared by their vectors, half floats that stay on the
+disk: only pages that are asked come into memory, and processes share them. One file holds it all,
+with a checksum; it can be made anew at any time.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ from topoloc.errors import AtlasError
 from topoloc.sequences.atomic import replaced_file
 
 NUM_COMPARED, MAX_COMPARED = 1024, 16_384
-"""Places that are compared by their vectors; where they are of too few tiles, eight times as many, up to the second number."""
+"""Places that are compared by their vectors; where they are of too few tiles, eight times as many,
+up to the second number."""
 MAX_ROWS_COMPARED = 8_192
 """Of tiles that have no more places together than this, all are compared."""
 _MIN_PROBES, _CELLS_PER_PROBE, _MAX_CELLS = 96, 8, 4096
@@ -35,7 +38,8 @@ _MAGIC, _ALIGNMENT = b"topoloc-places-1\n", 4096
 
 @dataclass(frozen=True)
 class ShardTile:
-    """A tile in a shard: its id, the checksum of the file that its place vectors are from, and how many they are."""
+    """A tile in a shard: its id, the checksum of the file that its place vectors are from, and how
+    many they are."""
 
     tile_id: str
     sha256: str
@@ -46,18 +50,31 @@ class PlaceShard:
     """Place vectors of some tiles, those of a tile one after the other.
 
     Args:
-        kind, vocabulary: the kind of features, and the version of the vocabulary that the vectors are by.
+        kind, vocabulary: the kind of features, and the version of the vocabulary that the vectors
+            are by.
         vectors: unit vectors of all tiles, in their order.
         codes: FAISS's index over them; made where it is None.
     """
 
     def __init__(
-        self, kind: str, vocabulary: str, tiles: Sequence[ShardTile], vectors: Float16[np.ndarray, "n d"], codes: Any = None
+        self,
+        kind: str,
+        vocabulary: str,
+        tiles: Sequence[ShardTile],
+        vectors: Float16[np.ndarray, "n d"],
+        codes: Any = None,
     ) -> None:
-        self.kind, self.vocabulary, self.tiles, self.vectors = kind, vocabulary, list(tiles), vectors
+        self.kind, self.vocabulary, self.tiles, self.vectors = (
+            kind,
+            vocabulary,
+            list(tiles),
+            vectors,
+        )
         self.bounds: Int[np.ndarray, " _"] = np.cumsum([0, *(tile.num_rows for tile in tiles)])
         self._codes = _coded(vectors) if codes is None else codes
-        self._num_probes = min(self._codes.nlist, max(_MIN_PROBES, round(self._codes.nlist / _CELLS_PER_PROBE)))
+        self._num_probes = min(
+            self._codes.nlist, max(_MIN_PROBES, round(self._codes.nlist / _CELLS_PER_PROBE))
+        )
         self._chosen: tuple[bytes, Any] | None = None
 
     @property
@@ -69,7 +86,8 @@ class PlaceShard:
     def rank(
         self, vector: Float32[np.ndarray, " d"], num_tiles: int, is_asked: Bool[np.ndarray, " t"]
     ) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
-        """The tiles (numbers in `tiles`) with the most similar places, up to `num_tiles`, and the similarity of each one's best.
+        """The tiles (numbers in `tiles`) with the most similar places, up to `num_tiles`, and the
+        similarity of each one's best.
 
         Args:
             is_asked: of each tile whether it may be named.
@@ -77,7 +95,9 @@ class PlaceShard:
         num_asked, count = int(is_asked.sum()), max(NUM_COMPARED, 16 * num_tiles)
         while True:
             rows, similarities = self.nearest(vector, count, is_asked)
-            tiles, first = np.unique(np.searchsorted(self.bounds, rows, "right") - 1, return_index=True)
+            tiles, first = np.unique(
+                np.searchsorted(self.bounds, rows, "right") - 1, return_index=True
+            )
             if len(tiles) >= min(num_tiles, num_asked) or count >= MAX_COMPARED:
                 best = np.argsort(first)[:num_tiles]
                 return tiles[best], similarities[first[best]]
@@ -86,8 +106,8 @@ class PlaceShard:
     def nearest(
         self, vector: Float32[np.ndarray, " d"], count: int, is_asked: Bool[np.ndarray, " t"]
     ) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
-        """The rows of about so many of the most similar places of these tiles, the nearest first, and their similarities; of more tiles
-        than few, those that look so by their codes."""
+        """The rows of about so many of the most similar places of these tiles, the nearest first,
+        and their similarities; of more tiles than few, those that look so by their codes."""
         asked = np.flatnonzero(is_asked)
         num_rows = int((self.bounds[asked + 1] - self.bounds[asked]).sum())
         if num_rows <= MAX_ROWS_COMPARED:
@@ -97,14 +117,17 @@ class PlaceShard:
             chosen = None if len(asked) == len(is_asked) else self._chosen_rows(is_asked)
             parameters = faiss.SearchParametersIVF(nprobe=self._num_probes, sel=chosen)  # pyright: ignore[reportCallIssue]
             with _one_thread():
-                found = self._codes.search(vector[None], min(count, num_rows), params=parameters)[1][0]
+                found = self._codes.search(vector[None], min(count, num_rows), params=parameters)[
+                    1
+                ][0]
             rows = found[found >= 0]
         similarities = self.vectors[rows].astype(np.float32) @ vector
         order = np.argsort(-similarities, kind="stable")
         return rows[order], similarities[order]
 
     def _chosen_rows(self, is_asked: Bool[np.ndarray, " t"]) -> Any:
-        """FAISS's filter for the places of these tiles; the last one is kept, for the next query mostly has the same."""
+        """FAISS's filter for the places of these tiles; the last one is kept, for the next query
+        mostly has the same."""
         key, known = is_asked.tobytes(), self._chosen
         if known is None or known[0] != key:
             bits = np.packbits(np.repeat(is_asked, np.diff(self.bounds)), bitorder="little")
@@ -114,8 +137,14 @@ class PlaceShard:
     def save(self, folder: Path) -> Path:
         """Write its file, at once or not at all. Raises OSError."""
         codes = faiss.serialize_index(self._codes)
-        facts = {"kind": self.kind, "vocabulary": self.vocabulary, "tiles": [astuple(tile) for tile in self.tiles]}
-        header = json.dumps(facts | {"shape": self.vectors.shape, "num_bytes_of_codes": len(codes)}).encode()
+        facts = {
+            "kind": self.kind,
+            "vocabulary": self.vocabulary,
+            "tiles": [astuple(tile) for tile in self.tiles],
+        }
+        header = json.dumps(
+            facts | {"shape": self.vectors.shape, "num_bytes_of_codes": len(codes)}
+        ).encode()
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / self.name
         with replaced_file(path) as temporary, temporary.open("wb") as file:
@@ -137,11 +166,22 @@ class PlaceShard:
 
     @staticmethod
     def open(path: Path) -> PlaceShard:
-        """A shard as it was saved; its vectors stay on the disk. Raises AtlasError: the file is missing, damaged or another."""
+        """A shard as it was saved; its vectors stay on the disk. Raises AtlasError: the file is
+        missing, damaged or another."""
         try:
             return _opened(path)
-        except (OSError, ValueError, TypeError, KeyError, RuntimeError, RecursionError, OverflowError) as error:
-            raise AtlasError(f"{path} is missing or damaged: {' '.join(str(error).split())[:120]}") from None
+        except (
+            OSError,
+            ValueError,
+            TypeError,
+            KeyError,
+            RuntimeError,
+            RecursionError,
+            OverflowError,
+        ) as error:
+            raise AtlasError(
+                f"{path} is missing or damaged: {' '.join(str(error).split())[:120]}"
+            ) from None
 
 
 def _opened(path: Path) -> PlaceShard:
@@ -155,12 +195,18 @@ def _opened(path: Path) -> PlaceShard:
             raise ValueError("its checksum is another")
         file.seek(len(_MAGIC) + 32)
         header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
-        codes = faiss.deserialize_index(np.frombuffer(file.read(header["num_bytes_of_codes"]), np.uint8))
+        codes = faiss.deserialize_index(
+            np.frombuffer(file.read(header["num_bytes_of_codes"]), np.uint8)
+        )
         start = file.tell() + -file.tell() % _ALIGNMENT
     num_rows, dimension = header["shape"]
     mapped = np.memmap(path, np.float16, "r", start, (num_rows, dimension))
     tiles = [ShardTile(*tile) for tile in header["tiles"]]
-    if codes.ntotal != num_rows or codes.d != dimension or sum(tile.num_rows for tile in tiles) != num_rows:
+    if (
+        codes.ntotal != num_rows
+        or codes.d != dimension
+        or sum(tile.num_rows for tile in tiles) != num_rows
+    ):
         raise ValueError("its parts do not belong together")
     return PlaceShard(header["kind"], header["vocabulary"], tiles, np.asarray(mapped), codes)
 
@@ -170,7 +216,16 @@ def _coded(vectors: Float16[np.ndarray, "n d"]) -> Any:
     num_rows, dimension = vectors.shape
     num_cells = max(1, min(round(math.sqrt(num_rows)), _MAX_CELLS))
     num_parts = dimension // 2 if dimension % 2 == 0 else dimension
-    index = faiss.IndexIVFPQFastScan(faiss.IndexFlatIP(dimension), dimension, num_cells, num_parts, 4, faiss.METRIC_INNER_PRODUCT, 32, True)
+    index = faiss.IndexIVFPQFastScan(
+        faiss.IndexFlatIP(dimension),
+        dimension,
+        num_cells,
+        num_parts,
+        4,
+        faiss.METRIC_INNER_PRODUCT,
+        32,
+        True,
+    )
     index.cp.niter, index.cp.seed, index.cp.min_points_per_centroid = 8, 1, 1
     index.pq.cp.min_points_per_centroid = 1
     sample = np.sort(np.random.default_rng(1).permutation(num_rows)[:_NUM_LEARNT_FROM])
@@ -183,7 +238,8 @@ def _coded(vectors: Float16[np.ndarray, "n d"]) -> Any:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """FAISS by this thread alone: its threads wait for each other at full speed, ten times as long where others need the processors."""
+    """FAISS by this thread alone: its threads wait for each other at full speed, ten times as long
+    where others need the processors."""
     before = faiss.omp_get_max_threads()
     faiss.omp_set_num_threads(1)
     try:

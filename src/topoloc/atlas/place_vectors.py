@@ -1,4 +1,5 @@
-"""A tile's place vectors: what each of its nodes looks like, by the shared vocabularies, from the features that the nodes keep."""
+"""A tile's place vectors: what each of its nodes looks like, by the shared vocabularies, from the
+features that the nodes keep."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ PlaceVectors = Mapping[str, Float32[np.ndarray, "_ _"]]
 
 
 def place_vectors(topomap: TopoMetricMap) -> dict[str, Float32[np.ndarray, "_ _"]]:
-    """Of all nodes of a map, in their order, by each of its kinds of features that has a shared vocabulary.
+    """Of all nodes of a map, in their order, by each of its kinds of features that has a shared
+    vocabulary.
 
     Raises:
         AtlasError: none has.
@@ -29,11 +31,15 @@ def place_vectors(topomap: TopoMetricMap) -> dict[str, Float32[np.ndarray, "_ _"
         vocabulary = shared_vocabulary(kind)
         if vocabulary is None:
             continue
-        rows = [vocabulary.vector(node.features, node.camera.width, node.camera.height) for node in topomap.by_kind(kind).nodes]
+        rows = [
+            vocabulary.vector(node.features, node.camera.width, node.camera.height)
+            for node in topomap.by_kind(kind).nodes
+        ]
         vectors[kind] = np.stack(rows)
     if not vectors:
         raise AtlasError(
-            f"there is no shared vocabulary for features {', '.join(topomap.kinds)}, so that no place of the map can be ranked"
+            f"there is no shared vocabulary for features {', '.join(topomap.kinds)}, so that no"
+            " place of the map can be ranked"
         )
     return vectors
 
@@ -46,7 +52,8 @@ def write_vectors(path: Path, vectors: PlaceVectors) -> None:
 
 
 def read_vectors(path: Path, versions: Mapping[str, str]) -> dict[str, Float32[np.ndarray, "_ _"]]:
-    """The inverse of `write_vectors`, of vectors by vocabularies of these versions (by kind); other versions than ours are left out.
+    """The inverse of `write_vectors`, of vectors by vocabularies of these versions (by kind); other
+    versions than ours are left out.
 
     Raises:
         AtlasError: missing, damaged, or of no vocabulary that this version has.
@@ -58,10 +65,19 @@ def read_vectors(path: Path, versions: Mapping[str, str]) -> dict[str, Float32[n
                 vocabulary, rows = shared_vocabulary(kind), stored[kind]
                 if rows.ndim != 2 or rows.dtype != np.float16 or not np.isfinite(rows).all():
                     raise AtlasError(f"{path} is damaged: the vectors of {kind} are none")
-                if vocabulary is not None and vocabulary.version == versions.get(kind) and rows.shape[1] == vocabulary.dimension:
+                if (
+                    vocabulary is not None
+                    and vocabulary.version == versions.get(kind)
+                    and rows.shape[1] == vocabulary.dimension
+                ):
                     vectors[kind] = rows.astype(np.float32)
     except (OSError, ValueError, KeyError, EOFError, SyntaxError, zipfile.BadZipFile) as error:
-        raise AtlasError(f"{path} is missing or damaged: {' '.join(str(error).split())[:120]}") from None
+        raise AtlasError(
+            f"{path} is missing or damaged: {' '.join(str(error).split())[:120]}"
+        ) from None
     if not vectors:
-        raise AtlasError(f"{path} holds place vectors of another version of topoloc: `topoloc atlas add --replace` makes them anew")
+        raise AtlasError(
+            f"{path} holds place vectors of another version of topoloc: `topoloc atlas add"
+            " --replace` makes them anew"
+        )
     return vectors

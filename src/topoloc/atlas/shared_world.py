@@ -23,8 +23,9 @@ class PlacedTile:
 
 @dataclass(frozen=True, eq=False)
 class SharedWorld:
-    """Tiles in the order of their ids. The world is the atlas's own, east-north-up, of tiles that know where on earth they lie; else the
-    joint world of joined ones, or what tiles of one world share. `georeference` is None where no place on earth is known."""
+    """Tiles in the order of their ids. The world is the atlas's own, east-north-up, of tiles that
+    know where on earth they lie; else the joint world of joined ones, or what tiles of one world
+    share. `georeference` is None where no place on earth is known."""
 
     tiles: tuple[PlacedTile, ...]
     georeference: Georeference | None
@@ -35,7 +36,9 @@ class SharedWorld:
 
     def world_from_map_of(self, tile_id: str | None) -> Rigid3 | None:
         """None of a tile that lies in no such world, or in another one."""
-        return next((placed.world_from_map for placed in self.tiles if placed.tile.tile_id == tile_id), None)
+        return next(
+            (placed.world_from_map for placed in self.tiles if placed.tile.tile_id == tile_id), None
+        )
 
 
 def shared_worlds(manifest: Manifest) -> list[SharedWorld]:
@@ -47,7 +50,10 @@ def shared_worlds(manifest: Manifest) -> list[SharedWorld]:
         groups.setdefault(key, []).append(PlacedTile(tile, pose))
     origin = manifest.origin
     on_earth = None if origin is None else Georeference(origin, Rigid3.identity(), "atlas")
-    worlds = [SharedWorld(tuple(group), on_earth if key is None else None) for key, group in groups.items()]
+    worlds = [
+        SharedWorld(tuple(group), on_earth if key is None else None)
+        for key, group in groups.items()
+    ]
     return sorted(worlds, key=lambda world: -world.num_nodes)
 
 
@@ -56,8 +62,11 @@ def world_of_tile(manifest: Manifest, tile: Tile) -> SharedWorld:
     return SharedWorld((PlacedTile(tile, Rigid3.identity()),), manifest.georeference_of(tile))
 
 
-def opened_tiles(atlas: Atlas, placed: Sequence[PlacedTile], warn: Callable[[str], None]) -> Iterator[tuple[PlacedTile, TopoMetricMap]]:
-    """Tiles with their maps, each open for its turn. One that cannot be read is left out, and `warn` told of it.
+def opened_tiles(
+    atlas: Atlas, placed: Sequence[PlacedTile], warn: Callable[[str], None]
+) -> Iterator[tuple[PlacedTile, TopoMetricMap]]:
+    """Tiles with their maps, each open for its turn. One that cannot be read is left out, and
+    `warn` told of it.
 
     Raises:
         AtlasError: none can be read.

@@ -1,7 +1,9 @@
-"""Where an atlas lies: files that are written once, and one manifest that is replaced only by who has read the one before.
+"""Where an atlas lies: files that are written once, and one manifest that is replaced only by who
+has read the one before.
 
-In a folder the manifest is `atlas.json`. Writers take turns by a lock (`flock`, which ends with its process) and look, while they hold it,
-whether the manifest is still the one that they read; a reader sees the old one or the new one, whole.
+In a folder the manifest is `atlas.json`. Writers take turns by a lock (`flock`, which ends with its
+process) and look, while they hold it, whether the manifest is still the one that they read; a
+reader sees the old one or the new one, whole.
 """
 
 from __future__ import annotations
@@ -40,23 +42,28 @@ class Store(Protocol):
         ...
 
     def version(self) -> Hashable | None:
-        """What is another one after each write of the manifest, and cheaper to ask for; None where there is none. Raises AtlasError."""
+        """What is another one after each write of the manifest, and cheaper to ask for; None where
+        there is none. Raises AtlasError."""
         ...
 
     def commit(self, before: bytes | None, after: bytes) -> bool:
-        """Replace the manifest, if it is still `before`; else nothing is changed and False returned. Raises AtlasError."""
+        """Replace the manifest, if it is still `before`; else nothing is changed and False
+        returned. Raises AtlasError."""
         ...
 
     def put(self, name: str, path: Path) -> None:
-        """Keep a copy of a file under a name that is made of its contents; one that is there already counts as written now."""
+        """Keep a copy of a file under a name that is made of its contents; one that is there
+        already counts as written now."""
         ...
 
     def local(self, name: str, sha256: str) -> Path:
-        """A file of this machine with these contents. Raises AtlasError where it is missing or another, StoreError where nobody answers."""
+        """A file of this machine with these contents. Raises AtlasError where it is missing or
+        another, StoreError where nobody answers."""
         ...
 
     def kept(self, name: str, sha256: str) -> Path | None:
-        """As `local`, if nothing need be fetched for it; else None. Raises AtlasError where it is missing."""
+        """As `local`, if nothing need be fetched for it; else None. Raises AtlasError where it is
+        missing."""
         ...
 
     def ages(self) -> dict[str, float]:
@@ -80,7 +87,9 @@ class FolderStore:
         except (FileNotFoundError, NotADirectoryError):
             return None
         except (OSError, ValueError) as error:
-            raise AtlasError(f"cannot read {self.folder / MANIFEST}: {getattr(error, 'strerror', error)}") from None
+            raise AtlasError(
+                f"cannot read {self.folder / MANIFEST}: {getattr(error, 'strerror', error)}"
+            ) from None
 
     def version(self) -> Hashable | None:
         with suppress(OSError):
@@ -143,7 +152,9 @@ class FolderStore:
             raise AtlasError(f"cannot write {self.folder}: {error.strerror}") from None
         try:
             if fcntl is not None:
-                with suppress(OSError):  # a file system without locks: then two writers at once may lose one's tiles
+                with suppress(
+                    OSError
+                ):  # a file system without locks: then two writers at once may lose one's tiles
                     fcntl.flock(descriptor, fcntl.LOCK_EX)
             yield
         finally:

@@ -1,7 +1,9 @@
-"""Tiles of object stores on their way to this machine, beside those who ask for them: nobody who answers pictures waits for a store.
+"""Tiles of object stores on their way to this machine, beside those who ask for them: nobody who
+answers pictures waits for a store.
 
-Whoever asks for a tile that is not here yet is told so (`TileAwaited`), may wait for it elsewhere, and asks again. A tile is fetched once
-however many ask for it. It is waited for only so long; it goes on coming, for those who ask later.
+Whoever asks for a tile that is not here yet is told so (`TileAwaited`), may wait for it elsewhere,
+and asks again. A tile is fetched once however many ask for it. It is waited for only so long; it
+goes on coming, for those who ask later.
 """
 
 from __future__ import annotations
@@ -24,8 +26,8 @@ _FAILED_S = 5.0
 
 @dataclass(eq=False)
 class Fetch:
-    """A tile on its way, from `where`; `ended` gets its result, the file or why there is none, and never raises. It is waited for
-    `until` then (`time.monotonic`)."""
+    """A tile on its way, from `where`; `ended` gets its result, the file or why there is none, and
+    never raises. It is waited for `until` then (`time.monotonic`)."""
 
     where: str
     until: float
@@ -74,21 +76,33 @@ class TileFetches:
                 raise outcome
             return outcome
         if time.monotonic() >= fetch.until:
-            raise StoreError(f"{fetch.where} has not given tile {tile.tile_id} within {self._wait_s:g} s; it is still being fetched")
+            raise StoreError(
+                f"{fetch.where} has not given tile {tile.tile_id} within {self._wait_s:g} s; it is"
+                " still being fetched"
+            )
         raise TileAwaited(fetch)
 
     def _fetch(self, atlas: Atlas, tile: Tile) -> Fetch:
         """The one that is under way, or has just failed; else a new one."""
         where, key = atlas.store.where, (atlas.store.where, tile.map.name)
         with self._lock:
-            self._fetches = {one: fetch for one, fetch in self._fetches.items() if not fetch.is_stale}
+            self._fetches = {
+                one: fetch for one, fetch in self._fetches.items() if not fetch.is_stale
+            }
             if key in self._fetches:
                 return self._fetches[key]
-            num_coming = sum(fetch.where == where and not fetch.ended.done() for fetch in self._fetches.values())
+            num_coming = sum(
+                fetch.where == where and not fetch.ended.done() for fetch in self._fetches.values()
+            )
             if num_coming >= _MAX_AT_A_TIME:
-                raise StoreError(f"{where}: tile {tile.tile_id} is not here yet, and {num_coming} others are being fetched")
+                raise StoreError(
+                    f"{where}: tile {tile.tile_id} is not here yet, and {num_coming} others are"
+                    " being fetched"
+                )
             fetch = self._fetches[key] = Fetch(where, time.monotonic() + self._wait_s)
-        threading.Thread(target=_fetched, args=(fetch, atlas, tile), name="tile", daemon=True).start()
+        threading.Thread(
+            target=_fetched, args=(fetch, atlas, tile), name="tile", daemon=True
+        ).start()
         return fetch
 
 

@@ -1,9 +1,10 @@
 """What several tiles say of one picture, heard together.
 
-Each tile weighs its own poses and knows nothing of the others. A pose is believed only where it leads every pose of every other tile that
-was asked, by the same evidence and by as much as two poses of one map must be apart (`localization/belief.py`). Else the picture is
-ambiguous, and the alternatives name their tiles. Where the atlas knows how two tiles lie to each other, poses that are the same one are no
-rivals.
+Each tile weighs its own poses and knows nothing of the others. A pose is believed only where it
+leads every pose of every other tile that was asked, by the same evidence and by as much as two
+poses of one map must be apart (`localization/belief.py`). Else the picture is ambiguous, and the
+alternatives name their tiles. Where the atlas knows how two tiles lie to each other, poses that are
+the same one are no rivals.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ _MIN_ALTERNATIVE = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Heard:
-    """What a tile said: its result, and each pose that this names. `is_full`: was it asked by all means?"""
+    """What a tile said: its result, and each pose that this names. `is_full`: was it asked by all
+    means?"""
 
     tile: Tile
     result: Localization | NotLocalized
@@ -40,16 +42,25 @@ class Heard:
     def is_clear(self) -> bool:
         """Is its pose so well founded that the map itself asked no further?"""
         result = self.result
-        return isinstance(result, Localization) and _log_odds(result) > _weights(result).evidence.clear_log_odds
+        return (
+            isinstance(result, Localization)
+            and _log_odds(result) > _weights(result).evidence.clear_log_odds
+        )
 
 
 def joint_result(heard: Sequence[Heard]) -> Localization | NotLocalized:
-    """The answer of several tiles; the first one of a tile speaks for it. Of refusals the one that found most."""
+    """The answer of several tiles; the first one of a tile speaks for it. Of refusals the one that
+    found most."""
     vouching = [(one.tile, pose) for one in heard for pose in one.named]
     found = [one for one in heard if isinstance(one.result, Localization) and one.is_full]
     if not found:
         return _refusal(heard)
-    best = max(found, key=lambda one: min((_lead(one.named[0], pose) for _, pose in _rivals_of(one, vouching)), default=math.inf))
+    best = max(
+        found,
+        key=lambda one: min(
+            (_lead(one.named[0], pose) for _, pose in _rivals_of(one, vouching)), default=math.inf
+        ),
+    )
     assert isinstance(best.result, Localization)
     rivals = _rivals_of(best, vouching)
     leads = [_lead(best.result, pose) for _, pose in rivals]
@@ -60,41 +71,77 @@ def joint_result(heard: Sequence[Heard]) -> Localization | NotLocalized:
 
 
 def is_far_behind(evidence: Evidence, features: str, answer: Localization) -> bool:
-    """Would a pose of another tile with this evidence be too improbable beside the answer to be named as an alternative?"""
+    """Would a pose of another tile with this evidence be too improbable beside the answer to be
+    named as an alternative?"""
     weights = weights_of(features)
     log_odds = log_odds_of(evidence, weights)
     is_alike = features == answer.provenance.features and not answer.is_from_walls
-    by = _strength(answer) - strength_of(evidence, log_odds, weights.rivals) if is_alike else _log_odds(answer) - log_odds
+    by = (
+        _strength(answer) - strength_of(evidence, log_odds, weights.rivals)
+        if is_alike
+        else _log_odds(answer) - log_odds
+    )
     return by > -math.log(_MIN_ALTERNATIVE)
 
 
-def _rivals_of(one: Heard, vouching: Sequence[tuple[Tile, Localization]]) -> list[tuple[Tile, Localization]]:
+def _rivals_of(
+    one: Heard, vouching: Sequence[tuple[Tile, Localization]]
+) -> list[tuple[Tile, Localization]]:
     """The poses of other tiles that are not the same as the one of this tile."""
-    return [(tile, pose) for tile, pose in vouching if tile is not one.tile and not _is_same(one.tile, one.named[0], tile, pose)]
+    return [
+        (tile, pose)
+        for tile, pose in vouching
+        if tile is not one.tile and not _is_same(one.tile, one.named[0], tile, pose)
+    ]
 
 
-def _ambiguity(best: Heard, rivals: Sequence[tuple[Tile, Localization]], leads: Sequence[float]) -> NotLocalized:
+def _ambiguity(
+    best: Heard, rivals: Sequence[tuple[Tile, Localization]], leads: Sequence[float]
+) -> NotLocalized:
     """It is one of these; how probable each is, beside "nowhere"."""
     assert isinstance(best.result, Localization)
     others = (1.0 / max(best.result.probability, 1e-6)) - 1.0 + sum(math.exp(-by) for by in leads)
     shares = [(1.0 / (1.0 + others), best.tile, best.result)]
-    shares += [(math.exp(-by) / (1.0 + others), tile, pose) for by, (tile, pose) in zip(leads, rivals, strict=True)]
-    probable = sorted((one for one in shares if one[0] >= _MIN_ALTERNATIVE * shares[0][0]), key=lambda one: -one[0])
+    shares += [
+        (math.exp(-by) / (1.0 + others), tile, pose)
+        for by, (tile, pose) in zip(leads, rivals, strict=True)
+    ]
+    probable = sorted(
+        (one for one in shares if one[0] >= _MIN_ALTERNATIVE * shares[0][0]),
+        key=lambda one: -one[0],
+    )
     alternatives = tuple(
-        Alternative(pose.world_from_cam, probability, pose.node_id, pose.geopose, tile.tile_id) for probability, tile, pose in probable
+        Alternative(pose.world_from_cam, probability, pose.node_id, pose.geopose, tile.tile_id)
+        for probability, tile, pose in probable
     )
     detail = f"as much like tile {alternatives[1].tile} as like tile {alternatives[0].tile}"
     result = best.result
     refusal = NotLocalized(
-        "ambiguous", result.candidates, result.num_matches, result.num_inliers, {}, detail, alternatives, result.provenance
+        "ambiguous",
+        result.candidates,
+        result.num_matches,
+        result.num_inliers,
+        {},
+        detail,
+        alternatives,
+        result.provenance,
     )
     return of_tile(replace(refusal, seen_camera=result.seen_camera), best.tile)
 
 
 def _refusal(heard: Sequence[Heard]) -> NotLocalized:
-    """That of the tile that knows most of the picture: one that has alternatives, or the most inliers."""
+    """That of the tile that knows most of the picture: one that has alternatives, or the most
+    inliers."""
     refused = [one for one in heard if isinstance(one.result, NotLocalized)]
-    best = max(refused, key=lambda one: (one.is_full, one.result.reason == "ambiguous", one.result.num_inliers, one.likeness))  # pyright: ignore
+    best = max(
+        refused,
+        key=lambda one: (
+            one.is_full,
+            one.result.reason == "ambiguous",
+            one.result.num_inliers,
+            one.likeness,
+        ),
+    )  # pyright: ignore
     assert isinstance(best.result, NotLocalized)
     result = best.result
     alternatives = tuple(replace(one, tile=best.tile.tile_id) for one in result.alternatives)
@@ -108,14 +155,22 @@ def of_tile(result: R, tile: Tile) -> R:
         pose = tile.atlas_from_world @ result.world_from_cam
     if isinstance(result, Localization) and tile.joint is not None:
         joint_pose = tile.joint.joint_from_world @ result.world_from_cam
-    of_atlas = {"tile": tile.tile_id, "atlas_from_cam": pose, "joint_world": joint, "joint_from_cam": joint_pose}
+    of_atlas = {
+        "tile": tile.tile_id,
+        "atlas_from_cam": pose,
+        "joint_world": joint,
+        "joint_from_cam": joint_pose,
+    }
     return replace(result, provenance=replace(result.provenance, **of_atlas))
 
 
 def _lead(a: Localization, b: Localization) -> float:
-    """By how much one pose is likelier than another of another tile, in logarithms of odds: by their strengths, which tell twins apart,
-    where features of one kind speak for both, else by the odds of each."""
-    is_alike = a.provenance.features == b.provenance.features and not (a.is_from_walls or b.is_from_walls)
+    """By how much one pose is likelier than another of another tile, in logarithms of odds: by
+    their strengths, which tell twins apart, where features of one kind speak for both, else by the
+    odds of each."""
+    is_alike = a.provenance.features == b.provenance.features and not (
+        a.is_from_walls or b.is_from_walls
+    )
     return _strength(a) - _strength(b) if is_alike else _log_odds(a) - _log_odds(b)
 
 
@@ -138,20 +193,28 @@ def _weights(result: Localization) -> FittedWeights:
 
 
 def _is_same(tile: Tile, pose: Localization, other: Tile, other_pose: Localization) -> bool:
-    """Do poses of two tiles say the same, as far as the atlas knows how these lie to each other? Of tiles that are joined this is known
-    within the joins' sigmas."""
+    """Do poses of two tiles say the same, as far as the atlas knows how these lie to each other? Of
+    tiles that are joined this is known within the joins' sigmas."""
     world_from_other = tile.from_world_of(other)
     if world_from_other is None:
         return False
     apart = pose.world_from_cam.inverse() @ world_from_other @ other_pose.world_from_cam
     metres, radians = _join_sigmas(tile, pose, other)
-    near = float(np.linalg.norm(apart.translation)) < _SAME_METRES + min(_SIGMAS * metres, _SAME_METRES)
-    return near and math.degrees(apart.angle()) < _SAME_DEG + min(_SIGMAS * math.degrees(radians), _SAME_DEG)
+    near = float(np.linalg.norm(apart.translation)) < _SAME_METRES + min(
+        _SIGMAS * metres, _SAME_METRES
+    )
+    return near and math.degrees(apart.angle()) < _SAME_DEG + min(
+        _SIGMAS * math.degrees(radians), _SAME_DEG
+    )
 
 
 def _join_sigmas(tile: Tile, pose: Localization, other: Tile) -> tuple[float, float]:
-    """How certain the way from one tile to another is at this pose of the first: metres and radians; 0 where it is no matter of joins."""
+    """How certain the way from one tile to another is at this pose of the first: metres and
+    radians; 0 where it is no matter of joins."""
     here, there = tile.joint, other.joint
     if tile.world == other.world or here is None or there is None or here.joint != there.joint:
         return 0.0, 0.0
-    return sigmas_at((here.joint_from_world @ pose.world_from_cam).translation, here.covariance + there.covariance)
+    return sigmas_at(
+        (here.joint_from_world @ pose.world_from_cam).translation,
+        here.covariance + there.covariance,
+    )

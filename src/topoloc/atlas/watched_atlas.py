@@ -1,7 +1,9 @@
-"""An atlas that others write to while it is asked for long: opened anew when its manifest was written again.
+"""An atlas that others write to while it is asked for long: opened anew when its manifest was
+written again.
 
-In a folder whoever asks looks at the manifest file. An object store may take a minute to say that nothing is new, so there somebody looks
-now and then (`look`), beside those who ask; they go on with what was opened before, also while the store is silent.
+In a folder whoever asks looks at the manifest file. An object store may take a minute to say that
+nothing is new, so there somebody looks now and then (`look`), beside those who ask; they go on with
+what was opened before, also while the store is silent.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ class WatchedAtlas:
         self.look()
 
     def now(self) -> Atlas:
-        """Of a folder by its manifest as it is; of an object store by the one that was seen last, at once. Raises AtlasError."""
+        """Of a folder by its manifest as it is; of an object store by the one that was seen last,
+        at once. Raises AtlasError."""
         if not self.is_remote:
             with self._lock:
                 self.look()
@@ -37,7 +40,8 @@ class WatchedAtlas:
         return self._atlas
 
     def look(self) -> bool:
-        """Is another manifest there than the one before? Its atlas is the one from now on, where it can be opened. One caller at a time.
+        """Is another manifest there than the one before? Its atlas is the one from now on, where it
+        can be opened. One caller at a time.
 
         Raises:
             AtlasError: it cannot, or is gone; StoreError where the store does not answer.

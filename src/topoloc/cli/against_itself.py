@@ -17,9 +17,14 @@ from topoloc.map.topomap import TopoMetricMap
 
 
 def evaluate_against_itself(
-    path: str, coarse: str | None, features: str | None, outputs: Mapping[str, str | None], config: str | None
+    path: str,
+    coarse: str | None,
+    features: str | None,
+    outputs: Mapping[str, str | None],
+    config: str | None,
 ) -> int:
-    """Prints which parts of a map are weakly held, and where to walk next; writes the files named by `outputs`: json, report.
+    """Prints which parts of a map are weakly held, and where to walk next; writes the files named
+    by `outputs`: json, report.
 
     Raises:
         UsageError: the map is an atlas, or an output is in the way.
@@ -35,7 +40,9 @@ def evaluate_against_itself(
     with TopoMetricMap.load(path) as topomap:
         info = describe_map(topomap, Path(path))
         with progress_bar() as progress:
-            weak = weak_parts(localizer_of(topomap, asked, features), settings.of(WeakPartsConfig), progress)
+            weak = weak_parts(
+                localizer_of(topomap, asked, features), settings.of(WeakPartsConfig), progress
+            )
         if json != "-":
             _print(weak)
         write_json(json, {"map": info, "against_itself": weak.to_json()})
@@ -52,7 +59,9 @@ def _page_writer() -> Callable[..., None]:
     except ModuleNotFoundError as error:
         if error.name is None or error.name.split(".")[0] != "matplotlib":
             raise
-        raise MissingExtraError("a report needs matplotlib: pip install 'topoloc[report]'") from error
+        raise MissingExtraError(
+            "a report needs matplotlib: pip install 'topoloc[report]'"
+        ) from error
     return write_weak_parts
 
 
@@ -61,7 +70,12 @@ def _print(weak: WeakParts) -> None:
     held = f"{num_asked - weak.count('not_held')} of {num_asked} nodes, each asked without itself"
     facts = [("held by the rest", held)]
     if weak.weakest and (least := weak.weakest[0]).answer is not None:
-        facts.append(("the weakest", f"node {least.node_id} ({least.name}), {least.answer.num_inliers} inliers"))
+        facts.append(
+            (
+                "the weakest",
+                f"node {least.node_id} ({least.name}), {least.answer.num_inliers} inliers",
+            )
+        )
     facts.append(("few landmarks", f"{weak.count('few_landmarks')} of {of}"))
     facts.append(("nobody looks back", f"{weak.count('one_direction')} of {of}"))
     sessions = f"{len(weak.session_names)} session{'s' if len(weak.session_names) > 1 else ''}"

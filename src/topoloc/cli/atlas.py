@@ -13,34 +13,51 @@ from topoloc.cli.joined_neighbours import joined_neighbours
 from topoloc.cli.output import File, Flag, RayOption, UsageError, print_facts, write_json
 from topoloc.cli.settings_file import read_settings
 
-Names = Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="MAP|TILE ...", help_behavior_hint="")]
+Names = Annotated[
+    tyro.conf.Positional[tuple[str, ...]],
+    tyro.conf.arg(metavar="MAP|TILE ...", help_behavior_hint=""),
+]
 
 
 @dataclass(frozen=True)
 class Command:
     """What `topoloc atlas` takes."""
 
-    action: Annotated[tyro.conf.Positional[Literal["create", "add", "remove", "join", "info"]], tyro.conf.arg(metavar="ACTION")]
-    """`create`: a new atlas of maps. `add`: more maps. `remove`: tiles by their ids. `join`: tiles that overlap get one world, as far as
-    what they see is beyond doubt the same. `info`: what it holds."""
+    action: Annotated[
+        tyro.conf.Positional[Literal["create", "add", "remove", "join", "info"]],
+        tyro.conf.arg(metavar="ACTION"),
+    ]
+    """`create`: a new atlas of maps. `add`: more maps. `remove`: tiles by their ids. `join`: tiles
+    that overlap get one world, as far as what they see is beyond doubt the same. `info`: what it
+    holds."""
     atlas: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ATLAS")]
-    """The atlas: a folder; or, with the extra `cluster`, a prefix of an object store, such as s3://bucket/campus."""
+    """The atlas: a folder; or, with the extra `cluster`, a prefix of an object store, such as
+    s3://bucket/campus."""
     names: Names = ()
-    """Of `create` and `add`: map files, which are copied. Of `remove`: ids of tiles. Of `join`: ids of tiles that others are
-    compared with (none: all with each other)."""
-    id: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the file's name without .topo)")] = None
+    """Of `create` and `add`: map files, which are copied. Of `remove`: ids of tiles. Of `join`: ids
+    of tiles that others are compared with (none: all with each other)."""
+    id: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="NAME", help_behavior_hint="(default: the file's name without .topo)"
+        ),
+    ] = None
     """Of `create` and `add`, for one map: what the tile is called."""
-    world: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: each its own)")] = None
-    """Of `create` and `add`: maps of one world, so that poses in one are poses in the other, too (maps of one recording split, or of
-    recordings whose poses are in one world)."""
+    world: Annotated[
+        str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: each its own)")
+    ] = None
+    """Of `create` and `add`: maps of one world, so that poses in one are poses in the other, too
+    (maps of one recording split, or of recordings whose poses are in one world)."""
     replace: Flag = False
     """Of `add`: a tile of the same id is replaced by the new map."""
     join: Flag = False
     """Of `create` and `add`: then the new tiles are joined with those that they overlap with."""
     ray: RayOption = None
-    """Of `join` and `--join`: a Ray cluster on which each pair of tiles is compared, as in `topoloc build`."""
+    """Of `join` and `--join`: a Ray cluster on which each pair of tiles is compared, as in `topoloc
+    build`."""
     check: Flag = False
-    """Of `info`: also compare every file with its checksum; exit status 1 where one is missing or another."""
+    """Of `info`: also compare every file with its checksum; exit status 1 where one is missing or
+    another."""
     json: File = None
     """Write what the atlas holds afterwards as JSON to this file (- for standard output)."""
     config: File = None
@@ -55,13 +72,19 @@ class Command:
             atlas = Atlas.open(self.atlas)
             manifest = atlas.manifest
             if self.check:
-                found = [f"tile {tile.tile_id}: {problem}" for tile in manifest.tiles if (problem := tile_problem(atlas, tile))]
+                found = [
+                    f"tile {tile.tile_id}: {problem}"
+                    for tile in manifest.tiles
+                    if (problem := tile_problem(atlas, tile))
+                ]
         else:
             settings = read_settings(self.config)
             manifest = None if self.action == "join" else self._written()
             if manifest is None or self.join:
                 ids = [tile.tile_id for tile in self._new()] if self.join else self.names
-                joined = joined_neighbours(self.atlas, ids, settings, self.json != "-", ray=self.ray)
+                joined = joined_neighbours(
+                    self.atlas, ids, settings, self.json != "-", ray=self.ray
+                )
                 manifest, found = joined.manifest, joined.not_compared
         facts = describe(self.atlas, manifest) | ({"check": found or "ok"} if self.check else {})
         facts |= {} if joined is None else {"tried": joined.rows}
@@ -78,7 +101,11 @@ class Command:
         if self.action == "remove":
             return remove_tiles(self.atlas, self.names)
         new = self._new()
-        return create_atlas(self.atlas, new) if self.action == "create" else add_tiles(self.atlas, new, self.replace)
+        return (
+            create_atlas(self.atlas, new)
+            if self.action == "create"
+            else add_tiles(self.atlas, new, self.replace)
+        )
 
     def _new(self) -> Any:
         from topoloc.atlas.editing import new_tiles
@@ -89,7 +116,10 @@ class Command:
         if self.action == "info" and self.names:
             raise UsageError("info takes an atlas alone")
         if self.action in ("add", "remove") and not self.names:
-            raise UsageError(f"{self.action} takes an atlas and at least one {'map' if self.action == 'add' else 'tile'}")
+            raise UsageError(
+                f"{self.action} takes an atlas and at least one"
+                f" {'map' if self.action == 'add' else 'tile'}"
+            )
         if self.id is not None and (self.action not in ("create", "add") or len(self.names) != 1):
             raise UsageError("--id is of one map that is added")
         if self.world is not None and self.action not in ("create", "add"):
@@ -97,7 +127,9 @@ class Command:
         if self.replace and self.action != "add":
             raise UsageError("--replace belongs to add")
         if self.join and self.action not in ("create", "add"):
-            raise UsageError("--join belongs to create and add; `topoloc atlas join` joins what is there")
+            raise UsageError(
+                "--join belongs to create and add; `topoloc atlas join` joins what is there"
+            )
         if self.config is not None and self.action != "join" and not self.join:
             raise UsageError("--config sets how tiles are joined")
         if self.ray is not None and self.action != "join" and not self.join:
@@ -132,7 +164,8 @@ def worlds_of(manifest: Any) -> dict[str, list[str]]:
 
 
 def _join_facts(join: Any, manifest: Any) -> dict[str, Any]:
-    """What the manifest says of it, and one sigma of where the second tile's middle lies in the first's world."""
+    """What the manifest says of it, and one sigma of where the second tile's middle lies in the
+    first's world."""
     from topoloc.atlas.joins import sigmas_at
 
     middle = manifest.by_id[join.second].box_world.mean(axis=0)
@@ -146,11 +179,31 @@ def print_atlas(facts: dict[str, Any]) -> None:
     print_facts(
         [
             ("atlas", f"{facts['path']}, serial {facts['serial']}"),
-            ("tiles", f"{facts['num_tiles']}, {facts['num_nodes']} nodes, {facts['bytes'] / 1e6:.2f} MB"),
+            (
+                "tiles",
+                f"{facts['num_tiles']}, {facts['num_nodes']} nodes, {facts['bytes'] / 1e6:.2f} MB",
+            ),
             *(("", f"{tile['id']:<{width}}  {_tile_line(tile)}") for tile in facts["tiles"]),
-            *(("world", f"{name}: {', '.join(ids)}") for name, ids in facts["worlds"].items() if len(ids) > 1),
+            *(
+                ("world", f"{name}: {', '.join(ids)}")
+                for name, ids in facts["worlds"].items()
+                if len(ids) > 1
+            ),
             *(("join", _join_line(join)) for join in facts["joins"]),
-            *([("check", "ok" if facts["check"] == "ok" else f"{len(facts['check'])} tiles are damaged")] if "check" in facts else []),
+            *(
+                [
+                    (
+                        "check",
+                        (
+                            "ok"
+                            if facts["check"] == "ok"
+                            else f"{len(facts['check'])} tiles are damaged"
+                        ),
+                    )
+                ]
+                if "check" in facts
+                else []
+            ),
         ]
     )
 
@@ -167,4 +220,7 @@ def _tile_line(tile: dict[str, Any]) -> str:
     extent = " x ".join(f"{high - low:.1f}" for low, high in zip(least, most, strict=True))
     box = tile["geo_box"]
     place = "" if box is None else f"  {box[0]:.6f} {box[1]:.6f} to {box[2]:.6f} {box[3]:.6f}"
-    return f"{tile['num_nodes']} nodes  {extent} m  {tile['map']['bytes'] / 1e6:.1f} MB  {', '.join(tile['kinds'])}{place}"
+    return (
+        f"{tile['num_nodes']} nodes  {extent} m  {tile['map']['bytes'] / 1e6:.1f} MB "
+        f" {', '.join(tile['kinds'])}{place}"
+    )

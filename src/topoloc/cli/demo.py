@@ -11,7 +11,15 @@ from typing import Annotated, Any
 
 import tyro
 
-from topoloc.cli.output import File, UsageError, check_outputs, print_recordings, progress_bar, report_writer, write_json
+from topoloc.cli.output import (
+    File,
+    UsageError,
+    check_outputs,
+    print_recordings,
+    progress_bar,
+    report_writer,
+    write_json,
+)
 from topoloc.demo.recordings import ROLES, SHIPPED, Role, missing_recordings
 from topoloc.demo.words import PAPER_LAB, night_in_words, words_of
 from topoloc.errors import MissingExtraError, TopolocError
@@ -37,7 +45,12 @@ class Command:
 
     out: Annotated[str, tyro.conf.arg(metavar="DIR")] = "topoloc-demo"
     """Where map, results, trajectories and report.html are written."""
-    recordings: Annotated[str | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="(default: those that topoloc brings along)")] = None
+    recordings: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="DIR", help_behavior_hint="(default: those that topoloc brings along)"
+        ),
+    ] = None
     """Take the recordings from here, as `topoloc simulate demo` renders them."""
     json: File = None
     """Write the evaluation as JSON to this file (- for standard output)."""
@@ -45,7 +58,9 @@ class Command:
     def run(self) -> int:
         start = time.perf_counter()
         out = _made_folder(Path(self.out))
-        check_outputs([str(out / "lab.topo"), str(out / "results.jsonl"), str(out / "report.html"), self.json])
+        check_outputs(
+            [str(out / "lab.topo"), str(out / "results.jsonl"), str(out / "report.html"), self.json]
+        )
         with progress_bar() as progress:
             folder = self._recordings()
             topomap = _map_the_lab(folder, out / "lab.topo", progress)
@@ -60,7 +75,10 @@ class Command:
             report = f"none; {missing}"
         write_json(self.json, evaluation | {"answers": [answer.to_json() for answer in answers]})
         if self.json != "-":
-            seconds = f"{time.perf_counter() - start:.0f} s in all, {mapped - start:.0f} s of them until the map was there"
+            seconds = (
+                f"{time.perf_counter() - start:.0f} s in all, {mapped - start:.0f} s of them until"
+                " the map was there"
+            )
             _print(out, evaluation, seconds, report)
         return 0
 
@@ -68,10 +86,19 @@ class Command:
         """The folder of the recordings, whole."""
         folder = Path(self.recordings) if self.recordings else SHIPPED
         if not folder.is_dir():
-            raise TopolocError(f"{folder}: no such folder; `topoloc simulate demo {folder}` renders the recordings into it")
+            raise TopolocError(
+                f"{folder}: no such folder; `topoloc simulate demo {folder}` renders the recordings"
+                " into it"
+            )
         if missing := missing_recordings(folder):
-            what = "this installation of topoloc lacks the demo's recordings" if folder == SHIPPED else f"{folder} lacks recordings"
-            raise TopolocError(f"{what} ({', '.join(missing)}); `topoloc simulate demo DIR` renders them")
+            what = (
+                "this installation of topoloc lacks the demo's recordings"
+                if folder == SHIPPED
+                else f"{folder} lacks recordings"
+            )
+            raise TopolocError(
+                f"{what} ({', '.join(missing)}); `topoloc simulate demo DIR` renders them"
+            )
         return folder
 
 
@@ -119,14 +146,24 @@ def _write_results(out: Path, folder: Path, answers: Sequence[Answer]) -> None:
     groups = by_recording(answers)
     for sequence in _open(folder, "queries"):
         t_ns = dict(zip(sequence.names, sequence.t_ns, strict=True))
-        found = [(t_ns[a.query], a.result.world_from_cam) for a in groups[_label(sequence)] if isinstance(a.result, Localization)]
-        write_tum(out / f"{sequence.name}.tum", Trajectory([pose for _, pose in found], [t for t, _ in found]))
+        found = [
+            (t_ns[a.query], a.result.world_from_cam)
+            for a in groups[_label(sequence)]
+            if isinstance(a.result, Localization)
+        ]
+        write_tum(
+            out / f"{sequence.name}.tum",
+            Trajectory([pose for _, pose in found], [t for t, _ in found]),
+        )
 
 
 def _print(out: Path, evaluation: dict[str, Any], seconds: str, report: str) -> None:
     print_recordings(evaluation, [PAPER_LAB])
     m = evaluation["map"]
     print(f"\n{night_in_words(evaluation)}\n")
-    print(f"map: {out / 'lab.topo'} ({m['num_nodes']} nodes, {m['bytes'] / 1e6:.1f} MB, {m['length_m']:.1f} m mapped; {seconds})")
+    print(
+        f"map: {out / 'lab.topo'} ({m['num_nodes']} nodes, {m['bytes'] / 1e6:.1f} MB,"
+        f" {m['length_m']:.1f} m mapped; {seconds})"
+    )
     print(f"poses: {out / 'results.jsonl'}, and a .tum file for each recording beside it")
     print(f"report: {report}")

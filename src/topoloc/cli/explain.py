@@ -35,13 +35,20 @@ class Command:
     image: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="IMAGE")]
     """The picture; or one of a recording, as in walk@17."""
     camera: Annotated[
-        str | None, tyro.conf.arg(metavar="FILE|fx,fy,cx,cy|map|unknown", help_behavior_hint="(default: that of the recording)")
+        str | None,
+        tyro.conf.arg(
+            metavar="FILE|fx,fy,cx,cy|map|unknown",
+            help_behavior_hint="(default: that of the recording)",
+        ),
     ] = None
     """Its calibration, as `topoloc localize` takes it."""
-    coarse: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")] = None
+    coarse: Annotated[
+        str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")
+    ] = None
     """Coarse localizer that is asked; `topoloc info` names those of the map."""
     features: ASKED_FEATURES = None
-    """Which of the map's features are asked; of several, the next where the one before leaves the pose unclear."""
+    """Which of the map's features are asked; of several, the next where the one before leaves the
+    pose unclear."""
     out: File = None
     """Write a page with the pictures, the matches and all that was tried to this file (HTML)."""
     json: File = None
@@ -50,12 +57,16 @@ class Command:
     """All other settings: a TOML file, as `topoloc config explain` prints it."""
 
     def run(self) -> int:
-        check_outputs([self.out, self.json], inputs=[path for path in (self.map, self.config) if path])
+        check_outputs(
+            [self.out, self.json], inputs=[path for path in (self.map, self.config) if path]
+        )
         settings = read_settings(self.config)
         config = with_option(settings.of(LocalizerConfig), "coarse", self.coarse, "--coarse")
         path, ranking = Path(self.map), list[str]()
         if is_atlas(self.map):
-            path, ranking = self._tile_of(open_atlas(self.map, config, self.features, settings.of(AtlasConfig)))
+            path, ranking = self._tile_of(
+                open_atlas(self.map, config, self.features, settings.of(AtlasConfig))
+            )
         with TopoMetricMap.load(path) as topomap:
             of_size = None if self.camera is None else named_camera(self.camera, topomap)
             localizer = localizer_of(topomap, config, self.features)
@@ -67,27 +78,45 @@ class Command:
             for line in ranking:
                 print(line)
             _print(explanation, self.out)
-        write_json(self.json, facts_of(frame.name, explanation) | ({"tiles": ranking} if ranking else {}))
+        write_json(
+            self.json, facts_of(frame.name, explanation) | ({"tiles": ranking} if ranking else {})
+        )
         return 0
 
     def _frame(self) -> StereoFrame:
         sequence = single_pictures(open_sequence(self.image))
         if len(sequence) != 1:
-            raise UsageError(f"explain takes one picture, and {self.image} has {len(sequence)}; {self.image}@0 is its first")
+            raise UsageError(
+                f"explain takes one picture, and {self.image} has {len(sequence)}; {self.image}@0"
+                " is its first"
+            )
         return sequence[0]
 
     def _tile_of(self, localizer: AtlasLocalizer) -> tuple[Path, list[str]]:
-        """The map of the tile that answers for the picture, and in words what the atlas made of it."""
-        frame, of_size = self._frame(), None if self.camera is None else camera_for(localizer, self.camera)
+        """The map of the tile that answers for the picture, and in words what the atlas made of
+        it."""
+        frame, of_size = (
+            self._frame(),
+            None if self.camera is None else camera_for(localizer, self.camera),
+        )
         camera = camera_of_frame(frame, of_size)
         result = localizer.localize(frame.image, camera)
         tile_id = result.provenance.tile
         assert tile_id is not None
-        likest = ", ".join(f"{name} {likeness:.2f}" for name, likeness in localizer.rank(Picture(frame.image, camera))[:5])
+        likest = ", ".join(
+            f"{name} {likeness:.2f}"
+            for name, likeness in localizer.rank(Picture(frame.image, camera))[:5]
+        )
         said = f"in tile {tile_id}"
         if not isinstance(result, Localization):
-            said = f"not localized ({result.reason}{f', {result.detail}' if result.detail else ''}); most of it is known to tile {tile_id}"
-        return localizer.atlas.map_path(localizer.atlas.tile(tile_id)), [f"atlas: {said}", f"looks most like: {likest}"]
+            said = (
+                f"not localized ({result.reason}{f', {result.detail}' if result.detail else ''});"
+                f" most of it is known to tile {tile_id}"
+            )
+        return localizer.atlas.map_path(localizer.atlas.tile(tile_id)), [
+            f"atlas: {said}",
+            f"looks most like: {likest}",
+        ]
 
 
 def _print(explanation: Explanation, page: str | None) -> None:
@@ -96,7 +125,16 @@ def _print(explanation: Explanation, page: str | None) -> None:
         print(f"- {line}")
     for pose in explanation.poses:
         source, features, node, first, found, _, _, probability, became = row_of(pose)
-        facts = ", ".join(text for text in (node and f"node {node}", f"{first} at first", found and f"found {found}", probability) if text)
+        facts = ", ".join(
+            text
+            for text in (
+                node and f"node {node}",
+                f"{first} at first",
+                found and f"found {found}",
+                probability,
+            )
+            if text
+        )
         print(f"  {source} ({features}): {facts}: {became}")
     if page:
         print(f"page: {page}")

@@ -16,10 +16,18 @@ from topoloc.map.config import MapConfig
 from topoloc.map.topomap import TopoMetricMap
 
 BUILD_FEATURES = Annotated[
-    str | None, tyro.conf.arg(metavar="surf|sift|learned|both|KIND[,KIND]", help_behavior_hint="(default: both where a network is here)")
+    str | None,
+    tyro.conf.arg(
+        metavar="surf|sift|learned|both|KIND[,KIND]",
+        help_behavior_hint="(default: both where a network is here)",
+    ),
 ]
 ASKED_FEATURES = Annotated[
-    str | None, tyro.conf.arg(metavar="surf|learned|both|KIND[,KIND]", help_behavior_hint="(default: all that the map holds)")
+    str | None,
+    tyro.conf.arg(
+        metavar="surf|learned|both|KIND[,KIND]",
+        help_behavior_hint="(default: all that the map holds)",
+    ),
 ]
 
 
@@ -43,11 +51,16 @@ def kinds_to_build(config: MapConfig, features: str | None) -> MapConfig:
         raise UsageError(f"--features {features}: a kind is named twice")
     for kind in kinds:
         check_available(kind)
-    return replace(config, features=replace(config.features, kind=kinds[0]), other_kinds=tuple(kinds[1:]))
+    return replace(
+        config, features=replace(config.features, kind=kinds[0]), other_kinds=tuple(kinds[1:])
+    )
 
 
-def localizer_of(topomap: TopoMetricMap, config: LocalizerConfig, features: str | None) -> Localizer:
-    """Asks the map by the kinds of features that the option names; one line on standard error for each of the map's that cannot be asked.
+def localizer_of(
+    topomap: TopoMetricMap, config: LocalizerConfig, features: str | None
+) -> Localizer:
+    """Asks the map by the kinds of features that the option names; one line on standard error for
+    each of the map's that cannot be asked.
 
     Raises:
         FeatureKindError: the map does not hold them.
@@ -59,14 +72,23 @@ def localizer_of(topomap: TopoMetricMap, config: LocalizerConfig, features: str 
     return localizer
 
 
-def _with_kinds(topomap: TopoMetricMap, config: LocalizerConfig, features: str | None) -> LocalizerConfig:
+def _with_kinds(
+    topomap: TopoMetricMap, config: LocalizerConfig, features: str | None
+) -> LocalizerConfig:
     if features is None:
         return config
     if features == "both":
         return replace(config, kinds=tuple(topomap.kinds))
     named = features.split(",")
-    kinds = [kind for kind in topomap.kinds if kind in named or (features == "learned" and KINDS[kind].network is not None)]
+    kinds = [
+        kind
+        for kind in topomap.kinds
+        if kind in named or (features == "learned" and KINDS[kind].network is not None)
+    ]
     missing = [name for name in named if name not in kinds] if features != "learned" else []
     if missing or not kinds:
-        raise FeatureKindError(f"the map holds no features {(missing or [features])[0]} (it holds: {', '.join(topomap.kinds)})")
+        raise FeatureKindError(
+            f"the map holds no features {(missing or [features])[0]} (it holds:"
+            f" {', '.join(topomap.kinds)})"
+        )
     return replace(config, kinds=tuple(kinds))

@@ -14,7 +14,15 @@ import tyro
 from topoloc.atlas.config import AtlasConfig
 from topoloc.cli.features_option import ASKED_FEATURES, localizer_of
 from topoloc.cli.map_or_atlas import camera_for, is_atlas, open_atlas
-from topoloc.cli.output import File, Flag, Format, Topics, UsageError, ended_by_signals, open_recording
+from topoloc.cli.output import (
+    File,
+    Flag,
+    Format,
+    Topics,
+    UsageError,
+    ended_by_signals,
+    open_recording,
+)
 from topoloc.cli.query_answers import QueryAnswer, answer_line
 from topoloc.cli.settings_file import Settings, read_settings
 from topoloc.errors import CalibrationError, UnreadableImageError
@@ -40,23 +48,31 @@ class Command:
     """What `topoloc follow` takes."""
 
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
-    """The map file; or an atlas: the tile is followed that recognises a picture, until another one does."""
+    """The map file; or an atlas: the tile is followed that recognises a picture, until another one
+    does."""
     source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SOURCE")]
     """A webcam's number or device, an address (rtsp://, http://), a video, or a recording."""
-    camera: Annotated[str | None, tyro.conf.arg(metavar="FILE|fx,fy,cx,cy|map", help_behavior_hint="(default: that of the recording)")] = (
-        None
-    )
-    """Calibration of the pictures: a camera.json, YAML of OpenCV or Kalibr, `fx,fy,cx,cy` in pixels, or `map` for that of the map."""
+    camera: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="FILE|fx,fy,cx,cy|map", help_behavior_hint="(default: that of the recording)"
+        ),
+    ] = None
+    """Calibration of the pictures: a camera.json, YAML of OpenCV or Kalibr, `fx,fy,cx,cy` in
+    pixels, or `map` for that of the map."""
     format: Format = None
-    """A recording's format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap, rosbag, mcap, zed, video or folder."""
+    """A recording's format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap, rosbag,
+    mcap, zed, video or folder."""
     topics: Topics = None
     """Of a bag, which topic is what: left=/cam0/image_raw."""
     features: ASKED_FEATURES = None
-    """Which of the map's features are asked; of several, the next where the one before leaves the pose unclear."""
+    """Which of the map's features are asked; of several, the next where the one before leaves the
+    pose unclear."""
     plain: Flag = False
     """Lines for people instead of JSON."""
     ros: Annotated[int | None, tyro.conf.arg(metavar="DOMAIN", help_behavior_hint="")] = None
-    """Also publish the poses to the ROS 2 robots of this domain: /topoloc/pose, and TF from map to topoloc_camera."""
+    """Also publish the poses to the ROS 2 robots of this domain: /topoloc/pose, and TF from map to
+    topoloc_camera."""
     config: File = None
     """All other settings: a TOML file, as `topoloc config follow` prints it."""
 
@@ -76,7 +92,9 @@ class Command:
                 answer = QueryAnswer(name, t_ns, streamed.result, streamed)
                 if robots is not None and isinstance(streamed.result, Localization):
                     robots.publish(t_ns, streamed.result.world_from_cam, streamed.result.covariance)
-                print(answer_line(answer) if self.plain else json.dumps(answer.to_json()), flush=True)
+                print(
+                    answer_line(answer) if self.plain else json.dumps(answer.to_json()), flush=True
+                )
         return 0
 
     @contextmanager
@@ -86,7 +104,9 @@ class Command:
             with TopoMetricMap.load(self.map) as topomap:
                 yield Tracker(localizer_of(topomap, localizing, self.features), tracking)
             return
-        tracker = TileTracker(open_atlas(self.map, localizing, self.features, settings.of(AtlasConfig)), tracking)
+        tracker = TileTracker(
+            open_atlas(self.map, localizing, self.features, settings.of(AtlasConfig)), tracking
+        )
         try:
             yield tracker
         finally:
@@ -95,10 +115,14 @@ class Command:
     def _pictures(self, is_ended: threading.Event) -> Iterator[tuple[str, int, ReadFrame]]:
         if is_live(self.source):
             return _captured(self.source, is_ended)
-        return _recorded(single_pictures(open_recording(self.source, self.format, None, self.topics)))
+        return _recorded(
+            single_pictures(open_recording(self.source, self.format, None, self.topics))
+        )
 
 
-def _streamed(tracker: Tracker | TileTracker, t_ns: int, read: ReadFrame, of_size: CameraOfSize | None) -> StreamedPose:
+def _streamed(
+    tracker: Tracker | TileTracker, t_ns: int, read: ReadFrame, of_size: CameraOfSize | None
+) -> StreamedPose:
     """The answer to the next picture. Raises CalibrationError where its camera is not known."""
     try:
         frame = read()
@@ -117,7 +141,8 @@ def _recorded(sequence: StereoSequence) -> Iterator[tuple[str, int, ReadFrame]]:
 
 
 def _captured(source: str, is_ended: threading.Event) -> Iterator[tuple[str, int, ReadFrame]]:
-    """The newest picture of a camera or an address whenever the one before is answered, by this machine's clock."""
+    """The newest picture of a camera or an address whenever the one before is answered, by this
+    machine's clock."""
     with LiveSource(source) as live:
         live.stop = is_ended
         for picture in live:

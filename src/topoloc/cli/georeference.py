@@ -26,20 +26,29 @@ class Command:
     """What `topoloc georeference` takes."""
 
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
-    """The map file; it is replaced by one that knows where on earth it lies. Or an atlas, with --tile."""
-    origin: Annotated[str | None, tyro.conf.arg(metavar="LAT,LON,H,HEADING", help_behavior_hint="")] = None
-    """Where the first mapping picture was taken (degrees, metres above the ellipsoid), and which way it looks: degrees clockwise from true
-    north."""
+    """The map file; it is replaced by one that knows where on earth it lies. Or an atlas, with
+    --tile."""
+    origin: Annotated[
+        str | None, tyro.conf.arg(metavar="LAT,LON,H,HEADING", help_behavior_hint="")
+    ] = None
+    """Where the first mapping picture was taken (degrees, metres above the ellipsoid), and which
+    way it looks: degrees clockwise from true north."""
     gnss: File = None
-    """Where the camera was: lines of `time,lat,lon,h` or `name of a mapping picture,lat,lon,h`; fitted robustly."""
+    """Where the camera was: lines of `time,lat,lon,h` or `name of a mapping picture,lat,lon,h`;
+    fitted robustly."""
     points: File = None
     """Three or more known points: lines of `x,y,z,lat,lon,h`, x, y, z metres in the map's world."""
     up: Annotated[
-        str | None, tyro.conf.arg(metavar="x|-x|y|-y|z|-z", help_behavior_hint="(default: the axis nearest to the cameras' up)")
+        str | None,
+        tyro.conf.arg(
+            metavar="x|-x|y|-y|z|-z",
+            help_behavior_hint="(default: the axis nearest to the cameras' up)",
+        ),
     ] = None
     """The axis of the map's world that is up; --points do not need it."""
     tile: TileOption = None
-    """Of an atlas: the tile; those that share its world, or are joined with it, then know where they lie, too."""
+    """Of an atlas: the tile; those that share its world, or are joined with it, then know where
+    they lie, too."""
     json: File = None
     """Write what is printed as JSON to this file (- for standard output)."""
 
@@ -47,9 +56,13 @@ class Command:
         given = [option for option in (self.origin, self.gnss, self.points) if option is not None]
         if len(given) != 1:
             raise UsageError("georeference takes a map and one of --origin, --gnss and --points")
-        check_outputs([self.json], inputs=[path for path in (self.map, self.gnss, self.points) if path])
+        check_outputs(
+            [self.json], inputs=[path for path in (self.map, self.gnss, self.points) if path]
+        )
         origin = None if self.origin is None else _origin_from(self.origin)
-        found, facts, fitted = edited_at(self.map, self.tile, lambda path: self._edited(path, origin))
+        found, facts, fitted = edited_at(
+            self.map, self.tile, lambda path: self._edited(path, origin)
+        )
         if self.json != "-":
             _print(found, facts, fitted)
         write_json(self.json, facts)
@@ -61,16 +74,25 @@ class Command:
         """Where the map lies, with what is said of it, and what it was fitted to."""
         with editing(path, say_waiting) as edit:
             topomap = edit.topomap
-            posed = [image.world_from_cam for image in topomap.place_images] or [s.world_from_cam for s in topomap.summaries]
+            posed = [image.world_from_cam for image in topomap.place_images] or [
+                s.world_from_cam for s in topomap.summaries
+            ]
             if not posed:
                 raise GeoreferenceError(f"map {path} has no mapping picture")
             up = find_up(posed, self.up)
             found, fitted = self._found(topomap, posed[0], up, origin)
             edit.commit(replace(topomap, georeference=found), f"georeference {found.source}")
-        facts = found.to_json() | {"heading_deg": found.heading_deg(posed[0].rotation[:, 2]), "up": None if self.points else up.axis}
+        facts = found.to_json() | {
+            "heading_deg": found.heading_deg(posed[0].rotation[:, 2]),
+            "up": None if self.points else up.axis,
+        }
         if fitted is not None:
             fit = fitted[1]
-            facts |= {"num_points": len(fit.used), "num_used": int(fit.used.sum()), "residuals_m": fit.residuals_m.round(4).tolist()}
+            facts |= {
+                "num_points": len(fit.used),
+                "num_used": int(fit.used.sum()),
+                "residuals_m": fit.residuals_m.round(4).tolist(),
+            }
         return found, facts, fitted
 
     def _found(
@@ -92,9 +114,13 @@ def _origin_from(text: str) -> tuple[GeoPoint, float]:
     try:
         lat, lon, h, heading_deg = map(float, text.split(","))
     except ValueError:
-        raise GeoreferenceError(f"--origin {text[:80]}: four numbers LAT,LON,H,HEADING are needed") from None
+        raise GeoreferenceError(
+            f"--origin {text[:80]}: four numbers LAT,LON,H,HEADING are needed"
+        ) from None
     if not -360.0 <= heading_deg <= 360.0:
-        raise GeoreferenceError(f"--origin: a heading of {heading_deg:g}; degrees clockwise from true north are needed")
+        raise GeoreferenceError(
+            f"--origin: a heading of {heading_deg:g}; degrees clockwise from true north are needed"
+        )
     return GeoPoint(lat, lon, h), heading_deg
 
 
@@ -105,15 +131,31 @@ def place_line(georeference: Georeference) -> str:
     return f"{o.lat:.7f}, {o.lon:.7f}, {o.h:.2f} m (from {georeference.source}{fitted})"
 
 
-def _print(found: Georeference, facts: dict[str, Any], fitted: tuple[KnownPlaces, WorldFit] | None) -> None:
-    lines = [("origin", place_line(found)), ("first picture looks to", f"{facts['heading_deg']:.1f} degrees from true north, clockwise")]
+def _print(
+    found: Georeference, facts: dict[str, Any], fitted: tuple[KnownPlaces, WorldFit] | None
+) -> None:
+    lines = [
+        ("origin", place_line(found)),
+        (
+            "first picture looks to",
+            f"{facts['heading_deg']:.1f} degrees from true north, clockwise",
+        ),
+    ]
     if facts["up"] is not None:
         lines.append(("up", f"the world's {facts['up']}"))
     if fitted is not None:
         known, fit = fitted
         worst = int(np.argmax(np.where(fit.used, fit.residuals_m, -1.0)))
         lines.append(("points", f"{facts['num_used']} of {facts['num_points']} agree"))
-        lines.append(("residuals", f"rms {found.rms_m:.3f} m, largest {fit.residuals_m[worst]:.3f} m ({known.names[worst]})"))
+        lines.append(
+            (
+                "residuals",
+                (
+                    f"rms {found.rms_m:.3f} m, largest {fit.residuals_m[worst]:.3f} m"
+                    f" ({known.names[worst]})"
+                ),
+            )
+        )
         if not fit.used.all():
             left_out = ", ".join(known.names[k] for k in np.flatnonzero(~fit.used)[:5].tolist())
             lines.append(("left out", f"{left_out}{', ...' if (~fit.used).sum() > 5 else ''}"))

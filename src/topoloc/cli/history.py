@@ -59,26 +59,42 @@ def _edits_of_tile(atlas: Atlas, tile: Tile) -> tuple[list[dict[str, Any]], int]
 
 
 def _edits(path: str | Path, log: Path | None = None) -> tuple[list[dict[str, Any]], int]:
-    """The edits of a map file, the first one first, and how many of the last ones can be taken back, by the undo file beside it or
-    another one. Raises MapError."""
+    """The edits of a map file, the first one first, and how many of the last ones can be taken
+    back, by the undo file beside it or another one. Raises MapError."""
     num_undoable = undoable_edits(path, log)
     with TopoMetricMap.load(path) as topomap:
         edits = [asdict(edit) for edit in topomap.edits]
-    return [edit | {"undoable": number > len(edits) - num_undoable} for number, edit in enumerate(edits, start=1)], num_undoable
+    return [
+        edit | {"undoable": number > len(edits) - num_undoable}
+        for number, edit in enumerate(edits, start=1)
+    ], num_undoable
 
 
 def _print_undo(where: str, num_undoable: int) -> None:
     if num_undoable:
-        print(f"`topoloc undo {where}` takes the last one back" + (f"; {num_undoable} can be" if num_undoable > 1 else ""))
+        print(
+            f"`topoloc undo {where}` takes the last one back"
+            + (f"; {num_undoable} can be" if num_undoable > 1 else "")
+        )
 
 
 def _print_edits(edits: list[dict[str, Any]], without: str) -> None:
-    print_facts([(f"{edit['edit_id']} {edit['date']}", f"{edit['name']}{_said(edit['changes'])}") for edit in edits] or [("", without)])
+    print_facts(
+        [
+            (f"{edit['edit_id']} {edit['date']}", f"{edit['name']}{_said(edit['changes'])}")
+            for edit in edits
+        ]
+        or [("", without)]
+    )
 
 
 def _said(changes) -> str:
     """What an edit changed, in the words of its numbers."""
     recall, numbers = described(changes or {}), (changes or {}).items()
-    shown = {name.replace("_", " "): value for name, value in numbers if value not in ([], None, "") and not name.startswith("earlier_")}
+    shown = {
+        name.replace("_", " "): value
+        for name, value in numbers
+        if value not in ([], None, "") and not name.startswith("earlier_")
+    }
     said = [f"{name} {value}" for name, value in shown.items()] + ([recall] if recall else [])
     return "" if not said else ": " + ", ".join(said)

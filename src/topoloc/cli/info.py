@@ -27,10 +27,14 @@ class Command:
     """Write the same as JSON to this file (- for standard output)."""
 
     check: Flag = False
-    """Also look at every byte of the map, and whether its nodes agree with their neighbours; exit status 1 where something is wrong."""
+    """Also look at every byte of the map, and whether its nodes agree with their neighbours; exit
+    status 1 where something is wrong."""
 
-    graph: Annotated[str | None, tyro.conf.arg(metavar="FILE.graphml|FILE.geojson", help_behavior_hint="")] = None
-    """Write nodes, junctions and the ways between them to this file; GeoJSON of a map that knows its place on earth."""
+    graph: Annotated[
+        str | None, tyro.conf.arg(metavar="FILE.graphml|FILE.geojson", help_behavior_hint="")
+    ] = None
+    """Write nodes, junctions and the ways between them to this file; GeoJSON of a map that knows
+    its place on earth."""
 
     def run(self) -> int:
         from topoloc.map.topomap import TopoMetricMap
@@ -44,7 +48,10 @@ class Command:
             found = _damages(topomap, Path(self.map)) if self.check else []
             if found:
                 print("\n".join(found[:MAX_DAMAGES]))
-                raise MapError(f"map {self.map} is damaged: {len(found)} things are wrong, the first: {found[0]}")
+                raise MapError(
+                    f"map {self.map} is damaged: {len(found)} things are wrong, the first:"
+                    f" {found[0]}"
+                )
             if self.graph:
                 from topoloc.export.map_graph import write_graph
 
@@ -66,7 +73,10 @@ def _damages(topomap: Any, path: Path) -> list[str]:
 
 
 def _print(info: dict[str, Any]) -> None:
-    nodes, normalization = info["config"].get("nodes", {}), info["config"].get("features", {}).get("normalization")
+    nodes, normalization = (
+        info["config"].get("nodes", {}),
+        info["config"].get("features", {}).get("normalization"),
+    )
     nan = float("nan")
     print_facts(
         [
@@ -76,12 +86,31 @@ def _print(info: dict[str, Any]) -> None:
             ("nodes", f"{info['num_nodes']}, {info['num_points']} points with 3-D position"),
             ("side nodes", str(info["num_side_nodes"])),
             ("place images", str(info["num_place_images"])),
-            ("mapped", f"{info['length_m']:.1f} m, extent {' x '.join(f'{e:.1f}' for e in info['extent_m'])} m"),
+            (
+                "mapped",
+                (
+                    f"{info['length_m']:.1f} m, extent"
+                    f" {' x '.join(f'{e:.1f}' for e in info['extent_m'])} m"
+                ),
+            ),
             ("recordings", ", ".join(info["recordings"])),
             ("on earth", _place_line(info["georeference"])),
-            *(("coarse localizer", _coarse_line(facts, info["default_coarse"])) for facts in info["coarse_models"]),
-            ("Eq. 1", f"D_thresh {nodes.get('d_thresh', nan):.3g} m, lambda {nodes.get('lambda_rot', nan):.3g} m/rad"),
-            ("features", ", ".join(info["kinds"]) + (f", normalization {normalization}" if normalization else "")),
+            *(
+                ("coarse localizer", _coarse_line(facts, info["default_coarse"]))
+                for facts in info["coarse_models"]
+            ),
+            (
+                "Eq. 1",
+                (
+                    f"D_thresh {nodes.get('d_thresh', nan):.3g} m, lambda"
+                    f" {nodes.get('lambda_rot', nan):.3g} m/rad"
+                ),
+            ),
+            (
+                "features",
+                ", ".join(info["kinds"])
+                + (f", normalization {normalization}" if normalization else ""),
+            ),
             *([("check", info["check"])] if "check" in info else []),
         ]
     )
@@ -91,11 +120,20 @@ def _place_line(facts: dict[str, Any] | None) -> str:
     from topoloc.cli.georeference import place_line
     from topoloc.geometry.geodesy import Georeference
 
-    return "unknown (topoloc georeference says where)" if facts is None else place_line(Georeference.from_json(facts))
+    return (
+        "unknown (topoloc georeference says where)"
+        if facts is None
+        else place_line(Georeference.from_json(facts))
+    )
 
 
 def _coarse_line(facts: dict[str, Any], default: str) -> str:
     weights = facts.get("weights")
-    source = f"{weights['file']}, SHA-256 {weights['sha256'][:12]}" if weights else "from random weights"
+    source = (
+        f"{weights['file']}, SHA-256 {weights['sha256'][:12]}" if weights else "from random weights"
+    )
     network = f", {facts['backbone']} ({source})" if "backbone" in facts else ""
-    return f"{facts['name']}{' (default)' if facts['name'] == default else ''}{network}, {facts['bytes'] / 1e6:.2f} MB"
+    return (
+        f"{facts['name']}{' (default)' if facts['name'] == default else ''}{network},"
+        f" {facts['bytes'] / 1e6:.2f} MB"
+    )

@@ -1,4 +1,5 @@
-"""Tiles that are joined: here, or on a cluster, a task a pair; a line for each pair that was compared."""
+"""Tiles that are joined: here, or on a cluster, a task a pair; a line for each pair that was
+compared."""
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class JoinedNeighbours:
-    """The atlas's manifest afterwards, what was found of each pair, as JSON has it, and a line for each that could not be compared."""
+    """The atlas's manifest afterwards, what was found of each pair, as JSON has it, and a line for
+    each that could not be compared."""
 
     manifest: Any
     rows: list[dict[str, Any]]
@@ -30,7 +32,8 @@ def joined_neighbours(
     pairs: Sequence[tuple[str, str]] | None = None,
     ray: str | None = None,
 ) -> JoinedNeighbours:
-    """These tiles joined with those that they overlap with, or just these `pairs`; on the cluster `ray`, if it is given.
+    """These tiles joined with those that they overlap with, or just these `pairs`; on the cluster
+    `ray`, if it is given.
 
     Raises:
         TopolocError: as of `join_tiles` and `run_on_ray`.
@@ -46,7 +49,11 @@ def joined_neighbours(
         done = join_tiles(where, tile_ids, settings.of(TileJoinConfig), tell, pairs)
     else:
         done = _joined_on_ray(where, tile_ids, settings, tell, pairs, ray)
-    lost = [f"{one.first} and {one.second}: {one.found.reason}" for one in done.tried if isinstance(one.found, NotCompared)]
+    lost = [
+        f"{one.first} and {one.second}: {one.found.reason}"
+        for one in done.tried
+        if isinstance(one.found, NotCompared)
+    ]
     return JoinedNeighbours(done.manifest, [_row(one) for one in done.tried], lost)
 
 
@@ -70,7 +77,10 @@ def _joined_on_ray(
             tell(state)
 
     config = settings.of(TileJoinConfig)
-    jobs = [PairJob(whole_address(where), first, second, config) for first, second in pairs_to_join(where, tile_ids, config, pairs)]
+    jobs = [
+        PairJob(whole_address(where), first, second, config)
+        for first, second in pairs_to_join(where, tile_ids, config, pairs)
+    ]
     tried = run_on_ray(jobs, ray, settings.of(ClusterConfig), show) if jobs else []
     return Neighbours(Atlas.open(where).manifest, tried)
 
@@ -83,15 +93,26 @@ def _said(one: Tried) -> str:
         return found.reason
     if found.is_by_shared:
         return f"joined, by {found.num_agreeing} pictures that are part of both"
-    return f"joined, {found.num_agreeing} nodes agree, {found.num_recognised} of {found.num_near} that must be recognised are"
+    return (
+        f"joined, {found.num_agreeing} nodes agree, {found.num_recognised} of {found.num_near} that"
+        " must be recognised are"
+    )
 
 
 def _row(one: Tried) -> dict[str, Any]:
     from topoloc.lifelong.tile_joins import NotJoined
 
-    row: dict[str, Any] = {"first": one.first, "second": one.second, "joined": not isinstance(one.found, NotJoined)}
+    row: dict[str, Any] = {
+        "first": one.first,
+        "second": one.second,
+        "joined": not isinstance(one.found, NotJoined),
+    }
     if isinstance(one.found, NotJoined):
         return row | {"reason": one.found.reason}
     found = one.found
     row |= {"num_agreeing": found.num_agreeing, "same_pictures": found.is_by_shared}
-    return row | {"num_near": found.num_near, "num_recognised": found.num_recognised, "agreeing": round(found.agreeing, 3)}
+    return row | {
+        "num_near": found.num_near,
+        "num_recognised": found.num_recognised,
+        "agreeing": round(found.agreeing, 3),
+    }

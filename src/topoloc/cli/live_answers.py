@@ -1,4 +1,5 @@
-"""Answers to a camera that runs now: each picture alone, or as the next of a stream; what it shows meanwhile is left out."""
+"""Answers to a camera that runs now: each picture alone, or as the next of a stream; what it shows
+meanwhile is left out."""
 
 from __future__ import annotations
 
@@ -16,7 +17,9 @@ from topoloc.localization.query_camera import CameraOfSize
 from topoloc.sequences.live import LivePicture, LiveSource, is_live
 from topoloc.tracking.tracker import Tracker
 
-NEEDS_CALIBRATION = "a stream needs a calibration: --camera FILE, --camera fx,fy,cx,cy or --camera map; or --single"
+NEEDS_CALIBRATION = (
+    "a stream needs a calibration: --camera FILE, --camera fx,fy,cx,cy or --camera map; or --single"
+)
 
 
 def live_input(inputs: tuple[str, ...]) -> str | None:
@@ -28,9 +31,13 @@ def live_input(inputs: tuple[str, ...]) -> str | None:
 
 
 def live_answers(
-    localizer: Localizer | AtlasLocalizer, tracker: Tracker | None, source: str, camera_of_size: CameraOfSize
+    localizer: Localizer | AtlasLocalizer,
+    tracker: Tracker | None,
+    source: str,
+    camera_of_size: CameraOfSize,
 ) -> Iterator[QueryAnswer]:
-    """Answers until the source ends, or Ctrl-C or SIGTERM come. Raises RecordingError where it does not answer, or stalls."""
+    """Answers until the source ends, or Ctrl-C or SIGTERM come. Raises RecordingError where it does
+    not answer, or stalls."""
     with ExitStack() as stack:
         live = stack.enter_context(LiveSource(source))
         live.stop = stack.enter_context(ended_by_signals())
@@ -39,16 +46,24 @@ def live_answers(
             yield _answer(localizer, tracker, picture, camera_of_size)
             asked += 1
         if not live.stop.is_set():
-            print(f"warning: {source} ended after {live.num_read} pictures, {asked} of them asked", file=sys.stderr)
+            print(
+                f"warning: {source} ended after {live.num_read} pictures, {asked} of them asked",
+                file=sys.stderr,
+            )
 
 
 def _answer(
-    localizer: Localizer | AtlasLocalizer, tracker: Tracker | None, picture: LivePicture, camera_of_size: CameraOfSize
+    localizer: Localizer | AtlasLocalizer,
+    tracker: Tracker | None,
+    picture: LivePicture,
+    camera_of_size: CameraOfSize,
 ) -> QueryAnswer:
     height, width = picture.image.shape[:2]
     name, camera = f"{picture.number:06d}", camera_of_size(width, height)
     if tracker is None:
-        return QueryAnswer(name, picture.t_ns, localizer.localize(picture.image, camera, t_ns=picture.t_ns))
+        return QueryAnswer(
+            name, picture.t_ns, localizer.localize(picture.image, camera, t_ns=picture.t_ns)
+        )
     if isinstance(camera, RoughCamera):
         raise CalibrationError(NEEDS_CALIBRATION)
     streamed = tracker.process(picture.image, camera, picture.t_ns)

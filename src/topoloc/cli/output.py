@@ -1,4 +1,5 @@
-"""What the commands share: kinds of options, output paths checked before the work, progress on a terminal, tables, results written."""
+"""What the commands share: kinds of options, output paths checked before the work, progress on a
+terminal, tables, results written."""
 
 from __future__ import annotations
 
@@ -25,20 +26,44 @@ Flag = Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(help_behavior
 # A path that may be left out.
 File = Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
 # The format of the recordings.
-Format = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: recognised)")]
+Format = Annotated[
+    str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: recognised)")
+]
 # The calibration of the recordings.
-CameraOption = Annotated[str | None, tyro.conf.arg(metavar="FILE|fx,fy,cx,cy", help_behavior_hint="(default: that of the recording)")]
+CameraOption = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="FILE|fx,fy,cx,cy", help_behavior_hint="(default: that of the recording)"
+    ),
+]
 # Which topic of a bag is what.
-Topics = Annotated[str | None, tyro.conf.arg(metavar="ROLE=TOPIC,...", help_behavior_hint="(default: guessed)")]
+Topics = Annotated[
+    str | None, tyro.conf.arg(metavar="ROLE=TOPIC,...", help_behavior_hint="(default: guessed)")
+]
 # A Ray cluster.
-RayOption = Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT|auto|local", help_behavior_hint="(default: none)")]
-_COLUMNS = ("recording", "localized", "median error", "in 5 cm, 5 deg", "in 25 cm, 2 deg", "false accepts", "ms")
+RayOption = Annotated[
+    str | None, tyro.conf.arg(metavar="HOST:PORT|auto|local", help_behavior_hint="(default: none)")
+]
+_COLUMNS = (
+    "recording",
+    "localized",
+    "median error",
+    "in 5 cm, 5 deg",
+    "in 25 cm, 2 deg",
+    "false accepts",
+    "ms",
+)
 
 
 def open_recording(
-    path: str, format: str | None, camera: str | None = None, topics: str | None = None, images: str | None = None
+    path: str,
+    format: str | None,
+    camera: str | None = None,
+    topics: str | None = None,
+    images: str | None = None,
 ) -> StereoSequence:
-    """`open_sequence`; what is to be known of the recording is said in a line each on stderr. Raises as that does."""
+    """`open_sequence`; what is to be known of the recording is said in a line each on stderr.
+    Raises as that does."""
     sequence = open_sequence(path, format, camera, images, topics)
     for note in notes_of(sequence):
         print(f"warning: {note}", file=sys.stderr)
@@ -50,14 +75,16 @@ class UsageError(TopolocError):
 
 
 def check_outputs(outputs: Sequence[str | None], inputs: Sequence[str] = ()) -> None:
-    """Hold that the files a command is to write can be written, so that it fails before the work and not after.
+    """Hold that the files a command is to write can be written, so that it fails before the work
+    and not after.
 
     Args:
         outputs: paths; None and ``-`` are no files.
         inputs: files that must not be overwritten.
 
     Raises:
-        TopolocError: the folder is missing or read-only, the path is no regular file, or it is named for two things.
+        TopolocError: the folder is missing or read-only, the path is no regular file, or it is
+            named for two things.
     """
     taken = {Path(path).resolve() for path in inputs}
     for path in (Path(output) for output in outputs if output not in (None, "-")):
@@ -77,7 +104,8 @@ def check_outputs(outputs: Sequence[str | None], inputs: Sequence[str] = ()) -> 
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Ctrl-C or too little memory inside a compiled function come out of it as a SystemError; here they become what they were."""
+    """Ctrl-C or too little memory inside a compiled function come out of it as a SystemError; here
+    they become what they were."""
     try:
         yield
     except Exception as error:
@@ -93,7 +121,8 @@ def interruptible() -> Iterator[None]:
 
 @contextmanager
 def ended_by_signals() -> Iterator[threading.Event]:
-    """Ctrl-C and SIGTERM set the event, at which work that could go on for ever ends in good order; a second one interrupts it."""
+    """Ctrl-C and SIGTERM set the event, at which work that could go on for ever ends in good order;
+    a second one interrupts it."""
     stop = threading.Event()
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
@@ -116,18 +145,31 @@ def ended_by_signals() -> Iterator[threading.Event]:
 def _is_out_of_memory(error: Exception) -> bool:
     """OpenCV, FAISS and the loader of shared libraries have words of their own for it."""
     text = str(error)
-    words = ("Insufficient memory", "std::bad_alloc", "Cannot allocate memory", "failed to map segment", "can't start new thread")
+    words = (
+        "Insufficient memory",
+        "std::bad_alloc",
+        "Cannot allocate memory",
+        "failed to map segment",
+        "can't start new thread",
+    )
     return (isinstance(error, OSError) and error.errno == 12) or any(word in text for word in words)
 
 
 @contextmanager
 def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
-    """A callable (stage, done, total) that draws one bar a stage where stderr is a terminal, and nothing elsewhere."""
+    """A callable (stage, done, total) that draws one bar a stage where stderr is a terminal, and
+    nothing elsewhere."""
     if not sys.stderr.isatty():
         yield lambda stage, done, total: None
         return
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
     columns = (
         TextColumn("{task.description}"),
@@ -137,26 +179,33 @@ def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
         TimeRemainingColumn(),
     )
     # Lines printed meanwhile go above the bar; where stdout is a file they must stay in that file.
-    with Progress(*columns, console=Console(stderr=True), redirect_stdout=sys.stdout.isatty()) as progress:
+    with Progress(
+        *columns, console=Console(stderr=True), redirect_stdout=sys.stdout.isatty()
+    ) as progress:
         tasks: dict[str, Any] = {}
 
         def update(stage: str, done: int, total: int) -> None:
             if stage not in tasks:
                 tasks[stage] = progress.add_task(stage, total=total, speed="")
             speed = progress.tasks[tasks[stage]].speed
-            progress.update(tasks[stage], completed=done, total=total, speed=f"{speed:.1f}/s" if speed else "")
+            progress.update(
+                tasks[stage], completed=done, total=total, speed=f"{speed:.1f}/s" if speed else ""
+            )
 
         yield update
 
 
 def report_writer() -> Callable[..., None]:
-    """`write_report`, of the extra `report`. Raises MissingExtraError where that is not installed."""
+    """`write_report`, of the extra `report`. Raises MissingExtraError where that is not
+    installed."""
     try:
         from topoloc.evaluation.report import write_report
     except ModuleNotFoundError as error:
         if error.name is None or error.name.split(".")[0] != "matplotlib":
             raise
-        raise MissingExtraError("a report needs matplotlib: pip install 'topoloc[report]'") from error
+        raise MissingExtraError(
+            "a report needs matplotlib: pip install 'topoloc[report]'"
+        ) from error
     return write_report
 
 
@@ -167,10 +216,15 @@ def print_facts(facts: Sequence[tuple[str, str]]) -> None:
         print(f"{name:<{width}}  {value}".rstrip())
 
 
-def print_recordings(evaluation: dict[str, Any], published: Sequence[tuple[str, float, float]] = ()) -> None:
-    """Print the rows of an evaluation (`summarize`), then what others published: (name, metres, degrees)."""
+def print_recordings(
+    evaluation: dict[str, Any], published: Sequence[tuple[str, float, float]] = ()
+) -> None:
+    """Print the rows of an evaluation (`summarize`), then what others published: (name, metres,
+    degrees)."""
     rows = [_COLUMNS, *(_row(recording) for recording in evaluation["recordings"])]
-    rows += [(name, "", _error(metres, degrees), "", "", "", "") for name, metres, degrees in published]
+    rows += [
+        (name, "", _error(metres, degrees), "", "", "", "") for name, metres, degrees in published
+    ]
     widths = [max(len(row[column]) for row in rows) for column in range(len(_COLUMNS))]
     for name, *cells in rows:
         padded = [f"{cell:>{width}}" for cell, width in zip(cells, widths[1:], strict=True)]
@@ -180,7 +234,11 @@ def print_recordings(evaluation: dict[str, Any], published: Sequence[tuple[str, 
 def _row(recording: dict[str, Any]) -> tuple[str, ...]:
     recall, num = recording["recall"], recording["num_queries"]
     shares = [f"{100 * recall[key]:.0f} %" if num else "" for key in ("0.05m_5deg", "0.25m_2deg")]
-    median = _error(recording["median_translation_m"], recording["median_rotation_deg"]) if recording["num_localized"] else ""
+    median = (
+        _error(recording["median_translation_m"], recording["median_rotation_deg"])
+        if recording["num_localized"]
+        else ""
+    )
     total = recording["median_times_ms"].get("total")
     return (
         recording["name"],

@@ -24,11 +24,18 @@ class Command:
 
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
     """The map file, which is replaced; or an atlas, whose tiles are, one after the other."""
-    max_mb: Annotated[float | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: only what is gone is dropped)")] = None
-    """Megabytes that the file may have, of an atlas that of each tile: every node keeps the landmarks that add most, and nodes that others
-    hold go before it keeps few."""
-    descriptors: Annotated[Literal["fine", "coarse"] | None, tyro.conf.arg(help_behavior_hint="(default: as [prune] says, fine)")] = None
-    """With `coarse` descriptors are rounded, to a third of their bytes, before anything goes that may be there."""
+    max_mb: Annotated[
+        float | None,
+        tyro.conf.arg(metavar="N", help_behavior_hint="(default: only what is gone is dropped)"),
+    ] = None
+    """Megabytes that the file may have, of an atlas that of each tile: every node keeps the
+    landmarks that add most, and nodes that others hold go before it keeps few."""
+    descriptors: Annotated[
+        Literal["fine", "coarse"] | None,
+        tyro.conf.arg(help_behavior_hint="(default: as [prune] says, fine)"),
+    ] = None
+    """With `coarse` descriptors are rounded, to a third of their bytes, before anything goes that
+    may be there."""
     tile: TileOption = None
     """Of an atlas: only this tile is pruned."""
     json: File = None
@@ -42,7 +49,9 @@ class Command:
         check_outputs([self.json], inputs=[path for path in (self.map, self.config) if path])
         check_tile_option(self.map, self.tile)
         config = read_settings(self.config).of(PruneConfig)
-        config = config if self.descriptors is None else replace(config, descriptors=self.descriptors)
+        config = (
+            config if self.descriptors is None else replace(config, descriptors=self.descriptors)
+        )
         if not is_atlas(self.map):
             changes = self._pruned(Path(self.map), config, self.map)
             write_json(self.json, {"map": self.map} | changes)
@@ -50,7 +59,11 @@ class Command:
         atlas = Atlas.open(self.map)
         ids = list(atlas.manifest.by_id) if self.tile is None else [atlas.tile(self.tile).tile_id]
         tiles, are_all_pruned = of_each_tile(
-            atlas, ids, lambda name: edited_at(self.map, name, lambda path: self._pruned(path, config, f"{self.map}, tile {name}"))
+            atlas,
+            ids,
+            lambda name: edited_at(
+                self.map, name, lambda path: self._pruned(path, config, f"{self.map}, tile {name}")
+            ),
         )
         write_json(self.json, {"atlas": self.map, "tiles": tiles})
         return 0 if are_all_pruned else 1
@@ -59,7 +72,12 @@ class Command:
         """What was dropped from a map file, which is said of it by its name."""
         with editing(path, say_waiting) as edit:
             before = edit.path.stat().st_size
-            pruned = prune_map(edit.topomap, edit.path, None if self.max_mb is None else round(self.max_mb * 1e6), config)
+            pruned = prune_map(
+                edit.topomap,
+                edit.path,
+                None if self.max_mb is None else round(self.max_mb * 1e6),
+                config,
+            )
             changes = pruned.changes | {"bytes_before": before}
             walked_km = edit.topomap.length_m / 1e3
             if pruned.topomap is not edit.topomap:
@@ -76,6 +94,9 @@ def describe_prune(changes: Mapping[str, Any], walked_km: float) -> str:
     """What was dropped, in one line."""
     c = changes
     nodes = f"{c['nodes_dropped']} nodes that others hold, " if c["nodes_dropped"] else ""
-    dropped = f"{c['landmarks_gone']} landmarks are gone, {nodes}{c['landmarks_dropped']} more landmarks dropped"
+    dropped = (
+        f"{c['landmarks_gone']} landmarks are gone, {nodes}{c['landmarks_dropped']} more landmarks"
+        " dropped"
+    )
     per_km = f" ({c['bytes'] / 1e6 / walked_km:.0f} MB a km walked)" if walked_km > 0 else ""
     return f"{dropped}, {c['bytes_before'] / 1e6:.2f} to {c['bytes'] / 1e6:.2f} MB{per_km}"

@@ -11,7 +11,14 @@ from typing import Annotated, Literal
 
 import tyro
 
-from topoloc.cli.output import File, UsageError, check_outputs, ended_by_signals, progress_bar, write_json
+from topoloc.cli.output import (
+    File,
+    UsageError,
+    check_outputs,
+    ended_by_signals,
+    progress_bar,
+    write_json,
+)
 from topoloc.errors import CalibrationError, MissingExtraError, TopolocError
 from topoloc.sequences.calibration import CalibrationOfSize, calibration_of
 from topoloc.sequences.capture.carla_capture import CarlaConfig, Weather, carla_client, carla_frames
@@ -29,12 +36,15 @@ class CarlaOptions:
 
     server: Annotated[str, tyro.conf.arg(metavar="HOST:PORT")] = "localhost:2000"
     """The running server."""
-    town: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: as it is)")] = None
+    town: Annotated[
+        str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: as it is)")
+    ] = None
     """The town that is loaded, such as Town10HD."""
     weather: Weather = "clear"
     """The paper's: clear noon, cloudy noon, hard rain at noon."""
     start: int = 0
-    """The spawn point at which the way begins; it follows the lane, and at junctions goes straight on."""
+    """The spawn point at which the way begins; it follows the lane, and at junctions goes straight
+    on."""
     length: float = 300.0
     """Length of the way."""
     spacing: float = 0.5
@@ -53,25 +63,45 @@ class CarlaOptions:
 class Command:
     """What `topoloc record` takes."""
 
-    kind: Annotated[tyro.conf.Positional[Literal["zed", "carla", "webcam"]], tyro.conf.arg(metavar="zed|carla|webcam")]
-    """What is recorded: a ZED that is plugged in, the simulator CARLA, or any camera or stream that OpenCV opens."""
+    kind: Annotated[
+        tyro.conf.Positional[Literal["zed", "carla", "webcam"]],
+        tyro.conf.arg(metavar="zed|carla|webcam"),
+    ]
+    """What is recorded: a ZED that is plugged in, the simulator CARLA, or any camera or stream that
+    OpenCV opens."""
     out: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="OUT")]
     """The recording's folder: a new one, or an empty one."""
     source: Annotated[
-        str | None, tyro.conf.arg(metavar="SOURCE", help_behavior_hint="(default: 0; of a ZED its SDK where that is installed)")
+        str | None,
+        tyro.conf.arg(
+            metavar="SOURCE",
+            help_behavior_hint="(default: 0; of a ZED its SDK where that is installed)",
+        ),
     ] = None
     """Device number or /dev/video0, rtsp:// or http:// URL, GStreamer pipeline, or a video file."""
-    camera: Annotated[str | None, tyro.conf.arg(metavar="FILE|fx,fy,cx,cy", help_behavior_hint="")] = None
-    """Calibration: of a ZED without its SDK the SN*.conf; of a webcam a camera.json, OpenCV's or Kalibr's YAML, or four numbers."""
-    size: Annotated[str | None, tyro.conf.arg(metavar="WxH", help_behavior_hint="(default: the device's; ZED 2560x720, CARLA 800x600)")] = (
-        None
-    )
+    camera: Annotated[
+        str | None, tyro.conf.arg(metavar="FILE|fx,fy,cx,cy", help_behavior_hint="")
+    ] = None
+    """Calibration: of a ZED without its SDK the SN*.conf; of a webcam a camera.json, OpenCV's or
+    Kalibr's YAML, or four numbers."""
+    size: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="WxH", help_behavior_hint="(default: the device's; ZED 2560x720, CARLA 800x600)"
+        ),
+    ] = None
     """Pixels that the device is asked for; of a ZED of both pictures side by side."""
-    fps: Annotated[float | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: all)")] = None
+    fps: Annotated[
+        float | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: all)")
+    ] = None
     """Frames a second at most."""
-    frames: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: until Ctrl-C)")] = None
+    frames: Annotated[
+        int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: until Ctrl-C)")
+    ] = None
     """Ends after so many frames."""
-    jpeg: Annotated[int | None, tyro.conf.arg(metavar="1-100", help_behavior_hint="(default: PNG)")] = None
+    jpeg: Annotated[
+        int | None, tyro.conf.arg(metavar="1-100", help_behavior_hint="(default: PNG)")
+    ] = None
     """Store pictures as JPEG of this quality."""
     carla: tyro.conf.OmitArgPrefixes[CarlaOptions] = field(default_factory=CarlaOptions)
     json: File = None
@@ -99,7 +129,9 @@ class Command:
         write_json(self.json, facts)
         return 0
 
-    def _write(self, writer: FolderWriter, frames: Iterator[StereoFrame], stop: threading.Event) -> StereoFrame | None:
+    def _write(
+        self, writer: FolderWriter, frames: Iterator[StereoFrame], stop: threading.Event
+    ) -> StereoFrame | None:
         """Writes all frames that come, no more of them than are wanted a second; gives the last."""
         last, next_ns = None, None
         with progress_bar() as progress:
@@ -107,17 +139,24 @@ class Command:
                 for frame in frames:
                     if next_ns is None or frame.t_ns >= next_ns:
                         writer.write(frame)
-                        last, next_ns = frame, frame.t_ns + (0 if self.fps is None else round(1e9 / self.fps))
+                        last, next_ns = (
+                            frame,
+                            frame.t_ns + (0 if self.fps is None else round(1e9 / self.fps)),
+                        )
                         progress("frames", writer.num_frames, self.frames or writer.num_frames)
                     if stop.is_set() or writer.num_frames == self.frames:
                         break
             except TopolocError as error:
                 if last is None:
                     raise
-                raise TopolocError(f"{error} ({writer.num_frames} frames before are in {self.out})") from error
+                raise TopolocError(
+                    f"{error} ({writer.num_frames} frames before are in {self.out})"
+                ) from error
         return last
 
-    def _frames(self, stop: threading.Event, stack: ExitStack) -> Generator[StereoFrame, None, None]:
+    def _frames(
+        self, stop: threading.Event, stack: ExitStack
+    ) -> Generator[StereoFrame, None, None]:
         """Raises what opening the camera, or connecting to the server, does."""
         if self.kind == "carla":
             config = self._carla_config()
@@ -126,17 +165,23 @@ class Command:
             try:
                 yield from sdk_frames(stop)
             except MissingExtraError as error:
-                raise MissingExtraError(f"{error}; without it --camera SN12345.conf records it as a USB camera") from None
+                raise MissingExtraError(
+                    f"{error}; without it --camera SN12345.conf records it as a USB camera"
+                ) from None
         else:
             size = self._size() or (_ZED_SIZE if self.kind == "zed" else None)
             source = stack.enter_context(LiveSource(self.source or "0", keep_all=True, size=size))
             source.stop = stop
             if self.kind == "zed":
                 if self.camera is None:
-                    raise CalibrationError("a ZED without Stereolabs' SDK needs its calibration: --camera SN12345.conf")
+                    raise CalibrationError(
+                        "a ZED without Stereolabs' SDK needs its calibration: --camera SN12345.conf"
+                    )
                 yield from side_by_side_frames(source, Path(self.camera))
             else:
-                yield from _single_frames(source, None if self.camera is None else calibration_of(self.camera))
+                yield from _single_frames(
+                    source, None if self.camera is None else calibration_of(self.camera)
+                )
 
     def _check_usage(self) -> None:
         if self.fps is not None and not self.fps > 0.0:
@@ -146,7 +191,10 @@ class Command:
         if self.jpeg is not None and not 1 <= self.jpeg <= 100:
             raise UsageError("--jpeg is a quality from 1 to 100")
         if self.kind == "carla" and (self.source is not None or self.camera is not None):
-            raise UsageError("--source and --camera are not for CARLA, whose cameras are made: --server, --size and --fov say which")
+            raise UsageError(
+                "--source and --camera are not for CARLA, whose cameras are made: --server, --size"
+                " and --fov say which"
+            )
         if self.kind != "carla" and self.carla != CarlaOptions():
             raise UsageError(f"options of CARLA's are not for a {self.kind}")
         self._size()
@@ -155,7 +203,12 @@ class Command:
         if self.size is None:
             return None
         width, _, height = self.size.lower().partition("x")
-        if not (width.isdigit() and height.isdigit() and 0 < int(width[:6]) <= 16384 and 0 < int(height[:6]) <= 16384):
+        if not (
+            width.isdigit()
+            and height.isdigit()
+            and 0 < int(width[:6]) <= 16384
+            and 0 < int(height[:6]) <= 16384
+        ):
             raise UsageError(f"--size {self.size[:40]} is no WIDTHxHEIGHT")
         return int(width), int(height)
 
@@ -182,12 +235,17 @@ class Command:
         )
 
 
-def _single_frames(source: LiveSource, calibration: CalibrationOfSize | None) -> Iterator[StereoFrame]:
+def _single_frames(
+    source: LiveSource, calibration: CalibrationOfSize | None
+) -> Iterator[StereoFrame]:
     camera = None
     for picture in source:
         height, width = picture.image.shape[:2]
         if calibration is not None and camera is None:
             camera = calibration(width, height).camera
         if camera is not None and (camera.width, camera.height) != (width, height):
-            raise CalibrationError(f"the pictures are {width}x{height}, their calibration is of {camera.width}x{camera.height}")
+            raise CalibrationError(
+                f"the pictures are {width}x{height}, their calibration is of"
+                f" {camera.width}x{camera.height}"
+            )
         yield StereoFrame(f"{picture.number:06d}", picture.t_ns, picture.image, camera)

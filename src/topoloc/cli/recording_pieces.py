@@ -1,4 +1,5 @@
-"""Long recordings in pieces that overlap, each mapped by itself: `topoloc build --ray ... --split`."""
+"""Long recordings in pieces that overlap, each mapped by itself: `topoloc build --ray ...
+--split`."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ LEAST_OVERLAP = 3
 
 @dataclass(frozen=True)
 class Split:
-    """Pieces of at most so many frames, and how many of these a piece shares with the next one at least.
+    """Pieces of at most so many frames, and how many of these a piece shares with the next one at
+    least.
 
     Raises:
         UsageError: they cannot be so.
@@ -29,23 +31,30 @@ class Split:
     def __post_init__(self) -> None:
         if not LEAST_OVERLAP <= self.num_shared <= self.num_frames // 2:
             raise UsageError(
-                f"--split takes the frames of a piece and, behind a comma, how many of these the next one shares: {LEAST_OVERLAP} at "
-                f"least and at most half, not {self.num_shared} of {self.num_frames}"
+                "--split takes the frames of a piece and, behind a comma, how many of these the"
+                f" next one shares: {LEAST_OVERLAP} at least and at most half, not"
+                f" {self.num_shared} of {self.num_frames}"
             )
 
     @staticmethod
     def of(text: str | None) -> Split | None:
-        """As the option says it, `500` or `500,50`: a tenth is shared where that is not said. Raises UsageError."""
+        """As the option says it, `500` or `500,50`: a tenth is shared where that is not said.
+        Raises UsageError."""
         if text is None:
             return None
         parts = text.split(",")
-        if len(parts) > 2 or not all(part.isascii() and part.isdigit() and len(part) < 10 for part in parts):
+        if len(parts) > 2 or not all(
+            part.isascii() and part.isdigit() and len(part) < 10 for part in parts
+        ):
             raise UsageError(f"--split takes frames, such as 500 or 500,50, not {text[:40]!r}")
         num_frames = int(parts[0])
-        return Split(num_frames, int(parts[1]) if len(parts) == 2 else max(num_frames // 10, LEAST_OVERLAP))
+        return Split(
+            num_frames, int(parts[1]) if len(parts) == 2 else max(num_frames // 10, LEAST_OVERLAP)
+        )
 
     def ranges(self, total: int) -> list[tuple[int, int]]:
-        """First frame and the one after the last of each piece of so many frames in all; all are of one length."""
+        """First frame and the one after the last of each piece of so many frames in all; all are of
+        one length."""
         if total <= self.num_frames:
             return [(0, total)]
         step = self.num_frames - self.num_shared
@@ -56,15 +65,16 @@ class Split:
 
 @dataclass(frozen=True)
 class Pieces:
-    """The maps to make of one recording, one after the other along it, and the world that they share by its own poses; None where it has
-    none, or there is but one map."""
+    """The maps to make of one recording, one after the other along it, and the world that they
+    share by its own poses; None where it has none, or there is but one map."""
 
     makings: list[MapMaking]
     world: str | None = None
 
 
 def pieces_of(making: MapMaking, tile_id: str, split: Split) -> Pieces:
-    """The pieces of a recording, that of `making`; as it is where it is short, or cannot be opened, of which its own task tells.
+    """The pieces of a recording, that of `making`; as it is where it is short, or cannot be opened,
+    of which its own task tells.
 
     Args:
         tile_id: what the tile of the whole recording would be called.
@@ -74,7 +84,9 @@ def pieces_of(making: MapMaking, tile_id: str, split: Split) -> Pieces:
     """
     (recording,) = making.recordings
     try:
-        sequence = open_sequence(recording, making.format, making.camera, making.images, making.topics)
+        sequence = open_sequence(
+            recording, making.format, making.camera, making.images, making.topics
+        )
     except TopolocError:
         return Pieces([making])
     ranges = split.ranges(len(sequence))
@@ -82,7 +94,9 @@ def pieces_of(making: MapMaking, tile_id: str, split: Split) -> Pieces:
         return Pieces([making])
     asked = making.asked
     if not asked.trajectory and any(sequence.poses):
-        asked = replace(asked, trajectory=("truth",))  # of every piece, also where one happens to have no pose
+        asked = replace(
+            asked, trajectory=("truth",)
+        )  # of every piece, also where one happens to have no pose
     has_poses = asked.trajectory not in ((), ("slam",))
     named = _named(recording, ranges)
     made = [replace(making, recordings=(name,), asked=asked) for name in named]
@@ -93,7 +107,9 @@ def _named(recording: str, ranges: Sequence[tuple[int, int]]) -> list[str]:
     """The recording with these of its frames chosen. Raises UsageError."""
     path, selection = split_selection(recording)
     if selection is not None:
-        raise UsageError(f"--split takes whole recordings, but frames are chosen of {path} ({selection[:40]})")
+        raise UsageError(
+            f"--split takes whole recordings, but frames are chosen of {path} ({selection[:40]})"
+        )
     return [f"{path}@{start}:{stop}" for start, stop in ranges]
 
 

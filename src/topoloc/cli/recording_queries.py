@@ -1,7 +1,8 @@
-"""Recordings as queries of a map or an atlas, asked here or, in pieces, on the machines of a cluster: the answers are the same.
+"""Recordings as queries of a map or an atlas, asked here or, in pieces, on the machines of a
+cluster: the answers are the same.
 
-A piece opens map and recording by their paths where it is asked, holds that they are those that the command opened, and sends back its
-answers, without pictures.
+A piece opens map and recording by their paths where it is asked, holds that they are those that the
+command opened, and sends back its answers, without pictures.
 """
 
 from __future__ import annotations
@@ -21,7 +22,13 @@ from topoloc.cli.output import open_recording
 from topoloc.cluster.config import ClusterConfig
 from topoloc.cluster.tasks import Running, Show, run_on_ray
 from topoloc.errors import MissingExtraError, RecordingError, TopolocError, WeightsError
-from topoloc.evaluation.experiments import Asked, answer_elsewhere, answer_queries, frames_with_truth, image_reader
+from topoloc.evaluation.experiments import (
+    Asked,
+    answer_elsewhere,
+    answer_queries,
+    frames_with_truth,
+    image_reader,
+)
 from topoloc.evaluation.metrics import Answer
 from topoloc.features.kinds import check_available
 from topoloc.geometry.pose_conventions import PoseReading
@@ -38,7 +45,8 @@ MAX_PICTURES = 50
 
 @dataclass(frozen=True)
 class QueryRecording:
-    """A recording, and how it is read: as the options of `topoloc evaluate` say it; `is_elsewhere`: of another place than the map."""
+    """A recording, and how it is read: as the options of `topoloc evaluate` say it; `is_elsewhere`:
+    of another place than the map."""
 
     path: str
     format: str | None
@@ -48,7 +56,8 @@ class QueryRecording:
     is_elsewhere: bool = False
 
     def open(self) -> StereoSequence:
-        """What is to be known of it is said on standard error. Raises as `open_sequence`; UsageError of the poses."""
+        """What is to be known of it is said on standard error. Raises as `open_sequence`;
+        UsageError of the poses."""
         reading = PoseReading.of(self.poses)
         sequence = open_recording(self.path, self.format, self.camera, self.topics)
         return sequence if self.is_elsewhere else as_read(sequence, reading)
@@ -56,7 +65,8 @@ class QueryRecording:
 
 @dataclass(frozen=True, eq=False)
 class Queries:
-    """A recording that is open, by the name that its answers call it; `map_from_truth` as of `answer_queries`."""
+    """A recording that is open, by the name that its answers call it; `map_from_truth` as of
+    `answer_queries`."""
 
     recording: QueryRecording
     sequence: StereoSequence
@@ -70,14 +80,23 @@ class Queries:
 
     @property
     def frames(self) -> list[int]:
-        """Which of its frames are asked. Raises TrajectoryError where none has a pose to judge against."""
-        return list(range(len(self.sequence))) if self.recording.is_elsewhere else frames_with_truth(self.sequence)
+        """Which of its frames are asked. Raises TrajectoryError where none has a pose to judge
+        against."""
+        return (
+            list(range(len(self.sequence)))
+            if self.recording.is_elsewhere
+            else frames_with_truth(self.sequence)
+        )
 
-    def answers(self, asked: Asked, progress: Progress, frames: Sequence[int] | None = None) -> list[Answer]:
+    def answers(
+        self, asked: Asked, progress: Progress, frames: Sequence[int] | None = None
+    ) -> list[Answer]:
         """As of `answer_queries` and `answer_elsewhere`; of these frames, or of all."""
         if self.recording.is_elsewhere:
             return answer_elsewhere(asked, self.sequence, progress, self.label, frames)
-        return answer_queries(asked, self.sequence, self.map_from_truth, progress, self.label, frames)
+        return answer_queries(
+            asked, self.sequence, self.map_from_truth, progress, self.label, frames
+        )
 
 
 @dataclass(frozen=True)
@@ -92,8 +111,9 @@ class SentAtlas:
 
 @dataclass(frozen=True, eq=False)
 class SentMap:
-    """What is asked, and how. A map is pickled as its path, and is refused where another one lies there by then; `kinds` are the features
-    of map or tiles that can be had where the command runs."""
+    """What is asked, and how. A map is pickled as its path, and is refused where another one lies
+    there by then; `kinds` are the features of map or tiles that can be had where the command
+    runs."""
 
     source: TopoMetricMap | SentAtlas
     kinds: frozenset[str]
@@ -106,7 +126,9 @@ class SentMap:
         if isinstance(asked, Localizer):
             return SentMap(asked.topomap, _available(asked.topomap.kinds), config, features)
         atlas, settings = asked.localizer.atlas, asked.localizer.config
-        sent = SentAtlas(whole_address(atlas.store.where), atlas.manifest.to_bytes(), asked.tile_id, settings)
+        sent = SentAtlas(
+            whole_address(atlas.store.where), atlas.manifest.to_bytes(), asked.tile_id, settings
+        )
         return SentMap(sent, _available(_kinds_of(atlas)), config, features)
 
     def opened(self, notes: list[str]) -> Asked:
@@ -114,7 +136,8 @@ class SentMap:
 
         Raises:
             MapError: there is no such map, or another one.
-            MissingExtraError: features can be had here and not there, or the other way round: answers would be others.
+            MissingExtraError: features can be had here and not there, or the other way round:
+                answers would be others.
         """
         if isinstance(self.source, TopoMetricMap):
             self._check_same(self.source.kinds)
@@ -122,18 +145,25 @@ class SentMap:
         sent = self.source
         atlas = Atlas(store_at(sent.where), Manifest.from_bytes(sent.manifest, sent.where))
         self._check_same(_kinds_of(atlas))
-        return JudgedTile.of(atlas_localizer(atlas, self.config, self.features, sent.settings, notes.append), sent.tile_id)
+        return JudgedTile.of(
+            atlas_localizer(atlas, self.config, self.features, sent.settings, notes.append),
+            sent.tile_id,
+        )
 
     def _check_same(self, kinds: Iterable[str]) -> None:
         other = sorted(_available(kinds) ^ self.kinds)
         if other:
             lacks = "lacks" if other[0] in self.kinds else "has"
-            raise MissingExtraError(f"{platform.node()} {lacks} what features {other[0]} need, unlike the machine that asks it")
+            raise MissingExtraError(
+                f"{platform.node()} {lacks} what features {other[0]} need, unlike the machine that"
+                " asks it"
+            )
 
 
 @dataclass(frozen=True, eq=False)
 class PieceAnswers:
-    """The answers of a piece, without their pictures; what was wrong with tiles; why there are none, where it failed."""
+    """The answers of a piece, without their pictures; what was wrong with tiles; why there are
+    none, where it failed."""
 
     answers: list[Answer]
     notes: list[str]
@@ -156,12 +186,16 @@ class Piece:
         return f"evaluate {self.label} {self.frames[0]}-{self.frames[-1]}"
 
     def run(self, progress: Progress) -> PieceAnswers:
-        """Raises RecordingError where the recording is not the one that the command opened, and as of `Queries.answers`."""
+        """Raises RecordingError where the recording is not the one that the command opened, and as
+        of `Queries.answers`."""
         notes = list[str]()
         queries = Queries(self.recording, self.recording.open(), self.label, self.map_from_truth)
         names = queries.sequence.names
         if self.pictures != [names[frame] for frame in self.frames if frame < len(names)]:
-            raise RecordingError(f"{self.recording.path} is another recording on {platform.node()} than where the command was called")
+            raise RecordingError(
+                f"{self.recording.path} is another recording on {platform.node()} than where the"
+                " command was called"
+            )
         answers = queries.answers(self.asked.opened(notes), progress, self.frames)
         return PieceAnswers([replace(answer, read_image=None) for answer in answers], notes)
 
@@ -169,8 +203,15 @@ class Piece:
         return PieceAnswers([], [], reason)
 
 
-def answers_on_ray(asked: SentMap, recordings: Sequence[Queries], address: str, config: ClusterConfig, progress: Progress) -> list[Answer]:
-    """What these recordings are answered, in their order and that of their frames, by the tasks of a cluster.
+def answers_on_ray(
+    asked: SentMap,
+    recordings: Sequence[Queries],
+    address: str,
+    config: ClusterConfig,
+    progress: Progress,
+) -> list[Answer]:
+    """What these recordings are answered, in their order and that of their frames, by the tasks of
+    a cluster.
 
     Raises:
         MissingExtraError, ClusterError: as of `connected`.
@@ -179,7 +220,9 @@ def answers_on_ray(asked: SentMap, recordings: Sequence[Queries], address: str, 
     """
     pieces = [(queries, piece) for queries in recordings for piece in _pieces(asked, queries)]
     show = _shown([(queries.stage, len(piece.frames)) for queries, piece in pieces], progress)
-    outcomes = run_on_ray([piece for _, piece in pieces], address, config, show, is_live=sys.stderr.isatty())
+    outcomes = run_on_ray(
+        [piece for _, piece in pieces], address, config, show, is_live=sys.stderr.isatty()
+    )
     for note in dict.fromkeys(note for outcome in outcomes for note in outcome.notes):
         print(f"warning: {note}", file=sys.stderr)
     answers = list[Answer]()
@@ -197,11 +240,19 @@ def _pieces(asked: SentMap, queries: Queries) -> Iterator[Piece]:
     count = -(-len(frames) // MAX_PICTURES)
     for number in range(count):
         some = frames[number * len(frames) // count : (number + 1) * len(frames) // count]
-        yield Piece(asked, queries.recording, queries.label, queries.map_from_truth, some, [names[frame] for frame in some])
+        yield Piece(
+            asked,
+            queries.recording,
+            queries.label,
+            queries.map_from_truth,
+            some,
+            [names[frame] for frame in some],
+        )
 
 
 def _shown(pieces: Sequence[tuple[str, int]], progress: Progress) -> Show[PieceAnswers]:
-    """Tells how many pictures of each recording are answered; of each piece its recording's stage and its pictures are given."""
+    """Tells how many pictures of each recording are answered; of each piece its recording's stage
+    and its pictures are given."""
     done = [0] * len(pieces)
 
     def show(number: int, state: PieceAnswers | Running) -> None:

@@ -27,11 +27,14 @@ class Command:
     """What `topoloc serve` takes."""
 
     maps: Annotated[
-        tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="MAP|FOLDER|ATLAS ...", help_behavior_hint="(required)")
+        tyro.conf.Positional[tuple[str, ...]],
+        tyro.conf.arg(metavar="MAP|FOLDER|ATLAS ...", help_behavior_hint="(required)"),
     ] = ()
-    """Map files, folders, and atlases (s3://bucket/campus, too). A map goes by the name of its file without .topo, a tile by its id."""
+    """Map files, folders, and atlases (s3://bucket/campus, too). A map goes by the name of its file
+    without .topo, a tile by its id."""
     host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
-    """Where to listen. Elsewhere than on this machine only with a token, and with TLS or a proxy that speaks it."""
+    """Where to listen. Elsewhere than on this machine only with a token, and with TLS or a proxy
+    that speaks it."""
     port: Annotated[int, tyro.conf.arg(metavar="N")] = 8571
     """Port; 0 takes a free one, which is printed."""
     token_file: File = None
@@ -43,16 +46,29 @@ class Command:
     behind_proxy: Flag = False
     """A proxy in front of the service speaks TLS with the clients."""
     features: ASKED_FEATURES = None
-    """Which of the maps' features are asked; of several, the next where the one before leaves the pose unclear."""
-    memory_mb: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: 512)")] = None
+    """Which of the maps' features are asked; of several, the next where the one before leaves the
+    pose unclear."""
+    memory_mb: Annotated[
+        int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: 512)")
+    ] = None
     """Megabytes of maps that are kept in memory; the maps used longest ago are closed first."""
-    workers: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: one a processor)")] = None
+    workers: Annotated[
+        int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: one a processor)")
+    ] = None
     """Pictures that are localized at a time."""
-    max_queue: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: 32)")] = None
+    max_queue: Annotated[
+        int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: 32)")
+    ] = None
     """Requests that may wait for a worker; one more is told to come again later."""
-    ray: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT|auto|local", help_behavior_hint="(default: none)")] = None
-    """A Ray cluster whose machines answer, by Ray Serve: `auto` is the one that runs on this machine, `local` one of this machine alone."""
-    replicas: Annotated[str | None, tyro.conf.arg(metavar="N|LEAST-MOST", help_behavior_hint="(default: 1)")] = None
+    ray: Annotated[
+        str | None,
+        tyro.conf.arg(metavar="HOST:PORT|auto|local", help_behavior_hint="(default: none)"),
+    ] = None
+    """A Ray cluster whose machines answer, by Ray Serve: `auto` is the one that runs on this
+    machine, `local` one of this machine alone."""
+    replicas: Annotated[
+        str | None, tyro.conf.arg(metavar="N|LEAST-MOST", help_behavior_hint="(default: 1)")
+    ] = None
     """With --ray, processes that answer; of LEAST-MOST as many as are needed."""
     config: File = None
     """All other settings: a TOML file, as `topoloc config serve` prints it."""
@@ -71,7 +87,9 @@ class Command:
         try:
             from topoloc.service.server import Address, serve
         except ModuleNotFoundError as error:
-            raise MissingExtraError(f"a service needs {error.name}: pip install 'topoloc[serve]'") from error
+            raise MissingExtraError(
+                f"a service needs {error.name}: pip install 'topoloc[serve]'"
+            ) from error
         if self.ray is not None:
             return self._run_on_ray(settings, config)
         cert, key = (None if path is None else Path(path) for path in (self.tls_cert, self.tls_key))
@@ -88,7 +106,14 @@ class Command:
         replicas = self._replicas(settings.of(ReplicasConfig))
         config = replace(config, workers=config.workers or replicas.cpus_per_replica)
         served = self._served(settings, config)
-        front = Front(self.host, self.port, config.num_workers, config.max_queue, _whole(self.tls_cert), _whole(self.tls_key))
+        front = Front(
+            self.host,
+            self.port,
+            config.num_workers,
+            config.max_queue,
+            _whole(self.tls_cert),
+            _whole(self.tls_key),
+        )
         serve_on_ray(served, self.ray, front, replicas, _wait_for_signal)
         return 0
 
@@ -122,9 +147,14 @@ class Command:
             raise UsageError("--tls-cert and --tls-key go together")
         is_private = self.host in _LOOPBACK and not self.behind_proxy
         if not is_private and self.token_file is None:
-            raise UsageError(f"--host {self.host} is reached from elsewhere: --token-file FILE is needed")
+            raise UsageError(
+                f"--host {self.host} is reached from elsewhere: --token-file FILE is needed"
+            )
         if self.host not in _LOOPBACK and self.tls_cert is None and not self.behind_proxy:
-            raise UsageError(f"--host {self.host} is reached from elsewhere: --tls-cert and --tls-key, or --behind-proxy, are needed")
+            raise UsageError(
+                f"--host {self.host} is reached from elsewhere: --tls-cert and --tls-key, or"
+                " --behind-proxy, are needed"
+            )
 
 
 def _wait_for_signal() -> None:

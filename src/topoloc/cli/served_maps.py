@@ -23,7 +23,8 @@ LEAST_TOKEN = 16
 
 @dataclass(frozen=True)
 class ServedMaps:
-    """Maps, and how they are asked. The token is named by its file, so that it is nowhere but there."""
+    """Maps, and how they are asked. The token is named by its file, so that it is nowhere but
+    there."""
 
     paths: tuple[str, ...]
     features: str | None
@@ -42,7 +43,8 @@ class ServedMaps:
         return make_application(self._opened(), self.service, access, self.tracker, self.atlas)
 
     def _opened(self) -> Maps:
-        """The maps, with half of the memory for nodes, and half for the rest of those that are open."""
+        """The maps, with half of the memory for nodes, and half for the rest of those that are
+        open."""
         if not is_warm():
             print("compiling, once, a minute ...", file=sys.stderr, flush=True)
             warm_up()
@@ -51,7 +53,12 @@ class ServedMaps:
         budget = self.service.memory_mb * 500_000
         set_node_memory(budget)
         fetches = TileFetches(self.service.fetch_s)
-        return Maps(self.paths, lambda topomap: localizer_of(topomap, self.localizer, self.features), budget, fetches.path)
+        return Maps(
+            self.paths,
+            lambda topomap: localizer_of(topomap, self.localizer, self.features),
+            budget,
+            fetches.path,
+        )
 
 
 def read_token(path: str | None) -> str | None:
@@ -61,7 +68,11 @@ def read_token(path: str | None) -> str | None:
     try:
         token = Path(path).read_text(encoding="utf-8").strip()
     except (OSError, ValueError) as error:
-        raise TopolocError(f"cannot read the token in {path}: {getattr(error, 'strerror', None) or 'no text'}") from None
+        raise TopolocError(
+            f"cannot read the token in {path}: {getattr(error, 'strerror', None) or 'no text'}"
+        ) from None
     if len(token) < LEAST_TOKEN or not token.isascii() or not token.isprintable() or " " in token:
-        raise TopolocError(f"{path}: a token has at least {LEAST_TOKEN} letters, digits or signs, and no spaces")
+        raise TopolocError(
+            f"{path}: a token has at least {LEAST_TOKEN} letters, digits or signs, and no spaces"
+        )
     return token

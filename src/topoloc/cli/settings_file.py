@@ -1,4 +1,5 @@
-"""Settings as TOML: what `topoloc config` prints and `--config FILE` reads, both from the configurations as they are declared."""
+"""Settings as TOML: what `topoloc config` prints and `--config FILE` reads, both from the
+configurations as they are declared."""
 
 from __future__ import annotations
 
@@ -14,19 +15,36 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
-from topoloc.bounds import annotations_of, bare, bounds_of, complaint, did_you_mean, quoted, settings_from
+from topoloc.bounds import (
+    annotations_of,
+    bare,
+    bounds_of,
+    complaint,
+    did_you_mean,
+    quoted,
+    settings_from,
+)
 from topoloc.cli import BROUGHT, all_commands, brought
 from topoloc.cli.output import UsageError
 from topoloc.errors import ConfigError
 
 T = TypeVar("T")
 
-# table of the file: module and class of its configuration, and the commands that it is for; more come with other distributions
+# table of the file: module and class of its configuration, and the commands that it is for; more
+# come with other distributions
 _ASKING = ("localize", "evaluate", "explain", "serve", "follow")
 TABLES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "build": ("topoloc.map.build", "BuildConfig", ("build",)),
-    "localize": ("topoloc.localization.localizer", "LocalizerConfig", (*_ASKING, "update", "merge")),
-    "atlas": ("topoloc.atlas.config", "AtlasConfig", ("localize", "evaluate", "explain", "serve", "follow", "update")),
+    "localize": (
+        "topoloc.localization.localizer",
+        "LocalizerConfig",
+        (*_ASKING, "update", "merge"),
+    ),
+    "atlas": (
+        "topoloc.atlas.config",
+        "AtlasConfig",
+        ("localize", "evaluate", "explain", "serve", "follow", "update"),
+    ),
     "track": ("topoloc.tracking.tracker", "TrackerConfig", ("localize", "serve", "follow")),
     "slam": ("topoloc.slam.slam", "SlamConfig", ("slam", "build", "update")),
     "update": ("topoloc.lifelong.update", "UpdateConfig", ("update", "merge")),
@@ -35,7 +53,11 @@ TABLES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "join": ("topoloc.lifelong.tile_joins", "TileJoinConfig", ("atlas", "build", "merge")),
     "prune": ("topoloc.lifelong.prune", "PruneConfig", ("prune",)),
     "serve": ("topoloc.service.config", "ServiceConfig", ("serve",)),
-    "cluster": ("topoloc.cluster.config", "ClusterConfig", ("build", "atlas", "update", "evaluate")),
+    "cluster": (
+        "topoloc.cluster.config",
+        "ClusterConfig",
+        ("build", "atlas", "update", "evaluate"),
+    ),
     "replicas": ("topoloc.cluster.config", "ReplicasConfig", ("serve",)),
 }
 _WIDTH = 110
@@ -54,10 +76,12 @@ class Settings:
 
 
 def read_settings(path: str | None) -> Settings:
-    """What the TOML file of `--config` says; None says nothing. Tables of other commands are read, too, and left aside.
+    """What the TOML file of `--config` says; None says nothing. Tables of other commands are read,
+    too, and left aside.
 
     Raises:
-        ConfigError: no such file, not TOML, or a key that is unknown, of the wrong type or out of its bounds; file and key are named.
+        ConfigError: no such file, not TOML, or a key that is unknown, of the wrong type or out of
+            its bounds; file and key are named.
     """
     if path is None:
         return Settings({})
@@ -67,7 +91,10 @@ def read_settings(path: str | None) -> Settings:
             if name not in all_tables():
                 is_missing = name in BROUGHT and name not in all_commands()
                 unknown = f"no such table{did_you_mean(name, all_tables())}"
-                raise ConfigError(f"{quoted(name)}: {f'comes with {BROUGHT[name]}, which is not installed' if is_missing else unknown}")
+                raise ConfigError(
+                    f"{quoted(name)}:"
+                    f" {f'comes with {BROUGHT[name]}, which is not installed' if is_missing else unknown}"  # noqa: E501
+                )
             kind = config_class(name)
             configs.append(settings_from(kind, table, name, default=kind()))
     except ConfigError as error:
@@ -87,7 +114,8 @@ def config_class(table: str) -> type:
 
 
 def with_option(config: T, key: str, value: Any, option: str) -> T:
-    """The configuration with an option of the command line at `key` ("nodes.d_thresh"), unless that is None: was not given.
+    """The configuration with an option of the command line at `key` ("nodes.d_thresh"), unless that
+    is None: was not given.
 
     Raises:
         UsageError: out of bounds; names the option.
@@ -125,7 +153,9 @@ def _table_lines(config: Any, key: str, note: str = "") -> Iterator[str]:
 
 
 def _comment(text: str) -> list[str]:
-    return textwrap.wrap(text, _WIDTH, initial_indent="# ", subsequent_indent="# ", break_on_hyphens=False)
+    return textwrap.wrap(
+        text, _WIDTH, initial_indent="# ", subsequent_indent="# ", break_on_hyphens=False
+    )
 
 
 def _about(kind: type) -> str:
@@ -157,7 +187,11 @@ def meanings_of(kind: type) -> dict[str, str]:
     assert isinstance(body, ast.ClassDef)
     meanings = {name: text for base in kind.__bases__ for name, text in meanings_of(base).items()}
     for item, after in zip(body.body, body.body[1:], strict=False):
-        if isinstance(item, ast.AnnAssign) and isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
+        if (
+            isinstance(item, ast.AnnAssign)
+            and isinstance(after, ast.Expr)
+            and isinstance(after.value, ast.Constant)
+        ):
             meanings[ast.unparse(item.target)] = " ".join(str(after.value.value).split())
     return meanings
 
@@ -172,5 +206,9 @@ def _parsed(path: str) -> dict[str, Any]:
         raise ConfigError(f"larger than {_LARGEST_FILE} bytes, no file of settings")
     try:
         return tomllib.loads(content.decode())
-    except (ValueError, RecursionError) as error:  # tomllib's own error is a ValueError, as are those of bad UTF-8 and of numbers too long
+    except (
+        ValueError,
+        RecursionError,
+        # tomllib's own error is a ValueError, as are those of bad UTF-8 and of numbers too long
+    ) as error:
         raise ConfigError(f"not TOML ({error})") from None

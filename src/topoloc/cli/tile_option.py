@@ -20,7 +20,8 @@ T = TypeVar("T")
 
 
 def edited_at(where: str, tile_id: str | None, edit: Callable[[Path], T]) -> T:
-    """What the edit of a map file says, or of the map of an atlas's tile, which is replaced by the edited one.
+    """What the edit of a map file says, or of the map of an atlas's tile, which is replaced by the
+    edited one.
 
     Raises:
         UsageError: an atlas without a tile, or a tile of what is no atlas.
@@ -30,7 +31,10 @@ def edited_at(where: str, tile_id: str | None, edit: Callable[[Path], T]) -> T:
     if not is_atlas(where):
         return edit(Path(where))
     if tile_id is None:
-        raise UsageError(f"{where} is an atlas: --tile says which of its maps is meant ({_listed(list(Atlas.open(where).manifest.by_id))})")
+        raise UsageError(
+            f"{where} is an atlas: --tile says which of its maps is meant"
+            f" ({_listed(list(Atlas.open(where).manifest.by_id))})"
+        )
     from topoloc.lifelong.tile_update import edited_tile
 
     return edited_tile(where, tile_id, edit)[1]
@@ -47,7 +51,8 @@ def _listed(ids: Sequence[str]) -> str:
 
 
 def chosen_world(atlas: Atlas, tile_id: str | None) -> SharedWorld:
-    """The tile alone; without one the tiles that share a world, those with most nodes, and a line where there are others.
+    """The tile alone; without one the tiles that share a world, those with most nodes, and a line
+    where there are others.
 
     Raises:
         AtlasError: there is no such tile, or none at all.
@@ -56,10 +61,16 @@ def chosen_world(atlas: Atlas, tile_id: str | None) -> SharedWorld:
         return world_of_tile(atlas.manifest, atlas.tile(tile_id))
     worlds = shared_worlds(atlas.manifest)
     if not worlds:
-        raise AtlasError(f"the atlas {atlas.store.where} has no tiles; `topoloc atlas add` adds them")
+        raise AtlasError(
+            f"the atlas {atlas.store.where} has no tiles; `topoloc atlas add` adds them"
+        )
     others = [placed.tile.tile_id for world in worlds[1:] for placed in world.tiles]
     if others:
-        what = "1 tile of another world is" if len(others) == 1 else f"{len(others)} tiles of other worlds are"
+        what = (
+            "1 tile of another world is"
+            if len(others) == 1
+            else f"{len(others)} tiles of other worlds are"
+        )
         say_warning(f"{what} left out ({_listed(others)}); --tile names one")
     return worlds[0]
 
@@ -73,11 +84,15 @@ def say_warning(text: str) -> None:
     print(f"warning: {text}", file=sys.stderr)
 
 
-def of_each_tile(atlas: Atlas, tile_ids: Sequence[str], work: Callable[[str], dict[str, Any]]) -> tuple[list[dict[str, Any]], bool]:
-    """What `work` says of each tile, beside its id, and whether all went well: one that fails is told of and leaves the others.
+def of_each_tile(
+    atlas: Atlas, tile_ids: Sequence[str], work: Callable[[str], dict[str, Any]]
+) -> tuple[list[dict[str, Any]], bool]:
+    """What `work` says of each tile, beside its id, and whether all went well: one that fails is
+    told of and leaves the others.
 
     Raises:
-        StoreError: the store does not answer; the other tiles would be waited for as long, one after the other.
+        StoreError: the store does not answer; the other tiles would be waited for as long, one
+            after the other.
     """
     done = list[dict[str, Any]]()
     for tile_id in tile_ids:
@@ -87,5 +102,8 @@ def of_each_tile(atlas: Atlas, tile_ids: Sequence[str], work: Callable[[str], di
             raise
         except MapError as error:
             said = str(error)
-            print(f"error: {said if f'tile {tile_id}' in said else f'tile {tile_id}: {said}'}", file=sys.stderr)
+            print(
+                f"error: {said if f'tile {tile_id}' in said else f'tile {tile_id}: {said}'}",
+                file=sys.stderr,
+            )
     return done, len(done) == len(tile_ids)

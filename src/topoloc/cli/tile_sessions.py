@@ -1,6 +1,8 @@
-"""Recordings that join the tiles of an atlas which they are of: here, or on a cluster. `topoloc update ATLAS SEQ [SEQ ...]`.
+"""Recordings that join the tiles of an atlas which they are of: here, or on a cluster. `topoloc
+update ATLAS SEQ [SEQ ...]`.
 
-First the atlas, as it is, is asked which tile each one is of; then those of one tile join it one after the other, others beside them.
+First the atlas, as it is, is asked which tile each one is of; then those of one tile join it one
+after the other, others beside them.
 """
 
 from __future__ import annotations
@@ -72,7 +74,9 @@ class TileSession:
             session = self.joining.opened()
             try:
                 with interruptible():
-                    tile, update = edited_tile(self.atlas, self.tile_id, lambda path: session.join(path, progress))
+                    tile, update = edited_tile(
+                        self.atlas, self.tile_id, lambda path: session.join(path, progress)
+                    )
             except SessionKnownError:
                 return "there", Atlas.open(self.atlas).tile(self.tile_id)
             changes.update(update.changes)
@@ -87,8 +91,8 @@ class TileSession:
 
 @dataclass(frozen=True)
 class AtlasUpdate:
-    """Recordings that join the atlas, each the tile that it is of, or all of them the tile `tile_id`; on the cluster `ray`, if that is
-    given."""
+    """Recordings that join the atlas, each the tile that it is of, or all of them the tile
+    `tile_id`; on the cluster `ray`, if that is given."""
 
     joinings: Sequence[SessionJoining]
     atlas: str
@@ -108,13 +112,27 @@ class AtlasUpdate:
         atlas, where = Atlas.open(self.atlas), whole_address(self.atlas)
         tile = None if self.tile_id is None else atlas.tile(self.tile_id)
         names = [joining.recording for joining in self.joinings]
-        with nullcontext() if self.ray is None else connected(self.ray), recordings_table(names) as (show, is_live):
-            chosen = [Outcome(name, tile.tile_id, "recognised") for name in names] if tile else self._chosen(where, show, is_live)
+        with (
+            nullcontext() if self.ray is None else connected(self.ray),
+            recordings_table(names) as (show, is_live),
+        ):
+            chosen = (
+                [Outcome(name, tile.tile_id, "recognised") for name in names]
+                if tile
+                else self._chosen(where, show, is_live)
+            )
             known = [number for number, one in enumerate(chosen) if one.state == "recognised"]
-            jobs = [TileSession(self.joinings[number], where, chosen[number].tile_id) for number in known]
-            joined = self._run(jobs, lambda k, state: show(known[k], state), is_live, [job.tile_id for job in jobs])
+            jobs = [
+                TileSession(self.joinings[number], where, chosen[number].tile_id)
+                for number in known
+            ]
+            joined = self._run(
+                jobs, lambda k, state: show(known[k], state), is_live, [job.tile_id for job in jobs]
+            )
         for number, outcome in zip(known, joined, strict=True):
-            chosen[number] = replace(outcome, notes=tuple(dict.fromkeys(chosen[number].notes + outcome.notes)))
+            chosen[number] = replace(
+                outcome, notes=tuple(dict.fromkeys(chosen[number].notes + outcome.notes))
+            )
         tell_notes(chosen, is_live)
         return chosen
 
@@ -125,9 +143,19 @@ class AtlasUpdate:
             if is_live or (isinstance(state, Outcome) and state.reason is not None):
                 show(number, state)
 
-        return self._run([TileChoice(one, where, self.asked, self.choice) for one in self.joinings], show_until_known, is_live)
+        return self._run(
+            [TileChoice(one, where, self.asked, self.choice) for one in self.joinings],
+            show_until_known,
+            is_live,
+        )
 
-    def _run(self, jobs: Sequence[Job[Outcome]], show: Show[Outcome], is_live: bool, lines: Sequence[str] | None = None) -> list[Outcome]:
+    def _run(
+        self,
+        jobs: Sequence[Job[Outcome]],
+        show: Show[Outcome],
+        is_live: bool,
+        lines: Sequence[str] | None = None,
+    ) -> list[Outcome]:
         if self.ray is None or not jobs:
             return run_here(jobs, show, is_live)
         return run_on_ray(jobs, self.ray, self.cluster, show, is_live, lines)

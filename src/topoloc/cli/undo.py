@@ -18,7 +18,8 @@ class Command:
     """What `topoloc undo` takes."""
 
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
-    """The map file; it becomes what it was before its last edit, to the byte. Or an atlas, with --tile."""
+    """The map file; it becomes what it was before its last edit, to the byte. Or an atlas, with
+    --tile."""
     tile: TileOption = None
     """Of an atlas: the tile whose last edit is taken back."""
     json: File = None
@@ -28,6 +29,9 @@ class Command:
         undone = edited_at(self.map, self.tile, lambda path: undo_edit(path, say_waiting))
         tile = {} if self.tile is None else {"tile": self.tile}
         if self.json != "-":
-            print(f"{self.map}{', tile ' * bool(tile)}{self.tile or ''}: {undone.name!r} of {undone.date} is taken back")
+            print(
+                f"{self.map}{', tile ' * bool(tile)}{self.tile or ''}: {undone.name!r} of"
+                f" {undone.date} is taken back"
+            )
         write_json(self.json, {"map": self.map, **tile, "undone": asdict(undone)})
         return 0

@@ -14,7 +14,13 @@ import tyro
 
 from topoloc.atlas.atlas import Atlas, is_atlas
 from topoloc.cli.output import File, UsageError, check_outputs, write_json
-from topoloc.cli.tile_option import TileOption, check_tile_option, chosen_world, name_of_atlas, say_warning
+from topoloc.cli.tile_option import (
+    TileOption,
+    check_tile_option,
+    chosen_world,
+    name_of_atlas,
+    say_warning,
+)
 from topoloc.map.contents import map_id_of
 from topoloc.map.topomap import TopoMetricMap
 from topoloc.viewer.document import ResultSet, SceneBudget, document_of
@@ -31,20 +37,30 @@ class Command:
     """What `topoloc view` takes."""
 
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
-    """The map file; or an atlas, of which the tiles are shown that share a world, those with most nodes."""
-    results: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="RESULTS ...", help_behavior_hint="")] = ()
-    """What to show in it: result files of `topoloc localize` and `topoloc evaluate` (JSON), trajectories (TUM, KITTI)."""
+    """The map file; or an atlas, of which the tiles are shown that share a world, those with most
+    nodes."""
+    results: Annotated[
+        tyro.conf.Positional[tuple[str, ...]],
+        tyro.conf.arg(metavar="RESULTS ...", help_behavior_hint=""),
+    ] = ()
+    """What to show in it: result files of `topoloc localize` and `topoloc evaluate` (JSON),
+    trajectories (TUM, KITTI)."""
     out: File = None
     """Write the page to this file (HTML, self-contained) instead of opening it in the browser."""
     screenshot: File = None
-    """Write a picture of the page to this file (PNG) instead, by a Chromium or Chrome that is installed."""
+    """Write a picture of the page to this file (PNG) instead, by a Chromium or Chrome that is
+    installed."""
     tile: TileOption = None
     """Of an atlas: only this tile, in its own world."""
-    points: Annotated[int, tyro.conf.arg(metavar="N", help_behavior_hint=f"(default: {_POINTS})")] = _POINTS
-    """At most so many of the map's points are shown; with the default a page has some 10 MB at most."""
+    points: Annotated[
+        int, tyro.conf.arg(metavar="N", help_behavior_hint=f"(default: {_POINTS})")
+    ] = _POINTS
+    """At most so many of the map's points are shown; with the default a page has some 10 MB at
+    most."""
 
     json: File = None
-    """Write the scene itself to this file instead, as the service gives it (JSON; - for standard output)."""
+    """Write the scene itself to this file instead, as the service gives it (JSON; - for standard
+    output)."""
 
     def run(self) -> int:
         check_outputs([self.out, self.screenshot, self.json], inputs=[self.map, *self.results])
@@ -58,7 +74,9 @@ class Command:
         if is_atlas(self.map):
             atlas = Atlas.open(self.map)
             world = chosen_world(atlas, self.tile)
-            document = document_of_world(atlas, world, self.tile or name_of_atlas(self.map), results, budget, say_warning)
+            document = document_of_world(
+                atlas, world, self.tile or name_of_atlas(self.map), results, budget, say_warning
+            )
             _warn_of_other_worlds(results, document["results"])
         else:
             with TopoMetricMap.load(self.map) as topomap:
@@ -82,18 +100,25 @@ class Command:
 
 
 def _opened(document: Mapping[str, Any]) -> str:
-    """The page, which the browser reads after we have ended: it stays in the system's folder for such files."""
+    """The page, which the browser reads after we have ended: it stays in the system's folder for
+    such files."""
     page = Path(tempfile.mkdtemp(prefix="topoloc-")) / "scene.html"
     write_scene_page(page, document)
     if not webbrowser.open(page.as_uri()):
-        print("warning: no browser opens here; --out FILE.html writes the page to a place of yours", file=sys.stderr)
+        print(
+            "warning: no browser opens here; --out FILE.html writes the page to a place of yours",
+            file=sys.stderr,
+        )
     return str(page)
 
 
 def _said(facts: dict[str, Any], results: Sequence[ResultSet]) -> str:
     answers = sum(len(one.answers) for one in results)
     tiles = f"{len(facts['tiles'])} tiles, " if "tiles" in facts else ""
-    shown = f"{tiles}{facts['num_nodes']} nodes, {facts['num_points_shown']} of {facts['num_points']} points"
+    shown = (
+        f"{tiles}{facts['num_nodes']} nodes, {facts['num_points_shown']} of {facts['num_points']}"
+        " points"
+    )
     return shown + (f", {answers} answers" if answers else "")
 
 
@@ -106,7 +131,14 @@ def _warn_of_other_worlds(results: Sequence[ResultSet], shown: Sequence[Mapping[
 
 
 def _warn_of_other_maps(results: Sequence[ResultSet], map_id: str) -> None:
-    """One line where answers are of another map: they are shown all the same, for two maps may share their world."""
-    others = {str(answer["map"]) for one in results for answer in one.answers if answer.get("map")} - {map_id}
+    """One line where answers are of another map: they are shown all the same, for two maps may
+    share their world."""
+    others = {
+        str(answer["map"]) for one in results for answer in one.answers if answer.get("map")
+    } - {map_id}
     if others:
-        print(f"warning: some answers are of another map ({', '.join(sorted(others)[:3])}; this is {map_id})", file=sys.stderr)
+        print(
+            f"warning: some answers are of another map ({', '.join(sorted(others)[:3])}; this is"
+            f" {map_id})",
+            file=sys.stderr,
+        )

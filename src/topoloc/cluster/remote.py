@@ -1,6 +1,8 @@
-"""What runs on the cluster's machines: a task a job, and a board on which the tasks write how far they are.
+"""What runs on the cluster's machines: a task a job, and a board on which the tasks write how far
+they are.
 
-This module loads nothing heavy by itself, so that the threads of the numeric libraries are said before any of them is loaded.
+This module loads nothing heavy by itself, so that the threads of the numeric libraries are said
+before any of them is loaded.
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 @dataclass(frozen=True)
 class Work:
-    """A job. `folder` is the driver's, where relative paths begin; `epoch` its SOURCE_DATE_EPOCH."""
+    """A job. `folder` is the driver's, where relative paths begin; `epoch` its
+    SOURCE_DATE_EPOCH."""
 
     job: Job[Any]
     folder: str
@@ -35,26 +38,32 @@ class Work:
 
 @dataclass(frozen=True)
 class Terms:
-    """What is said before the work is unpacked: threads it may use, and the driver's version of topoloc."""
+    """What is said before the work is unpacked: threads it may use, and the driver's version of
+    topoloc."""
 
     num_threads: int
     version: str = field(default_factory=lambda: version("topoloc"))
 
 
 def run_task(packed: bytes, terms: Terms, board: Any, number: int) -> bytes:
-    """A pickled `Work` is done; returns the job's outcome, pickled. `number` is that of the job on the board.
+    """A pickled `Work` is done; returns the job's outcome, pickled. `number` is that of the job on
+    the board.
 
     Raises:
         ClusterError: this machine has another version of topoloc.
         TopolocError: as of the job.
     """
     if terms.version != version("topoloc"):
-        raise ClusterError(f"{platform.node()} has topoloc {version('topoloc')}, and {terms.version} asks it")
+        raise ClusterError(
+            f"{platform.node()} has topoloc {version('topoloc')}, and {terms.version} asks it"
+        )
     os.environ |= dict.fromkeys(_THREADS, str(terms.num_threads))
     work: Work = pickle.loads(packed)
     try:
         os.chdir(work.folder)
-    except OSError:  # then whole paths are found all the same, and others are not looked for elsewhere
+    except (
+        OSError
+    ):  # then whole paths are found all the same, and others are not looked for elsewhere
         os.chdir("/")
     os.environ.pop("SOURCE_DATE_EPOCH", None)
     if work.epoch is not None:
@@ -104,5 +113,7 @@ class Board:
 
 def progress_board(ray: Any) -> Any:
     """A `Board` beside the driver; it begins empty again where it is lost."""
-    near = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=True)
+    near = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(
+        ray.get_runtime_context().get_node_id(), soft=True
+    )
     return ray.remote(Board).options(num_cpus=0, max_restarts=-1, scheduling_strategy=near).remote()

@@ -1,7 +1,9 @@
-"""Work of any kind on a Ray cluster, as its driver sees it: jobs are handed out, one task each, and what became of them is heard.
+"""Work of any kind on a Ray cluster, as its driver sees it: jobs are handed out, one task each, and
+what became of them is heard.
 
-What a job needs and makes travels by files that all machines see; through here go settings, progress and small outcomes. Whoever dies is
-begun again: a worker by Ray, the driver by its user, so that a job should find what it has done already.
+What a job needs and makes travels by files that all machines see; through here go settings,
+progress and small outcomes. Whoever dies is begun again: a worker by Ray, the driver by its user,
+so that a job should find what it has done already.
 """
 
 from __future__ import annotations
@@ -37,11 +39,13 @@ class Job(Protocol[Outcome_co]):
         ...
 
     def run(self, progress: Progress) -> Outcome_co:
-        """Do it, in a worker whose folder and SOURCE_DATE_EPOCH are the driver's. It may be begun again from the start."""
+        """Do it, in a worker whose folder and SOURCE_DATE_EPOCH are the driver's. It may be begun
+        again from the start."""
         ...
 
     def failed(self, reason: str) -> Outcome_co:
-        """The outcome, where `run` raised a TopolocError or its worker could not say anything any more."""
+        """The outcome, where `run` raised a TopolocError or its worker could not say anything any
+        more."""
         ...
 
 
@@ -69,22 +73,32 @@ def run_on_ray(
     """What became of each job, in their order.
 
     Args:
-        address: of the cluster, as `connected` takes it; inside of a block of that with the same address, it is the same connection.
-        show: is told of each job that is finished, and with `is_live` several times a second of those that are being done.
-        lines: a name for each job; those of one name are done one after the other, in their order. None: all side by side.
+        address: of the cluster, as `connected` takes it; inside of a block of that with the same
+            address, it is the same connection.
+        show: is told of each job that is finished, and with `is_live` several times a second of
+            those that are being done.
+        lines: a name for each job; those of one name are done one after the other, in their order.
+            None: all side by side.
 
     Raises:
         MissingExtraError, ClusterError: as of `connected`.
     """
     config, show = config or ClusterConfig(), show or (lambda number, state: None)
-    with redirect_stdout(io.StringIO()), connected(address) as ray:  # Ray prints there of workers that died, which are begun again
+    with (
+        redirect_stdout(io.StringIO()),
+        connected(address) as ray,
+    ):  # Ray prints there of workers that died, which are begun again
         _warn_of_few_processors(ray, config.cpus_per_recording)
         board = progress_board(ray) if is_live else None
         queues = _queues(len(jobs), lines)
         running = {_submitted(ray, jobs, queue[0], config, board): queue for queue in queues}
         outcomes: dict[int, T] = {}
         while running:
-            done, _ = ray.wait(list(running), num_returns=len(running), timeout=_LOOK_S) if is_live else ray.wait(list(running))
+            done, _ = (
+                ray.wait(list(running), num_returns=len(running), timeout=_LOOK_S)
+                if is_live
+                else ray.wait(list(running))
+            )
             for ref in done:
                 queue = running.pop(ref)
                 number = queue.popleft()
@@ -133,12 +147,20 @@ def _queues(num_jobs: int, lines: Sequence[str] | None) -> list[deque[int]]:
 
 def _warn_of_few_processors(ray: Any, wanted: int) -> None:
     """A cluster may grow as it is asked; one that does not would let the jobs wait for ever."""
-    most = max((node["Resources"].get("CPU", 0.0) for node in ray.nodes() if node["Alive"]), default=0.0)
+    most = max(
+        (node["Resources"].get("CPU", 0.0) for node in ray.nodes() if node["Alive"]), default=0.0
+    )
     if most < wanted:
-        print(f"warning: no machine of the cluster has {wanted} processors for a task now, {most:g} at most", file=sys.stderr)
+        print(
+            f"warning: no machine of the cluster has {wanted} processors for a task now, {most:g}"
+            " at most",
+            file=sys.stderr,
+        )
 
 
-def _submitted(ray: Any, jobs: Sequence[Job[Any]], number: int, config: ClusterConfig, board: Any) -> Any:
+def _submitted(
+    ray: Any, jobs: Sequence[Job[Any]], number: int, config: ClusterConfig, board: Any
+) -> Any:
     work = Work(jobs[number], os.getcwd(), os.environ.get("SOURCE_DATE_EPOCH"))
     task = ray.remote(run_task).options(
         num_cpus=config.cpus_per_recording,

@@ -1,7 +1,9 @@
-"""One recording becomes one tile of an atlas, wherever that is done: nothing here knows of a cluster.
+"""One recording becomes one tile of an atlas, wherever that is done: nothing here knows of a
+cluster.
 
-Whoever is killed in the middle is simply called again. What was made is told by the manifest alone: a tile remembers the digest of all
-that decided what its map looks like, and what is there already is not made twice.
+Whoever is killed in the middle is simply called again. What was made is told by the manifest alone:
+a tile remembers the digest of all that decided what its map looks like, and what is there already
+is not made twice.
 """
 
 from __future__ import annotations
@@ -47,7 +49,8 @@ class Maker(Protocol):
 
 @dataclass(frozen=True)
 class TileJob:
-    """A recording, the id of the tile that becomes of it, the world that it is in, and what makes its map.
+    """A recording, the id of the tile that becomes of it, the world that it is in, and what makes
+    its map.
 
     Raises:
         AtlasError: no tile, or no world, can be called so.
@@ -63,16 +66,18 @@ class TileJob:
         check_tile_id(self.world)
 
     def digest(self) -> str:
-        """Of all that decides what the tile looks like, 64 hexadecimal digits. Raises TopolocError."""
+        """Of all that decides what the tile looks like, 64 hexadecimal digits. Raises
+        TopolocError."""
         return sha256(f"{self.maker.digest()} {self.world}".encode()).hexdigest()
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a recording: `reason` says why it failed, `notes` are lines that are to be known beside, `changes` what its session
-    changed of a tile that was there.
+    """What became of a recording: `reason` says why it failed, `notes` are lines that are to be
+    known beside, `changes` what its session changed of a tile that was there.
 
-    `seconds` are those on the clock, `cpu_seconds` those of all its threads on a processor; `host` is the machine that did it.
+    `seconds` are those on the clock, `cpu_seconds` those of all its threads on a processor; `host`
+    is the machine that did it.
     """
 
     recording: str
@@ -88,12 +93,21 @@ class Outcome:
     changes: dict[str, Any] | None = None
 
     def to_json(self) -> dict[str, Any]:
-        data = asdict(self) | {"notes": list(self.notes), "seconds": round(self.seconds, 3), "cpu_seconds": round(self.cpu_seconds, 3)}
-        return data if self.changes is not None else {name: value for name, value in data.items() if name != "changes"}
+        data = asdict(self) | {
+            "notes": list(self.notes),
+            "seconds": round(self.seconds, 3),
+            "cpu_seconds": round(self.cpu_seconds, 3),
+        }
+        return (
+            data
+            if self.changes is not None
+            else {name: value for name, value in data.items() if name != "changes"}
+        )
 
 
 def build_tile(job: TileJob, atlas: str, replaces: bool, progress: Progress) -> Outcome:
-    """The recording mapped and its tile in the atlas, which is made where there is none; or why not.
+    """The recording mapped and its tile in the atlas, which is made where there is none; or why
+    not.
 
     Args:
         replaces: a tile of the same id that was made otherwise is replaced, else it is a failure.
@@ -102,7 +116,8 @@ def build_tile(job: TileJob, atlas: str, replaces: bool, progress: Progress) -> 
 
 
 def outcome_of(recording: str, tile_id: str, work: Callable[[], tuple[State, Tile]]) -> Outcome:
-    """What becomes of a recording by this work, which says it, with the tile as it is then; or why nothing does."""
+    """What becomes of a recording by this work, which says it, with the tile as it is then; or why
+    nothing does."""
     started, cpu_started, said = time.monotonic(), time.process_time(), io.StringIO()
     state, reason, tile = "failed", None, None
     with contextlib.redirect_stderr(said):
@@ -115,10 +130,16 @@ def outcome_of(recording: str, tile_id: str, work: Callable[[], tuple[State, Til
         except Exception as error:  # a bug: the others go on, and all of it is told
             traceback.print_exc()
             reason = " ".join(f"{type(error).__name__}: {error}".split())[:500]
-    done = Outcome(recording, tile_id, state, reason, tuple(said.getvalue().splitlines()), host=platform.node())
+    done = Outcome(
+        recording, tile_id, state, reason, tuple(said.getvalue().splitlines()), host=platform.node()
+    )
     if tile is not None:
-        done = replace(done, tile_id=tile.tile_id, num_nodes=tile.num_nodes, num_bytes=tile.map.num_bytes)
-    return replace(done, seconds=time.monotonic() - started, cpu_seconds=time.process_time() - cpu_started)
+        done = replace(
+            done, tile_id=tile.tile_id, num_nodes=tile.num_nodes, num_bytes=tile.map.num_bytes
+        )
+    return replace(
+        done, seconds=time.monotonic() - started, cpu_seconds=time.process_time() - cpu_started
+    )
 
 
 def _built(job: TileJob, atlas: str, replaces: bool, progress: Progress) -> tuple[State, Tile]:
@@ -127,11 +148,16 @@ def _built(job: TileJob, atlas: str, replaces: bool, progress: Progress) -> tupl
     if made := [tile for tile in before.tiles if tile.recipe == recipe]:
         return "there", made[0]
     if job.tile_id in before.by_id and not replaces:
-        raise AtlasError(f"the atlas has a tile {job.tile_id} already, which was made otherwise; --replace replaces it")
+        raise AtlasError(
+            f"the atlas has a tile {job.tile_id} already, which was made otherwise; --replace"
+            " replaces it"
+        )
     topomap, _ = job.maker.make(progress)
     with scratch_file(Path(tempfile.gettempdir()) / "topoloc-tile.topo") as path:
         write_map(topomap, path)
-        after = add_tiles(atlas, [NewTile(job.tile_id, path, job.world, recipe)], replaces, creates=True)
+        after = add_tiles(
+            atlas, [NewTile(job.tile_id, path, job.world, recipe)], replaces, creates=True
+        )
     return "built", after.by_id[job.tile_id]
 
 
@@ -151,12 +177,19 @@ def tile_ids(recordings: Sequence[str]) -> list[str]:
     paths = [_words(recording) for recording in recordings]
     for recording, words in zip(recordings, paths, strict=True):
         if paths.count(words) > 1:
-            raise AtlasError(f"recording {recording} is named twice, or its tile would be called as another one's")
+            raise AtlasError(
+                f"recording {recording} is named twice, or its tile would be called as another"
+                " one's"
+            )
     ids, depth = [""] * len(paths), 1
     left = set(range(len(paths)))
     while left:
         named = {k: "_".join(paths[k][-depth:])[-100:].lstrip("_.-") for k in left}
-        done = {k for k in left if (list(named.values()).count(named[k]) == 1 and named[k] not in ids) or depth > 100}
+        done = {
+            k
+            for k in left
+            if (list(named.values()).count(named[k]) == 1 and named[k] not in ids) or depth > 100
+        }
         for k in done:
             ids[k] = named[k]
             check_tile_id(ids[k])
@@ -167,7 +200,8 @@ def tile_ids(recordings: Sequence[str]) -> list[str]:
 
 
 def _words(recording: str) -> list[str]:
-    """The parts of a recording's path, each of letters that an id may have; the frames that are chosen of it belong to the last one."""
+    """The parts of a recording's path, each of letters that an id may have; the frames that are
+    chosen of it belong to the last one."""
     folder, at, selection = recording.rpartition("@")
     chosen = bool(at) and re.fullmatch(r"[-0-9:,/]+", selection) is not None
     parts = list(Path(folder if chosen else recording).parts) or [""]

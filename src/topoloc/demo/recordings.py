@@ -1,4 +1,5 @@
-"""The recordings of `topoloc demo`, which come with topoloc: the lab by day for the map, and what the map is asked about.
+"""The recordings of `topoloc demo`, which come with topoloc: the lab by day for the map, and what
+the map is asked about.
 
 They are rendered; `topoloc simulate demo`, of the distribution topoloc-worlds, makes them anew.
 """

@@ -1,4 +1,5 @@
-"""What the demo says of its own results, on the terminal and in the report: computed, so that it stays true whatever comes out."""
+"""What the demo says of its own results, on the terminal and in the report: computed, so that it
+stays true whatever comes out."""
 
 from __future__ import annotations
 
@@ -23,8 +24,9 @@ def words_of(evaluation: dict[str, Any]) -> ReportWords:
     return ReportWords(
         title="One room, mapped by day: what does it know by night?",
         subtitle=(
-            f"A lab of 5 x 4 m, walked through twice with a stereo camera ({m['length_m']:.0f} m, {m['num_nodes']} nodes, "
-            f"{m['bytes'] / 1e6:.1f} MB). Each query is one picture, alone."
+            f"A lab of 5 x 4 m, walked through twice with a stereo camera ({m['length_m']:.0f} m,"
+            f" {m['num_nodes']} nodes, {m['bytes'] / 1e6:.1f} MB). Each query is one picture,"
+            " alone."
         ),
         paragraphs=[night_in_words(evaluation), elsewhere_in_words(evaluation), _RENDERED],
         about=_ABOUT,
@@ -33,9 +35,10 @@ def words_of(evaluation: dict[str, Any]) -> ReportWords:
 
 
 _RENDERED = (
-    "The lab is rendered, so that every true pose is known exactly: its camera has noise, vignetting and an exposure that is never quite "
-    "right, but no error of calibration. The paper's figure is from a real room of about this size, so it says what scale to expect, not "
-    "who is better."
+    "The lab is rendered, so that every true pose is known exactly: its camera has noise,"
+    " vignetting and an exposure that is never quite right, but no error of calibration. The"
+    " paper's figure is from a real room of about this size, so it says what scale to expect, not"
+    " who is better."
 )
 
 
@@ -43,25 +46,34 @@ def night_in_words(evaluation: dict[str, Any]) -> str:
     """What the night costs against the day."""
     rows = {row["name"]: row for row in evaluation["recordings"]}
     day, night = rows[DAY], rows[NIGHT]
-    text = f"What the night costs: of {night['num_queries']} pictures {_share(night)} get a pose, by day {_share(day)}"
+    text = (
+        f"What the night costs: of {night['num_queries']} pictures {_share(night)} get a pose, by"
+        f" day {_share(day)}"
+    )
     if night["num_localized"] and day["num_localized"]:
         text += f"; the median error is {_error(night)} instead of {_error(day)}"
     text += "."
     if lost := night["num_queries"] - night["num_localized"]:
-        reasons = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in night["not_localized"].items())
+        reasons = ", ".join(
+            f"{count} {reason.replace('_', ' ')}"
+            for reason, count in night["not_localized"].items()
+        )
         text += f' {lost} {"is" if lost == 1 else "are"} answered with "not localized" ({reasons}).'
     false = night["false_accepts"]
     if false == 0:
         return text + " No pose is wrong."
     return (
-        text
-        + f" {false} {'pose is' if false == 1 else 'poses are'} wrong by more than {MAX_TRANSLATION:g} m or {MAX_ROTATION_DEG:g} degrees."
+        text + f" {false} {'pose is' if false == 1 else 'poses are'} wrong by more than"
+        f" {MAX_TRANSLATION:g} m or {MAX_ROTATION_DEG:g} degrees."
     )
 
 
 def elsewhere_in_words(evaluation: dict[str, Any]) -> str:
     """What happens to pictures that were not taken here."""
-    num, accepted = evaluation["num_elsewhere"], sum(row["false_accepts"] for row in evaluation["recordings"] if not row["num_queries"])
+    num, accepted = (
+        evaluation["num_elsewhere"],
+        sum(row["false_accepts"] for row in evaluation["recordings"] if not row["num_queries"]),
+    )
     said = "none is given a pose" if accepted == 0 else f"{accepted} wrongly get a pose"
     return f"Of {num} pictures that were taken elsewhere, or show nothing, {said}."
 
@@ -71,4 +83,6 @@ def _share(row: dict[str, Any]) -> str:
 
 
 def _error(row: dict[str, Any]) -> str:
-    return f"{100 * row['median_translation_m']:.2f} cm and {row['median_rotation_deg']:.2f} degrees"
+    return (
+        f"{100 * row['median_translation_m']:.2f} cm and {row['median_rotation_deg']:.2f} degrees"
+    )

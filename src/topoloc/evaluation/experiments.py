@@ -34,7 +34,8 @@ def answer_queries(
     label: str | None = None,
     frames: Sequence[int] | None = None,
 ) -> list[Answer]:
-    """Localize every frame whose pose is known; only the left (or colour) picture is shown to the localizer.
+    """Localize every frame whose pose is known; only the left (or colour) picture is shown to the
+    localizer.
 
     Args:
         map_from_truth: the recording's world given in the map's, where the two differ.
@@ -58,7 +59,16 @@ def answer_queries(
         nearest = localizer.topomap.summaries[int(np.argmin(distances))].node_id
         near = neighbours_of(localizer.topomap, distances)
         result = _localize(localizer, frame)
-        answer = Answer(frame.name, result, world_from_cam, nearest, label, image_reader(sequence, i), frame.camera, near)
+        answer = Answer(
+            frame.name,
+            result,
+            world_from_cam,
+            nearest,
+            label,
+            image_reader(sequence, i),
+            frame.camera,
+            near,
+        )
         answers.append(_in_answered_world(localizer, answer))
         if progress:
             progress(label, done + 1, len(frames))
@@ -85,7 +95,17 @@ def answer_elsewhere(
     for done, i in enumerate(frames):
         frame = sequence[i]
         result = _localize(localizer, frame)
-        answers.append(Answer(sequence.names[i], result, None, None, label, image_reader(sequence, i), frame.camera))
+        answers.append(
+            Answer(
+                sequence.names[i],
+                result,
+                None,
+                None,
+                label,
+                image_reader(sequence, i),
+                frame.camera,
+            )
+        )
         if progress:
             progress(f"{label} (elsewhere)", done + 1, len(frames))
     return answers
@@ -105,7 +125,8 @@ def image_reader(sequence: StereoSequence, index: int) -> Callable[[], Image]:
 
 
 def neighbours_of(topomap: TopoMetricMap, distances: Float[np.ndarray, " nodes"]) -> frozenset[int]:
-    """Ids of the nodes next to the nearest one along the route, and within 1.5 D_thresh, given D_total to each (metres, Eq. 1)."""
+    """Ids of the nodes next to the nearest one along the route, and within 1.5 D_thresh, given
+    D_total to each (metres, Eq. 1)."""
     nearest = topomap.summaries[int(np.argmin(distances))].node_id
     along = {edge.target_id for edge in topomap.edges if edge.source_id == nearest}
     along |= {edge.source_id for edge in topomap.edges if edge.target_id == nearest}
@@ -114,16 +135,25 @@ def neighbours_of(topomap: TopoMetricMap, distances: Float[np.ndarray, " nodes"]
 
 
 def _in_answered_world(localizer: Asked, answer: Answer) -> Answer:
-    """Where another tile of an atlas answered: with the truth in that one's world; which of its nodes is nearest is not asked."""
-    if isinstance(localizer, Localizer) or answer.world_from_cam is None or answer.result.provenance.tile in (None, localizer.tile_id):
+    """Where another tile of an atlas answered: with the truth in that one's world; which of its
+    nodes is nearest is not asked."""
+    if (
+        isinstance(localizer, Localizer)
+        or answer.world_from_cam is None
+        or answer.result.provenance.tile in (None, localizer.tile_id)
+    ):
         return answer
     truth = localizer.truth_in_world_of(answer.result, answer.world_from_cam)
     if truth is None:
-        return replace(answer, is_of_another_world=True, nearest_node_id=None, neighbour_ids=frozenset())
+        return replace(
+            answer, is_of_another_world=True, nearest_node_id=None, neighbour_ids=frozenset()
+        )
     return replace(answer, world_from_cam=truth, nearest_node_id=None, neighbour_ids=frozenset())
 
 
 def _localize(localizer: Asked, frame: StereoFrame) -> Localization | NotLocalized:
     if frame.camera is None:
-        raise CalibrationError(f"{frame.name}: no calibration; put a camera.json into the recording's folder")
+        raise CalibrationError(
+            f"{frame.name}: no calibration; put a camera.json into the recording's folder"
+        )
     return localizer.localize(frame.image, frame.camera, t_ns=frame.t_ns)

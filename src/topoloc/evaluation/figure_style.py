@@ -1,4 +1,5 @@
-"""What the figures of a report share: colours, type, and the way from a matplotlib figure to SVG text inside a page."""
+"""What the figures of a report share: colours, type, and the way from a matplotlib figure to SVG
+text inside a page."""
 
 from __future__ import annotations
 
@@ -11,9 +12,20 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INK, GREY, NODE, ERROR, BAD = "#1f2a37", "#6b7786", "#9db2ca", "#f0a202", "#d1345b"
-# One colour a recording, told apart also by people who see no red or no green; none is near ERROR or BAD.
-RECORDING_COLOURS = ("#0f8b8d", "#5b4fc7", "#b5651d", "#2f6db5", "#6a7f10", "#9c3f97", "#3d4b5c", "#12724a")
-# Beyond so many marks a figure's points become one picture inside it: a page must stay small whatever the number of queries.
+# One colour a recording, told apart also by people who see no red or no green; none is near ERROR
+# or BAD.
+RECORDING_COLOURS = (
+    "#0f8b8d",
+    "#5b4fc7",
+    "#b5651d",
+    "#2f6db5",
+    "#6a7f10",
+    "#9c3f97",
+    "#3d4b5c",
+    "#12724a",
+)
+# Beyond so many marks a figure's points become one picture inside it: a page must stay small
+# whatever the number of queries.
 MAX_MARKS = 2000
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "path",
@@ -37,12 +49,14 @@ STYLE: dict[Any, Any] = {
 
 
 def recording_colours(names: Sequence[str]) -> dict[str, str]:
-    """A colour for each recording, the same in all figures of a page; they come round again after the last."""
+    """A colour for each recording, the same in all figures of a page; they come round again after
+    the last."""
     return {name: RECORDING_COLOURS[i % len(RECORDING_COLOURS)] for i, name in enumerate(names)}
 
 
 def svg_text(figure: Figure, title: str) -> str:
-    """The figure as an `svg` element without a header; names inside are made from the title, so that figures on one page do not mix."""
+    """The figure as an `svg` element without a header; names inside are made from the title, so
+    that figures on one page do not mix."""
     import matplotlib
 
     buffer = io.StringIO()

@@ -1,6 +1,8 @@
-"""The error curves and times of a report, each as SVG text that can stand inside a page; `map_figure.py` draws the map.
+"""The error curves and times of a report, each as SVG text that can stand inside a page;
+`map_figure.py` draws the map.
 
-Drawn with matplotlib's figures directly, not through pyplot: nothing global is touched, and the same answers give the same bytes.
+Drawn with matplotlib's figures directly, not through pyplot: nothing global is touched, and the
+same answers give the same bytes.
 """
 
 from __future__ import annotations
@@ -15,7 +17,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter, PercentFormatter
 
-from topoloc.evaluation.figure_style import BAD, GREY, INK, MAX_MARKS, RECORDING_COLOURS, STYLE, recording_colours, svg_text
+from topoloc.evaluation.figure_style import (
+    BAD,
+    GREY,
+    INK,
+    MAX_MARKS,
+    RECORDING_COLOURS,
+    STYLE,
+    recording_colours,
+    svg_text,
+)
 from topoloc.evaluation.metrics import Answer, by_recording
 from topoloc.localization.result import NotLocalized
 
@@ -23,12 +34,21 @@ STAGES = ("patch_normalization", "features", "coarse", "matching", "pnp")
 
 
 def draw_error_curves(answers: Sequence[Answer]) -> tuple[str, str]:
-    """Which share of the queries with truth is within a given error, one line a recording: translation and rotation, a figure each."""
+    """Which share of the queries with truth is within a given error, one line a recording:
+    translation and rotation, a figure each."""
     groups = by_recording([a for a in answers if a.world_from_cam is not None])
     everything = [a for group in groups.values() for a in group]
-    metres = max((a.translation_m for a in everything if a.result.localized and not a.is_false_accept), default=0.0) > 2.0
+    metres = (
+        max(
+            (a.translation_m for a in everything if a.result.localized and not a.is_false_accept),
+            default=0.0,
+        )
+        > 2.0
+    )
     scale, unit = (1.0, " m") if metres else (100.0, " cm")
-    translations = {name: scale * np.array([a.translation_m for a in group]) for name, group in groups.items()}
+    translations = {
+        name: scale * np.array([a.translation_m for a in group]) for name, group in groups.items()
+    }
     rotations = {name: np.array([a.rotation_deg for a in group]) for name, group in groups.items()}
     return (
         _draw_curves(translations, f"translation error ({unit.strip()})", unit),
@@ -55,36 +75,81 @@ def draw_errors_along(answers: Sequence[Answer]) -> str:
             axes.set_yscale("log")
             for name, colour in colours.items():
                 own = np.array([a.recording == name for a in with_truth])
-                axes.plot(numbers, np.where(own, values, np.nan), "-", color=colour, linewidth=0.8, alpha=0.5)
-                axes.plot(numbers[own], values[own], ".", color=colour, markersize=4, rasterized=len(numbers) > MAX_MARKS)
+                axes.plot(
+                    numbers,
+                    np.where(own, values, np.nan),
+                    "-",
+                    color=colour,
+                    linewidth=0.8,
+                    alpha=0.5,
+                )
+                axes.plot(
+                    numbers[own],
+                    values[own],
+                    ".",
+                    color=colour,
+                    markersize=4,
+                    rasterized=len(numbers) > MAX_MARKS,
+                )
             axes.set_ylim(*_decades(values))
-            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _, label=label: label(value)))
+            axes.yaxis.set_major_formatter(
+                FuncFormatter(lambda value, _, label=label: label(value))
+            )
             axes.yaxis.set_minor_formatter(NullFormatter())
             axes.set_title(f"{title} error")
-            for start in (i for i, (a, b) in enumerate(pairwise(with_truth), 1) if a.recording != b.recording):
+            for start in (
+                i for i, (a, b) in enumerate(pairwise(with_truth), 1) if a.recording != b.recording
+            ):
                 axes.axvline(start - 0.5, color=GREY, linewidth=0.8, linestyle=":")
             if lost.any():  # an empty line, not clipped, would upset the layout
                 marks = numbers[lost]
-                axes.plot(marks, np.ones(len(marks)), "|", color=BAD, transform=axes.get_xaxis_transform(), clip_on=False, markersize=8)
-        panels[-1].set(xlabel="query" + (" (red marks: no pose)" if lost.any() else ""), xlim=(-0.5, max(len(numbers) - 0.5, 0.5)))
+                axes.plot(
+                    marks,
+                    np.ones(len(marks)),
+                    "|",
+                    color=BAD,
+                    transform=axes.get_xaxis_transform(),
+                    clip_on=False,
+                    markersize=8,
+                )
+        panels[-1].set(
+            xlabel="query" + (" (red marks: no pose)" if lost.any() else ""),
+            xlim=(-0.5, max(len(numbers) - 0.5, 0.5)),
+        )
         if len(groups) > 1:
-            handles = [panels[0].plot([], [], ".-", color=colour, label=name)[0] for name, colour in colours.items()]
+            handles = [
+                panels[0].plot([], [], ".-", color=colour, label=name)[0]
+                for name, colour in colours.items()
+            ]
             figure.legend(handles=handles, loc="outside lower center", ncols=4)
         return svg_text(figure, "errors along the recordings")
 
 
 def draw_stage_times(answers: Sequence[Answer]) -> str:
-    """Milliseconds of each stage: the median as a bar, a line up to what 95 % of the queries stay below."""
+    """Milliseconds of each stage: the median as a bar, a line up to what 95 % of the queries stay
+    below."""
     names = {stage for a in answers for stage in a.result.times_ms}
-    stages = [stage for stage in STAGES if stage in names] + sorted(names - {*STAGES, "total"}) + [s for s in ("total",) if s in names]
+    stages = (
+        [stage for stage in STAGES if stage in names]
+        + sorted(names - {*STAGES, "total"})
+        + [s for s in ("total",) if s in names]
+    )
     times = [np.array([a.result.times_ms.get(stage, 0.0) for a in answers]) for stage in stages]
-    medians, highs = [float(np.median(t)) for t in times], [float(np.percentile(t, 95)) for t in times]
+    medians, highs = (
+        [float(np.median(t)) for t in times],
+        [float(np.percentile(t, 95)) for t in times],
+    )
     rows = np.arange(len(stages))[::-1]
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(9.0, 0.6 + 0.32 * len(stages)), layout="constrained")
         axes = figure.add_subplot()
         axes.grid(visible=False, axis="y")
-        axes.barh(rows, medians, height=0.55, color=[INK if stage == "total" else RECORDING_COLOURS[0] for stage in stages])
+        axes.barh(
+            rows,
+            medians,
+            height=0.55,
+            color=[INK if stage == "total" else RECORDING_COLOURS[0] for stage in stages],
+        )
         axes.hlines(rows, medians, highs, color=GREY, linewidth=1.2)
         for row, median, high in zip(rows, medians, highs, strict=True):
             axes.annotate(
@@ -108,18 +173,37 @@ def _draw_curves(errors: dict[str, Float[np.ndarray, " _"]], label: str, unit: s
         figure = Figure(figsize=(4.6, 2.9 + 0.2 * len(errors)), layout="constrained")
         axes = figure.add_subplot()
         found = {name: np.sort(values[np.isfinite(values)]) for name, values in errors.items()}
-        # as wide as the middle of the recordings' tails: one bad recording must not squeeze the others to the left edge
+        # as wide as the middle of the recordings' tails: one bad recording must not squeeze the
+        # others to the left edge
         tails = [1.5 * float(np.percentile(values, 95)) for values in found.values() if len(values)]
         limit = max(float(np.median(tails)), 1e-3) if tails else 1.0
         for name, values in found.items():
-            _draw_curve(axes, values, len(errors[name]), limit, colours[name], f"{name}: " if len(errors) > 1 else "", unit)
-        axes.set(xlabel=label, ylabel="queries within this error", xlim=(0.0, limit), ylim=(0.0, 1.03))
+            _draw_curve(
+                axes,
+                values,
+                len(errors[name]),
+                limit,
+                colours[name],
+                f"{name}: " if len(errors) > 1 else "",
+                unit,
+            )
+        axes.set(
+            xlabel=label, ylabel="queries within this error", xlim=(0.0, limit), ylim=(0.0, 1.03)
+        )
         axes.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
         figure.legend(loc="outside lower left", ncols=1, handlelength=1.4)
         return svg_text(figure, f"cumulative {label.partition(' (')[0]}")
 
 
-def _draw_curve(axes: Axes, found: Float[np.ndarray, " n"], num_queries: int, limit: float, colour: str, name: str, unit: str) -> None:
+def _draw_curve(
+    axes: Axes,
+    found: Float[np.ndarray, " n"],
+    num_queries: int,
+    limit: float,
+    colour: str,
+    name: str,
+    unit: str,
+) -> None:
     """One curve; what lies beyond the right edge is named in the legend instead of drawn."""
     if len(found) == 0:
         axes.plot([], [], color=colour, label=f"{name}none of {num_queries} localized")
@@ -127,9 +211,18 @@ def _draw_curve(axes: Axes, found: Float[np.ndarray, " n"], num_queries: int, li
     drawn = found[found <= limit]
     shares = np.arange(1, len(drawn) + 1) / num_queries
     last = shares[-1] if len(shares) else 0.0
-    beyond = f", {len(found) - len(drawn)} of {num_queries} beyond" if len(found) > len(drawn) else ""
+    beyond = (
+        f", {len(found) - len(drawn)} of {num_queries} beyond" if len(found) > len(drawn) else ""
+    )
     median = f"{name}median {float(np.median(found)):.3g}{unit}{beyond}"
-    axes.step(np.r_[0.0, drawn, limit], np.r_[0.0, shares, last], where="post", color=colour, linewidth=1.8, label=median)
+    axes.step(
+        np.r_[0.0, drawn, limit],
+        np.r_[0.0, shares, last],
+        where="post",
+        color=colour,
+        linewidth=1.8,
+        label=median,
+    )
 
 
 def _decades(values: Float[np.ndarray, " n"]) -> tuple[float, float]:

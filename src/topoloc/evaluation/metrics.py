@@ -22,11 +22,13 @@ MAX_TRANSLATION, MAX_ROTATION_DEG = 0.5, 10.0
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """A query with its result and its truth, which is None for an image from elsewhere: any pose given for that is false.
+    """A query with its result and its truth, which is None for an image from elsewhere: any pose
+    given for that is false.
 
-    `read_image` reads the picture once more, for who wants to look at it: answers hold no pictures. `camera` is what it was taken with.
-    `neighbour_ids` are the nodes that are as good as the nearest one: see `neighbours_of`. `is_of_another_world`: the pose is in a world of
-    which the truth says nothing, that of another tile of an atlas, and so it is false.
+    `read_image` reads the picture once more, for who wants to look at it: answers hold no pictures.
+    `camera` is what it was taken with. `neighbour_ids` are the nodes that are as good as the
+    nearest one: see `neighbours_of`. `is_of_another_world`: the pose is in a world of which the
+    truth says nothing, that of another tile of an atlas, and so it is false.
     """
 
     query: str
@@ -41,15 +43,25 @@ class Answer:
 
     @property
     def translation_m(self) -> float:
-        """Distance from the truth, metres; NaN where there is no pose or no truth, or truth says nothing of its world."""
-        if isinstance(self.result, NotLocalized) or self.world_from_cam is None or self.is_of_another_world:
+        """Distance from the truth, metres; NaN where there is no pose or no truth, or truth says
+        nothing of its world."""
+        if (
+            isinstance(self.result, NotLocalized)
+            or self.world_from_cam is None
+            or self.is_of_another_world
+        ):
             return float("nan")
         return translation_error(self.result.world_from_cam, self.world_from_cam)
 
     @property
     def rotation_deg(self) -> float:
-        """Angle from the truth, degrees; NaN where there is no pose or no truth, or truth says nothing of its world."""
-        if isinstance(self.result, NotLocalized) or self.world_from_cam is None or self.is_of_another_world:
+        """Angle from the truth, degrees; NaN where there is no pose or no truth, or truth says
+        nothing of its world."""
+        if (
+            isinstance(self.result, NotLocalized)
+            or self.world_from_cam is None
+            or self.is_of_another_world
+        ):
             return float("nan")
         return float(np.rad2deg(rotation_error(self.result.world_from_cam, self.world_from_cam)))
 
@@ -62,9 +74,13 @@ class Answer:
         return self.translation_m > MAX_TRANSLATION or self.rotation_deg > MAX_ROTATION_DEG
 
     def to_json(self) -> dict[str, Any]:
-        """The result's line, with its recording and its truth, which is null for an image from elsewhere."""
+        """The result's line, with its recording and its truth, which is null for an image from
+        elsewhere."""
         truth = None if self.world_from_cam is None else pose_json(self.world_from_cam)
-        return self.result.to_json(self.query) | {"recording": self.recording, "true_world_from_cam": truth}
+        return self.result.to_json(self.query) | {
+            "recording": self.recording,
+            "true_world_from_cam": truth,
+        }
 
 
 def by_recording(answers: Sequence[Answer]) -> dict[str, list[Answer]]:
@@ -76,7 +92,8 @@ def by_recording(answers: Sequence[Answer]) -> dict[str, list[Answer]]:
 
 
 def summarize(answers: list[Answer]) -> dict[str, Any]:
-    """The evaluation as JSON, of all answers together and, under "recordings", of each recording alone.
+    """The evaluation as JSON, of all answers together and, under "recordings", of each recording
+    alone.
 
     Counts, medians over what was localized, recall over all queries that have a truth.
     """
@@ -92,7 +109,10 @@ def _summary(answers: list[Answer]) -> dict[str, Any]:
     ranked = [a for a in with_truth if a.nearest_node_id is not None]
     first = [a.result.candidates[0].node_id if a.result.candidates else None for a in ranked]
     hits = [node == a.nearest_node_id for node, a in zip(first, ranked, strict=True)]
-    near = [node == a.nearest_node_id or node in a.neighbour_ids for node, a in zip(first, ranked, strict=True)]
+    near = [
+        node == a.nearest_node_id or node in a.neighbour_ids
+        for node, a in zip(first, ranked, strict=True)
+    ]
     stages = sorted({stage for a in answers for stage in a.result.times_ms})
     return {
         "num_queries": len(with_truth),
@@ -100,7 +120,11 @@ def _summary(answers: list[Answer]) -> dict[str, Any]:
         "median_translation_m": _median(translation[localized]),
         "median_rotation_deg": _median(rotation[localized]),
         "recall": {
-            f"{metres:g}m_{degrees:g}deg": float(np.mean((translation <= metres) & (rotation <= degrees))) if len(with_truth) else None
+            f"{metres:g}m_{degrees:g}deg": float(
+                np.mean((translation <= metres) & (rotation <= degrees))
+            )
+            if len(with_truth)
+            else None
             for metres, degrees in RECALL_THRESHOLDS
         },
         "topological_accuracy": float(np.mean(hits)) if hits else None,
@@ -108,7 +132,10 @@ def _summary(answers: list[Answer]) -> dict[str, Any]:
         "num_elsewhere": len(answers) - len(with_truth),
         "false_accepts": sum(a.is_false_accept for a in answers),
         "not_localized": _reasons(answers),
-        "median_times_ms": {stage: _median(np.array([a.result.times_ms.get(stage, 0.0) for a in answers])) for stage in stages},
+        "median_times_ms": {
+            stage: _median(np.array([a.result.times_ms.get(stage, 0.0) for a in answers]))
+            for stage in stages
+        },
     }
 
 

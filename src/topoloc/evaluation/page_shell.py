@@ -10,7 +10,9 @@ from topoloc.viewer.page import static_text
 
 def page_style() -> str:
     """The style sheet."""
-    return static_text("theme.css") + resources.files("topoloc.evaluation").joinpath("report.css").read_text(encoding="utf-8")
+    return static_text("theme.css") + resources.files("topoloc.evaluation").joinpath(
+        "report.css"
+    ).read_text(encoding="utf-8")
 
 
 def page_text(title: str, subtitle: str, body: str, head: str = "") -> str:
@@ -20,10 +22,15 @@ def page_text(title: str, subtitle: str, body: str, head: str = "") -> str:
         title: plain text, as the subtitle.
         body: HTML; `head` what the page's head needs beside the style.
     """
-    meta = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
-    header = f'<header><div class="page"><h1>{escape(title)}</h1><p>{escape(subtitle)}</p></div></header>'
+    meta = (
+        '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
+    )
+    header = (
+        "<header><div"
+        f' class="page"><h1>{escape(title)}</h1><p>{escape(subtitle)}</p></div></header>'
+    )
     return (
-        f'<!DOCTYPE html>\n<html lang="en"><head>{meta}\n<title>{escape(title)}</title>\n'
-        f"<style>\n{page_style()}</style>{head}</head><body>\n"
-        f'{header}\n<div class="page">{body}<footer>Written by topoloc.</footer></div></body></html>\n'
+        "<!DOCTYPE html>\n<html"
+        f' lang="en"><head>{meta}\n<title>{escape(title)}</title>\n<style>\n{page_style()}</style>{head}</head><body>\n{header}\n<div'  # noqa: E501
+        f' class="page">{body}<footer>Written by topoloc.</footer></div></body></html>\n'
     )

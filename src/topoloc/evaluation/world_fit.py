@@ -1,7 +1,8 @@
-"""Truth and map in different worlds: answers that agree with each other, and whose errors one rigid transform explains.
+"""Truth and map in different worlds: answers that agree with each other, and whose errors one rigid
+transform explains.
 
-Recordings of one place often have worlds of their own. Errors of 20 degrees then say nothing of the answers; what they would be in one
-world is offered beside them, never in their place.
+Recordings of one place often have worlds of their own. Errors of 20 degrees then say nothing of the
+answers; what they would be in one world is offered beside them, never in their place.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ _GATE = 3.0
 
 @dataclass(frozen=True, eq=False)
 class WorldFit:
-    """`map_from_truth` by the answers to one recording; medians of the errors that are left, of `num_answers` of `num_localized`."""
+    """`map_from_truth` by the answers to one recording; medians of the errors that are left, of
+    `num_answers` of `num_localized`."""
 
     recording: str
     map_from_truth: Rigid3
@@ -48,11 +50,17 @@ class WorldFit:
 
 
 def fit_worlds(answers: Sequence[Answer]) -> WorldFit | None:
-    """The transform that explains the errors of one recording's answers; None where they are small already, or none explains most of them.
+    """The transform that explains the errors of one recording's answers; None where they are small
+    already, or none explains most of them.
 
-    Each answer proposes one; the one that leaves the least median error is refined by the answers that agree with it.
+    Each answer proposes one; the one that leaves the least median error is refined by the answers
+    that agree with it.
     """
-    pairs = [(a.result.world_from_cam, a.world_from_cam) for a in answers if isinstance(a.result, Localization) and a.world_from_cam]
+    pairs = [
+        (a.result.world_from_cam, a.world_from_cam)
+        for a in answers
+        if isinstance(a.result, Localization) and a.world_from_cam
+    ]
     if len(pairs) < _MIN_ANSWERS:
         return None
     before = float(np.median(_errors(Rigid3.identity(), pairs)))
@@ -61,9 +69,15 @@ def fit_worlds(answers: Sequence[Answer]) -> WorldFit | None:
     proposals = [found @ true.inverse() for found, true in pairs]
     best = min(proposals, key=lambda one: float(np.median(_errors(one, pairs))))
     errors = _errors(best, pairs)
-    agreeing = [pair for pair, error in zip(pairs, errors, strict=True) if error < max(_GATE * float(np.median(errors)), 1e-3)]
+    agreeing = [
+        pair
+        for pair, error in zip(pairs, errors, strict=True)
+        if error < max(_GATE * float(np.median(errors)), 1e-3)
+    ]
     map_from_truth = align_poses([found for found, _ in agreeing], [true for _, true in agreeing])
-    if float(np.median(_errors(map_from_truth, pairs))) > _MAX_SHARE * before or 2 * len(agreeing) < len(pairs):
+    if float(np.median(_errors(map_from_truth, pairs))) > _MAX_SHARE * before or 2 * len(
+        agreeing
+    ) < len(pairs):
         return None
     translations = [translation_error(found, map_from_truth @ true) for found, true in pairs]
     rotations = [rotation_error(found, map_from_truth @ true) for found, true in pairs]
@@ -71,7 +85,11 @@ def fit_worlds(answers: Sequence[Answer]) -> WorldFit | None:
     return WorldFit(answers[0].recording, map_from_truth, *medians, len(agreeing), len(pairs))
 
 
-def _errors(map_from_truth: Rigid3, pairs: Sequence[tuple[Rigid3, Rigid3]]) -> Float[np.ndarray, " n"]:
+def _errors(
+    map_from_truth: Rigid3, pairs: Sequence[tuple[Rigid3, Rigid3]]
+) -> Float[np.ndarray, " n"]:
     """Of each answer, 1 for 25 cm or 2 degrees."""
     moved = [(found, map_from_truth @ true) for found, true in pairs]
-    return np.array([max(translation_error(a, b) / _METRES, rotation_error(a, b) / _RADIANS) for a, b in moved])
+    return np.array(
+        [max(translation_error(a, b) / _METRES, rotation_error(a, b) / _RADIANS) for a, b in moved]
+    )

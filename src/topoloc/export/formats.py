@@ -36,7 +36,8 @@ FORMATS = {
 
 
 def find_export_format(out: Path, named: str | None = None) -> ExportFormat:
-    """The format that is named, or else by the suffix of `out`; a name without one is the folder of a COLMAP model.
+    """The format that is named, or else by the suffix of `out`; a name without one is the folder of
+    a COLMAP model.
 
     Raises:
         TopolocError: there is no such format, or the suffix says none.
@@ -45,7 +46,10 @@ def find_export_format(out: Path, named: str | None = None) -> ExportFormat:
     if named is None and out.is_dir():
         name = "colmap"
     if name not in FORMATS:
-        raise TopolocError(f"{out if named is None else named}: no format of ours; --format takes {', '.join(FORMATS)}")
+        raise TopolocError(
+            f"{out if named is None else named}: no format of ours; --format takes"
+            f" {', '.join(FORMATS)}"
+        )
     return FORMATS[name]
 
 

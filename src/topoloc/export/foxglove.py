@@ -1,8 +1,9 @@
-"""MCAP with Foxglove's schemas (Protobuf), for Foxglove and other viewers of robots' logs. Needs the extra `bags`.
+"""MCAP with Foxglove's schemas (Protobuf), for Foxglove and other viewers of robots' logs. Needs
+the extra `bags`.
 
-Topics: `/camera` foxglove.PoseInFrame, `/camera/calibration` CameraCalibration, `/camera/image` CompressedImage, `/tf` FrameTransform
-(map to camera), `/camera/fix` LocationFix of places on earth, and once `/path` PosesInFrame and `/points` PointCloud.
-https://docs.foxglove.dev/docs/sdk/schemas
+Topics: `/camera` foxglove.PoseInFrame, `/camera/calibration` CameraCalibration, `/camera/image`
+CompressedImage, `/tf` FrameTransform (map to camera), `/camera/fix` LocationFix of places on earth,
+and once `/path` PosesInFrame and `/points` PointCloud. https://docs.foxglove.dev/docs/sdk/schemas
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ _MODELS = {True: "kannala_brandt", False: "rational_polynomial"}
 
 
 def mcap_file(scene: Scene) -> bytes:
-    """A whole log; where views have no times, or those of two do not increase, they are a second apart from 0.
+    """A whole log; where views have no times, or those of two do not increase, they are a second
+    apart from 0.
 
     Raises:
         MissingExtraError: `mcap` or Foxglove's schemas are not installed.
@@ -34,7 +36,9 @@ def mcap_file(scene: Scene) -> bytes:
         from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
         from mcap_protobuf.writer import Writer
     except ModuleNotFoundError as error:
-        raise MissingExtraError("MCAP needs mcap and Foxglove's schemas: pip install 'topoloc[bags]'") from error
+        raise MissingExtraError(
+            "MCAP needs mcap and Foxglove's schemas: pip install 'topoloc[bags]'"
+        ) from error
     views, times = _in_time(scene)
     buffer = io.BytesIO()
     with Writer(buffer) as writer:
@@ -46,7 +50,13 @@ def mcap_file(scene: Scene) -> bytes:
         if len(scene.points.world):
             write("/points", _cloud(scene, times[0]), times[0])
         for view, t_ns in zip(views, times, strict=True):
-            write("/camera", PoseInFrame(timestamp=_stamp(t_ns), frame_id=MAP_FRAME, pose=_pose(view.world_from_cam)), t_ns)
+            write(
+                "/camera",
+                PoseInFrame(
+                    timestamp=_stamp(t_ns), frame_id=MAP_FRAME, pose=_pose(view.world_from_cam)
+                ),
+                t_ns,
+            )
             for topic, message in _messages(view, t_ns):
                 write(topic, message, t_ns)
     return buffer.getvalue()
@@ -69,7 +79,15 @@ def _messages(view: View, t_ns: int) -> list[tuple[str, Any]]:
     pose, stamp = _pose(view.world_from_cam), _stamp(t_ns)
     frames = {"parent_frame_id": MAP_FRAME, "child_frame_id": CAMERA_FRAME}
     messages: list[tuple[str, Any]] = [
-        ("/tf", FrameTransform(timestamp=stamp, **frames, translation=_vector(view.world_from_cam), rotation=pose.orientation))
+        (
+            "/tf",
+            FrameTransform(
+                timestamp=stamp,
+                **frames,
+                translation=_vector(view.world_from_cam),
+                rotation=pose.orientation,
+            ),
+        )
     ]
     camera = view.jpeg_camera or view.camera
     if camera is not None:
@@ -87,10 +105,23 @@ def _messages(view: View, t_ns: int) -> list[tuple[str, Any]]:
         )
         messages.append(("/camera/calibration", calibration))
     if view.jpeg:
-        messages.append(("/camera/image", CompressedImage(timestamp=stamp, frame_id=CAMERA_FRAME, data=view.jpeg, format="jpeg")))
+        messages.append(
+            (
+                "/camera/image",
+                CompressedImage(
+                    timestamp=stamp, frame_id=CAMERA_FRAME, data=view.jpeg, format="jpeg"
+                ),
+            )
+        )
     if view.geopose is not None:
         place = view.geopose.position
-        fix = LocationFix(timestamp=stamp, frame_id=CAMERA_FRAME, latitude=place.lat, longitude=place.lon, altitude=place.h)
+        fix = LocationFix(
+            timestamp=stamp,
+            frame_id=CAMERA_FRAME,
+            latitude=place.lat,
+            longitude=place.lon,
+            altitude=place.h,
+        )
         messages.append(("/camera/fix", fix))
     return messages
 
@@ -98,7 +129,9 @@ def _messages(view: View, t_ns: int) -> list[tuple[str, Any]]:
 def _path(scene: Scene, t_ns: int) -> Any:
     from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 
-    return PosesInFrame(timestamp=_stamp(t_ns), frame_id=MAP_FRAME, poses=[_pose(pose) for pose in scene.trajectory])
+    return PosesInFrame(
+        timestamp=_stamp(t_ns), frame_id=MAP_FRAME, poses=[_pose(pose) for pose in scene.trajectory]
+    )
 
 
 def _cloud(scene: Scene, t_ns: int) -> Any:
@@ -106,12 +139,29 @@ def _cloud(scene: Scene, t_ns: int) -> Any:
     from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 
     points = np.zeros(len(scene.points.world), [("xyz", "<f4", 3), ("rgba", "u1", 4)])
-    points["xyz"], points["rgba"][:, :3], points["rgba"][:, 3] = scene.points.world, scene.points.rgb, 255
-    fields = [PackedElementField(name=name, offset=4 * k, type=PackedElementField.FLOAT32) for k, name in enumerate("xyz")]
-    fields += [PackedElementField(name=name, offset=12 + k, type=PackedElementField.UINT8) for k, name in enumerate(_CHANNELS)]
+    points["xyz"], points["rgba"][:, :3], points["rgba"][:, 3] = (
+        scene.points.world,
+        scene.points.rgb,
+        255,
+    )
+    fields = [
+        PackedElementField(name=name, offset=4 * k, type=PackedElementField.FLOAT32)
+        for k, name in enumerate("xyz")
+    ]
+    fields += [
+        PackedElementField(name=name, offset=12 + k, type=PackedElementField.UINT8)
+        for k, name in enumerate(_CHANNELS)
+    ]
     origin = _pose(Rigid3.identity())
     step = struct.calcsize("<fffBBBB")
-    return PointCloud(timestamp=_stamp(t_ns), frame_id=MAP_FRAME, pose=origin, point_stride=step, fields=fields, data=points.tobytes())
+    return PointCloud(
+        timestamp=_stamp(t_ns),
+        frame_id=MAP_FRAME,
+        pose=origin,
+        point_stride=step,
+        fields=fields,
+        data=points.tobytes(),
+    )
 
 
 def _stamp(t_ns: int) -> Any:

@@ -1,4 +1,5 @@
-"""A map's graph for other programs: nodes, the ways between them, junctions; GraphML, or GeoJSON of a map that knows its place on earth."""
+"""A map's graph for other programs: nodes, the ways between them, junctions; GraphML, or GeoJSON of
+a map that knows its place on earth."""
 
 from __future__ import annotations
 
@@ -22,10 +23,12 @@ _TYPES = {bool: "boolean", int: "long", float: "double", str: "string"}
 
 @dataclass(frozen=True, eq=False)
 class MapGraph:
-    """`nodes` by their ids and `ways` by the ids of the node that one leaves and the one that one comes to, with what is known of each.
+    """`nodes` by their ids and `ways` by the ids of the node that one leaves and the one that one
+    comes to, with what is known of each.
 
-    Of a node: session, world_from_cam (x, y, z in metres; qw, qx, qy, qz), points, ways out, whether it is a junction: more than two
-    neighbours. Of a way: metres, source_from_target (x, y, z, qw, qx, qy, qz), the times that mapping pictures went it.
+    Of a node: session, world_from_cam (x, y, z in metres; qw, qx, qy, qz), points, ways out,
+    whether it is a junction: more than two neighbours. Of a way: metres, source_from_target (x, y,
+    z, qw, qx, qy, qz), the times that mapping pictures went it.
     """
 
     nodes: dict[int, dict[str, Any]]
@@ -40,7 +43,12 @@ def graph_of(topomap: TopoMetricMap) -> MapGraph:
         neighbours[edge.source_id].add(edge.target_id)
         neighbours[edge.target_id].add(edge.source_id)
     nodes = {
-        s.node_id: {"session": s.session_id, "name": s.name, **_pose(s.world_from_cam), "points": s.num_points}
+        s.node_id: {
+            "session": s.session_id,
+            "name": s.name,
+            **_pose(s.world_from_cam),
+            "points": s.num_points,
+        }
         | {"ways_out": out[s.node_id], "is_junction": len(neighbours[s.node_id]) > 2}
         for s in topomap.summaries
     }
@@ -91,30 +99,51 @@ def _graphml(graph: MapGraph) -> bytes:
     for of, entries in (("node", graph.nodes), ("edge", graph.ways)):
         first = next(iter(entries.values()), {})
         for name, value in first.items():
-            attributes = {"id": f"{of}_{name}", "for": of, "attr.name": name, "attr.type": _TYPES[type(value)]}
+            attributes = {
+                "id": f"{of}_{name}",
+                "for": of,
+                "attr.name": name,
+                "attr.type": _TYPES[type(value)],
+            }
             ElementTree.SubElement(root, "key", attributes)
     top = ElementTree.SubElement(root, "graph", id="map", edgedefault="directed")
     for node_id, facts in graph.nodes.items():
         _add_facts(ElementTree.SubElement(top, "node", id=f"n{node_id}"), "node", facts)
     for (source, target), facts in graph.ways.items():
-        _add_facts(ElementTree.SubElement(top, "edge", source=f"n{source}", target=f"n{target}"), "edge", facts)
+        _add_facts(
+            ElementTree.SubElement(top, "edge", source=f"n{source}", target=f"n{target}"),
+            "edge",
+            facts,
+        )
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
 
 
 def _add_facts(element: ElementTree.Element, of: str, facts: dict[str, Any]) -> None:
     for name, value in facts.items():
-        text = str(value).lower() if isinstance(value, bool) else "".join(c for c in str(value) if c.isprintable())
+        text = (
+            str(value).lower()
+            if isinstance(value, bool)
+            else "".join(c for c in str(value) if c.isprintable())
+        )
         ElementTree.SubElement(element, "data", key=f"{of}_{name}").text = text
 
 
 def _geojson(topomap: TopoMetricMap, graph: MapGraph) -> bytes:
     if topomap.georeference is None:
-        raise GeoreferenceError("nobody said where on earth this map lies (topoloc georeference); .graphml needs no place")
+        raise GeoreferenceError(
+            "nobody said where on earth this map lies (topoloc georeference); .graphml needs no"
+            " place"
+        )
     places = {s.node_id: _lon_lat_h(topomap, s.world_from_cam) for s in topomap.summaries}
-    features = [feature("Point", places[node_id], {"node": node_id} | facts) for node_id, facts in graph.nodes.items()]
+    features = [
+        feature("Point", places[node_id], {"node": node_id} | facts)
+        for node_id, facts in graph.nodes.items()
+    ]
     features += [
-        feature("LineString", [places[source], places[target]], {"from": source, "to": target} | facts)
+        feature(
+            "LineString", [places[source], places[target]], {"from": source, "to": target} | facts
+        )
         for (source, target), facts in graph.ways.items()
     ]
     return json.dumps({"type": "FeatureCollection", "features": features}).encode()

@@ -21,7 +21,8 @@ _POINTS = "sparse_pc.ply"
 
 
 def nerfstudio_files(scene: Scene) -> dict[str, bytes]:
-    """``transforms.json``, the pictures as a map keeps them (results name theirs), and the points that training may begin with.
+    """``transforms.json``, the pictures as a map keeps them (results name theirs), and the points
+    that training may begin with.
 
     Raises:
         TopolocError: a view has no camera.
@@ -35,10 +36,15 @@ def nerfstudio_files(scene: Scene) -> dict[str, bytes]:
             file_path = f"images/{number:06d}_{_plain(view)}.jpg"
             files[file_path] = view.jpeg
         matrix = view.world_from_cam.matrix() @ _CAM_FROM_OPENGL
-        frames.append({"file_path": file_path, **_intrinsics(camera), "transform_matrix": matrix.tolist()})
+        frames.append(
+            {"file_path": file_path, **_intrinsics(camera), "transform_matrix": matrix.tolist()}
+        )
     models = {frame.pop("camera_model") for frame in frames}
     if len(models) > 1:
-        raise TopolocError(f"nerfstudio takes one camera model, not {' and '.join(sorted(models))}; --session N exports one session")
+        raise TopolocError(
+            f"nerfstudio takes one camera model, not {' and '.join(sorted(models))}; --session N"
+            " exports one session"
+        )
     transforms: dict[str, Any] = {"camera_model": models.pop(), "frames": frames}
     if len(scene.points.world):
         transforms["ply_file_path"] = _POINTS
@@ -47,16 +53,26 @@ def nerfstudio_files(scene: Scene) -> dict[str, bytes]:
 
 
 def _plain(view: View) -> str:
-    return re.sub(r"[^\w.-]", "_", view.name.rpartition("/")[2].rpartition(".")[0] or view.name)[:100]
+    return re.sub(r"[^\w.-]", "_", view.name.rpartition("/")[2].rpartition(".")[0] or view.name)[
+        :100
+    ]
 
 
 def _intrinsics(camera: Camera) -> dict[str, Any]:
     """Its pixels begin at the corner of the first one, as COLMAP's do."""
     model, width, height, _ = camera.to_colmap()
-    names = ("k1", "k2", "k3", "k4") if camera.is_fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    names = (
+        ("k1", "k2", "k3", "k4")
+        if camera.is_fisheye
+        else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    )
     distortion = dict(zip(names, camera.distortion().tolist(), strict=True))
-    if any(distortion.get(name, 0.0) for name in ("k5", "k6")) or (not camera.is_fisheye and distortion["k4"]):
-        raise TopolocError(f"nerfstudio does not know the lens {model} with more than three radial coefficients")
+    if any(distortion.get(name, 0.0) for name in ("k5", "k6")) or (
+        not camera.is_fisheye and distortion["k4"]
+    ):
+        raise TopolocError(
+            f"nerfstudio does not know the lens {model} with more than three radial coefficients"
+        )
     return {
         "camera_model": "OPENCV_FISHEYE" if camera.is_fisheye else "OPENCV",
         "fl_x": camera.fx,

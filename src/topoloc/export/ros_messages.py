@@ -1,7 +1,8 @@
-"""ROS 2's messages as they go over DDS, field by field as their IDL says (geometry_msgs, tf2_msgs, std_msgs, builtin_interfaces).
+"""ROS 2's messages as they go over DDS, field by field as their IDL says (geometry_msgs, tf2_msgs,
+std_msgs, builtin_interfaces).
 
-Type names and topics are those that rmw makes of them: `geometry_msgs::msg::dds_::Pose_`, and `rt/` before a topic's name. This needs
-`cyclonedds`, the extra `ros`.
+Type names and topics are those that rmw makes of them: `geometry_msgs::msg::dds_::Pose_`, and `rt/`
+before a topic's name. This needs `cyclonedds`, the extra `ros`.
 """
 
 # No `from __future__ import annotations`: cyclonedds reads the types of the fields as they are.
@@ -58,7 +59,9 @@ class PoseWithCovariance(IdlStruct, typename="geometry_msgs::msg::dds_::PoseWith
 
 
 @dataclass
-class PoseWithCovarianceStamped(IdlStruct, typename="geometry_msgs::msg::dds_::PoseWithCovarianceStamped_"):
+class PoseWithCovarianceStamped(
+    IdlStruct, typename="geometry_msgs::msg::dds_::PoseWithCovarianceStamped_"
+):
     header: Header
     pose: PoseWithCovariance
 

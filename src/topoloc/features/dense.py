@@ -1,7 +1,9 @@
-"""A network's descriptors of a whole picture, and how far they agree with map points where these must be seen.
+"""A network's descriptors of a whole picture, and how far they agree with map points where these
+must be seen.
 
-A key point must be found anew to speak for a pose, and in rain or by night most are not. What a network says of every few pixels needs no
-finding: where a pose is right, the descriptor most like the map point's, of all around, lies where the point must be seen.
+A key point must be found anew to speak for a pose, and in rain or by night most are not. What a
+network says of every few pixels needs no finding: where a pose is right, the descriptor most like
+the map point's, of all around, lies where the point must be seen.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ _RADIUS = 4  # grid steps to each side among which the most similar descriptor i
 
 
 class DenseDescriptors(ABC):
-    """One descriptor each `stride_px` pixels; that of pixel (x, y) lies at column (x + 0.5) / stride_px - 0.5."""
+    """One descriptor each `stride_px` pixels; that of pixel (x, y) lies at column (x + 0.5) /
+    stride_px - 0.5."""
 
     stride_px: float
 
@@ -46,9 +49,18 @@ class DenseDescriptors(ABC):
     def _grid(self) -> Float32[np.ndarray, "rows columns d"]:
         return self._unit_grid()
 
-    def agrees(self, points_img: Float[np.ndarray, "n 2"], descriptors: Float32[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
-        """Is the descriptor most like each of these, of all within 4 grid steps to each side of its point, at most one step off?"""
-        return is_most_similar_here(self._grid, points_img.astype(np.float32), descriptors, np.float32(self.stride_px), _RADIUS)
+    def agrees(
+        self, points_img: Float[np.ndarray, "n 2"], descriptors: Float32[np.ndarray, "n d"]
+    ) -> Bool[np.ndarray, " n"]:
+        """Is the descriptor most like each of these, of all within 4 grid steps to each side of its
+        point, at most one step off?"""
+        return is_most_similar_here(
+            self._grid,
+            points_img.astype(np.float32),
+            descriptors,
+            np.float32(self.stride_px),
+            _RADIUS,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +83,9 @@ class Planes(DenseDescriptors):
 
 @dataclass(frozen=True, eq=False)
 class TwoLevels(DenseDescriptors):
-    """As a network gives them that only ever adds two levels up: `coarse`, enlarged to twice its rows and columns (bilinear), and `fine`
-    times `weights`. Both are linear, and far fewer descriptors are asked for than there are: so they are added up where they are."""
+    """As a network gives them that only ever adds two levels up: `coarse`, enlarged to twice its
+    rows and columns (bilinear), and `fine` times `weights`. Both are linear, and far fewer
+    descriptors are asked for than there are: so they are added up where they are."""
 
     coarse: Float32[np.ndarray, "half_rows half_columns d"]
     fine: Float32[np.ndarray, "rows columns k"]
@@ -84,7 +97,9 @@ class TwoLevels(DenseDescriptors):
         return self.coarse.shape[2]
 
     def at(self, points_img: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n d"]:
-        return sample_levels(self.coarse, self.fine, self.weights, points_img, np.float32(self.stride_px))
+        return sample_levels(
+            self.coarse, self.fine, self.weights, points_img, np.float32(self.stride_px)
+        )
 
     def _unit_grid(self) -> Float32[np.ndarray, "rows columns d"]:
         return levels_of_unit_length(self.coarse, self.fine, self.weights)

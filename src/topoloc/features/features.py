@@ -1,4 +1,5 @@
-"""The currency between the feature steps: key points with descriptors, and matches between two sets of them."""
+"""The currency between the feature steps: key points with descriptors, and matches between two sets
+of them."""
 
 from __future__ import annotations
 
@@ -16,10 +17,11 @@ _OF_EACH = ("points_img", "sizes_px", "angles", "responses", "descriptors")
 class Features:
     """Local features of one image, strongest first.
 
-    points_img are pixels (centre of the top-left pixel at (0, 0)); sizes_px the diameter of the neighbourhood described;
-    angles in radians from +x towards +y (clockwise on the screen), 0 for upright ones; descriptors have unit length.
-    Of a network also what it says of the whole picture, which a part of the features is without, and no node keeps: `cells` is what it
-    saw in each cell, where the network has such, `dense` its descriptors each few pixels.
+    points_img are pixels (centre of the top-left pixel at (0, 0)); sizes_px the diameter of the
+    neighbourhood described; angles in radians from +x towards +y (clockwise on the screen), 0 for
+    upright ones; descriptors have unit length. Of a network also what it says of the whole picture,
+    which a part of the features is without, and no node keeps: `cells` is what it saw in each cell,
+    where the network has such, `dense` its descriptors each few pixels.
     """
 
     points_img: Float32[np.ndarray, "n 2"]
@@ -39,7 +41,9 @@ class Features:
 
     @staticmethod
     def concatenate(parts: list[Features]) -> Features:
-        return Features._of_each([np.concatenate([getattr(part, name) for part in parts]) for name in _OF_EACH])
+        return Features._of_each(
+            [np.concatenate([getattr(part, name) for part in parts]) for name in _OF_EACH]
+        )
 
     @staticmethod
     def _of_each(arrays: list[np.ndarray]) -> Features:
@@ -49,12 +53,15 @@ class Features:
     @staticmethod
     def empty(dimension: int) -> Features:
         zero = np.zeros(0, np.float32)
-        return Features(np.zeros((0, 2), np.float32), zero, zero, zero, np.zeros((0, dimension), np.float32))
+        return Features(
+            np.zeros((0, 2), np.float32), zero, zero, zero, np.zeros((0, dimension), np.float32)
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Pairs of rows: `query_idx[k]` of the one set goes with `train_idx[k]` of the other, at this descriptor distance."""
+    """Pairs of rows: `query_idx[k]` of the one set goes with `train_idx[k]` of the other, at this
+    descriptor distance."""
 
     query_idx: Int32[np.ndarray, " m"]
     train_idx: Int32[np.ndarray, " m"]

@@ -1,8 +1,10 @@
-"""The kinds of local features that a map may be made of, in one table: all that differs between them stands here.
+"""The kinds of local features that a map may be made of, in one table: all that differs between
+them stands here.
 
-A kind is added by one entry in `KINDS`: how a picture gives its features, and the thresholds with which they are matched. What makes
-its answers honest is fitted and kept beside the code that uses it (`localization/fitted_weights.py`); until then its answers say that
-their probability is not calibrated.
+A kind is added by one entry in `KINDS`: how a picture gives its features, and the thresholds with
+which they are matched. What makes its answers honest is fitted and kept beside the code that uses
+it (`localization/fitted_weights.py`); until then its answers say that their probability is not
+calibrated.
 """
 
 from __future__ import annotations
@@ -26,18 +28,20 @@ Normalization = Literal["none", "paper", "wide"]
 
 @dataclass(frozen=True)
 class FeatureConfig:
-    """Which features an image gives. Plain values only: it is stored in the map and built again from them."""
+    """Which features an image gives. Plain values only: it is stored in the map and built again
+    from them."""
 
     kind: str = "surf"
     """Local features of the map, and of every query to it: a name in `KINDS`."""
     normalization: Normalization | None = None
-    """`none`. `paper`: 17x17 windows and no noise floor. `wide`: 65x65 windows and a floor of 24 grey levels, which keeps what the paper's
-    form gains when the light changes and loses little where it does not. Unset: what suits the kind."""
+    """`none`. `paper`: 17x17 windows and no noise floor. `wide`: 65x65 windows and a floor of 24
+    grey levels, which keeps what the paper's form gains when the light changes and loses little
+    where it does not. Unset: what suits the kind."""
     max_features: Annotated[int, Between(1, 100_000)] = 1000
     """The strongest are kept."""
     hessian_threshold: Annotated[float, AtLeast(0)] = 20.0
-    """Of SURF, for images of 0..255. Low on purpose: a fixed one is a threshold on contrast, and finds next to nothing in a dark
-    picture."""
+    """Of SURF, for images of 0..255. Low on purpose: a fixed one is a threshold on contrast, and
+    finds next to nothing in a dark picture."""
     contrast_threshold: Annotated[float, AtLeast(0)] = 0.01
     """The same of SIFT, as OpenCV's."""
 
@@ -46,9 +50,10 @@ class FeatureConfig:
 class GuidedThresholds:
     """Which key point near the place where a map point must be seen is that point.
 
-    min_similarity: least scalar product of the two descriptors; min_margin: by how much the best key point must lead the next one.
-    max_scale: largest ratio of a key point's size to the one expected, or the other way round; max_turn: largest difference of its
-    orientation from the one expected, radians.
+    min_similarity: least scalar product of the two descriptors; min_margin: by how much the best
+    key point must lead the next one. max_scale: largest ratio of a key point's size to the one
+    expected, or the other way round; max_turn: largest difference of its orientation from the one
+    expected, radians.
     """
 
     min_similarity: float
@@ -61,18 +66,19 @@ class GuidedThresholds:
 class FeatureKind:
     """A kind of local feature.
 
-    extract: gives the features of a grey uint8 picture, strongest first, with these settings on so many threads. Descriptors must have
-    unit length: they are compared by their scalar product.
+    extract: gives the features of a grey uint8 picture, strongest first, with these settings on so
+    many threads. Descriptors must have unit length: they are compared by their scalar product.
     normalization: what is done to the picture first, unless the settings say otherwise.
-    descriptor_scale: a map file keeps a descriptor's numbers times this as signed bytes; what exceeds 127 (at 200: 0.63) is clipped.
-    has_scale, has_angle: do `Features.sizes_px` and `angles` follow the picture? Where they do not, all are the same, and matching
-    does not look at them.
-    sigma_px: standard deviation (pixels) of a matched key point along x and along y.
-    ratio: a match must be nearer than this times its nearest rival; wall_ratio, of walls seen from the side, which repeat themselves.
-    position_weight: how much a feature's place in the picture counts beside its descriptor where pictures are ranked (`places/vlad.py`).
-    network: what gives the features, if a network does (`network_files.py`). sides: the kind that describes views to the sides
-    (`side_views.py`) of a map of this one, if that is another.
-    guided: thresholds for key points near their projection; distant: far from it, where the pose is only that of a node nearby.
+    descriptor_scale: a map file keeps a descriptor's numbers times this as signed bytes; what
+    exceeds 127 (at 200: 0.63) is clipped. has_scale, has_angle: do `Features.sizes_px` and `angles`
+    follow the picture? Where they do not, all are the same, and matching does not look at them.
+    sigma_px: standard deviation (pixels) of a matched key point along x and along y. ratio: a match
+    must be nearer than this times its nearest rival; wall_ratio, of walls seen from the side, which
+    repeat themselves. position_weight: how much a feature's place in the picture counts beside its
+    descriptor where pictures are ranked (`places/vlad.py`). network: what gives the features, if a
+    network does (`network_files.py`). sides: the kind that describes views to the sides
+    (`side_views.py`) of a map of this one, if that is another. guided: thresholds for key points
+    near their projection; distant: far from it, where the pose is only that of a node nearby.
     """
 
     name: str
@@ -97,20 +103,38 @@ class FeatureKind:
         return self.sides or self.name
 
 
-def _extract_surf(image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None) -> Features:
-    settings = SurfConfig(hessian_threshold=config.hessian_threshold, max_features=config.max_features, num_threads=num_threads)
+def _extract_surf(
+    image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None
+) -> Features:
+    settings = SurfConfig(
+        hessian_threshold=config.hessian_threshold,
+        max_features=config.max_features,
+        num_threads=num_threads,
+    )
     return extract_surf(image, settings)
 
 
-def _extract_sift(image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None) -> Features:
-    return extract_sift(image, SiftConfig(max_features=config.max_features, contrast_threshold=config.contrast_threshold))
+def _extract_sift(
+    image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None
+) -> Features:
+    return extract_sift(
+        image,
+        SiftConfig(max_features=config.max_features, contrast_threshold=config.contrast_threshold),
+    )
 
 
-def _learned_kind(network: str, descriptor_size: int, min_score: float, sides: str | None = None) -> FeatureKind:
+def _learned_kind(
+    network: str, descriptor_size: int, min_score: float, sides: str | None = None
+) -> FeatureKind:
     """A kind whose features a network gives: no size, no angle, and the picture as it is."""
 
-    def extract(image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None) -> Features:
-        return extract_learned(image, LearnedConfig(network, descriptor_size, config.max_features, min_score, num_threads))
+    def extract(
+        image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None
+    ) -> Features:
+        return extract_learned(
+            image,
+            LearnedConfig(network, descriptor_size, config.max_features, min_score, num_threads),
+        )
 
     return FeatureKind(
         network,
@@ -149,7 +173,8 @@ LEARNED = (
 KINDS: dict[str, FeatureKind] = {kind.name: kind for kind in (SURF, SIFT, *LEARNED)}
 
 _OF_SIDES = {"topoloc-net-sides": _learned_kind("topoloc-net-sides", 64, min_score=0.0067)}
-"""Those of side views alone, which no map is made of: `topoloc-net`, taught further on walls that are seen from their two ends."""
+"""Those of side views alone, which no map is made of: `topoloc-net`, taught further on walls that
+are seen from their two ends."""
 
 
 def find_kind(name: str) -> FeatureKind:
@@ -165,7 +190,8 @@ def find_kind(name: str) -> FeatureKind:
 
 
 def learned_kind() -> str:
-    """The learned features that are taken where the user names none: those whose answers are calibrated.
+    """The learned features that are taken where the user names none: those whose answers are
+    calibrated.
 
     Raises:
         MissingExtraError, WeightsError: what their network needs is not here.

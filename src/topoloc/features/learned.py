@@ -1,8 +1,11 @@
-"""Learned local features: a network reads the whole picture once and gives a score for every pixel and a descriptor for every few.
+"""Learned local features: a network reads the whole picture once and gives a score for every pixel
+and a descriptor for every few.
 
-All networks come as ONNX files of one form and run in ONNX Runtime: grey in [0, 1] goes in, its sides multiples of 32; out come the score
-of each pixel being a key point, and descriptors on a coarser grid; of some networks also a level by which places are known again. Key
-points are the maxima of the scores, the strongest to a fraction of a pixel by a parabola through each and its neighbours.
+All networks come as ONNX files of one form and run in ONNX Runtime: grey in [0, 1] goes in, its
+sides multiples of 32; out come the score of each pixel being a key point, and descriptors on a
+coarser grid; of some networks also a level by which places are known again. Key points are the
+maxima of the scores, the strongest to a fraction of a pixel by a parabola through each and its
+neighbours.
 """
 
 from __future__ import annotations
@@ -55,7 +58,10 @@ def extract_learned(image: UInt8[np.ndarray, "h w"], config: LearnedConfig) -> F
     answer = run_network(image, config.network, config.num_threads)
     scores, dense = answer.scores, answer.dense
     if dense.size != config.descriptor_size:
-        raise WeightsError(f"the network {config.network} gives descriptors of {dense.size} numbers, not {config.descriptor_size}")
+        raise WeightsError(
+            f"the network {config.network} gives descriptors of {dense.size} numbers, not"
+            f" {config.descriptor_size}"
+        )
     pixels, found = find_maxima(scores, height, width, _BORDER_PX, np.float32(config.min_score))
     order = np.argsort(-found, kind="stable")[: config.max_features]
     points_img = refined(scores, pixels[order])
@@ -65,8 +71,11 @@ def extract_learned(image: UInt8[np.ndarray, "h w"], config: LearnedConfig) -> F
     return Features(points_img, sizes, angles, found[order], dense.at(points_img), cells, dense)
 
 
-def mean_cells(level: Float32[np.ndarray, "c h w"], height_share: float, width_share: float) -> Float32[np.ndarray, "rows columns c"]:
-    """Means of a network's level over a grid of cells, of that share of its rows and columns that the picture fills."""
+def mean_cells(
+    level: Float32[np.ndarray, "c h w"], height_share: float, width_share: float
+) -> Float32[np.ndarray, "rows columns c"]:
+    """Means of a network's level over a grid of cells, of that share of its rows and columns that
+    the picture fills."""
     for axis, share, count in ((1, height_share, _CELLS[0]), (2, width_share, _CELLS[1])):
         length = max(1, round(level.shape[axis] * share))
         starts = np.arange(count) * length // count
@@ -83,32 +92,46 @@ def check_network(network: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class NetworkAnswer:
-    """Scores of the pixels, descriptors, and the level by which places are known again, where the network has one."""
+    """Scores of the pixels, descriptors, and the level by which places are known again, where the
+    network has one."""
 
     scores: Float32[np.ndarray, "padded_h padded_w"]
     dense: DenseDescriptors
     places: Float32[np.ndarray, "c level_h level_w"] | None
 
 
-def run_network(image: UInt8[np.ndarray, "h w"], network: str, num_threads: int | None = None) -> NetworkAnswer:
+def run_network(
+    image: UInt8[np.ndarray, "h w"], network: str, num_threads: int | None = None
+) -> NetworkAnswer:
     """What a network says of a picture, which is continued by its border to the sides asked."""
     height, width = image.shape
     padding = [(0, -side % _SIDE_MULTIPLE) for side in (height, width)]
     grey = np.pad(image, padding, mode="edge").astype(np.float32) / np.float32(255.0)
-    session = _session(network, find_network(network), num_threads or compiled.num_threads(), grey.shape, os.getpid())
+    session = _session(
+        network,
+        find_network(network),
+        num_threads or compiled.num_threads(),
+        grey.shape,
+        os.getpid(),
+    )
     names = [output.name for output in session.get_outputs()]
     of = dict(zip(names, session.run(names, {"image": grey[None, None]}), strict=True))
     scores, places = of["scores"][0, 0], of.get("places")
     if "coarse" in of:
-        dense = TwoLevels(of["coarse"][0], of["fine"][0], of["fine_weights"], len(scores) / of["fine"].shape[1])
+        dense = TwoLevels(
+            of["coarse"][0], of["fine"][0], of["fine_weights"], len(scores) / of["fine"].shape[1]
+        )
     else:
         dense = Planes(of["descriptors"][0], len(scores) / of["descriptors"].shape[2])
     return NetworkAnswer(scores, dense, None if places is None else places[0])
 
 
 @functools.lru_cache(maxsize=6)
-def _session(network: str, path: Path, num_threads: int, size: tuple[int, int], process_id: int) -> Any:
-    """The network made ready for pictures of one size, in some 10 ms, after which each takes 0.8 of the time; a forked child makes its own.
+def _session(
+    network: str, path: Path, num_threads: int, size: tuple[int, int], process_id: int
+) -> Any:
+    """The network made ready for pictures of one size, in some 10 ms, after which each takes 0.8 of
+    the time; a forked child makes its own.
 
     Each holds some 100 bytes a pixel, so few are kept.
     """

@@ -9,12 +9,18 @@ _RADIUS = 2
 
 @kernel()
 def find_maxima(scores, height, width, border, min_score):
-    """Pixels (x, y) that score more than all others within two pixels and more than `min_score`, row by row; and their scores. Of equal
-    ones the first counts. The picture has `height` rows and `width` columns, the scores may have more."""
-    pixels, found = np.empty((height * width // 9 + 1, 2), np.int32), np.empty(height * width // 9 + 1, np.float32)
+    """Pixels (x, y) that score more than all others within two pixels and more than `min_score`,
+    row by row; and their scores. Of equal ones the first counts. The picture has `height` rows and
+    `width` columns, the scores may have more."""
+    pixels, found = (
+        np.empty((height * width // 9 + 1, 2), np.int32),
+        np.empty(height * width // 9 + 1, np.float32),
+    )
     border = max(border, _RADIUS)
     count, num_columns = 0, max(width - 2 * border, 0)
-    along = np.empty((2 * _RADIUS + 1, num_columns), np.float32)  # the largest along each row's window, of as many rows as a window has
+    along = np.empty(
+        (2 * _RADIUS + 1, num_columns), np.float32
+    )  # the largest along each row's window, of as many rows as a window has
     around = np.empty(num_columns, np.float32)
     for y in range(border - _RADIUS, min(height - border + _RADIUS, height) if num_columns else 0):
         _largest_of_windows(scores[y], border, along[y % len(along)])
@@ -24,7 +30,11 @@ def find_maxima(scores, height, width, border, min_score):
         _largest_of_rows(along, around)
         row = scores[middle][border : border + num_columns]
         for x in range(num_columns):
-            if row[x] >= around[x] and row[x] > min_score and _is_first_maximum(scores, middle, border + x):
+            if (
+                row[x] >= around[x]
+                and row[x] > min_score
+                and _is_first_maximum(scores, middle, border + x)
+            ):
                 pixels[count, 0], pixels[count, 1], found[count] = border + x, middle, row[x]
                 count += 1
     return pixels[:count].copy(), found[:count].copy()
@@ -34,7 +44,11 @@ def find_maxima(scores, height, width, border, min_score):
 def _largest_of_windows(row, border, out):
     """The largest score within two pixels along a row, of each from `border` on."""
     n = len(out)
-    a, b, c = row[border - 2 : border - 2 + n], row[border - 1 : border - 1 + n], row[border : border + n]
+    a, b, c = (
+        row[border - 2 : border - 2 + n],
+        row[border - 1 : border - 1 + n],
+        row[border : border + n],
+    )
     d, e = row[border + 1 : border + 1 + n], row[border + 2 : border + 2 + n]
     for x in range(n):  # without branches, so that it runs many pixels at a time
         left = a[x] if a[x] > b[x] else b[x]
@@ -66,7 +80,8 @@ def _is_first_maximum(scores, y, x):
 
 @kernel()
 def refined(scores, pixels):
-    """Pixels (x, y) moved to the top of the parabola through the scores of each and its neighbours."""
+    """Pixels (x, y) moved to the top of the parabola through the scores of each and its
+    neighbours."""
     points = np.empty((len(pixels), 2), np.float32)
     for k in range(len(pixels)):
         x, y = pixels[k, 0], pixels[k, 1]
@@ -77,8 +92,13 @@ def refined(scores, pixels):
 
 @kernel()
 def _top(before, here, after):
-    """Where the parabola through the logarithms of three scores, at -1, 0 and 1, has its top; within half a pixel."""
-    a, b, c = np.log(before + np.float32(1e-6)), np.log(here + np.float32(1e-6)), np.log(after + np.float32(1e-6))
+    """Where the parabola through the logarithms of three scores, at -1, 0 and 1, has its top;
+    within half a pixel."""
+    a, b, c = (
+        np.log(before + np.float32(1e-6)),
+        np.log(here + np.float32(1e-6)),
+        np.log(after + np.float32(1e-6)),
+    )
     bend = a - 2 * b + c
     if bend > -1e-6:
         return np.float32(0.0)
@@ -87,12 +107,19 @@ def _top(before, here, after):
 
 @kernel()
 def sample_descriptors(dense, points_img, stride):
-    """(n, d) descriptors of unit length, bilinear between those of the grid; pixel x lies at (x + 0.5) / stride - 0.5 in it."""
+    """(n, d) descriptors of unit length, bilinear between those of the grid; pixel x lies at (x +
+    0.5) / stride - 0.5 in it."""
     size, rows, columns = dense.shape
     out = np.empty((len(points_img), size), np.float32)
     for k in range(len(points_img)):
-        u = min(max((points_img[k, 0] + np.float32(0.5)) / stride - np.float32(0.5), np.float32(0)), np.float32(columns - 1))
-        v = min(max((points_img[k, 1] + np.float32(0.5)) / stride - np.float32(0.5), np.float32(0)), np.float32(rows - 1))
+        u = min(
+            max((points_img[k, 0] + np.float32(0.5)) / stride - np.float32(0.5), np.float32(0)),
+            np.float32(columns - 1),
+        )
+        v = min(
+            max((points_img[k, 1] + np.float32(0.5)) / stride - np.float32(0.5), np.float32(0)),
+            np.float32(rows - 1),
+        )
         x, y = min(int(u), columns - 2), min(int(v), rows - 2)
         s, t = np.float32(u - x), np.float32(v - y)
         total = np.float32(0)
@@ -129,12 +156,19 @@ def turned_to_unit_length(planes):
 
 @kernel(fastmath={"contract"})
 def sample_levels(coarse, fine, weights, points_img, stride):
-    """As `sample_descriptors`, of the sum of two levels (`dense.TwoLevels`) whose finer grid has that stride."""
+    """As `sample_descriptors`, of the sum of two levels (`dense.TwoLevels`) whose finer grid has
+    that stride."""
     rows, columns, size = fine.shape[0], fine.shape[1], coarse.shape[2]
     out, mixed = np.empty((len(points_img), size), np.float32), np.empty(fine.shape[2], np.float32)
     for k in range(len(points_img)):
-        u = min(max((points_img[k, 0] + np.float32(0.5)) / stride - np.float32(0.5), np.float32(0)), np.float32(columns - 1))
-        v = min(max((points_img[k, 1] + np.float32(0.5)) / stride - np.float32(0.5), np.float32(0)), np.float32(rows - 1))
+        u = min(
+            max((points_img[k, 0] + np.float32(0.5)) / stride - np.float32(0.5), np.float32(0)),
+            np.float32(columns - 1),
+        )
+        v = min(
+            max((points_img[k, 1] + np.float32(0.5)) / stride - np.float32(0.5), np.float32(0)),
+            np.float32(rows - 1),
+        )
         x, y = min(int(u), columns - 2), min(int(v), rows - 2)
         s, t = np.float32(u - x), np.float32(v - y)
         value = out[k]
@@ -148,7 +182,12 @@ def sample_levels(coarse, fine, weights, points_img, stride):
         for i in range(0, len(mixed), 4):
             a, b, c, d = weights[i], weights[i + 1], weights[i + 2], weights[i + 3]
             for j in range(size):
-                value[j] += mixed[i] * a[j] + mixed[i + 1] * b[j] + mixed[i + 2] * c[j] + mixed[i + 3] * d[j]
+                value[j] += (
+                    mixed[i] * a[j]
+                    + mixed[i + 1] * b[j]
+                    + mixed[i + 2] * c[j]
+                    + mixed[i + 3] * d[j]
+                )
         total = np.float32(1e-12)
         for j in range(size):
             total += value[j] * value[j]
@@ -160,16 +199,23 @@ def sample_levels(coarse, fine, weights, points_img, stride):
 
 @kernel(fastmath={"contract", "reassoc"})
 def levels_of_unit_length(coarse, fine, weights):
-    """(rows, columns, d) descriptors of unit length, of two levels (`dense.TwoLevels`), whose columns and k are multiples of four."""
+    """(rows, columns, d) descriptors of unit length, of two levels (`dense.TwoLevels`), whose
+    columns and k are multiples of four."""
     rows, columns, size = fine.shape[0], fine.shape[1], coarse.shape[2]
     grid = np.empty((rows, columns, size), np.float32)
     blend, sums = np.empty((coarse.shape[1] + 2, size), np.float32), np.empty(4 * size, np.float32)
     by_four = weights.copy().reshape(weights.shape[0] // 4, 4 * size)
     for y in range(rows):
         _blend_rows(coarse, y, blend)
-        for x in range(0, columns, 4):  # four at a time, so that the weights are read a quarter as often
+        for x in range(
+            0, columns, 4
+        ):  # four at a time, so that the weights are read a quarter as often
             for half in range(2):
-                before, here, after = blend[x // 2 + half], blend[x // 2 + half + 1], blend[x // 2 + half + 2]
+                before, here, after = (
+                    blend[x // 2 + half],
+                    blend[x // 2 + half + 1],
+                    blend[x // 2 + half + 2],
+                )
                 for j in range(size):
                     most = np.float32(0.75) * here[j]
                     sums[2 * half * size + j] = most + np.float32(0.25) * before[j]
@@ -187,7 +233,8 @@ def levels_of_unit_length(coarse, fine, weights):
 
 @kernel(fastmath={"contract", "reassoc"})
 def _blend_rows(coarse, y, out):
-    """What row y of a grid twice as fine lies between, with the first and the last column once more at the ends."""
+    """What row y of a grid twice as fine lies between, with the first and the last column once more
+    at the ends."""
     above, below = coarse[max((y - 1) // 2, 0)], coarse[min((y + 1) // 2, coarse.shape[0] - 1)]
     t = np.float32(0.25) if y % 2 else np.float32(0.75)
     for x in range(coarse.shape[1]):
@@ -198,13 +245,29 @@ def _blend_rows(coarse, y, out):
 
 @kernel(fastmath={"contract", "reassoc"})
 def _add_fine(row, x, by_four, size, sums):
-    """Adds what the finer level says of four pixels from x on; `sums` holds one descriptor after the other, `by_four` four weights of k."""
+    """Adds what the finer level says of four pixels from x on; `sums` holds one descriptor after
+    the other, `by_four` four weights of k."""
     for k in range(by_four.shape[0]):
         w = by_four[k]
         a0, a1, a2, a3 = row[x, 4 * k], row[x, 4 * k + 1], row[x, 4 * k + 2], row[x, 4 * k + 3]
-        b0, b1, b2, b3 = row[x + 1, 4 * k], row[x + 1, 4 * k + 1], row[x + 1, 4 * k + 2], row[x + 1, 4 * k + 3]
-        c0, c1, c2, c3 = row[x + 2, 4 * k], row[x + 2, 4 * k + 1], row[x + 2, 4 * k + 2], row[x + 2, 4 * k + 3]
-        d0, d1, d2, d3 = row[x + 3, 4 * k], row[x + 3, 4 * k + 1], row[x + 3, 4 * k + 2], row[x + 3, 4 * k + 3]
+        b0, b1, b2, b3 = (
+            row[x + 1, 4 * k],
+            row[x + 1, 4 * k + 1],
+            row[x + 1, 4 * k + 2],
+            row[x + 1, 4 * k + 3],
+        )
+        c0, c1, c2, c3 = (
+            row[x + 2, 4 * k],
+            row[x + 2, 4 * k + 1],
+            row[x + 2, 4 * k + 2],
+            row[x + 2, 4 * k + 3],
+        )
+        d0, d1, d2, d3 = (
+            row[x + 3, 4 * k],
+            row[x + 3, 4 * k + 1],
+            row[x + 3, 4 * k + 2],
+            row[x + 3, 4 * k + 3],
+        )
         for j in range(size):
             w0, w1, w2, w3 = w[j], w[size + j], w[2 * size + j], w[3 * size + j]
             sums[j] = sums[j] + a0 * w0 + a1 * w1 + a2 * w2 + a3 * w3
@@ -220,7 +283,12 @@ def _add_coarse(coarse, y, x, share, out):
     below, right = min((y + 1) // 2, coarse.shape[0] - 1), min((x + 1) // 2, coarse.shape[1] - 1)
     t = np.float32(0.25) if y % 2 else np.float32(0.75)
     s = np.float32(0.25) if x % 2 else np.float32(0.75)
-    a, b, c, d = coarse[above, left], coarse[above, right], coarse[below, left], coarse[below, right]
+    a, b, c, d = (
+        coarse[above, left],
+        coarse[above, right],
+        coarse[below, left],
+        coarse[below, right],
+    )
     p, q, r, z = share * (1 - t) * (1 - s), share * (1 - t) * s, share * t * (1 - s), share * t * s
     for j in range(len(out)):
         out[j] += p * a[j] + q * b[j] + r * c[j] + z * d[j]
@@ -228,7 +296,8 @@ def _add_coarse(coarse, y, x, share, out):
 
 @kernel(error_model="numpy", fastmath={"reassoc", "contract"})
 def is_most_similar_here(grid, points_img, descriptors, stride, radius):
-    """For each point: is the descriptor most like its own, of those within `radius` grid steps to each side, within one step of it?"""
+    """For each point: is the descriptor most like its own, of those within `radius` grid steps to
+    each side, within one step of it?"""
     rows, columns, size = grid.shape
     found = np.zeros(len(points_img), np.bool_)
     for k in range(len(points_img)):

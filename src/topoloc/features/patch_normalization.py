@@ -1,7 +1,7 @@
 """Patch normalisation: every pixel by the mean and standard deviation of its own neighbourhood.
 
-The paper, section III-C: ``N(p) = (I(p) - mu_P) / (sigma_P + epsilon)`` in 17x17 windows, before the key points, which
-makes the features outlive a change of lighting (Zhang and Kleeman, 2009).
+The paper, section III-C: ``N(p) = (I(p) - mu_P) / (sigma_P + epsilon)`` in 17x17 windows, before
+the key points, which makes the features outlive a change of lighting (Zhang and Kleeman, 2009).
 """
 
 from __future__ import annotations
@@ -25,20 +25,25 @@ class PatchNormalizationConfig:
     window_px: Annotated[int, Between(3, 127)] = 17
     """Side of the window, odd."""
     epsilon: Annotated[float, AtLeast(0)] = 1e-3
-    """Grey levels added to sigma: tiny as in the paper it only prevents the division by zero, a few grey levels keep plain surfaces
-    from becoming amplified sensor noise."""
+    """Grey levels added to sigma: tiny as in the paper it only prevents the division by zero, a few
+    grey levels keep plain surfaces from becoming amplified sensor noise."""
     shape: Literal["square", "round"] = "square"
-    """`square` weighs all pixels of the window alike, `round` is the box of half the width applied twice, a pyramid-like bell of the
-    same support without the axis-parallel ringing."""
+    """`square` weighs all pixels of the window alike, `round` is the box of half the width applied
+    twice, a pyramid-like bell of the same support without the axis-parallel ringing."""
     gain: Annotated[float, Above(0)] = 40.0
     """Grey levels of the result a unit of N, which is mapped to 128 + gain N and clipped."""
 
     def __post_init__(self) -> None:
         largest = 127 if self.shape == "square" else 37  # sums of squares stay within 32 bits
         if not 3 <= self.window_px <= largest or self.window_px % 2 == 0:
-            raise ValueError(f"window_px must be odd and within 3 .. {largest}, not {self.window_px}")
+            raise ValueError(
+                f"window_px must be odd and within 3 .. {largest}, not {self.window_px}"
+            )
         if not self.epsilon >= 0.0 or not self.gain > 0.0:
-            raise ValueError(f"epsilon must not be negative and gain be positive, not {self.epsilon} and {self.gain}")
+            raise ValueError(
+                f"epsilon must not be negative and gain be positive, not {self.epsilon} and"
+                f" {self.gain}"
+            )
 
     @staticmethod
     def paper() -> PatchNormalizationConfig:
@@ -46,7 +51,8 @@ class PatchNormalizationConfig:
         return PatchNormalizationConfig(window_px=17, epsilon=1e-3, shape="square")
 
     def boxes(self) -> tuple[int, int]:
-        """Sides of the two boxes that are applied one after the other; together they reach over `window_px`."""
+        """Sides of the two boxes that are applied one after the other; together they reach over
+        `window_px`."""
         if self.shape == "square":
             return self.window_px, 1
         second = (self.window_px + 1) // 2
@@ -54,12 +60,14 @@ class PatchNormalizationConfig:
 
 
 def patch_normalize(
-    image: UInt8[np.ndarray, "h w"], config: PatchNormalizationConfig, num_threads: int | None = None
+    image: UInt8[np.ndarray, "h w"],
+    config: PatchNormalizationConfig,
+    num_threads: int | None = None,
 ) -> UInt8[np.ndarray, "h w"]:
     """The normalised image N as 8 bit: 128 + gain N, rounded, clipped to 0 .. 255.
 
-    The picture is reflected at its borders (the border row itself not repeated). Where sigma + epsilon is 0, N is 0.
-    The result is the same, byte for byte, for any `num_threads`.
+    The picture is reflected at its borders (the border row itself not repeated). Where sigma +
+    epsilon is 0, N is 0. The result is the same, byte for byte, for any `num_threads`.
     """
     first_box, second_box = config.boxes()
     radius = config.window_px // 2
@@ -67,7 +75,16 @@ def patch_normalize(
     normalized = np.empty_like(image, order="C")
 
     def run(first_row: int, last_row: int) -> None:
-        normalize_band(padded, normalized, first_row, last_row, first_box, second_box, config.epsilon, config.gain)
+        normalize_band(
+            padded,
+            normalized,
+            first_row,
+            last_row,
+            first_box,
+            second_box,
+            config.epsilon,
+            config.gain,
+        )
 
     run_in_bands(run, len(image), num_threads)
     return normalized

@@ -19,22 +19,27 @@ def _slide(values, width, out):
 
 @kernel(error_model="numpy")
 def _normalize_row(centre, sums, sums_sq, weight, floor, gain, out):
-    """128 + gain (I - mean) / (sigma + epsilon), numerator and denominator times the window's weight."""
+    """128 + gain (I - mean) / (sigma + epsilon), numerator and denominator times the window's
+    weight."""
     for x in range(out.shape[0]):
         total = np.float64(sums[x])
         spread = np.sqrt(np.float32(weight * np.float64(sums_sq[x]) - total * total))
         above_mean = np.float32(weight * (np.float64(centre[x]) - 128.0) - total)
         denominator = spread + floor
-        value = np.float32(128.5) + (gain * above_mean / denominator if denominator > 0 else np.float32(0.0))
+        value = np.float32(128.5) + (
+            gain * above_mean / denominator if denominator > 0 else np.float32(0.0)
+        )
         out[x] = np.uint8(min(max(value, np.float32(0.0)), np.float32(255.0)))
 
 
 @kernel(error_model="numpy")
 def normalize_band(padded, out, first_row, last_row, first_box, second_box, epsilon, gain):
-    """Rows [first_row, last_row) of `out`, from the image padded on each side by (first_box + second_box) / 2 - 1.
+    """Rows [first_row, last_row) of `out`, from the image padded on each side by (first_box +
+    second_box) / 2 - 1.
 
-    The window is a box of `first_box` pixels a side smoothed by one of `second_box` (1: the box alone). All sums are
-    integers and thus the same wherever a band begins; grey levels are taken about 128 to keep them within 32 bits.
+    The window is a box of `first_box` pixels a side smoothed by one of `second_box` (1: the box
+    alone). All sums are integers and thus the same wherever a band begins; grey levels are taken
+    about 128 to keep them within 32 bits.
     """
     padded_width = padded.shape[1]
     inner_width = padded_width - first_box + 1
@@ -81,4 +86,6 @@ def normalize_band(padded, out, first_row, last_row, first_box, second_box, epsi
         _slide(rows_sq, second_box, sums_sq)
         y = first_row + step - height_of_window + 1
         centre = padded[y + radius, radius : radius + width]
-        _normalize_row(centre, sums, sums_sq, weight, np.float32(weight * epsilon), np.float32(gain), out[y])
+        _normalize_row(
+            centre, sums, sums_sq, weight, np.float32(weight * epsilon), np.float32(gain), out[y]
+        )

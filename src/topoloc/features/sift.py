@@ -1,4 +1,5 @@
-"""SIFT (Lowe, 2004), OpenCV's, as `Features`; by default with RootSIFT descriptors (Arandjelovic and Zisserman, 2012)."""
+"""SIFT (Lowe, 2004), OpenCV's, as `Features`; by default with RootSIFT descriptors (Arandjelovic
+and Zisserman, 2012)."""
 
 from __future__ import annotations
 
@@ -28,7 +29,8 @@ class SiftConfig:
     num_octave_layers: Annotated[int, Between(1, 16)] = 3
     """As OpenCV's."""
     root: bool = True
-    """Descriptors are L1-normalised and their square root is taken, so that their distance is Hellinger's."""
+    """Descriptors are L1-normalised and their square root is taken, so that their distance is
+    Hellinger's."""
 
 
 def extract_sift(image: UInt8[np.ndarray, "h w"], config: SiftConfig) -> Features:
@@ -48,7 +50,15 @@ def extract_sift(image: UInt8[np.ndarray, "h w"], config: SiftConfig) -> Feature
     if config.max_features:
         order = order[: config.max_features]  # OpenCV keeps all that tie with the last
     table, descriptors = table[order], descriptors[order].astype(np.float32)
-    descriptors /= np.maximum(np.linalg.norm(descriptors, ord=1 if config.root else 2, axis=1, keepdims=True), 1e-6)
+    descriptors /= np.maximum(
+        np.linalg.norm(descriptors, ord=1 if config.root else 2, axis=1, keepdims=True), 1e-6
+    )
     if config.root:
         descriptors = np.sqrt(descriptors)
-    return Features(table[:, :2].copy(), table[:, 2].copy(), np.deg2rad(table[:, 3]), table[:, 4].copy(), descriptors)
+    return Features(
+        table[:, :2].copy(),
+        table[:, 2].copy(),
+        np.deg2rad(table[:, 3]),
+        table[:, 4].copy(),
+        descriptors,
+    )

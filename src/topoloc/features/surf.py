@@ -1,13 +1,16 @@
-"""SURF: speeded-up robust features, our own, on two CPU cores and without a build of OpenCV's non-free modules.
+"""SURF: speeded-up robust features, our own, on two CPU cores and without a build of OpenCV's
+non-free modules.
 
-H. Bay, T. Tuytelaars, L. Van Gool, "SURF: Speeded Up Robust Features", ECCV 2006; with A. Ess, CVIU 110(3), 2008. Filter
-sizes, sampling, orientation window and the order of a descriptor's numbers are those of OpenCV's implementation: key points
-have the same places and sizes, and descriptors of either can be matched with the other's.
+H. Bay, T. Tuytelaars, L. Van Gool, "SURF: Speeded Up Robust Features", ECCV 2006; with A. Ess, CVIU
+110(3), 2008. Filter sizes, sampling, orientation window and the order of a descriptor's numbers are
+those of OpenCV's implementation: key points have the same places and sizes, and descriptors of
+either can be matched with the other's.
 
-Patents: the method (not any one implementation) was patented by its authors' employers, KU Leuven and ETH Zurich, with
-Toyota Motor Europe: US 8,165,401, granted in 2012, and EP 2 027 558, of the international application WO 2007/128452, with a
-priority of 2006. Terms of twenty years from filing end, nominally, in 2026 or 2027, and differ from country to country; whether
-one is still in force where you are has not been checked here, and this is not legal advice. Where it matters, choose SIFT
+Patents: the method (not any one implementation) was patented by its authors' employers, KU Leuven
+and ETH Zurich, with Toyota Motor Europe: US 8,165,401, granted in 2012, and EP 2 027 558, of the
+international application WO 2007/128452, with a priority of 2006. Terms of twenty years from filing
+end, nominally, in 2026 or 2027, and differ from country to country; whether one is still in force
+where you are has not been checked here, and this is not legal advice. Where it matters, choose SIFT
 (`topoloc.features.sift`): its patent, US 6,711,293, expired in March 2020.
 """
 
@@ -33,7 +36,8 @@ SIGMA_OF_FILTER = 1.2 / SMALLEST_FILTER_PX
 PATCH_SAMPLES = 21
 # 32-bit sums hold a filter response up to this side (whole box 1 by 5/9 of it, values of 255).
 LARGEST_FILTER_PX = 3600
-# Sample spacings in pixels, from that of the smallest key points on, for which smoothed images are made.
+# Sample spacings in pixels, from that of the smallest key points on, for which smoothed images are
+# made.
 LEVEL_RATIO = 1.2
 LEVEL_SPACINGS = 1.4 * LEVEL_RATIO ** np.arange(33)
 
@@ -53,21 +57,35 @@ class SurfConfig:
     max_features: Annotated[int, Between(0, 100_000)] = 2000
     """The strongest are kept."""
     num_threads: Annotated[int | None, Between(1, 1024)] = None
-    """Threads; the features are the same for any number. Unset: as many as `set_num_threads` said."""
+    """Threads; the features are the same for any number. Unset: as many as `set_num_threads`
+    said."""
 
     def __post_init__(self) -> None:
-        counts = (self.num_octaves, self.num_layers, 1 if self.num_threads is None else self.num_threads)
+        counts = (
+            self.num_octaves,
+            self.num_layers,
+            1 if self.num_threads is None else self.num_threads,
+        )
         if self.hessian_threshold < 0 or min(counts) < 1 or self.max_features < 0:
-            raise ValueError(f"SURF: threshold and max_features must be at least 0, the other numbers at least 1: {self}")
-        if (SMALLEST_FILTER_PX + FILTER_INCREMENT_PX * (self.num_layers + 1)) << (self.num_octaves - 1) > LARGEST_FILTER_PX:
-            raise ValueError(f"SURF: filters beyond {LARGEST_FILTER_PX} px, fewer octaves or layers are needed: {self}")
+            raise ValueError(
+                "SURF: threshold and max_features must be at least 0, the other numbers at least"
+                f" 1: {self}"
+            )
+        if (SMALLEST_FILTER_PX + FILTER_INCREMENT_PX * (self.num_layers + 1)) << (
+            self.num_octaves - 1
+        ) > LARGEST_FILTER_PX:
+            raise ValueError(
+                f"SURF: filters beyond {LARGEST_FILTER_PX} px, fewer octaves or layers are needed:"
+                f" {self}"
+            )
 
 
 def extract_surf(image: UInt8[np.ndarray, "h w"], config: SurfConfig = SurfConfig()) -> Features:
-    """The strongest SURF key points of a grey image, strongest first, with descriptors (n, 64) of unit length.
+    """The strongest SURF key points of a grey image, strongest first, with descriptors (n, 64) of
+    unit length.
 
-    Upright key points have angle 0; their windows are read as OpenCV's are, turned by 270 degrees. The result is the same for any
-    number of threads.
+    Upright key points have angle 0; their windows are read as OpenCV's are, turned by 270 degrees.
+    The result is the same for any number of threads.
     """
     integral = integral_image(np.ascontiguousarray(image))
     found = _detect(integral, config)
@@ -80,22 +98,31 @@ def extract_surf(image: UInt8[np.ndarray, "h w"], config: SurfConfig = SurfConfi
 
 
 def _filter_sizes(octave: int, num_layers: int) -> Int64[np.ndarray, " layers"]:
-    """Filter sizes of an octave in pixels, with the layer below and the one above those in which maxima are sought."""
+    """Filter sizes of an octave in pixels, with the layer below and the one above those in which
+    maxima are sought."""
     return (SMALLEST_FILTER_PX + FILTER_INCREMENT_PX * np.arange(num_layers + 2)) << octave
 
 
 def _pattern_edges(sizes: Int64[np.ndarray, " layers"]) -> Int64[np.ndarray, "layers 10"]:
-    """Where the lobes of a 9x9 second-derivative pattern begin and end when it is scaled to each size, in pixels."""
-    return np.rint(np.outer((sizes / SMALLEST_FILTER_PX).astype(np.float32), np.arange(10, dtype=np.float32))).astype(np.int64)
+    """Where the lobes of a 9x9 second-derivative pattern begin and end when it is scaled to each
+    size, in pixels."""
+    return np.rint(
+        np.outer((sizes / SMALLEST_FILTER_PX).astype(np.float32), np.arange(10, dtype=np.float32))
+    ).astype(np.int64)
 
 
 def _detect(integral: Int32[np.ndarray, "h1 w1"], config: SurfConfig) -> Float32[np.ndarray, "m 4"]:
     """Maxima of the Hessian's determinant: rows x, y, size, response."""
     height, width = integral.shape[0] - 1, integral.shape[1] - 1
 
-    # A maximum needs filters below and above its own: an octave whose third does not fit into the image holds none.
-    sizes = {octave: _filter_sizes(octave, config.num_layers) for octave in range(config.num_octaves)}
-    octaves = {octave: _pattern_edges(s) for octave, s in sizes.items() if s[2] < min(height, width)}
+    # A maximum needs filters below and above its own: an octave whose third does not fit into the
+    # image holds none.
+    sizes = {
+        octave: _filter_sizes(octave, config.num_layers) for octave in range(config.num_octaves)
+    }
+    octaves = {
+        octave: _pattern_edges(s) for octave, s in sizes.items() if s[2] < min(height, width)
+    }
     if not octaves:
         return np.zeros((0, 4), np.float32)
 
@@ -105,25 +132,39 @@ def _detect(integral: Int32[np.ndarray, "h1 w1"], config: SurfConfig) -> Float32
             first, last = _borders(height // step, part, num_parts)
             columns, top, rows = edges, 0, integral
             if step > 1:
-                top, bottom = max((first - 1) * step - size, 0), min(last * step + size + step, height + 1)
+                top, bottom = (
+                    max((first - 1) * step - size, 0),
+                    min(last * step + size + step, height + 1),
+                )
                 rows = scratch[part][: (bottom - top) * split_width(step)].reshape(bottom - top, -1)
                 split_columns(integral, step, top, rows)
                 columns = edges % step * (split_width(step) // step) + edges // step
-            found[octave, part] = detect_band(rows, top, height, width, edges, columns, step, first, last, threshold)
+            found[octave, part] = detect_band(
+                rows, top, height, width, edges, columns, step, first, last, threshold
+            )
 
     def split_width(step: int) -> int:
         return -(-(width + 1) // step) * step
 
     def largest_split(part_rows: int) -> int:
         """Numbers in the largest band of reordered sums, of all octaves but the first."""
-        return max(((part_rows + 3 * (1 << o) + 2 * int(e[-1, -1])) * split_width(1 << o) for o, e in octaves.items() if o > 0), default=0)
+        return max(
+            (
+                (part_rows + 3 * (1 << o) + 2 * int(e[-1, -1])) * split_width(1 << o)
+                for o, e in octaves.items()
+                if o > 0
+            ),
+            default=0,
+        )
 
     num_parts, threshold = config.num_threads or num_threads(), np.float32(config.hessian_threshold)
-    # Allocated here, not in the threads: the allocator gives a helper thread's memory back to the system after each call.
+    # Allocated here, not in the threads: the allocator gives a helper thread's memory back to the
+    # system after each call.
     scratch = np.empty((num_parts, largest_split(-(-height // num_parts))), np.int32)
     found: dict[tuple[int, int], Float32[np.ndarray, "m 4"]] = {}
     run_in_bands(detect_part, num_parts, num_parts)
-    # By octave, then row: the order, and so the ranking of equal responses, does not depend on the number of parts.
+    # By octave, then row: the order, and so the ranking of equal responses, does not depend on the
+    # number of parts.
     return np.concatenate([found[key] for key in sorted(found)])
 
 
@@ -139,7 +180,8 @@ def _part_of(rows: Int64[np.ndarray, " n"], part: int, num_parts: int) -> Int64[
 
 @dataclass(frozen=True)
 class _Level:
-    """A smoothed image of every step-th pixel; pixel (0, 0) is at (offset, offset) of the image, `share` as in `smooth_rows`."""
+    """A smoothed image of every step-th pixel; pixel (0, 0) is at (offset, offset) of the image,
+    `share` as in `smooth_rows`."""
 
     pixels: Float32[np.ndarray, "lh lw"]
     step: int
@@ -152,10 +194,11 @@ class _Level:
 
 
 def _empty_level(integral: Int32[np.ndarray, "h1 w1"], spacing: float) -> _Level:
-    """A level, yet to be filled, that read bilinearly is as smooth as the image averaged over windows of `spacing` pixels.
+    """A level, yet to be filled, that read bilinearly is as smooth as the image averaged over
+    windows of `spacing` pixels.
 
-    Bilinear reads have a variance of step^2 / 6 on the mean, on top of a box's (side^2 - 1) / 12. What OpenCV does has
-    (spacing^2 + 1) / 12 + 1 / 6: it reads the image bilinearly, then averages.
+    Bilinear reads have a variance of step^2 / 6 on the mean, on top of a box's (side^2 - 1) / 12.
+    What OpenCV does has (spacing^2 + 1) / 12 + 1 / 6: it reads the image bilinearly, then averages.
     """
     step = 1 << max(int(np.log2(spacing / 2.2)), 0)
     side = float(np.sqrt(spacing**2 + 4 - 2 * step**2))
@@ -166,7 +209,10 @@ def _empty_level(integral: Int32[np.ndarray, "h1 w1"], spacing: float) -> _Level
 
 
 def _describe(
-    integral: Int32[np.ndarray, "h1 w1"], points: Float32[np.ndarray, "n 2"], scales: Float32[np.ndarray, " n"], config: SurfConfig
+    integral: Int32[np.ndarray, "h1 w1"],
+    points: Float32[np.ndarray, "n 2"],
+    scales: Float32[np.ndarray, " n"],
+    config: SurfConfig,
 ) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, "n 64"]]:
     """Angles in radians and descriptors of key points at these scales (sigma, pixels)."""
     num_parts = config.num_threads or num_threads()
@@ -175,7 +221,9 @@ def _describe(
     # OpenCV averages over a whole number of pixels a side
     spacings = (np.floor(PATCH_SAMPLES * scales) / PATCH_SAMPLES).astype(np.float32)
     level_idx = np.searchsorted(LEVEL_SPACINGS[:-1] * np.sqrt(LEVEL_RATIO), spacings)
-    levels = {int(k): _empty_level(integral, float(LEVEL_SPACINGS[k])) for k in np.unique(level_idx)}
+    levels = {
+        int(k): _empty_level(integral, float(LEVEL_SPACINGS[k])) for k in np.unique(level_idx)
+    }
 
     def prepare_part(part: int, _: int) -> None:
         for level in levels.values():
@@ -187,7 +235,16 @@ def _describe(
     def describe_part(part: int, _: int) -> None:
         for k, level in levels.items():
             rows = _part_of(downwards[level_idx[downwards] == k], part, num_parts)
-            describe(level.pixels, level.offset, level.step, points, spacings, directions, rows, descriptors)
+            describe(
+                level.pixels,
+                level.offset,
+                level.step,
+                points,
+                spacings,
+                directions,
+                rows,
+                descriptors,
+            )
 
     # From the top of the image down, so that a thread finds what it reads in its own core's cache.
     downwards = np.argsort(points[:, 1], kind="stable")

@@ -17,9 +17,12 @@ def _gaussian(length, sigma):
 
 
 def _orientation_samples():
-    """Rows (x, y, weight) of the samples within 6 s of the key point, in units of s; weights of a Gaussian of 2.5 s."""
+    """Rows (x, y, weight) of the samples within 6 s of the key point, in units of s; weights of a
+    Gaussian of 2.5 s."""
     radius = ORIENTATION_RADIUS
-    x, y = np.meshgrid(np.arange(-radius, radius + 1), np.arange(-radius, radius + 1), indexing="ij")
+    x, y = np.meshgrid(
+        np.arange(-radius, radius + 1), np.arange(-radius, radius + 1), indexing="ij"
+    )
     inside = x**2 + y**2 <= radius**2
     kernel = _gaussian(2 * radius + 1, 2.5)
     return np.stack([x[inside], y[inside], np.outer(kernel, kernel)[inside]]).astype(np.float32)
@@ -27,8 +30,11 @@ def _orientation_samples():
 
 ORIENTATION_SAMPLES = _orientation_samples()
 # Rows and columns of the (21, 21) samples of a patch, one after the other.
-GRID_ROWS, GRID_COLUMNS = np.indices((PATCH_SIZE + 1, PATCH_SIZE + 1)).reshape(2, -1).astype(np.float32)
-# Padded with zeros to whole vectors of eight numbers: what lies beyond a row is read and counts nothing.
+GRID_ROWS, GRID_COLUMNS = (
+    np.indices((PATCH_SIZE + 1, PATCH_SIZE + 1)).reshape(2, -1).astype(np.float32)
+)
+# Padded with zeros to whole vectors of eight numbers: what lies beyond a row is read and counts
+# nothing.
 PADDED_SIZE = 24
 PATCH_WEIGHTS = np.zeros((PATCH_SIZE, PADDED_SIZE), np.float32)
 PATCH_WEIGHTS[:, :PATCH_SIZE] = np.outer(_gaussian(PATCH_SIZE, 3.3), _gaussian(PATCH_SIZE, 3.3))
@@ -36,7 +42,8 @@ PATCH_WEIGHTS[:, :PATCH_SIZE] = np.outer(_gaussian(PATCH_SIZE, 3.3), _gaussian(P
 
 @kernel(fastmath=True, error_model="numpy")
 def smooth_rows(integral, box, share, step, level, first, last):
-    """Rows [first, last) of `level`: at every step-th pixel `share` of the mean over box x box, the rest over box + 2 a side.
+    """Rows [first, last) of `level`: at every step-th pixel `share` of the mean over box x box, the
+    rest over box + 2 a side.
 
     Pixel (0, 0) of the level is where the larger box touches the upper left corner of the image.
     """
@@ -53,11 +60,19 @@ def smooth_rows(integral, box, share, step, level, first, last):
         for x in range(width):
             columns[x] = np.int32(bottom[x] - top[x])
             columns_inner[x] = np.int32(bottom_inner[x] - top_inner[x])
-        right, left_inner, right_inner = columns[larger:], columns_inner[1:], columns_inner[1 + box :]
-        # The whole line although every step-th of it is kept: only reads without a stride vectorise.
+        right, left_inner, right_inner = (
+            columns[larger:],
+            columns_inner[1:],
+            columns_inner[1 + box :],
+        )
+        # The whole line although every step-th of it is kept: only reads without a stride
+        # vectorise.
         target = level[i] if step == 1 else line
         for x in range(line.shape[0]):
-            target[x] = np.float32(np.int32(right[x] - columns[x])) * outer + np.float32(np.int32(right_inner[x] - left_inner[x])) * inner
+            target[x] = (
+                np.float32(np.int32(right[x] - columns[x])) * outer
+                + np.float32(np.int32(right_inner[x] - left_inner[x])) * inner
+            )
         if step > 1:
             for j in range(level.shape[1]):
                 level[i, j] = line[j * step]
@@ -65,15 +80,20 @@ def smooth_rows(integral, box, share, step, level, first, last):
 
 @kernel(fastmath=True, error_model="numpy")
 def _haar_samples(integral, centre_x, centre_y, scale, corners, weights, gradients):
-    """Fill gradients (2, n) with the weighted Haar responses (side about 4 s) around a key point, zero beyond the image.
+    """Fill gradients (2, n) with the weighted Haar responses (side about 4 s) around a key point,
+    zero beyond the image.
 
-    corners and weights (n,) are scratch space: first the places of all windows, in a loop that vectorises, then their sums.
+    corners and weights (n,) are scratch space: first the places of all windows, in a loop that
+    vectorises, then their sums.
     """
     stride = np.int32(integral.shape[1])
     half = np.int32(np.rint(np.float32(2.0) * scale))
     side = np.int32(2 * half)
     last_x, last_y = np.int32(integral.shape[1] - side), np.int32(integral.shape[0] - side)
-    start_x, start_y = centre_x - (side - 1) * np.float32(0.5), centre_y - (side - 1) * np.float32(0.5)
+    start_x, start_y = (
+        centre_x - (side - 1) * np.float32(0.5),
+        centre_y - (side - 1) * np.float32(0.5),
+    )
     for k in range(corners.shape[0]):
         x = np.int32(np.rint(start_x + ORIENTATION_SAMPLES[0, k] * scale))
         y = np.int32(np.rint(start_y + ORIENTATION_SAMPLES[1, k] * scale))
@@ -83,7 +103,11 @@ def _haar_samples(integral, centre_x, centre_y, scale, corners, weights, gradien
     a_flat = integral.ravel()
     b_flat, c_flat = a_flat[half:], a_flat[side:]
     d_flat, f_flat = a_flat[half * stride :], a_flat[half * stride + side :]
-    g_flat, h_flat, i_flat = a_flat[side * stride :], a_flat[side * stride + half :], a_flat[side * stride + side :]
+    g_flat, h_flat, i_flat = (
+        a_flat[side * stride :],
+        a_flat[side * stride + half :],
+        a_flat[side * stride + side :],
+    )
     for k in range(corners.shape[0]):
         at = np.uintp(corners[k])
         rising = np.int32(i_flat[at] - a_flat[at])
@@ -96,9 +120,11 @@ def _haar_samples(integral, centre_x, centre_y, scale, corners, weights, gradien
 
 @kernel(fastmath=True, error_model="numpy")
 def _sectors(gradients, sectors, first_degree):
-    """The sector of each gradient's direction, rounded to whole degrees; first_degree (2, n) repeats those at a sector's first.
+    """The sector of each gradient's direction, rounded to whole degrees; first_degree (2, n)
+    repeats those at a sector's first.
 
-    The arc tangent is a polynomial, good to 0.001 degrees, and without branches, so that the loop vectorises.
+    The arc tangent is a polynomial, good to 0.001 degrees, and without branches, so that the loop
+    vectorises.
     """
     for k in range(sectors.shape[0]):
         x, y = gradients[0, k], gradients[1, k]
@@ -124,9 +150,11 @@ def _sectors(gradients, sectors, first_degree):
 
 @kernel(fastmath=True, error_model="numpy")
 def _dominant_angle(gradients, sectors, first_degree, sums, threes, windows):
-    """The direction of the longest sum of gradients within any window of 60 degrees (Bay et al. 2008, 4.1).
+    """The direction of the longest sum of gradients within any window of 60 degrees (Bay et al.
+    2008, 4.1).
 
-    Windows are centred on multiples of 5 degrees and open, 59 whole degrees wide: twelve sectors less the first degree.
+    Windows are centred on multiples of 5 degrees and open, 59 whole degrees wide: twelve sectors
+    less the first degree.
     """
     num_sectors = windows.shape[1]
     sums[:] = 0
@@ -140,7 +168,9 @@ def _dominant_angle(gradients, sectors, first_degree, sums, threes, windows):
         for first in range(threes.shape[0]):
             threes[first] = sums[axis, first] + sums[axis, first + 1] + sums[axis, first + 2]
         for first in range(num_sectors):
-            windows[axis, first] += threes[first] + threes[first + 3] + threes[first + 6] + threes[first + 9]
+            windows[axis, first] += (
+                threes[first] + threes[first + 3] + threes[first + 6] + threes[first + 9]
+            )
     best, best_x, best_y = np.float32(-1.0), np.float32(0.0), np.float32(0.0)
     for first in range(num_sectors):
         x, y = windows[0, first], windows[1, first]
@@ -156,19 +186,25 @@ def orient(integral, points, scales, rows, angles):
     num_samples, num_sectors = ORIENTATION_SAMPLES.shape[1], 360 // SECTOR_DEG
     corners, sectors = np.empty(num_samples, np.int32), np.empty(num_samples, np.int32)
     weights = np.empty(num_samples, np.float32)
-    gradients, first_degree = np.empty((2, num_samples), np.float32), np.empty((2, num_samples), np.float32)
+    gradients, first_degree = (
+        np.empty((2, num_samples), np.float32),
+        np.empty((2, num_samples), np.float32),
+    )
     sums = np.empty((2, num_sectors + WINDOW_SECTORS), np.float32)
     threes = np.empty(num_sectors + WINDOW_SECTORS - 3, np.float32)
     windows = np.empty((2, num_sectors), np.float32)
     for row in rows:
-        _haar_samples(integral, points[row, 0], points[row, 1], scales[row], corners, weights, gradients)
+        _haar_samples(
+            integral, points[row, 0], points[row, 1], scales[row], corners, weights, gradients
+        )
         _sectors(gradients, sectors, first_degree)
         angles[row] = _dominant_angle(gradients, sectors, first_degree, sums, threes, windows)
 
 
 @kernel(fastmath=True, error_model="numpy")
 def _sample_patch(level, origin_x, origin_y, step_x, step_y, indices, fractions, patch):
-    """Bilinear samples of `level` on the grid origin + column * (step_x, step_y) + row * (-step_y, step_x), clamped to the image."""
+    """Bilinear samples of `level` on the grid origin + column * (step_x, step_y) + row * (-step_y,
+    step_x), clamped to the image."""
     stride = np.int32(level.shape[1])
     max_left, max_top = np.int32(level.shape[1] - 2), np.int32(level.shape[0] - 2)
     max_x, max_y = np.float32(level.shape[1] - 1), np.float32(level.shape[0] - 1)
@@ -192,7 +228,8 @@ def _sample_patch(level, origin_x, origin_y, step_x, step_y, indices, fractions,
 
 @kernel(fastmath=True, error_model="numpy")
 def _describe_patch(patch, sums, descriptor):
-    """Sums of dx, dy, |dx|, |dy| in 4x4 cells of the (21, 21) patch, Gaussian-weighted, to unit length (Bay et al. 2008, 4.2)."""
+    """Sums of dx, dy, |dx|, |dy| in 4x4 cells of the (21, 21) patch, Gaussian-weighted, to unit
+    length (Bay et al. 2008, 4.2)."""
     side = PATCH_SIZE + 1
     cell = PATCH_SIZE // 4
     square = np.float32(0.0)
@@ -222,7 +259,8 @@ def _describe_patch(patch, sums, descriptor):
 
 @kernel(error_model="numpy")
 def describe(level, offset, level_step, points, spacings, angles, rows, descriptors):
-    """Fill descriptors[rows] from one level of the pyramid, whose pixel (0, 0) is at (offset, offset) of the image."""
+    """Fill descriptors[rows] from one level of the pyramid, whose pixel (0, 0) is at (offset,
+    offset) of the image."""
     side = PATCH_SIZE + 1
     indices = np.empty(side * side, np.int32)
     fractions = np.empty((2, side * side), np.float32)
@@ -234,5 +272,14 @@ def describe(level, offset, level_step, points, spacings, angles, rows, descript
         step_y = np.sin(angles[row]) * spacings[row] * per_pixel
         origin_x = (points[row, 0] - offset) * per_pixel - (step_x - step_y) * (PATCH_SIZE // 2)
         origin_y = (points[row, 1] - offset) * per_pixel - (step_x + step_y) * (PATCH_SIZE // 2)
-        _sample_patch(level, np.float32(origin_x), np.float32(origin_y), np.float32(step_x), np.float32(step_y), indices, fractions, patch)
+        _sample_patch(
+            level,
+            np.float32(origin_x),
+            np.float32(origin_y),
+            np.float32(step_x),
+            np.float32(step_y),
+            indices,
+            fractions,
+            patch,
+        )
         _describe_patch(patch, sums, descriptors[row])

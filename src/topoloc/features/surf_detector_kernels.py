@@ -1,6 +1,8 @@
-"""Numba kernels of `surf`, first half: integral image, determinant of the Hessian, maxima over place and scale.
+"""Numba kernels of `surf`, first half: integral image, determinant of the Hessian, maxima over
+place and scale.
 
-All sums live in int32 that may wrap: a difference of wrapped sums is still right as long as the box itself fits.
+All sums live in int32 that may wrap: a difference of wrapped sums is still right as long as the box
+itself fits.
 """
 
 import numpy as np
@@ -30,9 +32,11 @@ def integral_image(image):
 
 @kernel()
 def split_columns(integral, step, first, split):
-    """Fill `split` with rows of the integral image from `first` on, columns reordered: those at 0, step, 2 step, ..., then 1, 1 + step, ...
+    """Fill `split` with rows of the integral image from `first` on, columns reordered: those at 0,
+    step, 2 step, ..., then 1, 1 + step, ...
 
-    What a filter bank sampled at every step-th pixel reads is then contiguous, so that its loops vectorise.
+    What a filter bank sampled at every step-th pixel reads is then contiguous, so that its loops
+    vectorise.
     """
     width, phase_length = integral.shape[1], split.shape[1] // step
     for y in range(split.shape[0]):
@@ -43,27 +47,48 @@ def split_columns(integral, step, first, split):
                 target[j] = source[phase + j * step]
 
 
-# No fastmath: a fused product here rounded differently when compiled in this process and when read from the compiler's cache.
+# No fastmath: a fused product here rounded differently when compiled in this process and when read
+# from the compiler's cache.
 @kernel(error_model="numpy")
 def _hessian_row(sums, top, edges, columns, rows, out):
     """Determinants of one row of filters with their upper edge at row `top` of `sums`.
 
-    edges are the ten edge positions of the pattern in pixels, columns the places where `split_columns` put them.
+    edges are the ten edge positions of the pattern in pixels, columns the places where
+    `split_columns` put them.
     """
     rows_xx, rows_yy, rows_xy = rows[0], rows[1], rows[2]
-    i0, i1, i2, i3, i4 = sums[top], sums[top + edges[1]], sums[top + edges[2]], sums[top + edges[3]], sums[top + edges[4]]
+    i0, i1, i2, i3, i4 = (
+        sums[top],
+        sums[top + edges[1]],
+        sums[top + edges[2]],
+        sums[top + edges[3]],
+        sums[top + edges[4]],
+    )
     i5, i6, i7 = sums[top + edges[5]], sums[top + edges[6]], sums[top + edges[7]]
     i8, i9 = sums[top + edges[8]], sums[top + edges[9]]
-    # A second derivative is the whole box less three times its middle third: two boxes in place of three.
+    # A second derivative is the whole box less three times its middle third: two boxes in place of
+    # three.
     for x in range(rows.shape[1]):
         rows_xx[x] = np.int32(i7[x] - i2[x])
         rows_yy[x] = np.int32(i9[x] - i0[x] - 3 * (i6[x] - i3[x]))
         rows_xy[x] = np.int32(i4[x] - i1[x] - i8[x] + i5[x])
-    xx_0, xx_3, xx_6, xx_9 = rows_xx, rows_xx[columns[3] :], rows_xx[columns[6] :], rows_xx[columns[9] :]
+    xx_0, xx_3, xx_6, xx_9 = (
+        rows_xx,
+        rows_xx[columns[3] :],
+        rows_xx[columns[6] :],
+        rows_xx[columns[9] :],
+    )
     yy_2, yy_7 = rows_yy[columns[2] :], rows_yy[columns[7] :]
-    xy_1, xy_4, xy_5, xy_8 = rows_xy[columns[1] :], rows_xy[columns[4] :], rows_xy[columns[5] :], rows_xy[columns[8] :]
+    xy_1, xy_4, xy_5, xy_8 = (
+        rows_xy[columns[1] :],
+        rows_xy[columns[4] :],
+        rows_xy[columns[5] :],
+        rows_xy[columns[8] :],
+    )
     lobe = np.float32(1.0) / np.float32((edges[6] - edges[3]) * (edges[7] - edges[2]))
-    quarter = np.float32(0.9) / np.float32((edges[4] - edges[1]) * (edges[4] - edges[1]))  # 0.9^2 = 0.81, Bay et al. 2008, Eq. 3
+    quarter = np.float32(0.9) / np.float32(
+        (edges[4] - edges[1]) * (edges[4] - edges[1])
+    )  # 0.9^2 = 0.81, Bay et al. 2008, Eq. 3
     for x in range(out.shape[0]):
         dxx = np.float32(np.int32(xx_9[x] - xx_0[x] - 3 * (xx_6[x] - xx_3[x]))) * lobe
         dyy = np.float32(np.int32(yy_7[x] - yy_2[x])) * lobe
@@ -73,13 +98,22 @@ def _hessian_row(sums, top, edges, columns, rows, out):
 
 @kernel(fastmath=True, error_model="numpy")
 def _mark_candidates(below, up, mid, down, above, first, last, threshold, marks):
-    """marks[j] = 1 where mid[j] exceeds the threshold and six of its 26 neighbours: a cheap sieve that vectorises."""
+    """marks[j] = 1 where mid[j] exceeds the threshold and six of its 26 neighbours: a cheap sieve
+    that vectorises."""
     count = last - first
     centre, left, right = mid[first:last], mid[first - 1 : last - 1], mid[first + 1 : last + 1]
-    north, south, smaller, larger = up[first:last], down[first:last], below[first:last], above[first:last]
+    north, south, smaller, larger = (
+        up[first:last],
+        down[first:last],
+        below[first:last],
+        above[first:last],
+    )
     for j in range(count):
         value = centre[j]
-        ring = max(max(max(left[j], right[j]), max(north[j], south[j])), max(max(smaller[j], larger[j]), threshold))
+        ring = max(
+            max(max(left[j], right[j]), max(north[j], south[j])),
+            max(max(smaller[j], larger[j]), threshold),
+        )
         marks[j] = np.uint8(value > ring)
 
 
@@ -89,14 +123,17 @@ def _is_maximum(ring, layer, up, mid, down, j):
     for other in range(layer - 1, layer + 2):
         for row in (up, mid, down):
             for column in range(j - 1, j + 2):
-                if ring[other, row, column] >= value and not (other == layer and row == mid and column == j):
+                if ring[other, row, column] >= value and not (
+                    other == layer and row == mid and column == j
+                ):
                     return False
     return True
 
 
 @kernel(error_model="numpy")
 def _refine(ring, layer, up, mid, down, j):
-    """The vertex (x, y, scale) of the quadratic through the 27 determinants, in grid units; ok is False beyond one unit."""
+    """The vertex (x, y, scale) of the quadratic through the 27 determinants, in grid units; ok is
+    False beyond one unit."""
     below, here, above = ring[layer - 1], ring[layer], ring[layer + 1]
     value = np.float64(here[mid, j])
     gx = (here[mid, j + 1] - here[mid, j - 1]) * 0.5
@@ -121,13 +158,22 @@ def _refine(ring, layer, up, mid, down, j):
 
 @kernel(error_model="numpy")
 def _collect_row(ring, layer, i, sizes, step, threshold, marks, words, found, count):
-    """Append the maxima of row i of this layer to `found` (x, y, size, response); returns the (grown) array and its count."""
+    """Append the maxima of row i of this layer to `found` (x, y, size, response); returns the
+    (grown) array and its count."""
     num_columns = ring.shape[2]
     margin = sizes[layer + 1] // 2 // step + 1
     up, mid, down = (i - 1) % 3, i % 3, (i + 1) % 3
     last = num_columns - margin
     _mark_candidates(
-        ring[layer - 1, mid], ring[layer, up], ring[layer, mid], ring[layer, down], ring[layer + 1, mid], margin, last, threshold, marks
+        ring[layer - 1, mid],
+        ring[layer, up],
+        ring[layer, mid],
+        ring[layer, down],
+        ring[layer + 1, mid],
+        margin,
+        last,
+        threshold,
+        marks,
     )
     num_marks = last - margin
     for k in range(num_marks, min((num_marks + 7) // 8 * 8, marks.shape[0])):
@@ -160,10 +206,12 @@ def _collect_row(ring, layer, i, sizes, step, threshold, marks, words, found, co
 
 @kernel(error_model="numpy")
 def detect_band(sums, sums_top, height, width, edges, columns, step, first, last, threshold):
-    """Maxima (m, 4) = x, y, size, response in rows [first, last) of an octave's grid (every step-th pixel).
+    """Maxima (m, 4) = x, y, size, response in rows [first, last) of an octave's grid (every step-th
+    pixel).
 
-    sums are the rows from `sums_top` on of the integral image of a (height, width) image, as `split_columns` orders them.
-    edges and columns (n, 10) describe the filters of the octave's n layers. Only three rows of each layer are ever held.
+    sums are the rows from `sums_top` on of the integral image of a (height, width) image, as
+    `split_columns` orders them. edges and columns (n, 10) describe the filters of the octave's n
+    layers. Only three rows of each layer are ever held.
     """
     sizes = edges[:, 9].copy()
     num_layers, num_rows, num_columns = sizes.shape[0], height // step, width // step
@@ -180,12 +228,16 @@ def detect_band(sums, sums_top, height, width, edges, columns, step, first, last
             if i < margin or (i - margin) * step + size > height or width < size:
                 continue
             out = ring[layer, i % 3, margin : margin + 1 + (width - size) // step]
-            _hessian_row(sums, (i - margin) * step - sums_top, edges[layer], columns[layer], rows, out)
+            _hessian_row(
+                sums, (i - margin) * step - sums_top, edges[layer], columns[layer], rows, out
+            )
         row = i - 1
         if row < first:
             continue
         for layer in range(1, num_layers - 1):
             margin = sizes[layer + 1] // 2 // step + 1
             if margin <= row < num_rows - margin and num_columns > 2 * margin:
-                found, count = _collect_row(ring, layer, row, sizes, step, threshold, marks, words, found, count)
+                found, count = _collect_row(
+                    ring, layer, row, sizes, step, threshold, marks, words, found, count
+                )
     return found[:count].copy()

@@ -1,9 +1,10 @@
 """Pose and focal length together, for cameras that nobody has calibrated.
 
-RANSAC is run with a handful of focal lengths a quarter apart, and no longer than it takes to beat the best so far: at an inlier threshold
-of some pixels the nearest of them is near enough to find the inliers. From the best ones, Gauss-Newton refines the pose's six numbers and
-the logarithm of the focal length together. What is not known of the focal length and of the principal point, which is taken to be in the
-middle, is added to the pose's covariance.
+RANSAC is run with a handful of focal lengths a quarter apart, and no longer than it takes to beat
+the best so far: at an inlier threshold of some pixels the nearest of them is near enough to find
+the inliers. From the best ones, Gauss-Newton refines the pose's six numbers and the logarithm of
+the focal length together. What is not known of the focal length and of the principal point, which
+is taken to be in the middle, is added to the pose's covariance.
 """
 
 from __future__ import annotations
@@ -35,17 +36,21 @@ _Finite = tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 3"], Float[np.nda
 
 _STEP = 1.25
 _MIN_INLIERS = 4  # any sample agrees with three
-# Of RANSAC for each focal length: where one match in four is right, all of them miss it once in a hundred times. The focal lengths
-# beside the right one find most of its inliers too, by samples of their own.
+# Of RANSAC for each focal length: where one match in four is right, all of them miss it once in a
+# hundred times. The focal lengths beside the right one find most of its inliers too, by samples of
+# their own.
 _MAX_ITERATIONS = 300
-# The best is not always next to the right focal length where few matches are right; a third start helps no more.
+# The best is not always next to the right focal length where few matches are right; a third start
+# helps no more.
 _MAX_STARTS = 2
-# Inliers of a focal length far off are few, and gather over some rounds: five mostly; one picture of a street took more, and was 2.7 m
-# wrong without them.
+# Inliers of a focal length far off are few, and gather over some rounds: five mostly; one picture
+# of a street took more, and was 2.7 m wrong without them.
 _MAX_ROUNDS = 20
-# How far the principal point lies from the middle (standard deviation, of the longer side); it trades places with a rotation.
+# How far the principal point lies from the middle (standard deviation, of the longer side); it
+# trades places with a rotation.
 _CENTRE_SHARE = 0.01
-# Weak prior on the logarithm of the focal length (standard deviation): without it, what is seen of a wall alone fixes none.
+# Weak prior on the logarithm of the focal length (standard deviation): without it, what is seen of
+# a wall alone fixes none.
 _PRIOR = 0.7
 
 
@@ -58,30 +63,55 @@ def estimate_pose_and_focal(
     point_covariances: Float[np.ndarray, "n 3 3"],
     start: tuple[Rigid3, Camera] | None = None,
 ) -> tuple[AbsolutePose, Camera] | None:
-    """cam_from_world and the camera, from n matches of pixels with world points (metres); None where none follows from them.
+    """cam_from_world and the camera, from n matches of pixels with world points (metres); None
+    where none follows from them.
 
     Args:
-        start: a pose and a camera that are nearly right already: they are refined, and no others are sought.
+        start: a pose and a camera that are nearly right already: they are refined, and no others
+            are sought.
 
-    The focal length found lies in `rough`'s range. The covariance is that of the pose whatever the focal length.
+    The focal length found lies in `rough`'s range. The covariance is that of the pose whatever the
+    focal length.
     """
-    usable = np.isfinite(points_img).all(axis=1) & np.isfinite(points_world).all(axis=1) & np.isfinite(point_covariances).all(axis=(1, 2))
+    usable = (
+        np.isfinite(points_img).all(axis=1)
+        & np.isfinite(points_world).all(axis=1)
+        & np.isfinite(point_covariances).all(axis=(1, 2))
+    )
     finite = points_img[usable], points_world[usable], point_covariances[usable]
     starts = [start] if start else _search(finite, rough, config)
     refined = [one for each in starts if (one := _refined_together(each, finite, rough, config))]
     if not refined:
         return None
     _, cam_from_world, camera = max(refined, key=lambda one: one[0])
-    pose = estimate_absolute_pose(points_img, points_world, camera, config, point_covariances=point_covariances, start=cam_from_world)
+    pose = estimate_absolute_pose(
+        points_img,
+        points_world,
+        camera,
+        config,
+        point_covariances=point_covariances,
+        start=cam_from_world,
+    )
     if pose is None:
         return None
-    information, _ = _normal_equations(pose.cam_from_world, _matches(finite, camera, config), pose.inliers[usable], camera, rough)
+    information, _ = _normal_equations(
+        pose.cam_from_world, _matches(finite, camera, config), pose.inliers[usable], camera, rough
+    )
     covariance = _whatever_the_focal(pose.covariance, information)
-    return replace(pose, covariance=covariance + _whatever_the_centre(points_world[pose.inliers], pose, camera)), camera
+    return (
+        replace(
+            pose,
+            covariance=covariance + _whatever_the_centre(points_world[pose.inliers], pose, camera),
+        ),
+        camera,
+    )
 
 
-def _search(finite: _Finite, rough: RoughCamera, config: AbsolutePoseConfig) -> list[tuple[Rigid3, Camera]]:
-    """Poses with the focal lengths that explain most; the middle ones are tried first: a right one makes the rest short."""
+def _search(
+    finite: _Finite, rough: RoughCamera, config: AbsolutePoseConfig
+) -> list[tuple[Rigid3, Camera]]:
+    """Poses with the focal lengths that explain most; the middle ones are tried first: a right one
+    makes the rest short."""
     points_img, points_world, _ = finite
     if len(points_img) < _MIN_INLIERS:
         return []
@@ -90,26 +120,40 @@ def _search(finite: _Finite, rough: RoughCamera, config: AbsolutePoseConfig) -> 
     found: list[tuple[float, Rigid3, Camera]] = []
     most = _MIN_INLIERS - 1
     for k, exponent in enumerate(exponents):
-        camera = rough.with_focal(rough.min_focal * (rough.max_focal / rough.min_focal) ** float(exponent))
+        camera = rough.with_focal(
+            rough.min_focal * (rough.max_focal / rough.min_focal) ** float(exponent)
+        )
         enough = _num_iterations(most / len(points_img), config.confidence)
-        quick = replace(config, max_iterations=min(config.max_iterations, _MAX_ITERATIONS, enough), seed=config.seed + k)
-        cam_from_world, num_inliers, loss = ransac_pose(points_img, points_world, camera, quick) or (None, 0, math.inf)
+        quick = replace(
+            config,
+            max_iterations=min(config.max_iterations, _MAX_ITERATIONS, enough),
+            seed=config.seed + k,
+        )
+        cam_from_world, num_inliers, loss = ransac_pose(
+            points_img, points_world, camera, quick
+        ) or (None, 0, math.inf)
         if cam_from_world is not None and num_inliers >= _MIN_INLIERS:
             found.append((loss, cam_from_world, camera))
             most = max(most, num_inliers)
-    found.sort(key=lambda one: one[0])  # where most is far and flat, all focal lengths find it: their counts are alike, the errors are not
+    found.sort(
+        key=lambda one: one[0]
+    )  # where most is far and flat, all focal lengths find it: their counts are alike, the errors are not  # noqa: E501
     return [(cam_from_world, camera) for _, cam_from_world, camera in found[:_MAX_STARTS]]
 
 
 def _num_iterations(share: float, confidence: float) -> int:
-    """So many samples of three hit right matches alone once, at this confidence, where this share is right."""
-    return max(1, math.ceil(math.log(max(1.0 - confidence, 1e-9)) / math.log1p(-(min(share, 0.99) ** 3))))
+    """So many samples of three hit right matches alone once, at this confidence, where this share
+    is right."""
+    return max(
+        1, math.ceil(math.log(max(1.0 - confidence, 1e-9)) / math.log1p(-(min(share, 0.99) ** 3)))
+    )
 
 
 def _refined_together(
     start: tuple[Rigid3, Camera], finite: _Finite, rough: RoughCamera, config: AbsolutePoseConfig
 ) -> tuple[int, Rigid3, Camera] | None:
-    """The pose and the camera that fit the inliers best, and how many these are; they are chosen anew each round."""
+    """The pose and the camera that fit the inliers best, and how many these are; they are chosen
+    anew each round."""
     cam_from_world, camera = start
     num_inliers = 0
     for _ in range(_MAX_ROUNDS):
@@ -123,7 +167,11 @@ def _refined_together(
         is_definite, step = solve_definite(information, -gradient)
         if not is_definite:
             return None
-        focal = float(np.clip(camera.fx * math.exp(np.clip(step[6], -0.2, 0.2)), rough.min_focal, rough.max_focal))
+        focal = float(
+            np.clip(
+                camera.fx * math.exp(np.clip(step[6], -0.2, 0.2)), rough.min_focal, rough.max_focal
+            )
+        )
         if abs(math.log(focal / camera.fx)) < 1e-4:
             break
         camera, cam_from_world = rough.with_focal(focal), Rigid3.exp(step[:6]) @ cam_from_world
@@ -132,30 +180,50 @@ def _refined_together(
 
 def _matches(finite: _Finite, camera: Camera, config: AbsolutePoseConfig) -> Matches:
     pixels, points_world, covariances = finite
-    return Matches.of(pixels, camera.normalized_from_img(pixels), points_world, covariances, camera, config.key_point_sigma_px)
+    return Matches.of(
+        pixels,
+        camera.normalized_from_img(pixels),
+        points_world,
+        covariances,
+        camera,
+        config.key_point_sigma_px,
+    )
 
 
 def _normal_equations(
-    cam_from_world: Rigid3, matches: Matches, active: Bool[np.ndarray, " n"], camera: Camera, rough: RoughCamera
+    cam_from_world: Rigid3,
+    matches: Matches,
+    active: Bool[np.ndarray, " n"],
+    camera: Camera,
+    rough: RoughCamera,
 ) -> tuple[Float[np.ndarray, "7 7"], Float[np.ndarray, " 7"]]:
-    """Gauss-Newton's, by the left perturbation of the pose and the logarithm of the focal length, with the prior on that."""
-    information, gradient, *_ = normal_equations(*matches.arguments(cam_from_world), active, CAUCHY_SCALE, 7)
+    """Gauss-Newton's, by the left perturbation of the pose and the logarithm of the focal length,
+    with the prior on that."""
+    information, gradient, *_ = normal_equations(
+        *matches.arguments(cam_from_world), active, CAUCHY_SCALE, 7
+    )
     middle = math.sqrt(rough.min_focal * rough.max_focal)
     information[6, 6] += 1.0 / _PRIOR**2
     gradient[6] += math.log(camera.fx / middle) / _PRIOR**2
     return information, gradient
 
 
-def _whatever_the_focal(covariance: Float[np.ndarray, "6 6"], information: Float[np.ndarray, "7 7"]) -> Float[np.ndarray, "6 6"]:
-    """The pose's covariance at a fixed focal length, and what the focal length's own uncertainty adds to it."""
+def _whatever_the_focal(
+    covariance: Float[np.ndarray, "6 6"], information: Float[np.ndarray, "7 7"]
+) -> Float[np.ndarray, "6 6"]:
+    """The pose's covariance at a fixed focal length, and what the focal length's own uncertainty
+    adds to it."""
     by_focal = -np.linalg.solve(information[:6, :6], information[:6, 6])
     scale = float(np.trace(covariance @ information[:6, :6])) / 6.0
     variance = scale / max(information[6, 6] + float(information[:6, 6] @ by_focal), 1e-12)
     return covariance + variance * np.outer(by_focal, by_focal)
 
 
-def _whatever_the_centre(points_world: Float[np.ndarray, "n 3"], pose: AbsolutePose, camera: Camera) -> Float[np.ndarray, "6 6"]:
-    """What a principal point away from the middle adds to the pose's covariance: the pose moves so as to shift all pixels alike."""
+def _whatever_the_centre(
+    points_world: Float[np.ndarray, "n 3"], pose: AbsolutePose, camera: Camera
+) -> Float[np.ndarray, "6 6"]:
+    """What a principal point away from the middle adds to the pose's covariance: the pose moves so
+    as to shift all pixels alike."""
     x, y, z = pose.cam_from_world.apply(points_world).T
     u, v, w = x / z, y / z, 1.0 / z
     zero = np.zeros_like(u)

@@ -1,4 +1,5 @@
-"""Compiled inner loops of `absolute_pose` and `clustered_errors`: one pass over the points a call, no allocation a point."""
+"""Compiled inner loops of `absolute_pose` and `clustered_errors`: one pass over the points a call,
+no allocation a point."""
 
 import numpy as np
 
@@ -7,10 +8,12 @@ from topoloc.compiled import kernel
 
 @kernel()
 def _whitened(rotation, translation, normalized, covariances, points_world, point_covariances, i):
-    """(u, v, 1/z, e, S^-1, e' S^-1 e) of match i, with e = projected - observed on the plane z = 1; the last is infinite behind.
+    """(u, v, 1/z, e, S^-1, e' S^-1 e) of match i, with e = projected - observed on the plane z = 1;
+    the last is infinite behind.
 
-    S = the pixel's covariance + D R P R' D' with D the projection's derivative and P the point's covariance, absent if there are none.
-    Rows are not taken out of the arrays: a view of each would cost more than the arithmetic.
+    S = the pixel's covariance + D R P R' D' with D the projection's derivative and P the point's
+    covariance, absent if there are none. Rows are not taken out of the arrays: a view of each would
+    cost more than the arithmetic.
     """
     px, py, pz = points_world[i, 0], points_world[i, 1], points_world[i, 2]
     x = rotation[0, 0] * px + rotation[0, 1] * py + rotation[0, 2] * pz + translation[0]
@@ -21,12 +24,33 @@ def _whitened(rotation, translation, normalized, covariances, points_world, poin
     u, v, w = x / z, y / z, 1.0 / z
     s00, s01, s11 = covariances[i, 0, 0], covariances[i, 0, 1], covariances[i, 1, 1]
     if len(point_covariances) > 0:
-        p00, p01, p02 = point_covariances[i, 0, 0], point_covariances[i, 0, 1], point_covariances[i, 0, 2]
-        p10, p11, p12 = point_covariances[i, 1, 0], point_covariances[i, 1, 1], point_covariances[i, 1, 2]
-        p20, p21, p22 = point_covariances[i, 2, 0], point_covariances[i, 2, 1], point_covariances[i, 2, 2]
-        a0, b0 = w * (rotation[0, 0] - u * rotation[2, 0]), w * (rotation[1, 0] - v * rotation[2, 0])
-        a1, b1 = w * (rotation[0, 1] - u * rotation[2, 1]), w * (rotation[1, 1] - v * rotation[2, 1])
-        a2, b2 = w * (rotation[0, 2] - u * rotation[2, 2]), w * (rotation[1, 2] - v * rotation[2, 2])
+        p00, p01, p02 = (
+            point_covariances[i, 0, 0],
+            point_covariances[i, 0, 1],
+            point_covariances[i, 0, 2],
+        )
+        p10, p11, p12 = (
+            point_covariances[i, 1, 0],
+            point_covariances[i, 1, 1],
+            point_covariances[i, 1, 2],
+        )
+        p20, p21, p22 = (
+            point_covariances[i, 2, 0],
+            point_covariances[i, 2, 1],
+            point_covariances[i, 2, 2],
+        )
+        a0, b0 = (
+            w * (rotation[0, 0] - u * rotation[2, 0]),
+            w * (rotation[1, 0] - v * rotation[2, 0]),
+        )
+        a1, b1 = (
+            w * (rotation[0, 1] - u * rotation[2, 1]),
+            w * (rotation[1, 1] - v * rotation[2, 1]),
+        )
+        a2, b2 = (
+            w * (rotation[0, 2] - u * rotation[2, 2]),
+            w * (rotation[1, 2] - v * rotation[2, 2]),
+        )
         pa0, pb0 = p00 * a0 + p01 * a1 + p02 * a2, p00 * b0 + p01 * b1 + p02 * b2
         pa1, pb1 = p10 * a0 + p11 * a1 + p12 * a2, p10 * b0 + p11 * b1 + p12 * b2
         pa2, pb2 = p20 * a0 + p21 * a1 + p22 * a2, p20 * b0 + p21 * b1 + p22 * b2
@@ -46,19 +70,33 @@ def squared_errors(rotation, translation, normalized, covariances, points_world,
     """Squared Mahalanobis length of each match's reprojection error; infinite behind the camera."""
     squares = np.empty(len(normalized))
     for i in range(len(normalized)):
-        squares[i] = _whitened(rotation, translation, normalized, covariances, points_world, point_covariances, i)[8]
+        squares[i] = _whitened(
+            rotation, translation, normalized, covariances, points_world, point_covariances, i
+        )[8]
     return squares
 
 
 @kernel()
-def normal_equations(rotation, translation, normalized, covariances, points_world, point_covariances, active, cauchy_scale, num_unknowns):
+def normal_equations(
+    rotation,
+    translation,
+    normalized,
+    covariances,
+    points_world,
+    point_covariances,
+    active,
+    cauchy_scale,
+    num_unknowns,
+):
     """Gauss-Newton's normal equations of the whitened reprojection errors on the plane z = 1.
 
-    `covariances` (n, 2, 2) are those of `normalized`; `point_covariances` is (n, 3, 3), or (0, 3, 3) for exact points.
-    The derivative of an error by the left perturbation (translation, rotation) is D [I, -[p]x]; each match weighs
-    1 / (1 + e' S^-1 e / c^2), Cauchy's weight. The seventh unknown, of `num_unknowns` = 6 or 7, is the logarithm of the focal length:
-    noise is of pixels, so that it is the projection that moves with it; were the observations taken to move, it would come out too long.
-    Returns the information (k, k) and the gradient (k) of k unknowns, the Cauchy cost and the sum of the weighted squared residuals.
+    `covariances` (n, 2, 2) are those of `normalized`; `point_covariances` is (n, 3, 3), or (0, 3,
+    3) for exact points. The derivative of an error by the left perturbation (translation, rotation)
+    is D [I, -[p]x]; each match weighs 1 / (1 + e' S^-1 e / c^2), Cauchy's weight. The seventh
+    unknown, of `num_unknowns` = 6 or 7, is the logarithm of the focal length: noise is of pixels,
+    so that it is the projection that moves with it; were the observations taken to move, it would
+    come out too long. Returns the information (k, k) and the gradient (k) of k unknowns, the Cauchy
+    cost and the sum of the weighted squared residuals.
     """
     information = np.zeros((num_unknowns, num_unknowns))
     gradient = np.zeros(num_unknowns)
@@ -96,9 +134,20 @@ def normal_equations(rotation, translation, normalized, covariances, points_worl
 
 
 @kernel()
-def squared_pulls(rotation, translation, normalized, covariances, points_world, point_covariances, cells, num_cells, cauchy_scale):
-    """The information (6, 6) of all matches, and of the gradients by which they pull at the pose, less their mean, the sums of squares
-    g g' of single matches and of those of one cell together."""
+def squared_pulls(
+    rotation,
+    translation,
+    normalized,
+    covariances,
+    points_world,
+    point_covariances,
+    cells,
+    num_cells,
+    cauchy_scale,
+):
+    """The information (6, 6) of all matches, and of the gradients by which they pull at the pose,
+    less their mean, the sums of squares g g' of single matches and of those of one cell
+    together."""
     count = len(normalized)
     active = np.ones(1, np.bool_)
     information, alone, together = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6))
@@ -131,10 +180,29 @@ def squared_pulls(rotation, translation, normalized, covariances, points_world, 
 
 
 @kernel()
-def refine(rotation, translation, normalized, covariances, points_world, point_covariances, active, cauchy_scale, max_steps):
-    """Iteratively reweighted Gauss-Newton under Cauchy's loss; ends where the cost falls no more. Returns (rotation, translation)."""
+def refine(
+    rotation,
+    translation,
+    normalized,
+    covariances,
+    points_world,
+    point_covariances,
+    active,
+    cauchy_scale,
+    max_steps,
+):
+    """Iteratively reweighted Gauss-Newton under Cauchy's loss; ends where the cost falls no more.
+    Returns (rotation, translation)."""
     information, gradient, cost, _ = normal_equations(
-        rotation, translation, normalized, covariances, points_world, point_covariances, active, cauchy_scale, 6
+        rotation,
+        translation,
+        normalized,
+        covariances,
+        points_world,
+        point_covariances,
+        active,
+        cauchy_scale,
+        6,
     )
     for _ in range(max_steps):
         is_definite, step = solve_definite(information, -gradient)
@@ -149,7 +217,15 @@ def refine(rotation, translation, normalized, covariances, points_world, point_c
                 for j in range(3):
                     new_rotation[i, j] += turn[i, k] * rotation[k, j]
         information, gradient, new_cost, _ = normal_equations(
-            new_rotation, new_translation, normalized, covariances, points_world, point_covariances, active, cauchy_scale, 6
+            new_rotation,
+            new_translation,
+            normalized,
+            covariances,
+            points_world,
+            point_covariances,
+            active,
+            cauchy_scale,
+            6,
         )
         if not new_cost <= cost:
             break
@@ -162,7 +238,8 @@ def refine(rotation, translation, normalized, covariances, points_world, point_c
 
 @kernel()
 def solve_definite(matrix, right):
-    """(True, x) with matrix @ x = right by Cholesky's decomposition; (False, _) if not positive definite."""
+    """(True, x) with matrix @ x = right by Cholesky's decomposition; (False, _) if not positive
+    definite."""
     n = len(right)
     lower = np.zeros((n, n))
     x = np.zeros(n)

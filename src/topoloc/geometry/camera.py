@@ -1,7 +1,7 @@
 """Cameras: pinhole with distortion, under COLMAP's model names.
 
-Pixels are (x, y) with the centre of the top-left pixel at (0, 0); COLMAP's own origin, half a pixel up and left,
-appears only where its files are read or written.
+Pixels are (x, y) with the centre of the top-left pixel at (0, 0); COLMAP's own origin, half a pixel
+up and left, appears only where its files are read or written.
 """
 
 from __future__ import annotations
@@ -12,7 +12,13 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.errors import CalibrationError
-from topoloc.geometry.distortion import distort_fisheye, distort_rational, max_radius, undistort_fisheye, undistort_rational
+from topoloc.geometry.distortion import (
+    distort_fisheye,
+    distort_rational,
+    max_radius,
+    undistort_fisheye,
+    undistort_rational,
+)
 
 # Parameter names of each model, in COLMAP's order.
 MODELS: dict[str, tuple[str, ...]] = {
@@ -24,7 +30,10 @@ MODELS: dict[str, tuple[str, ...]] = {
     "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
-_LEAST_FOCAL, _MOST_FOCAL = 1e-3, 1e4  # times the longer side of the picture; real lenses have 0.2 to 100
+_LEAST_FOCAL, _MOST_FOCAL = (
+    1e-3,
+    1e4,
+)  # times the longer side of the picture; real lenses have 0.2 to 100
 _TWO_FOCAL = {"SIMPLE_PINHOLE": "PINHOLE", "SIMPLE_RADIAL": "OPENCV", "RADIAL": "OPENCV"}
 
 
@@ -33,7 +42,8 @@ class Camera:
     """One camera: COLMAP model name, image size in pixels, parameters in the model's order.
 
     Raises:
-        CalibrationError: unknown model, wrong number of parameters, values not finite, focal length not positive or of no lens.
+        CalibrationError: unknown model, wrong number of parameters, values not finite, focal length
+            not positive or of no lens.
     """
 
     model: str
@@ -43,17 +53,28 @@ class Camera:
 
     def __post_init__(self) -> None:
         if self.model not in MODELS:
-            raise CalibrationError(f"unknown camera model {self.model!r}; known: {', '.join(MODELS)}")
+            raise CalibrationError(
+                f"unknown camera model {self.model!r}; known: {', '.join(MODELS)}"
+            )
         names = MODELS[self.model]
         if len(self.params) != len(names):
-            raise CalibrationError(f"camera {self.model} takes {len(names)} parameters ({', '.join(names)}), not {len(self.params)}")
+            raise CalibrationError(
+                f"camera {self.model} takes {len(names)} parameters ({', '.join(names)}), not"
+                f" {len(self.params)}"
+            )
         if not np.all(np.isfinite(self.params)):
             raise CalibrationError(f"camera parameters are not finite: {self.params}")
         if self.width < 1 or self.height < 1 or self.fx <= 0 or self.fy <= 0:
-            raise CalibrationError(f"camera needs a positive size and focal length, not {self.width}x{self.height}, f = {self.fx:g}")
+            raise CalibrationError(
+                f"camera needs a positive size and focal length, not {self.width}x{self.height}, f"
+                f" = {self.fx:g}"
+            )
         side = max(self.width, self.height)
         if not all(_LEAST_FOCAL < focal / side < _MOST_FOCAL for focal in (self.fx, self.fy)):
-            raise CalibrationError(f"no lens has a focal length of {self.fx:g}, {self.fy:g} pixels with a picture of {side} pixels")
+            raise CalibrationError(
+                f"no lens has a focal length of {self.fx:g}, {self.fy:g} pixels with a picture of"
+                f" {side} pixels"
+            )
 
     @staticmethod
     def pinhole(width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> Camera:
@@ -86,7 +107,11 @@ class Camera:
     @property
     def is_distorted(self) -> bool:
         """Anything but a plain pinhole; a fisheye lens is, whatever its coefficients."""
-        return self.is_fisheye or any(value != 0.0 for name, value in zip(MODELS[self.model], self.params, strict=True) if name[0] in "kp")
+        return self.is_fisheye or any(
+            value != 0.0
+            for name, value in zip(MODELS[self.model], self.params, strict=True)
+            if name[0] in "kp"
+        )
 
     def matrix(self) -> Float[np.ndarray, "3 3"]:
         """K: pixels from the normalised plane."""
@@ -94,31 +119,45 @@ class Camera:
 
     def distortion(self) -> Float[np.ndarray, " d"]:
         """Coefficients in OpenCV's order: (k1, k2, p1, p2, k3 .. k6), or (k1 .. k4) for fisheye."""
-        names = ("k1", "k2", "k3", "k4") if self.is_fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+        names = (
+            ("k1", "k2", "k3", "k4")
+            if self.is_fisheye
+            else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+        )
         return np.array([self._param(name) for name in names])
 
     def img_from_cam(self, points_cam: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
         """Pixels of points in the camera frame (metres).
 
-        Points at or behind the camera, and points beyond the field that the distortion model describes, give NaN.
+        Points at or behind the camera, and points beyond the field that the distortion model
+        describes, give NaN.
         """
         in_front = points_cam[:, 2] > 1e-9
         normalized = points_cam[:, :2] / np.where(in_front, points_cam[:, 2], np.nan)[:, None]
         if self.is_distorted:
-            in_field = np.linalg.norm(normalized, axis=1) <= max_radius(tuple(self.distortion().tolist()), self.is_fisheye)
+            in_field = np.linalg.norm(normalized, axis=1) <= max_radius(
+                tuple(self.distortion().tolist()), self.is_fisheye
+            )
             normalized = self._distort(np.where(in_field[:, None], normalized, np.nan))[0]
         return normalized * [self.fx, self.fy] + [self.cx, self.cy]
 
     def normalized_from_img(self, points_img: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Undistorted coordinates (x / z, y / z) on the plane z = 1 of pixels; NaN for pixels that no ray reaches."""
-        distorted = (np.asarray(points_img, dtype=np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
+        """Undistorted coordinates (x / z, y / z) on the plane z = 1 of pixels; NaN for pixels that
+        no ray reaches."""
+        distorted = (np.asarray(points_img, dtype=np.float64) - [self.cx, self.cy]) / [
+            self.fx,
+            self.fy,
+        ]
         if not self.is_distorted:
             return distorted
         undistort = undistort_fisheye if self.is_fisheye else undistort_rational
         return undistort(self.distortion(), distorted)
 
-    def normalized_jacobian(self, normalized: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2 2"]:
-        """Derivative of `normalized_from_img` at the pixels whose undistorted coordinates these are."""
+    def normalized_jacobian(
+        self, normalized: Float[np.ndarray, "n 2"]
+    ) -> Float[np.ndarray, "n 2 2"]:
+        """Derivative of `normalized_from_img` at the pixels whose undistorted coordinates these
+        are."""
         focal = np.array([self.fx, self.fy])
         if not self.is_distorted:
             return np.broadcast_to(np.diag(1.0 / focal), (len(normalized), 2, 2)).copy()
@@ -126,8 +165,12 @@ class Camera:
         inverse = np.stack([d, -b, -c, a], axis=1) / (a * d - b * c)[:, None]
         return inverse.reshape(-1, 2, 2) / focal
 
-    def _distort(self, normalized: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
-        return (distort_fisheye if self.is_fisheye else distort_rational)(self.distortion(), normalized)
+    def _distort(
+        self, normalized: Float[np.ndarray, "n 2"]
+    ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
+        return (distort_fisheye if self.is_fisheye else distort_rational)(
+            self.distortion(), normalized
+        )
 
     def rays_from_img(self, points_img: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
         """Unit direction in the camera frame of each pixel."""
@@ -140,14 +183,19 @@ class Camera:
         return Camera.pinhole(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
 
     def rescaled(self, width: int, height: int) -> Camera:
-        """The same camera for its image resized to width x height; pixel centres stay pixel centres.
+        """The same camera for its image resized to width x height; pixel centres stay pixel
+        centres.
 
         Models with one focal length become their two-focal siblings where the two scales differ.
         """
         scale_x, scale_y = width / self.width, height / self.height
         model = self.model if scale_x == scale_y else _TWO_FOCAL.get(self.model, self.model)
         values = {name: self._param(name) for name in MODELS[model]}
-        for name, value in (("f", self.fx * scale_x), ("fx", self.fx * scale_x), ("fy", self.fy * scale_y)):
+        for name, value in (
+            ("f", self.fx * scale_x),
+            ("fx", self.fx * scale_x),
+            ("fy", self.fy * scale_y),
+        ):
             if name in values:
                 values[name] = value
         values["cx"] = (self.cx + 0.5) * scale_x - 0.5
@@ -155,7 +203,8 @@ class Camera:
         return Camera(model, width, height, tuple(values.values()))
 
     def to_colmap(self) -> tuple[str, int, int, tuple[float, ...]]:
-        """(model, width, height, params) as COLMAP writes them: there the centre of the top-left pixel is (0.5, 0.5)."""
+        """(model, width, height, params) as COLMAP writes them: there the centre of the top-left
+        pixel is (0.5, 0.5)."""
         return self.model, self.width, self.height, self._shifted(0.5)
 
     @staticmethod
@@ -185,7 +234,9 @@ class Camera:
             CalibrationError: a key is missing or not a number, or the camera is not usable.
         """
         if not isinstance(data, dict):
-            raise CalibrationError(f"camera: an object of named values is expected, not {type(data).__name__}")
+            raise CalibrationError(
+                f"camera: an object of named values is expected, not {type(data).__name__}"
+            )
         try:
             model = str(data.get("model", "PINHOLE"))
             params = tuple(float(data[name]) for name in MODELS.get(model, ()))  # type: ignore[arg-type]

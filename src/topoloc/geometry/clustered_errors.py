@@ -1,9 +1,12 @@
-"""What the errors of matches have in common that lie near each other in the picture, and how much less they say together for it.
+"""What the errors of matches have in common that lie near each other in the picture, and how much
+less they say together for it.
 
-PnP's covariance takes the errors of all matches for independent. Where a chair was moved by a centimetre, or a wall's depth is wrong, the
-errors of all points there pull the pose the same way. That shows: summed over a part of the picture, what pulls at the pose is then larger
-than the sum of as many independent pulls. The ratio of the two covariances of the pose that follow is that of the clustered "sandwich" to
-the plain one (Liang and Zeger, *Longitudinal data analysis using generalized linear models*, 1986).
+PnP's covariance takes the errors of all matches for independent. Where a chair was moved by a
+centimetre, or a wall's depth is wrong, the errors of all points there pull the pose the same way.
+That shows: summed over a part of the picture, what pulls at the pose is then larger than the sum of
+as many independent pulls. The ratio of the two covariances of the pose that follow is that of the
+clustered "sandwich" to the plain one (Liang and Zeger, *Longitudinal data analysis using
+generalized linear models*, 1986).
 """
 
 from __future__ import annotations
@@ -28,22 +31,39 @@ def coherence(
     cam_from_world: Rigid3,
     config: AbsolutePoseConfig,
 ) -> float:
-    """How many times larger the pose's variance is than if the errors of its inliers were independent, in the mean of its six directions;
-    at least 1.
+    """How many times larger the pose's variance is than if the errors of its inliers were
+    independent, in the mean of its six directions; at least 1.
 
     Args:
-        points_img: pixels of the inliers, and their points (metres) with the covariances of these (m^2).
+        points_img: pixels of the inliers, and their points (metres) with the covariances of these
+            (m^2).
     """
     normalized = camera.normalized_from_img(points_img)
-    matches = Matches.of(points_img, normalized, points_world, point_covariances, camera, config.key_point_sigma_px)
-    columns = np.clip((points_img[:, 0] + 0.5) * _COLUMNS / camera.width, 0, _COLUMNS - 1).astype(np.intp)
+    matches = Matches.of(
+        points_img, normalized, points_world, point_covariances, camera, config.key_point_sigma_px
+    )
+    columns = np.clip((points_img[:, 0] + 0.5) * _COLUMNS / camera.width, 0, _COLUMNS - 1).astype(
+        np.intp
+    )
     rows = np.clip((points_img[:, 1] + 0.5) * _ROWS / camera.height, 0, _ROWS - 1).astype(np.intp)
     used, cells = np.unique(rows * _COLUMNS + columns, return_inverse=True)
     if len(used) < _MIN_CELLS:
         return 1.0
-    information, alone, together = squared_pulls(*matches.arguments(cam_from_world), cells, len(used), CAUCHY_SCALE)
-    if not (np.isfinite(information).all() and np.linalg.matrix_rank(information, hermitian=True) == 6):
+    information, alone, together = squared_pulls(
+        *matches.arguments(cam_from_world), cells, len(used), CAUCHY_SCALE
+    )
+    if not (
+        np.isfinite(information).all() and np.linalg.matrix_rank(information, hermitian=True) == 6
+    ):
         return 1.0
-    of_fit = len(used) / (len(used) - 3.0)  # the pose follows from the same pulls, which makes their sums smaller
-    variance_alone, variance_together = (np.trace(np.linalg.solve(information, pulls)) for pulls in (alone, together))
-    return max(1.0, float(of_fit * variance_together / variance_alone)) if variance_alone > 0.0 else 1.0
+    of_fit = len(used) / (
+        len(used) - 3.0
+    )  # the pose follows from the same pulls, which makes their sums smaller
+    variance_alone, variance_together = (
+        np.trace(np.linalg.solve(information, pulls)) for pulls in (alone, together)
+    )
+    return (
+        max(1.0, float(of_fit * variance_together / variance_alone))
+        if variance_alone > 0.0
+        else 1.0
+    )

@@ -1,8 +1,9 @@
-"""Lens distortion on the plane z = 1: OpenCV's rational model and its fisheye model, each with its Jacobian and inverse.
+"""Lens distortion on the plane z = 1: OpenCV's rational model and its fisheye model, each with its
+Jacobian and inverse.
 
-Coefficients are in OpenCV's order: (k1, k2, p1, p2, k3, k4, k5, k6), or (k1, k2, k3, k4) for fisheye.
-Radial polynomials fold back beyond some radius, so that one pixel would belong to two rays: all functions here are confined
-to the part before the first fold and give NaN outside.
+Coefficients are in OpenCV's order: (k1, k2, p1, p2, k3, k4, k5, k6), or (k1, k2, k3, k4) for
+fisheye. Radial polynomials fold back beyond some radius, so that one pixel would belong to two
+rays: all functions here are confined to the part before the first fold and give NaN outside.
 """
 
 from __future__ import annotations
@@ -21,14 +22,23 @@ _CONVERGED = 1e-13
 def distort_rational(
     coefficients: Float[np.ndarray, "8"], normalized: Float[np.ndarray, "n 2"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
-    """Distorted coordinates and their derivative (OpenCV's calib3d documentation: six radial, two tangential coefficients)."""
+    """Distorted coordinates and their derivative (OpenCV's calib3d documentation: six radial, two
+    tangential coefficients)."""
     k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
     x, y = normalized[:, 0], normalized[:, 1]
     xy, r2 = x * y, x * x + y * y
     denominator = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
     radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / denominator
-    slope = (k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / denominator
-    distorted = np.stack([x * radial + 2 * p1 * xy + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * xy], axis=1)
+    slope = (
+        k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))
+    ) / denominator
+    distorted = np.stack(
+        [
+            x * radial + 2 * p1 * xy + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * xy,
+        ],
+        axis=1,
+    )
     jacobian = np.empty((len(normalized), 2, 2))
     jacobian[:, 0, 0] = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
     jacobian[:, 1, 1] = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
@@ -39,19 +49,26 @@ def distort_rational(
 def distort_fisheye(
     coefficients: Float[np.ndarray, "4"], normalized: Float[np.ndarray, "n 2"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
-    """Distorted coordinates and their derivative (Kannala and Brandt, *A generic camera model*, 2006)."""
+    """Distorted coordinates and their derivative (Kannala and Brandt, *A generic camera model*,
+    2006)."""
     r = np.linalg.norm(normalized, axis=1)
     theta_d, theta_d_slope = _fisheye_polynomial(coefficients, np.arctan(r))
     safe = np.maximum(r, 1e-9)
     scale = np.where(r > 1e-9, theta_d / safe, 1.0)
     scale_slope = np.where(r > 1e-9, (theta_d_slope / (1.0 + r * r) - scale) / safe, 0.0)
     unit = normalized / safe[:, None]
-    jacobian = scale[:, None, None] * np.eye(2) + (r * scale_slope)[:, None, None] * unit[:, :, None] * unit[:, None, :]
+    jacobian = (
+        scale[:, None, None] * np.eye(2)
+        + (r * scale_slope)[:, None, None] * unit[:, :, None] * unit[:, None, :]
+    )
     return normalized * scale[:, None], jacobian
 
 
-def undistort_rational(coefficients: Float[np.ndarray, "8"], distorted: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """The inverse of `distort_rational` by Newton's method, to machine precision; NaN where no ray belongs to the point."""
+def undistort_rational(
+    coefficients: Float[np.ndarray, "8"], distorted: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "n 2"]:
+    """The inverse of `distort_rational` by Newton's method, to machine precision; NaN where no ray
+    belongs to the point."""
     normalized = distorted.copy()
     limit = max_radius(tuple(coefficients.tolist()), is_fisheye=False)
     error = np.full(len(distorted), np.inf)
@@ -67,15 +84,19 @@ def undistort_rational(coefficients: Float[np.ndarray, "8"], distorted: Float[np
             step_x = (d * residual[:, 0] - b * residual[:, 1]) / determinant
             step_y = (a * residual[:, 1] - b * residual[:, 0]) / determinant
             normalized = normalized + np.stack([step_x, step_y], axis=1)
-            # A point at the limit is kept there, so that one that has no ray cannot wander to the far side of the fold.
+            # A point at the limit is kept there, so that one that has no ray cannot wander to the
+            # far side of the fold.
             radius = np.linalg.norm(normalized, axis=1, keepdims=True)
             normalized = np.where(radius > limit, normalized * (limit / radius), normalized)
         solved = error < 1e-9
     return np.where(solved[:, None], normalized, np.nan)
 
 
-def undistort_fisheye(coefficients: Float[np.ndarray, "4"], distorted: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """The inverse of `distort_fisheye` by Newton's method on the angle; NaN where no ray before 87 deg belongs to the point."""
+def undistort_fisheye(
+    coefficients: Float[np.ndarray, "4"], distorted: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "n 2"]:
+    """The inverse of `distort_fisheye` by Newton's method on the angle; NaN where no ray before 87
+    deg belongs to the point."""
     theta_d = np.linalg.norm(distorted, axis=1)
     limit = float(np.arctan(max_radius(tuple(coefficients.tolist()), is_fisheye=True)))
     theta = np.minimum(theta_d, limit)
@@ -93,7 +114,8 @@ def undistort_fisheye(coefficients: Float[np.ndarray, "4"], distorted: Float[np.
 
 @lru_cache(maxsize=256)
 def max_radius(coefficients: tuple[float, ...], is_fisheye: bool) -> float:
-    """Largest distance from the axis on the plane z = 1 up to which the distorted radius still grows; at most tan(87 deg)."""
+    """Largest distance from the axis on the plane z = 1 up to which the distorted radius still
+    grows; at most tan(87 deg)."""
     r = np.tan(np.linspace(0.0, np.arctan(_MAX_TAN), _NUM_SAMPLES))
     k = np.array(coefficients)
     if is_fisheye:
@@ -102,7 +124,9 @@ def max_radius(coefficients: tuple[float, ...], is_fisheye: bool) -> float:
         # The radial part alone: the tangential one is a small correction without a fold of its own.
         radial_only = k * [1, 1, 0, 0, 1, 1, 1, 1]
         with np.errstate(all="ignore"):
-            distorted, jacobian = distort_rational(radial_only, np.stack([r, np.zeros_like(r)], axis=1))
+            distorted, jacobian = distort_rational(
+                radial_only, np.stack([r, np.zeros_like(r)], axis=1)
+            )
         grows = (jacobian[:, 0, 0] > 0.0) & (distorted[:, 0] >= 0.0)
     folds = np.flatnonzero(~grows)
     return float(r[-1] if len(folds) == 0 else r[max(int(folds[0]) - 1, 0)])

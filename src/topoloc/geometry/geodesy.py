@@ -1,8 +1,10 @@
-"""WGS-84: latitude, longitude and height, earth-centred coordinates, and the plane east-north-up of a place.
+"""WGS-84: latitude, longitude and height, earth-centred coordinates, and the plane east-north-up of
+a place.
 
-Latitudes and longitudes are degrees, heights metres above the ellipsoid. ECEF: x to latitude 0, longitude 0, z to the north pole,
-metres. Formulas: Torge and Mueller, *Geodesy*, 4.1; the way back by Bowring, *Transformation from spatial to geographical
-coordinates*, 1976, repeated until it stands still.
+Latitudes and longitudes are degrees, heights metres above the ellipsoid. ECEF: x to latitude 0,
+longitude 0, z to the north pole, metres. Formulas: Torge and Mueller, *Geodesy*, 4.1; the way back
+by Bowring, *Transformation from spatial to geographical coordinates*, 1976, repeated until it
+stands still.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ FLATTENING = 1.0 / 298.257223563
 _SEMI_MINOR = SEMI_MAJOR * (1.0 - FLATTENING)
 _E2 = FLATTENING * (2.0 - FLATTENING)
 _MAX_HEIGHT = 1e8  # metres
-# Axes of a camera as a body (x forward, y left, z up) in its own (x right, y down, z forward), as the OSCP's reference server has them.
+# Axes of a camera as a body (x forward, y left, z up) in its own (x right, y down, z forward), as
+# the OSCP's reference server has them.
 CAM_FROM_BODY = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
@@ -41,7 +44,10 @@ class GeoPoint:
         if not all(map(math.isfinite, (self.lat, self.lon, self.h))):
             raise GeoreferenceError(f"not a place on earth: {self.lat}, {self.lon}, {self.h}")
         if abs(self.lat) > 90.0 or abs(self.lon) > 360.0:
-            raise GeoreferenceError(f"latitude {self.lat:g}, longitude {self.lon:g}: -90 to 90 and -180 to 180 degrees, in this order")
+            raise GeoreferenceError(
+                f"latitude {self.lat:g}, longitude {self.lon:g}: -90 to 90 and -180 to 180 degrees,"
+                " in this order"
+            )
         if abs(self.h) > _MAX_HEIGHT:
             raise GeoreferenceError(f"a height of {self.h:g} m above the ellipsoid")
 
@@ -50,11 +56,18 @@ class GeoPoint:
         lat, lon = math.radians(self.lat), math.radians(self.lon)
         normal = SEMI_MAJOR / math.sqrt(1.0 - _E2 * math.sin(lat) ** 2)
         across = (normal + self.h) * math.cos(lat)
-        return np.array([across * math.cos(lon), across * math.sin(lon), (normal * (1.0 - _E2) + self.h) * math.sin(lat)])
+        return np.array(
+            [
+                across * math.cos(lon),
+                across * math.sin(lon),
+                (normal * (1.0 - _E2) + self.h) * math.sin(lat),
+            ]
+        )
 
     @staticmethod
     def from_ecef(ecef: Float[np.ndarray, "3"]) -> GeoPoint:
-        """Of a point less than `_MAX_HEIGHT` from the ellipsoid. Raises GeoreferenceError for any other."""
+        """Of a point less than `_MAX_HEIGHT` from the ellipsoid. Raises GeoreferenceError for any
+        other."""
         x, y, z = (float(value) for value in ecef)
         across = math.hypot(x, y)
         beta = math.atan2(SEMI_MAJOR * z, _SEMI_MINOR * across)
@@ -64,7 +77,9 @@ class GeoPoint:
             lat = math.atan2(up, across - _E2 * SEMI_MAJOR * math.cos(beta) ** 3)
             beta = math.atan2((1.0 - FLATTENING) * math.sin(lat), math.cos(lat))
         normal = SEMI_MAJOR / math.sqrt(1.0 - _E2 * math.sin(lat) ** 2)
-        height = across * math.cos(lat) + z * math.sin(lat) - normal * (1.0 - _E2 * math.sin(lat) ** 2)
+        height = (
+            across * math.cos(lat) + z * math.sin(lat) - normal * (1.0 - _E2 * math.sin(lat) ** 2)
+        )
         return GeoPoint(math.degrees(lat), math.degrees(math.atan2(y, x)), height)
 
     def ecef_from_enu(self) -> Rigid3:
@@ -78,7 +93,8 @@ class GeoPoint:
 
 @dataclass(frozen=True, eq=False)
 class GeoPose:
-    """OGC GeoPose 1.0, Basic-Quaternion: where the camera is, and how it is turned against east-north-up at that very place.
+    """OGC GeoPose 1.0, Basic-Quaternion: where the camera is, and how it is turned against
+    east-north-up at that very place.
 
     The camera is turned as a body: x forward, y left, z up.
     """
@@ -100,7 +116,9 @@ class GeoPose:
             lat, lon, h = (float(position[name]) for name in ("lat", "lon", "h"))
             quat_wxyz = np.array([float(quaternion[name]) for name in ("w", "x", "y", "z")])
         except (KeyError, TypeError, ValueError, OverflowError):
-            raise GeoreferenceError("no GeoPose: position (lat, lon, h) and quaternion (x, y, z, w) are needed") from None
+            raise GeoreferenceError(
+                "no GeoPose: position (lat, lon, h) and quaternion (x, y, z, w) are needed"
+            ) from None
         if not abs(float(np.linalg.norm(quat_wxyz)) - 1.0) < 1e-3:  # NaN is not
             raise GeoreferenceError("no GeoPose: its quaternion is not of unit length")
         return GeoPose(GeoPoint(lat, lon, h), quat_wxyz)
@@ -110,7 +128,8 @@ class GeoPose:
 class Georeference:
     """Where a map's world lies on earth: `enu_from_world` into the plane east-north-up at `origin`.
 
-    `source` says what it comes from; `rms_m` is the root mean square of what the fit left over (metres), None where nothing was fitted.
+    `source` says what it comes from; `rms_m` is the root mean square of what the fit left over
+    (metres), None where nothing was fitted.
     """
 
     origin: GeoPoint
@@ -122,7 +141,12 @@ class Georeference:
         """As the map file keeps it."""
         origin = {"lat": self.origin.lat, "lon": self.origin.lon, "h": self.origin.h}
         matrix = self.enu_from_world.matrix()[:3].tolist()
-        return {"origin": origin, "enu_from_world": matrix, "source": self.source, "rms_m": self.rms_m}
+        return {
+            "origin": origin,
+            "enu_from_world": matrix,
+            "source": self.source,
+            "rms_m": self.rms_m,
+        }
 
     @staticmethod
     def from_json(data: object) -> Georeference:
@@ -132,22 +156,30 @@ class Georeference:
             lat, lon, h = (float(origin[name]) for name in ("lat", "lon", "h"))
             matrix = np.array(data["enu_from_world"], np.float64)  # type: ignore[index]
             enu_from_world = Rigid3.from_matrix(matrix)
-            if np.abs(enu_from_world.matrix()[:3] - matrix[:3]).max() < 1e-9:  # as it was written, to the last bit
+            if (
+                np.abs(enu_from_world.matrix()[:3] - matrix[:3]).max() < 1e-9
+            ):  # as it was written, to the last bit
                 enu_from_world = Rigid3(matrix[:3, :3].copy(), matrix[:3, 3].copy())
             rms_m = None if rms_m is None else float(rms_m)
         except (KeyError, TypeError, ValueError, OverflowError, TrajectoryError):
-            raise GeoreferenceError("no georeference: origin, enu_from_world (3x4), source and rms_m are needed") from None
+            raise GeoreferenceError(
+                "no georeference: origin, enu_from_world (3x4), source and rms_m are needed"
+            ) from None
         if not isinstance(source, str) or (rms_m is not None and not 0.0 <= rms_m < math.inf):
-            raise GeoreferenceError("no georeference: its source is a text, its rms_m no negative number")
+            raise GeoreferenceError(
+                "no georeference: its source is a text, its rms_m no negative number"
+            )
         return Georeference(GeoPoint(lat, lon, h), enu_from_world, source, rms_m)
 
     def geopoint(self, point_world: Float[np.ndarray, "3"]) -> GeoPoint:
-        """Latitude, longitude and height of a point of the world (metres). Raises GeoreferenceError where it is far from the earth."""
+        """Latitude, longitude and height of a point of the world (metres). Raises GeoreferenceError
+        where it is far from the earth."""
         ecef_from_world = self.origin.ecef_from_enu() @ self.enu_from_world
         return GeoPoint.from_ecef(ecef_from_world.apply(point_world))
 
     def geopose(self, world_from_cam: Rigid3) -> GeoPose:
-        """Of a camera. East, north and up are those of its own place, which differ from the origin's by 0.01 degrees a kilometre."""
+        """Of a camera. East, north and up are those of its own place, which differ from the
+        origin's by 0.01 degrees a kilometre."""
         ecef_from_cam = self.origin.ecef_from_enu() @ self.enu_from_world @ world_from_cam
         position = GeoPoint.from_ecef(ecef_from_cam.translation)
         enu_from_body = position.ecef_from_enu().rotation.T @ ecef_from_cam.rotation @ CAM_FROM_BODY

@@ -27,11 +27,16 @@ class LazyPoses(Sequence[Rigid3]):
     @overload
     def __getitem__(self, index: slice) -> Sequence[Rigid3]: ...
     def __getitem__(self, index: int | slice) -> Rigid3 | Sequence[Rigid3]:
-        return LazyPoses(self.rows[index], self.pose_of) if isinstance(index, slice) else self.pose_of(self.rows[index])
+        return (
+            LazyPoses(self.rows[index], self.pose_of)
+            if isinstance(index, slice)
+            else self.pose_of(self.rows[index])
+        )
 
 
 def pose_of_quaternion(row: Float[np.ndarray, "7"]) -> Rigid3:
-    """Of a position (metres) and a quaternion (x, y, z, w), which need not be of unit length. Raises TrajectoryError: it has none."""
+    """Of a position (metres) and a quaternion (x, y, z, w), which need not be of unit length.
+    Raises TrajectoryError: it has none."""
     return Rigid3.from_quat_wxyz(row[[6, 3, 4, 5]], row[:3])
 
 
@@ -41,8 +46,11 @@ def _pose_of_matrix(row: Float[np.ndarray, "12"]) -> Rigid3:
     return Rigid3(matrix[:, :3].copy(), matrix[:, 3].copy())
 
 
-def poses_of_matrices(numbers: Float[np.ndarray, "n 12"], tolerance: float) -> tuple[LazyPoses, Bool[np.ndarray, " n"]]:
-    """Poses of matrices' upper rows, made exact (Newton's iteration for the polar factor), and whether they are such but for rounding."""
+def poses_of_matrices(
+    numbers: Float[np.ndarray, "n 12"], tolerance: float
+) -> tuple[LazyPoses, Bool[np.ndarray, " n"]]:
+    """Poses of matrices' upper rows, made exact (Newton's iteration for the polar factor), and
+    whether they are such but for rounding."""
     matrices = numbers.reshape(-1, 3, 4).copy()
     given = matrices[:, :, :3]
     with np.errstate(over="ignore", invalid="ignore"):

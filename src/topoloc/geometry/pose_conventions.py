@@ -1,8 +1,10 @@
-"""How trajectories of other programs are written, and how they become ours: world_from_cam, metres, camera axes x right, y down, z forward.
+"""How trajectories of other programs are written, and how they become ours: world_from_cam, metres,
+camera axes x right, y down, z forward.
 
-Conventions are named as `--poses` takes them, one or several in turn: ``inverse``, ``wxyz,opengl``, ``mm``, ``scale=0.42``,
-``body=0.1,0,0,0,0,0,1`` (body_from_cam: x, y, z, and the quaternion x, y, z, w), ``shift=0.2`` (seconds by which the poses' clock is
-ahead of the pictures'), ``clock=1e6`` (times of the file, as read, in units of what they should be).
+Conventions are named as `--poses` takes them, one or several in turn: ``inverse``, ``wxyz,opengl``,
+``mm``, ``scale=0.42``, ``body=0.1,0,0,0,0,0,1`` (body_from_cam: x, y, z, and the quaternion x, y,
+z, w), ``shift=0.2`` (seconds by which the poses' clock is ahead of the pictures'), ``clock=1e6``
+(times of the file, as read, in units of what they should be).
 """
 
 from __future__ import annotations
@@ -34,7 +36,9 @@ def _turned(pose: Rigid3, body_from_cam: Float[np.ndarray, "3 3"]) -> Rigid3:
 
 def _w_first(pose: Rigid3) -> Rigid3:
     w, x, y, z = pose.quat_wxyz()
-    return Rigid3.from_quat_wxyz(np.array([x, y, z, w]), pose.translation)  # what was taken for x is w, for y is x, and so on
+    return Rigid3.from_quat_wxyz(
+        np.array([x, y, z, w]), pose.translation
+    )  # what was taken for x is w, for y is x, and so on
 
 
 def _mirrored(pose: Rigid3) -> Rigid3:
@@ -76,8 +80,8 @@ MEANINGS = {
 
 @dataclass(frozen=True)
 class PoseReading:
-    """How the poses of a file become ours: `conventions` undone in turn. The file's times, as read, times `clock`, are the pictures' plus
-    `shift_s`."""
+    """How the poses of a file become ours: `conventions` undone in turn. The file's times, as read,
+    times `clock`, are the pictures' plus `shift_s`."""
 
     conventions: tuple[str, ...] = ()
     clock: float = 1.0
@@ -88,7 +92,8 @@ class PoseReading:
 
     @staticmethod
     def of(text: str | None) -> PoseReading:
-        """``wxyz,body=1,2,3,0,0,0,1,shift=0.2``: a part that begins with a number belongs to the one before.
+        """``wxyz,body=1,2,3,0,0,0,1,shift=0.2``: a part that begins with a number belongs to the
+        one before.
 
         Raises:
             TrajectoryError: it names no known convention, or numbers are missing.
@@ -100,18 +105,25 @@ class PoseReading:
                 parts[-1] += "," + part
             elif part:
                 parts.append(part)
-        times = {name: value for name, _, value in (part.partition("=") for part in parts) if name in ("clock", "shift")}
+        times = {
+            name: value
+            for name, _, value in (part.partition("=") for part in parts)
+            if name in ("clock", "shift")
+        }
         conventions = tuple(part for part in parts if part.partition("=")[0] not in times)
         for convention in conventions:
             mend_of(convention)
         clock = _numbers("clock", times["clock"], 1)[0] if "clock" in times else 1.0
         if clock <= 0.0:
             raise TrajectoryError("poses 'clock': the factor must be above 0")
-        return PoseReading(conventions, clock, _numbers("shift", times["shift"], 1)[0] if "shift" in times else 0.0)
+        return PoseReading(
+            conventions, clock, _numbers("shift", times["shift"], 1)[0] if "shift" in times else 0.0
+        )
 
 
 def mended(pose: Rigid3, conventions: Sequence[str]) -> Rigid3:
-    """One pose, with these conventions undone in turn. Raises TrajectoryError: there is no such convention."""
+    """One pose, with these conventions undone in turn. Raises TrajectoryError: there is no such
+    convention."""
     for convention in conventions:
         pose = mend_of(convention)(pose)
     return pose
@@ -123,7 +135,8 @@ def meaning(conventions: Sequence[str]) -> str:
 
 
 def mend_of(convention: str) -> Mend:
-    """What undoes a convention, written as `--poses` takes it. Raises TrajectoryError: there is none of that name."""
+    """What undoes a convention, written as `--poses` takes it. Raises TrajectoryError: there is
+    none of that name."""
     name, _, value = convention.partition("=")
     if name in ("scale", "body"):
         numbers = _numbers(convention, value, 1 if name == "scale" else 7)
@@ -131,7 +144,9 @@ def mend_of(convention: str) -> Mend:
             if numbers[0] <= 0.0:
                 raise TrajectoryError(f"poses {convention!r}: the scale must be above 0")
             return lambda pose: _scaled(pose, numbers[0])
-        body_from_cam = Rigid3.from_quat_wxyz(np.array([numbers[6], *numbers[3:6]]), np.array(numbers[:3]))
+        body_from_cam = Rigid3.from_quat_wxyz(
+            np.array([numbers[6], *numbers[3:6]]), np.array(numbers[:3])
+        )
         return lambda pose: pose @ body_from_cam
     if name in UNITS and not value:
         return lambda pose: _scaled(pose, UNITS[name])
@@ -148,5 +163,7 @@ def _numbers(convention: str, value: str, count: int) -> list[float]:
     except ValueError:
         numbers = []
     if len(numbers) != count or not all(math.isfinite(number) for number in numbers):
-        raise TrajectoryError(f"poses {convention[:80]!r}: {count} number{'s' if count > 1 else ''} are needed")
+        raise TrajectoryError(
+            f"poses {convention[:80]!r}: {count} number{'s' if count > 1 else ''} are needed"
+        )
     return numbers

@@ -1,5 +1,6 @@
-"""How a camera moved between two of its pictures, by what both show: the turn, and the direction of the way, for pictures alone know no
-metre. PoseLib's five-point method in LO-RANSAC (https://github.com/PoseLib/PoseLib)."""
+"""How a camera moved between two of its pictures, by what both show: the turn, and the direction of
+the way, for pictures alone know no metre. PoseLib's five-point method in LO-RANSAC
+(https://github.com/PoseLib/PoseLib)."""
 
 from __future__ import annotations
 
@@ -26,30 +27,48 @@ class RelativePose:
 
 
 def estimate_relative_pose(
-    first_img: Float[np.ndarray, "n 2"], first: Camera, second_img: Float[np.ndarray, "n 2"], second: Camera
+    first_img: Float[np.ndarray, "n 2"],
+    first: Camera,
+    second_img: Float[np.ndarray, "n 2"],
+    second: Camera,
 ) -> RelativePose | None:
-    """From pixels of the same points in two pictures; None where none is found, or the camera moved too little to say where to.
+    """From pixels of the same points in two pictures; None where none is found, or the camera moved
+    too little to say where to.
 
     The way must show: half of the points must be displaced by a degree and more, beyond the turn.
     """
     if len(first_img) < 8:
         return None
-    rays = [camera.normalized_from_img(points) for points, camera in ((first_img, first), (second_img, second))]
+    rays = [
+        camera.normalized_from_img(points)
+        for points, camera in ((first_img, first), (second_img, second))
+    ]
     kept = np.flatnonzero(np.isfinite(np.column_stack(rays)).all(axis=1))
     if len(kept) < 8:
         return None
     focal = 0.5 * (first.fx + second.fx)
-    pinhole = {"model": "SIMPLE_PINHOLE", "width": first.width, "height": first.height, "params": [focal, 0.0, 0.0]}
+    pinhole = {
+        "model": "SIMPLE_PINHOLE",
+        "width": first.width,
+        "height": first.height,
+        "params": [focal, 0.0, 0.0],
+    }
     ransac = {"max_epipolar_error": _MAX_EPIPOLAR_ERROR_PX, "seed": 0}
-    pose, said = poselib.estimate_relative_pose(focal * rays[0][kept], focal * rays[1][kept], pinhole, pinhole, ransac, {})
+    pose, said = poselib.estimate_relative_pose(
+        focal * rays[0][kept], focal * rays[1][kept], pinhole, pinhole, ransac, {}
+    )
     matrix, inliers = np.asarray(pose.Rt, dtype=np.float64), np.zeros(len(first_img), bool)
     inliers[kept] = said["inliers"]
     way = float(np.linalg.norm(matrix[:, 3]))
     if not np.isfinite(matrix).all() or way == 0.0 or not inliers.any():
         return None
-    turned = np.column_stack([rays[0][inliers], np.ones(np.count_nonzero(inliers))]) @ matrix[:, :3].T
+    turned = (
+        np.column_stack([rays[0][inliers], np.ones(np.count_nonzero(inliers))]) @ matrix[:, :3].T
+    )
     seen = np.column_stack([rays[1][inliers], np.ones(len(turned))])
-    cosines = np.sum(turned * seen, axis=1) / (np.linalg.norm(turned, axis=1) * np.linalg.norm(seen, axis=1))
+    cosines = np.sum(turned * seen, axis=1) / (
+        np.linalg.norm(turned, axis=1) * np.linalg.norm(seen, axis=1)
+    )
     if np.median(np.arccos(np.clip(cosines, -1.0, 1.0))) < _MIN_PARALLAX:
         return None
     return RelativePose(Rigid3(matrix[:, :3].copy(), matrix[:, 3] / way), inliers)

@@ -1,4 +1,5 @@
-"""A stereo rig: two calibrated cameras, the transform between them, and its rectification to equal pinholes side by side."""
+"""A stereo rig: two calibrated cameras, the transform between them, and its rectification to equal
+pinholes side by side."""
 
 from __future__ import annotations
 
@@ -43,13 +44,18 @@ class StereoRig:
 
     @property
     def is_rectified(self) -> bool:
-        """Undistorted, equal rows, right camera straight to +x (principal points may differ in x)."""
+        """Undistorted, equal rows, right camera straight to +x (principal points may differ in
+        x)."""
         if self.left.is_distorted or self.right.is_distorted:
             return False
         translation = self.right_from_left.translation
         return bool(
             (self.left.width, self.left.height) == (self.right.width, self.right.height)
-            and np.allclose([self.left.fx, self.left.fy, self.left.cy], [self.right.fx, self.right.fy, self.right.cy], atol=1e-6)
+            and np.allclose(
+                [self.left.fx, self.left.fy, self.left.cy],
+                [self.right.fx, self.right.fy, self.right.cy],
+                atol=1e-6,
+            )
             and np.allclose(self.right_from_left.rotation, np.eye(3), atol=1e-9)
             and translation[0] < 0
             and np.allclose(translation[1:], 0.0, atol=1e-9)
@@ -58,10 +64,12 @@ class StereoRig:
 
 @dataclass(frozen=True, eq=False)
 class Rectification:
-    """How to make a rectified pair of a raw one: ``cv2.remap(image, left_map, None, cv2.INTER_LINEAR)``, the same for right.
+    """How to make a rectified pair of a raw one: ``cv2.remap(image, left_map, None,
+    cv2.INTER_LINEAR)``, the same for right.
 
-    `rig` is what the remapped images see. `rectified_from_left` is a pure rotation, so a pose of the left camera becomes
-    ``world_from_rectified = world_from_left @ rectified_from_left.inverse()``. The maps hold raw pixels (x, y).
+    `rig` is what the remapped images see. `rectified_from_left` is a pure rotation, so a pose of
+    the left camera becomes ``world_from_rectified = world_from_left @
+    rectified_from_left.inverse()``. The maps hold raw pixels (x, y).
     """
 
     rig: StereoRig
@@ -71,18 +79,21 @@ class Rectification:
 
 
 def rectify(rig: StereoRig) -> Rectification:
-    """Rectify a rig of any two camera models: equal pinhole cameras, equal rows, zero disparity at infinity, no black border.
+    """Rectify a rig of any two camera models: equal pinhole cameras, equal rows, zero disparity at
+    infinity, no black border.
 
-    Each camera turns by half of the angle between the two, then both turn so that the baseline becomes the x axis
-    (Bouguet's method, as in OpenCV's stereoRectify). The common pinhole is the widest that both images fill.
-    A rig that is rectified already keeps its cameras.
+    Each camera turns by half of the angle between the two, then both turn so that the baseline
+    becomes the x axis (Bouguet's method, as in OpenCV's stereoRectify). The common pinhole is the
+    widest that both images fill. A rig that is rectified already keeps its cameras.
 
     Raises:
-        CalibrationError: the right camera is not to the right of the left one, the sizes differ, or the views hardly overlap.
+        CalibrationError: the right camera is not to the right of the left one, the sizes differ, or
+            the views hardly overlap.
     """
     if (rig.left.width, rig.left.height) != (rig.right.width, rig.right.height):
         raise CalibrationError(
-            f"stereo rig: left image is {rig.left.width}x{rig.left.height}, right is {rig.right.width}x{rig.right.height}; sizes must agree"
+            f"stereo rig: left image is {rig.left.width}x{rig.left.height}, right is"
+            f" {rig.right.width}x{rig.right.height}; sizes must agree"
         )
     rotation_left, rotation_right = _rectifying_rotations(rig)
     if rig.is_rectified:
@@ -97,13 +108,18 @@ def rectify(rig: StereoRig) -> Rectification:
     )
 
 
-def _rectifying_rotations(rig: StereoRig) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:
+def _rectifying_rotations(
+    rig: StereoRig,
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:
     """(rectified_from_left, rectified_from_right)."""
     half = log_so3(rig.right_from_left.rotation) / 2.0
     mid_from_left, mid_from_right = exp_so3(half), exp_so3(-half)
     right_in_mid = -(mid_from_right @ rig.right_from_left.translation)
     x, y, z = right_in_mid
-    shown = f"the right camera is at ({x:.3g}, {y:.3g}, {z:.3g}) m from the left one (x right, y down, z forward)"
+    shown = (
+        f"the right camera is at ({x:.3g}, {y:.3g}, {z:.3g}) m from the left one (x right, y down,"
+        " z forward)"
+    )
     if abs(x) < max(abs(y), abs(z)):
         raise CalibrationError(f"stereo rig: not side by side: {shown}")
     if x < 0:
@@ -111,26 +127,42 @@ def _rectifying_rotations(rig: StereoRig) -> tuple[Float[np.ndarray, "3 3"], Flo
     direction = right_in_mid / rig.baseline
     axis = np.cross(direction, [1.0, 0.0, 0.0])
     length = float(np.linalg.norm(axis))
-    rectified_from_mid = exp_so3(axis / length * np.arctan2(length, direction[0])) if length > 0.0 else np.eye(3)
+    rectified_from_mid = (
+        exp_so3(axis / length * np.arctan2(length, direction[0])) if length > 0.0 else np.eye(3)
+    )
     return rectified_from_mid @ mid_from_left, rectified_from_mid @ mid_from_right
 
 
-def _common_pinhole(rig: StereoRig, rotation_left: Float[np.ndarray, "3 3"], rotation_right: Float[np.ndarray, "3 3"]) -> Camera:
+def _common_pinhole(
+    rig: StereoRig,
+    rotation_left: Float[np.ndarray, "3 3"],
+    rotation_right: Float[np.ndarray, "3 3"],
+) -> Camera:
     """The widest pinhole whose every pixel both raw images fill."""
-    lows, highs = zip(_inner_rectangle(rig.left, rotation_left), _inner_rectangle(rig.right, rotation_right), strict=True)
+    lows, highs = zip(
+        _inner_rectangle(rig.left, rotation_left),
+        _inner_rectangle(rig.right, rotation_right),
+        strict=True,
+    )
     low, high = np.max(lows, axis=0), np.min(highs, axis=0)
     size = np.array([rig.left.width, rig.left.height], dtype=np.float64)
     if not np.all(high - low > 1e-3):
-        raise CalibrationError("stereo rig: the views of left and right hardly overlap; the calibration looks wrong")
+        raise CalibrationError(
+            "stereo rig: the views of left and right hardly overlap; the calibration looks wrong"
+        )
     focal = float(np.max((size - 1.0) / (high - low)))
     cx, cy = (size - 1.0) / 2.0 - focal * (low + high) / 2.0
     return Camera.pinhole(rig.left.width, rig.left.height, focal, focal, cx, cy)
 
 
-def _inner_rectangle(camera: Camera, rotation: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    """(low, high) corners, on the rectified plane z = 1, of an upright rectangle inside the raw image's outline.
+def _inner_rectangle(
+    camera: Camera, rotation: Float[np.ndarray, "3 3"]
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+    """(low, high) corners, on the rectified plane z = 1, of an upright rectangle inside the raw
+    image's outline.
 
-    Rays further than 60 degrees off the axis are left out: a pinhole would spend most of its pixels on them.
+    Rays further than 60 degrees off the axis are left out: a pinhole would spend most of its pixels
+    on them.
     """
     right, bottom = camera.width - 1.0, camera.height - 1.0
     steps = np.linspace(0.0, 1.0, _NUM_OUTLINE)
@@ -140,13 +172,23 @@ def _inner_rectangle(camera: Camera, rotation: Float[np.ndarray, "3 3"]) -> tupl
         rays = camera.rays_from_img(np.column_stack([x * right, y * bottom])) @ rotation.T
         sides.append(rays[:, :2] / np.where(rays[:, 2:] > np.cos(_MAX_ANGLE), rays[:, 2:], np.nan))
     widest = np.tan(_MAX_ANGLE)
-    low = np.array([np.nanmax(sides[0][:, 0], initial=-widest), np.nanmax(sides[1][:, 1], initial=-widest)])
-    high = np.array([np.nanmin(sides[2][:, 0], initial=widest), np.nanmin(sides[3][:, 1], initial=widest)])
+    low = np.array(
+        [np.nanmax(sides[0][:, 0], initial=-widest), np.nanmax(sides[1][:, 1], initial=-widest)]
+    )
+    high = np.array(
+        [np.nanmin(sides[2][:, 0], initial=widest), np.nanmin(sides[3][:, 1], initial=widest)]
+    )
     return low, high
 
 
-def _map(raw: Camera, rectified: Camera, rotation: Float[np.ndarray, "3 3"]) -> Float32[np.ndarray, "h w 2"]:
-    x, y = np.meshgrid(np.arange(rectified.width, dtype=np.float64), np.arange(rectified.height, dtype=np.float64))
+def _map(
+    raw: Camera, rectified: Camera, rotation: Float[np.ndarray, "3 3"]
+) -> Float32[np.ndarray, "h w 2"]:
+    x, y = np.meshgrid(
+        np.arange(rectified.width, dtype=np.float64), np.arange(rectified.height, dtype=np.float64)
+    )
     rays = rectified.rays_from_img(np.column_stack([x.ravel(), y.ravel()])) @ rotation
-    pixels = np.nan_to_num(raw.img_from_cam(rays), nan=-1e4)  # outside of the image: remap paints it black
+    pixels = np.nan_to_num(
+        raw.img_from_cam(rays), nan=-1e4
+    )  # outside of the image: remap paints it black
     return pixels.reshape(rectified.height, rectified.width, 2).astype(np.float32)

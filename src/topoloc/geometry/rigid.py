@@ -1,8 +1,8 @@
 """SE(3): rigid transforms between named frames.
 
-Frames are read right to left: ``cam_from_world = cam_from_node @ node_from_world``; equal neighbours cancel.
-Tangent vectors are ``xi = (translation, rotation)`` and perturbations act on the left:
-``exp(xi) @ a_from_b`` (Sola et al., *A micro Lie theory*, 2018).
+Frames are read right to left: ``cam_from_world = cam_from_node @ node_from_world``; equal
+neighbours cancel. Tangent vectors are ``xi = (translation, rotation)`` and perturbations act on the
+left: ``exp(xi) @ a_from_b`` (Sola et al., *A micro Lie theory*, 2018).
 """
 
 from __future__ import annotations
@@ -30,11 +30,14 @@ def exp_so3(omega: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     k = skew(omega)
     if angle < _SMALL_ANGLE:
         return np.eye(3) + k + 0.5 * k @ k
-    return np.eye(3) + np.sin(angle) / angle * k + 2.0 * np.sin(angle / 2.0) ** 2 / angle**2 * (k @ k)
+    return (
+        np.eye(3) + np.sin(angle) / angle * k + 2.0 * np.sin(angle / 2.0) ** 2 / angle**2 * (k @ k)
+    )
 
 
 def log_so3(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
-    """Rotation vector (radians, norm in [0, pi]) of a rotation matrix; stable at 0 and at pi by the quaternion."""
+    """Rotation vector (radians, norm in [0, pi]) of a rotation matrix; stable at 0 and at pi by the
+    quaternion."""
     w, x, y, z = quat_wxyz_from_matrix(rotation)
     v = np.array([x, y, z])
     sin_half = float(np.linalg.norm(v))
@@ -137,7 +140,9 @@ class Rigid3:
         return np.concatenate([np.linalg.solve(_left_jacobian_so3(omega), self.translation), omega])
 
     def __matmul__(self, other: Rigid3) -> Rigid3:
-        return Rigid3(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
+        return Rigid3(
+            self.rotation @ other.rotation, self.rotation @ other.translation + self.translation
+        )
 
     def inverse(self) -> Rigid3:
         return Rigid3(self.rotation.T.copy(), -(self.rotation.T @ self.translation))
@@ -167,26 +172,35 @@ class Rigid3:
         return float(np.linalg.norm(log_so3(self.rotation)))
 
     def interpolate(self, other: Rigid3, fraction: float) -> Rigid3:
-        """The pose `fraction` of the way from this one to `other`: position linear, rotation along the geodesic."""
+        """The pose `fraction` of the way from this one to `other`: position linear, rotation along
+        the geodesic."""
         omega = log_so3(other.rotation @ self.rotation.T)
         translation = (1.0 - fraction) * self.translation + fraction * other.translation
         return Rigid3(exp_so3(fraction * omega) @ self.rotation, translation)
 
 
-def covariance_of_inverse(a_from_b: Rigid3, covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
-    """Covariance of the left perturbation of ``b_from_a = a_from_b.inverse()``, from that of `a_from_b`.
+def covariance_of_inverse(
+    a_from_b: Rigid3, covariance: Float[np.ndarray, "6 6"]
+) -> Float[np.ndarray, "6 6"]:
+    """Covariance of the left perturbation of ``b_from_a = a_from_b.inverse()``, from that of
+    `a_from_b`.
 
-    As ``(exp(xi) @ a_from_b).inverse() == exp(-Ad @ xi) @ b_from_a`` with Ad the adjoint of b_from_a.
-    The result's translation part is of the frame b at its origin; see `position_covariance` for the camera's own position.
+    As ``(exp(xi) @ a_from_b).inverse() == exp(-Ad @ xi) @ b_from_a`` with Ad the adjoint of
+    b_from_a. The result's translation part is of the frame b at its origin; see
+    `position_covariance` for the camera's own position.
     """
     adjoint = a_from_b.inverse().adjoint()
     return adjoint @ covariance @ adjoint.T
 
 
-def position_covariance(cam_from_world: Rigid3, covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "3 3"]:
-    """Covariance (m^2, world axes) of the camera's position, from that of the left perturbation of `cam_from_world`.
+def position_covariance(
+    cam_from_world: Rigid3, covariance: Float[np.ndarray, "6 6"]
+) -> Float[np.ndarray, "3 3"]:
+    """Covariance (m^2, world axes) of the camera's position, from that of the left perturbation of
+    `cam_from_world`.
 
-    The position is ``-R' t``; moving R and t by (rho, omega) moves it by ``-R' rho`` alone, to first order.
+    The position is ``-R' t``; moving R and t by (rho, omega) moves it by ``-R' rho`` alone, to
+    first order.
     """
     return cam_from_world.rotation.T @ covariance[:3, :3] @ cam_from_world.rotation
 
@@ -196,4 +210,8 @@ def _left_jacobian_so3(omega: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"
     k = skew(omega)
     if angle < 1e-5:  # the closed form loses all digits of (angle - sin angle) below this
         return np.eye(3) + 0.5 * k + k @ k / 6.0
-    return np.eye(3) + 2.0 * np.sin(angle / 2.0) ** 2 / angle**2 * k + (angle - np.sin(angle)) / angle**3 * (k @ k)
+    return (
+        np.eye(3)
+        + 2.0 * np.sin(angle / 2.0) ** 2 / angle**2 * k
+        + (angle - np.sin(angle)) / angle**3 * (k @ k)
+    )

@@ -8,15 +8,18 @@ from dataclasses import dataclass
 from topoloc.errors import CalibrationError
 from topoloc.geometry.camera import Camera
 
-# Of the longer side: fields of view of 103 to 19 degrees along it, from the wide lens of a telephone to its long one.
+# Of the longer side: fields of view of 103 to 19 degrees along it, from the wide lens of a
+# telephone to its long one.
 MIN_FOCAL, MAX_FOCAL = 0.4, 3.0
-# What a focal length written into a picture's file may be wrong by: it is rounded, and focusing and stabilisation change it.
+# What a focal length written into a picture's file may be wrong by: it is rounded, and focusing and
+# stabilisation change it.
 NOTED_TOLERANCE = 1.15
 
 
 @dataclass(frozen=True)
 class RoughCamera:
-    """Pinhole, square pixels, principal point in the middle; the focal length (pixels) between these two.
+    """Pinhole, square pixels, principal point in the middle; the focal length (pixels) between
+    these two.
 
     Raises:
         CalibrationError: no positive size, or no range of positive lengths.
@@ -28,10 +31,15 @@ class RoughCamera:
     max_focal: float
 
     def __post_init__(self) -> None:
-        if self.width < 1 or self.height < 1 or not 0.0 < self.min_focal <= self.max_focal < math.inf:
+        if (
+            self.width < 1
+            or self.height < 1
+            or not 0.0 < self.min_focal <= self.max_focal < math.inf
+        ):
             size = f"{self.width}x{self.height}"
             raise CalibrationError(
-                f"a camera needs a size and a range of focal lengths, not {size}, f = {self.min_focal:g} to {self.max_focal:g}"
+                f"a camera needs a size and a range of focal lengths, not {size}, f ="
+                f" {self.min_focal:g} to {self.max_focal:g}"
             )
 
     @staticmethod
@@ -47,7 +55,9 @@ class RoughCamera:
 
     def with_focal(self, focal: float) -> Camera:
         """The pinhole camera of this focal length (pixels)."""
-        return Camera.pinhole(self.width, self.height, focal, focal, (self.width - 1) / 2, (self.height - 1) / 2)
+        return Camera.pinhole(
+            self.width, self.height, focal, focal, (self.width - 1) / 2, (self.height - 1) / 2
+        )
 
     def rescaled(self, width: int, height: int) -> RoughCamera:
         """The same camera for its image resized to width x height."""
@@ -57,4 +67,8 @@ class RoughCamera:
 
 def usual_camera(lens: Camera | RoughCamera) -> Camera:
     """The camera, of a rough one that with the focal length in the middle of its range."""
-    return lens.with_focal(math.sqrt(lens.min_focal * lens.max_focal)) if isinstance(lens, RoughCamera) else lens
+    return (
+        lens.with_focal(math.sqrt(lens.min_focal * lens.max_focal))
+        if isinstance(lens, RoughCamera)
+        else lens
+    )

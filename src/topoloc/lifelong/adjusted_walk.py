@@ -1,7 +1,9 @@
-"""A single camera's walk adjusted as a whole: all that its key frames see, and what the map answers, brought to agree.
+"""A single camera's walk adjusted as a whole: all that its key frames see, and what the map
+answers, brought to agree.
 
-Odometry adjusts the last key frames alone, and a pose graph afterwards knows the steps alone: neither uses that all answers together say
-how long the whole walk is. Here each landmark and each key frame moves, and the map's answers hold them by their covariances.
+Odometry adjusts the last key frames alone, and a pose graph afterwards knows the steps alone:
+neither uses that all answers together say how long the whole walk is. Here each landmark and each
+key frame moves, and the map's answers hold them by their covariances.
 """
 
 from __future__ import annotations
@@ -28,25 +30,37 @@ def adjusted_walk(
     points_widened: float,
     config: BundleConfig,
 ) -> list[Rigid3 | None]:
-    """world_from_cam of the frames, better than `held`, which has them in the map's world and metres; None stays None.
+    """world_from_cam of the frames, better than `held`, which has them in the map's world and
+    metres; None stays None.
 
     The stretch's own key frames and landmarks move along: they are in the map's world afterwards.
 
     Args:
         anchors: the map's answers that are believed, by frame.
-        points_widened: how many times as large the sigmas of followed points are as odometry took them for.
+        points_widened: how many times as large the sigmas of followed points are as odometry took
+            them for.
     """
     keyframes = _in_the_map(stretch, held)
     moved = set(map(id, keyframes))
-    frames = {f.frame_idx: f for f in stretch.frames if id(f.keyframe) in moved and _is_known(held, f.frame_idx)}
+    frames = {
+        f.frame_idx: f
+        for f in stretch.frames
+        if id(f.keyframe) in moved and _is_known(held, f.frame_idx)
+    }
     relative = {index: _seen_from(frame, held) for index, frame in frames.items()}
     for keyframe in keyframes:
         keyframe.observations.weights /= points_widened
-    said = [_anchor(relative[index], frame, anchors[index]) for index, frame in frames.items() if index in anchors]
+    said = [
+        _anchor(relative[index], frame, anchors[index])
+        for index, frame in frames.items()
+        if index in anchors
+    ]
     adjust_bundle(keyframes, [], stretch.landmarks, config, said)
     adjusted = list(held)
     for index, frame in frames.items():
-        adjusted[index] = (relative[index] @ frame.keyframe.cam_from_world).inverse() @ frame.view_from_cam
+        adjusted[index] = (
+            relative[index] @ frame.keyframe.cam_from_world
+        ).inverse() @ frame.view_from_cam
     return adjusted
 
 
@@ -66,28 +80,47 @@ def _anchor(cam_from_keyframe: Rigid3, frame: FramePose, answer: Localization) -
     keyframe_from_cam = cam_from_keyframe.inverse() @ frame.view_from_cam
     information = np.linalg.inv(covariance_of_inverse(answer.world_from_cam, answer.covariance))
     turned = keyframe_from_cam.inverse().adjoint()
-    return Anchor(frame.keyframe, keyframe_from_cam @ answer.world_from_cam.inverse(), turned.T @ information @ turned)
+    return Anchor(
+        frame.keyframe,
+        keyframe_from_cam @ answer.world_from_cam.inverse(),
+        turned.T @ information @ turned,
+    )
 
 
 def _in_the_map(stretch: Stretch, held: Sequence[Rigid3 | None]) -> list[KeyFrame]:
-    """Bring the key frames whose pose is known, and the landmarks that they see, into the map's world and metres; these key frames."""
+    """Bring the key frames whose pose is known, and the landmarks that they see, into the map's
+    world and metres; these key frames."""
     views = {f.frame_idx: f.view_from_cam for f in stretch.frames}
-    keyframes = [k for k in stretch.keyframes if _is_known(held, k.frame_idx) and k.frame_idx in views]
+    keyframes = [
+        k for k in stretch.keyframes if _is_known(held, k.frame_idx) and k.frame_idx in views
+    ]
     before = [k.cam_from_world for k in keyframes]
-    after = [views[k.frame_idx] @ pose.inverse() for k in keyframes if (pose := held[k.frame_idx]) is not None]
+    after = [
+        views[k.frame_idx] @ pose.inverse()
+        for k in keyframes
+        if (pose := held[k.frame_idx]) is not None
+    ]
     moved = np.zeros(stretch.landmarks.num, np.bool_)
-    for keyframe, old, new, metres in zip(keyframes, before, after, _units(before, after), strict=True):
+    for keyframe, old, new, metres in zip(
+        keyframes, before, after, _units(before, after), strict=True
+    ):
         ids = keyframe.observations.landmark_ids[keyframe.observations.active]
         ids = ids[~moved[ids]]
         moved[ids] = True
-        stretch.landmarks.positions[ids] = new.inverse().apply(metres * old.apply(stretch.landmarks.positions[ids]))
+        stretch.landmarks.positions[ids] = new.inverse().apply(
+            metres * old.apply(stretch.landmarks.positions[ids])
+        )
         keyframe.cam_from_world = new
     return keyframes
 
 
 def _units(before: Sequence[Rigid3], after: Sequence[Rigid3]) -> Float[np.ndarray, " k"]:
-    """What a unit of the motion is in metres at each key frame, by the way to the ones around it."""
-    ways = [ways_of(np.array([pose.inverse().translation for pose in poses]).reshape(-1, 3)) for poses in (before, after)]
+    """What a unit of the motion is in metres at each key frame, by the way to the ones around
+    it."""
+    ways = [
+        ways_of(np.array([pose.inverse().translation for pose in poses]).reshape(-1, 3))
+        for poses in (before, after)
+    ]
     first = np.maximum(np.arange(len(before)) - _NEIGHBOURS, 0)
     last = np.minimum(np.arange(len(before)) + _NEIGHBOURS, len(before) - 1)
     own, metres = (way[last] - way[first] for way in ways)

@@ -11,9 +11,13 @@ from topoloc.map.topomap import TopoMetricMap
 
 
 def ask_nodes(
-    localizer: Localizer, of: TopoMetricMap, rows: Sequence[int], asked: Callable[[int], None] = lambda done: None
+    localizer: Localizer,
+    of: TopoMetricMap,
+    rows: Sequence[int],
+    asked: Callable[[int], None] = lambda done: None,
 ) -> dict[int, Localization | None]:
-    """What the localizer's map answers to these nodes (rows) of another one, which has all its kinds of features; None where it refuses.
+    """What the localizer's map answers to these nodes (rows) of another one, which has all its
+    kinds of features; None where it refuses.
 
     Args:
         asked: called with the number of nodes that were asked so far.

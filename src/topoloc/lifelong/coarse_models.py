@@ -1,4 +1,5 @@
-"""Coarse localizers learn the pictures of a new session: k-NN adds vectors, under the vocabulary or the network that is there."""
+"""Coarse localizers learn the pictures of a new session: k-NN adds vectors, under the vocabulary or
+the network that is there."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ from topoloc.places.vlad import SurfVlad
 
 @dataclass(frozen=True, eq=False)
 class PlaceView:
-    """What a mapping picture of this size (pixels) shows, and the id of the node that it belongs to."""
+    """What a mapping picture of this size (pixels) shows, and the id of the node that it belongs
+    to."""
 
     features: Features
     width: int
@@ -27,16 +29,19 @@ class PlaceView:
 
 @dataclass(frozen=True, eq=False)
 class Taught:
-    """A map's coarse localizers with what was added, and the names of those that could not learn it."""
+    """A map's coarse localizers with what was added, and the names of those that could not learn
+    it."""
 
     models: dict[str, CoarseModel]
     not_taught: list[str]
 
 
-def taught_places(topomap: TopoMetricMap, views: Mapping[str, Sequence[PlaceView]], images: Sequence[PlaceImage]) -> Taught:
-    """The map's coarse localizers with new places: those by local features learn `views`, by their kinds, and those that compare a
-    network's vectors the small pictures `images`. One with an output a node (cnn-fc) is to be trained, and without PyTorch no network is
-    asked.
+def taught_places(
+    topomap: TopoMetricMap, views: Mapping[str, Sequence[PlaceView]], images: Sequence[PlaceImage]
+) -> Taught:
+    """The map's coarse localizers with new places: those by local features learn `views`, by their
+    kinds, and those that compare a network's vectors the small pictures `images`. One with an
+    output a node (cnn-fc) is to be trained, and without PyTorch no network is asked.
 
     Raises:
         MapError: a coarse localizer of the map, or a picture, is damaged.
@@ -57,7 +62,9 @@ def _with_views(model: CoarseModel, views: Sequence[PlaceView]) -> CoarseModel:
     if not views:
         return model
     described = [(view.features, view.width, view.height) for view in views]
-    grown = SurfVlad.from_model(model).with_images(described, np.array([view.node_id for view in views]))
+    grown = SurfVlad.from_model(model).with_images(
+        described, np.array([view.node_id for view in views])
+    )
     return replace(grown.to_model(), name=model.name)
 
 
@@ -68,4 +75,7 @@ def _with_pictures(model: CoarseModel, images: Sequence[PlaceImage]) -> CoarseMo
         return None
     if not isinstance(localizer, GrowsByPictures):
         return None
-    return localizer.with_pictures([decode_picture(image.jpeg) for image in images], np.array([image.node_id for image in images]))
+    return localizer.with_pictures(
+        [decode_picture(image.jpeg) for image in images],
+        np.array([image.node_id for image in images]),
+    )

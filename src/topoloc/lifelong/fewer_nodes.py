@@ -1,9 +1,11 @@
 """Whole nodes that a map can do without: what they show is shown by nodes that stay.
 
-A node stands for the pictures that belong to it, its own first. It is held by the one among the nodes that stay whose landmarks are
-recognised in it most; what many show alike counts once (facility location, which is submodular: Krause & Golovin 2014). So the node
-goes whose loss takes least from the places it stands for and holds, one after the other, never one that nothing else holds. The node that
-holds a place then stands for its pictures, too: what goes today is not forgotten when the next one is chosen.
+A node stands for the pictures that belong to it, its own first. It is held by the one among the
+nodes that stay whose landmarks are recognised in it most; what many show alike counts once
+(facility location, which is submodular: Krause & Golovin 2014). So the node goes whose loss takes
+least from the places it stands for and holds, one after the other, never one that nothing else
+holds. The node that holds a place then stands for its pictures, too: what goes today is not
+forgotten when the next one is chosen.
 """
 
 from __future__ import annotations
@@ -26,8 +28,9 @@ _PER_VECTOR = ("vectors", "centres", "cell_vectors")
 
 @dataclass(frozen=True, eq=False)
 class Holds:
-    """How firmly nodes hold each other, by their rows: landmarks of node `by[v, k]` that are recognised in node v, `landmarks[v, k]`. The
-    node itself is among them, with all of its own. `pictures` counts what each node stands for."""
+    """How firmly nodes hold each other, by their rows: landmarks of node `by[v, k]` that are
+    recognised in node v, `landmarks[v, k]`. The node itself is among them, with all of its own.
+    `pictures` counts what each node stands for."""
 
     by: Int[np.ndarray, "nodes k"]
     landmarks: Int[np.ndarray, "nodes k"]
@@ -35,7 +38,8 @@ class Holds:
 
 
 def holds_of(topomap: TopoMetricMap, num_compared: int) -> Holds:
-    """Each node compared with so many others, the nearest by Eq. 1. Of several kinds of features the one that recognises most counts.
+    """Each node compared with so many others, the nearest by Eq. 1. Of several kinds of features
+    the one that recognises most counts.
 
     Raises:
         MapError: from reading the nodes.
@@ -43,14 +47,23 @@ def holds_of(topomap: TopoMetricMap, num_compared: int) -> Holds:
     config = topomap.config
     lambda_rot = config.nodes.lambda_rot
     assert lambda_rot is not None, "a map's own configuration is resolved"
-    nearest = NearestNodes(NodePoses.of([summary.world_from_cam for summary in topomap.summaries]), lambda_rot)
+    nearest = NearestNodes(
+        NodePoses.of([summary.world_from_cam for summary in topomap.summaries]), lambda_rot
+    )
     count = min(num_compared + 1, len(topomap.summaries))
-    by = np.array([nearest.rows(summary.world_from_cam, count) for summary in topomap.summaries], np.int64)
+    by = np.array(
+        [nearest.rows(summary.world_from_cam, count) for summary in topomap.summaries], np.int64
+    )
     landmarks = np.zeros(by.shape, np.int64)
     for kind in topomap.kinds:
         nodes = topomap.nodes_of(kind)
         for row, others in enumerate(by):
-            seen = [_num_seen(nodes[int(k)], nodes[row], topomap) if k != row else len(nodes[row].features) for k in others]
+            seen = [
+                _num_seen(nodes[int(k)], nodes[row], topomap)
+                if k != row
+                else len(nodes[row].features)
+                for k in others
+            ]
             landmarks[row] = np.maximum(landmarks[row], seen)
     row_of = {summary.node_id: row for row, summary in enumerate(topomap.summaries)}
     owners = [row_of[image.node_id] for image in topomap.place_images]
@@ -65,9 +78,12 @@ def _num_seen(node: TopoNode, view: TopoNode, topomap: TopoMetricMap) -> int:
     return len(observe_node(node, view.features, view.camera, cam_from_node, topomap.config).rows)
 
 
-def dropped_one_by_one(holds: Holds, min_held: int) -> Iterable[tuple[int, Int[np.ndarray, " nodes"]]]:
-    """The rows of nodes in the order in which they go, with the row of the node that holds each place then. It ends where every further one
-    would leave a place with fewer than `min_held` landmarks recognised."""
+def dropped_one_by_one(
+    holds: Holds, min_held: int
+) -> Iterable[tuple[int, Int[np.ndarray, " nodes"]]]:
+    """The rows of nodes in the order in which they go, with the row of the node that holds each
+    place then. It ends where every further one would leave a place with fewer than `min_held`
+    landmarks recognised."""
     num = len(holds.by)
     stays, weights = np.ones(num, bool), np.log1p(holds.landmarks)
     while stays.sum() > 1:
@@ -88,15 +104,21 @@ def dropped_one_by_one(holds: Holds, min_held: int) -> Iterable[tuple[int, Int[n
         yield row, np.where(holder == row, holds.by[rows, second], holder)
 
 
-def without_nodes(topomap: TopoMetricMap, dropped: Sequence[int], holder: Int[np.ndarray, " nodes"]) -> TopoMetricMap:
-    """The map without these rows, of nodes of which `holder` (rows) says which holds the place of each: edges and pictures are the
-    holder's then. Of a dropped node's mapping pictures one stays, and one place vector."""
+def without_nodes(
+    topomap: TopoMetricMap, dropped: Sequence[int], holder: Int[np.ndarray, " nodes"]
+) -> TopoMetricMap:
+    """The map without these rows, of nodes of which `holder` (rows) says which holds the place of
+    each: edges and pictures are the holder's then. Of a dropped node's mapping pictures one stays,
+    and one place vector."""
     gone = set(dropped)
     kept = [row for row in range(len(topomap.summaries)) if row not in gone]
     ids = [summary.node_id for summary in topomap.summaries]
     new_id = {ids[row]: ids[int(holder[row])] for row in gone}
     nodes = {kind: Selected(topomap.nodes_of(kind), kept) for kind in topomap.kinds}
-    edges = {tuple(new_id.get(one, one) for one in (edge.source_id, edge.target_id)) for edge in topomap.edges}
+    edges = {
+        tuple(new_id.get(one, one) for one in (edge.source_id, edge.target_id))
+        for edge in topomap.edges
+    }
     return replace(
         topomap,
         summaries=[topomap.summaries[row] for row in kept],
@@ -104,7 +126,9 @@ def without_nodes(topomap: TopoMetricMap, dropped: Sequence[int], holder: Int[np
         other_kinds=nodes,
         edges=[Edge(source, target) for source, target in sorted(edges) if source != target],
         place_images=_pictures(topomap.place_images, new_id),
-        coarse_models={name: _vectors(model, new_id) for name, model in topomap.coarse_models.items()},
+        coarse_models={
+            name: _vectors(model, new_id) for name, model in topomap.coarse_models.items()
+        },
         sides=_sides(topomap, new_id),
     )
 
@@ -122,10 +146,13 @@ def _pictures(images: Sequence[PlaceImage], new_id: Mapping[int, int]) -> list[P
 
 
 def _vectors(model: CoarseModel, new_id: Mapping[int, int]) -> CoarseModel:
-    """A coarse localizer by vectors: of each dropped node the one nearest to the middle of its own, which leads to the holder now."""
+    """A coarse localizer by vectors: of each dropped node the one nearest to the middle of its own,
+    which leads to the holder now."""
     vectors, of_node = model.arrays.get("vectors"), model.arrays.get("node_ids")
     if vectors is None or of_node is None:
-        return model  # it has an output a node; what it says of nodes that are not there is left out
+        return (
+            model  # it has an output a node; what it says of nodes that are not there is left out
+        )
     stays, ids = np.ones(len(of_node), bool), of_node.copy()
     for node_id, holder_id in new_id.items():
         rows = np.flatnonzero(of_node == node_id)
@@ -133,7 +160,10 @@ def _vectors(model: CoarseModel, new_id: Mapping[int, int]) -> CoarseModel:
             own = vectors[rows].astype(np.float32)
             stays[rows] = np.arange(len(rows)) == int((own @ own.mean(axis=0)).argmax())
             ids[rows] = holder_id
-    arrays = {name: array[stays] if len(array) == len(of_node) and name in _PER_VECTOR else array for name, array in model.arrays.items()}
+    arrays = {
+        name: array[stays] if len(array) == len(of_node) and name in _PER_VECTOR else array
+        for name, array in model.arrays.items()
+    }
     return replace(model, arrays=arrays | {"node_ids": ids[stays]})
 
 
@@ -142,14 +172,18 @@ def _sides(topomap: TopoMetricMap, new_id: Mapping[int, int]) -> SideNodes | Non
     sides = topomap.sides
     if sides is None or not any(summary.of_node in new_id for summary in sides.summaries):
         return sides
-    return gather_sides([node for node in sides.nodes if node.summary.of_node not in new_id], sides.kind, topomap.config.sides)
+    return gather_sides(
+        [node for node in sides.nodes if node.summary.of_node not in new_id],
+        sides.kind,
+        topomap.config.sides,
+    )
 
 
 def fewest_dropped(
     holds: Holds, min_held: int, is_enough: Callable[[list[int]], bool]
 ) -> tuple[list[int], Int[np.ndarray, " nodes"]] | None:
-    """The first so many nodes that go, until it `is_enough` or no further one can go, and what holds each place then; None where none
-    can go."""
+    """The first so many nodes that go, until it `is_enough` or no further one can go, and what
+    holds each place then; None where none can go."""
     dropped, last = list[int](), None
     for row, holder in dropped_one_by_one(holds, min_held):
         dropped.append(row)

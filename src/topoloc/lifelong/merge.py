@@ -1,8 +1,9 @@
 """Two maps of overlapping places become one: read from `merge_maps`.
 
-Nothing but the maps is needed: what is stored of a node is asked of the other map as a picture would be. The second map's nodes, which keep
-their order and distances, are held in place by these answers like the frames of a session (`session_poses.py`). Nodes that the
-first map holds well are left out, the others join it, with their sessions, what these know of their points, and their walls.
+Nothing but the maps is needed: what is stored of a node is asked of the other map as a picture
+would be. The second map's nodes, which keep their order and distances, are held in place by these
+answers like the frames of a session (`session_poses.py`). Nodes that the first map holds well are
+left out, the others join it, with their sessions, what these know of their points, and their walls.
 """
 
 from __future__ import annotations
@@ -49,18 +50,24 @@ def merge_maps(
         ConfigError: a setting is out of its bounds.
         MapError: they are one map, or the second lacks a kind of features of the first.
         TrajectoryError: they see too little in common, or not at the distances that both say.
-        FeatureKindError, MissingExtraError, WeightsError: the maps' features cannot be compared here.
+        FeatureKindError, MissingExtraError, WeightsError: the maps' features cannot be compared
+            here.
     """
     config, progress = config or UpdateConfig(), progress or (lambda stage, done, total: None)
     check_bounds(config)
     if missing := set(first.kinds) - set(second.kinds):
-        raise MapError(f"the second map holds no features {', '.join(sorted(missing))}, which the first has; build it with them")
+        raise MapError(
+            f"the second map holds no features {', '.join(sorted(missing))}, which the first has;"
+            " build it with them"
+        )
     if first.map_id is not None and first.map_id == second.map_id:
         raise MapError("they are one map in two versions; nothing is merged")
     held = _held(first, second, config, localizer_config, progress)
     d_thresh = first.config.nodes.d_thresh
     assert d_thresh is not None, "a map's own configuration is resolved"
-    added = [row for row, answer in held.answers.items() if not is_well_held(answer, d_thresh, config)]
+    added = [
+        row for row, answer in held.answers.items() if not is_well_held(answer, d_thresh, config)
+    ]
     poses = {row: pose for row, pose in enumerate(held.world_from_cams) if pose is not None}
     merged, not_taught = _with_nodes(first, second, added, poses)
     changes = {
@@ -71,34 +78,57 @@ def merge_maps(
         "not_taught": not_taught,
     }
     merged = with_map_facts(merged, progress)
-    return MergedMap(merged, changes | earlier_recall(first, merged, config.earlier_asked, localizer_config))
+    return MergedMap(
+        merged, changes | earlier_recall(first, merged, config.earlier_asked, localizer_config)
+    )
 
 
 def _held(
-    first: TopoMetricMap, second: TopoMetricMap, config: UpdateConfig, localizer_config: LocalizerConfig | None, progress: Progress
+    first: TopoMetricMap,
+    second: TopoMetricMap,
+    config: UpdateConfig,
+    localizer_config: LocalizerConfig | None,
+    progress: Progress,
 ) -> SessionPoses:
     """The second map's nodes, by their rows, in the world of the first."""
     rows = range(len(second.summaries))
-    answers = ask_nodes(Localizer(first, localizer_config), second, rows, lambda done: progress("comparing the maps", done, len(rows)))
+    answers = ask_nodes(
+        Localizer(first, localizer_config),
+        second,
+        rows,
+        lambda done: progress("comparing the maps", done, len(rows)),
+    )
     own = {row: summary.world_from_cam for row, summary in enumerate(second.summaries)}
     d_thresh = first.config.nodes.d_thresh
     assert d_thresh is not None, "a map's own configuration is resolved"
     try:
         return held_by("the second map", own, answers, d_thresh, config.poses)
     except TrajectoryError as error:
-        raise TrajectoryError(str(error).replace("the map stays as it is", "nothing is merged")) from None
+        raise TrajectoryError(
+            str(error).replace("the map stays as it is", "nothing is merged")
+        ) from None
 
 
 def _with_nodes(
     first: TopoMetricMap, second: TopoMetricMap, added: Sequence[int], poses: Mapping[int, Rigid3]
 ) -> tuple[TopoMetricMap, list[str]]:
-    """The first map with these nodes of the second, and the coarse localizers that could not learn them."""
+    """The first map with these nodes of the second, and the coarse localizers that could not learn
+    them."""
     base = first.free_ids.session
-    sessions = {session.session_id: replace(session, session_id=base + k) for k, session in enumerate(second.sessions)}
+    sessions = {
+        session.session_id: replace(session, session_id=base + k)
+        for k, session in enumerate(second.sessions)
+    }
     session_ids = {old: session.session_id for old, session in sessions.items()}
     first_id = first.free_ids.node
     new_id = {row: first_id + k for k, row in enumerate(added)}
-    nodes = {kind: [_moved(second.nodes_of(kind)[row], new_id[row], poses[row], session_ids) for row in added] for kind in first.kinds}
+    nodes = {
+        kind: [
+            _moved(second.nodes_of(kind)[row], new_id[row], poses[row], session_ids)
+            for row in added
+        ]
+        for kind in first.kinds
+    }
     views = {kind: [_view(node) for node in of_kind] for kind, of_kind in nodes.items()}
     summaries = [*first.summaries, *(node.summary for node in nodes[first.kind])]
     grown = {kind: Overlay(first.nodes_of(kind), {}, nodes[kind]) for kind in first.kinds}
@@ -109,7 +139,10 @@ def _with_nodes(
         summaries=summaries,
         nodes=grown.pop(first.kind),
         other_kinds=grown,
-        edges=sorted({*first.edges, *_edges(first, second, new_id, poses)}, key=lambda edge: (edge.source_id, edge.target_id)),
+        edges=sorted(
+            {*first.edges, *_edges(first, second, new_id, poses)},
+            key=lambda edge: (edge.source_id, edge.target_id),
+        ),
         place_images=Overlay(first.place_images, {}, images),
         coarse_models=taught.models,
         length_m=first.length_m + second.length_m * len(added) / max(len(second.summaries), 1),
@@ -123,10 +156,17 @@ def _view(node: TopoNode) -> PlaceView:
     return PlaceView(node.features, node.camera.width, node.camera.height, node.summary.node_id)
 
 
-def _moved(node: TopoNode, node_id: int, world_from_cam: Rigid3, session_ids: Mapping[int, int]) -> TopoNode:
+def _moved(
+    node: TopoNode, node_id: int, world_from_cam: Rigid3, session_ids: Mapping[int, int]
+) -> TopoNode:
     """A node of the second map as one of the first."""
     of = node.summary
-    summary = replace(of, node_id=node_id, world_from_cam=world_from_cam, session_id=session_ids.get(of.session_id, of.session_id))
+    summary = replace(
+        of,
+        node_id=node_id,
+        world_from_cam=world_from_cam,
+        session_id=session_ids.get(of.session_id, of.session_id),
+    )
     sums = [_of_session(sums, session_ids) for sums in node.sums]
     return replace(node, summary=summary, sums=sums)
 
@@ -136,7 +176,10 @@ def _of_session(sums: LandmarkSums, session_ids: Mapping[int, int]) -> LandmarkS
 
 
 def _images(
-    second: TopoMetricMap, new_id: Mapping[int, int], poses: Mapping[int, Rigid3], session_ids: Mapping[int, int]
+    second: TopoMetricMap,
+    new_id: Mapping[int, int],
+    poses: Mapping[int, Rigid3],
+    session_ids: Mapping[int, int],
 ) -> list[PlaceImage]:
     """The mapping pictures that became the added nodes: others cannot be looked at again."""
     wanted = {(second.summaries[row].session_id, second.summaries[row].name): row for row in new_id}
@@ -145,13 +188,24 @@ def _images(
         row = wanted.get((image.session_id, image.name))
         if row is not None:
             session_id = session_ids.get(image.session_id, image.session_id)
-            changes = {"node_id": new_id[row], "world_from_cam": poses[row], "session_id": session_id, "image_id": None}
+            changes = {
+                "node_id": new_id[row],
+                "world_from_cam": poses[row],
+                "session_id": session_id,
+                "image_id": None,
+            }
             found.append(replace(image, **changes))
     return found
 
 
-def _edges(first: TopoMetricMap, second: TopoMetricMap, new_id: Mapping[int, int], poses: Mapping[int, Rigid3]) -> set[Edge]:
-    """The second map's edges; a node that was left out is the one of the first map that stands nearest."""
+def _edges(
+    first: TopoMetricMap,
+    second: TopoMetricMap,
+    new_id: Mapping[int, int],
+    poses: Mapping[int, Rigid3],
+) -> set[Edge]:
+    """The second map's edges; a node that was left out is the one of the first map that stands
+    nearest."""
     lambda_rot = first.config.nodes.lambda_rot
     assert lambda_rot is not None, "a map's own configuration is resolved"
     old = NodePoses.of([summary.world_from_cam for summary in first.summaries])
@@ -159,10 +213,20 @@ def _edges(first: TopoMetricMap, second: TopoMetricMap, new_id: Mapping[int, int
     for row, summary in enumerate(second.summaries):
         nearest = int(node_distances(poses[row], old, lambda_rot).argmin())
         ids[summary.node_id] = new_id.get(row, first.summaries[nearest].node_id)
-    return {Edge(ids[e.source_id], ids[e.target_id]) for e in second.edges if ids[e.source_id] != ids[e.target_id]}
+    return {
+        Edge(ids[e.source_id], ids[e.target_id])
+        for e in second.edges
+        if ids[e.source_id] != ids[e.target_id]
+    }
 
 
-def _sides(first: TopoMetricMap, second: TopoMetricMap, new_id: Mapping[int, int], poses: Mapping[int, Rigid3], summaries: Sequence[Any]):
+def _sides(
+    first: TopoMetricMap,
+    second: TopoMetricMap,
+    new_id: Mapping[int, int],
+    poses: Mapping[int, Rigid3],
+    summaries: Sequence[Any],
+):
     """The walls along the way of both, where they are described alike."""
     if first.sides is None or second.sides is None or first.sides.kind != second.sides.kind:
         return first.sides
@@ -173,7 +237,16 @@ def _sides(first: TopoMetricMap, second: TopoMetricMap, new_id: Mapping[int, int
         row = None if side.summary.of_node is None else row_of[side.summary.of_node]
         if row is not None and row in new_id:
             of_node = known[new_id[row]]
-            moved = poses[row] @ second.summaries[row].world_from_cam.inverse() @ side.summary.world_from_cam
-            summary = replace(side.summary, of_node=of_node.node_id, session_id=of_node.session_id, world_from_cam=moved)
+            moved = (
+                poses[row]
+                @ second.summaries[row].world_from_cam.inverse()
+                @ side.summary.world_from_cam
+            )
+            summary = replace(
+                side.summary,
+                of_node=of_node.node_id,
+                session_id=of_node.session_id,
+                world_from_cam=moved,
+            )
             nodes.append(replace(side, summary=summary))
     return grown_sides(first, nodes)

@@ -1,10 +1,12 @@
 """How far a session's motion and the map's answers are to be trusted, as they tell of each other.
 
-Sigmas that are assumed are wrong by different factors in each recording: SLAM of a rendered lap drifts by a thousandth of its way, that of
-a hand-held camera whose calibration is nominal by some hundredths, and what a map says of its answers' errors holds for its worst parts.
-How much the answers scatter from one to the next, and how much further they are off after a longer way, tells both apart (variance
-components; Harville, JASA 72, 1977). The motion is predicted from answer to answer and corrected by each (Kalman filter); the factors under
-which the answers are the least surprise win. A few answers may be wrong: each counts as one of Student's t distribution.
+Sigmas that are assumed are wrong by different factors in each recording: SLAM of a rendered lap
+drifts by a thousandth of its way, that of a hand-held camera whose calibration is nominal by some
+hundredths, and what a map says of its answers' errors holds for its worst parts. How much the
+answers scatter from one to the next, and how much further they are off after a longer way, tells
+both apart (variance components; Harville, JASA 72, 1977). The motion is predicted from answer to
+answer and corrected by each (Kalman filter); the factors under which the answers are the least
+surprise win. A few answers may be wrong: each counts as one of Student's t distribution.
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ _DIMENSIONS = 6
 
 @dataclass(frozen=True)
 class Trust:
-    """By how many times the sigmas of the motion, and of the answers, are as large as they were assumed to be."""
+    """By how many times the sigmas of the motion, and of the answers, are as large as they were
+    assumed to be."""
 
     motion: float = 1.0
     answers: float = 1.0
@@ -34,8 +37,9 @@ class Trust:
 class SeenStep:
     """A picture that the map answered, and the motion to it from the one that was answered before.
 
-    `cam_from_before` and `motion_covariance` (6, 6) say nothing in the first one. Covariances are those of left perturbations
-    (translation, rotation; metres and radians) of `cam_from_before` and of the answer, `cam_from_world`.
+    `cam_from_before` and `motion_covariance` (6, 6) say nothing in the first one. Covariances are
+    those of left perturbations (translation, rotation; metres and radians) of `cam_from_before` and
+    of the answer, `cam_from_world`.
     """
 
     cam_from_before: Rigid3
@@ -44,16 +48,25 @@ class SeenStep:
     covariance: Float[np.ndarray, "6 6"]
 
 
-def measured_trust(steps: Sequence[SeenStep], of_motion: Sequence[float], of_answers: Sequence[float]) -> Trust:
-    """The pair of these factors under which the answers are the least surprise; 1 and 1 where fewer than two pictures were answered."""
+def measured_trust(
+    steps: Sequence[SeenStep], of_motion: Sequence[float], of_answers: Sequence[float]
+) -> Trust:
+    """The pair of these factors under which the answers are the least surprise; 1 and 1 where fewer
+    than two pictures were answered."""
     if len(steps) < 2:
         return Trust()
     adjoints = [step.cam_from_before.adjoint() for step in steps]
-    return min((Trust(*pair) for pair in product(of_motion, of_answers)), key=lambda trust: _surprise(steps, adjoints, trust))
+    return min(
+        (Trust(*pair) for pair in product(of_motion, of_answers)),
+        key=lambda trust: _surprise(steps, adjoints, trust),
+    )
 
 
-def _surprise(steps: Sequence[SeenStep], adjoints: Sequence[Float[np.ndarray, "6 6"]], trust: Trust) -> float:
-    """-2 times the logarithm of how likely the answers are after the first one, but for a constant."""
+def _surprise(
+    steps: Sequence[SeenStep], adjoints: Sequence[Float[np.ndarray, "6 6"]], trust: Trust
+) -> float:
+    """-2 times the logarithm of how likely the answers are after the first one, but for a
+    constant."""
     pose, covariance = steps[0].cam_from_world, trust.answers**2 * steps[0].covariance
     surprise = 0.0
     for step, adjoint in zip(steps[1:], adjoints[1:], strict=True):
@@ -63,7 +76,9 @@ def _surprise(steps: Sequence[SeenStep], adjoints: Sequence[Float[np.ndarray, "6
         off = (step.cam_from_world @ pose.inverse()).log()
         both = covariance + of_answer
         square = float(off @ np.linalg.solve(both, off))
-        surprise += float(np.linalg.slogdet(both)[1]) + (_FREEDOM + _DIMENSIONS) * np.log1p(square / _FREEDOM)
+        surprise += float(np.linalg.slogdet(both)[1]) + (_FREEDOM + _DIMENSIONS) * np.log1p(
+            square / _FREEDOM
+        )
         # an answer that strays corrects less
         doubt = max((_FREEDOM + square) / (_FREEDOM + _DIMENSIONS), 1.0)
         gain = np.linalg.solve(covariance + doubt * of_answer, covariance).T

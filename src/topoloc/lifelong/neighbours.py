@@ -1,7 +1,8 @@
 """The tiles of an atlas that overlap are joined: read from `join_tiles`.
 
-Only tiles whose places look alike are compared, by the atlas's index over the places of all; each pair as `tile_joins.py` says. What is
-found is committed at once, so that whoever is called again goes on. The manifest adjusts all joins together (`atlas/joint_worlds.py`).
+Only tiles whose places look alike are compared, by the atlas's index over the places of all; each
+pair as `tile_joins.py` says. What is found is committed at once, so that whoever is called again
+goes on. The manifest adjusts all joins together (`atlas/joint_worlds.py`).
 """
 
 from __future__ import annotations
@@ -84,16 +85,21 @@ def join_tiles(
 
 
 def pairs_to_join(
-    where: str, tile_ids: Sequence[str] = (), config: TileJoinConfig | None = None, pairs: Sequence[tuple[str, str]] | None = None
+    where: str,
+    tile_ids: Sequence[str] = (),
+    config: TileJoinConfig | None = None,
+    pairs: Sequence[tuple[str, str]] | None = None,
 ) -> list[tuple[str, str]]:
-    """The ids of the tiles that `join_tiles` compares, in its order. Raises ConfigError, AtlasError as that does."""
+    """The ids of the tiles that `join_tiles` compares, in its order. Raises ConfigError, AtlasError
+    as that does."""
     found = _pairs(Atlas.open(where), tile_ids, config or TileJoinConfig(), pairs)
     return [(first.tile_id, second.tile_id) for first, second in found]
 
 
 @dataclass(frozen=True)
 class PairJob:
-    """Two tiles of the atlas at `where`, which are compared, and joined if they overlap, by whoever runs it: a job of a cluster."""
+    """Two tiles of the atlas at `where`, which are compared, and joined if they overlap, by whoever
+    runs it: a job of a cluster."""
 
     where: str
     first: str
@@ -109,7 +115,9 @@ class PairJob:
         maps = Maps([], Localizer, _MAX_BYTES)
         try:
             atlas = Atlas.open(self.where)
-            return _joined(atlas, maps, (atlas.tile(self.first), atlas.tile(self.second)), self.config)
+            return _joined(
+                atlas, maps, (atlas.tile(self.first), atlas.tile(self.second)), self.config
+            )
         finally:
             maps.close()
 
@@ -118,7 +126,10 @@ class PairJob:
 
 
 def _pairs(
-    atlas: Atlas, tile_ids: Sequence[str], config: TileJoinConfig, pairs: Sequence[tuple[str, str]] | None
+    atlas: Atlas,
+    tile_ids: Sequence[str],
+    config: TileJoinConfig,
+    pairs: Sequence[tuple[str, str]] | None,
 ) -> list[tuple[Tile, Tile]]:
     check_bounds(config)
     wanted = {atlas.tile(tile_id).tile_id for tile_id in tile_ids} or set(atlas.manifest.by_id)
@@ -133,30 +144,46 @@ def _joined(atlas: Atlas, maps: Maps, pair: tuple[Tile, Tile], config: TileJoinC
     except (MapError, AtlasError) as error:
         found = NotJoined(str(error))
     if isinstance(found, Found):
-        join = Join(first.tile_id, second.tile_id, found.first_from_second, found.covariance, found.num_agreeing)
+        join = Join(
+            first.tile_id,
+            second.tile_id,
+            found.first_from_second,
+            found.covariance,
+            found.num_agreeing,
+        )
         add_joins(atlas.store.where, [join], {first.tile_id: first, second.tile_id: second})
     return Tried(first.tile_id, second.tile_id, found)
 
 
-def _compared(atlas: Atlas, maps: Maps, first: Tile, second: Tile, config: TileJoinConfig) -> Found | NotJoined:
+def _compared(
+    atlas: Atlas, maps: Maps, first: Tile, second: Tile, config: TileJoinConfig
+) -> Found | NotJoined:
     places = [atlas.places_of(tile) for tile in (first, second)]
     with (
         maps.lent(first.tile_id, atlas.map_path(first)) as one,
         maps.lent(second.tile_id, atlas.map_path(second)) as other,
     ):
-        return joined(OpenTile(one.localizer, places[0]), OpenTile(other.localizer, places[1]), config)
+        return joined(
+            OpenTile(one.localizer, places[0]), OpenTile(other.localizer, places[1]), config
+        )
 
 
 def _open_pairs(atlas: Atlas, pairs: Sequence[tuple[str, str]]) -> list[tuple[Tile, Tile]]:
     """Those of the pairs, in the order of their ids, that are not joined yet."""
     ordered = [(min(pair), max(pair)) for pair in pairs]
     known = {join.pair for join in atlas.manifest.joins}
-    return [(atlas.tile(first), atlas.tile(second)) for first, second in ordered if (first, second) not in known]
+    return [
+        (atlas.tile(first), atlas.tile(second))
+        for first, second in ordered
+        if (first, second) not in known
+    ]
 
 
-def likely_pairs(atlas: Atlas, wanted: Collection[str], config: TileJoinConfig) -> list[tuple[Tile, Tile]]:
-    """Pairs of tiles in the order of their ids that may overlap, the most alike first: of worlds of their own, not joined yet, not known to
-    lie far apart; their most similar places look alike."""
+def likely_pairs(
+    atlas: Atlas, wanted: Collection[str], config: TileJoinConfig
+) -> list[tuple[Tile, Tile]]:
+    """Pairs of tiles in the order of their ids that may overlap, the most alike first: of worlds of
+    their own, not joined yet, not known to lie far apart; their most similar places look alike."""
     manifest, index = atlas.manifest, atlas.index
     scores = dict[tuple[str, str], float]()
     known = {join.pair for join in manifest.joins}
@@ -172,15 +199,26 @@ def likely_pairs(atlas: Atlas, wanted: Collection[str], config: TileJoinConfig) 
     return [(manifest.by_id[first], manifest.by_id[second]) for first, second in best]
 
 
-def _alike(atlas: Atlas, tile: Tile, among: Sequence[str], config: TileJoinConfig) -> Iterator[tuple[str, float]]:
-    """The tiles that look most like a tile, with how much: the median of the most similar places."""
+def _alike(
+    atlas: Atlas, tile: Tile, among: Sequence[str], config: TileJoinConfig
+) -> Iterator[tuple[str, float]]:
+    """The tiles that look most like a tile, with how much: the median of the most similar
+    places."""
     places, found = atlas.places_of(tile), dict[str, list[float]]()
     kind = next((kind for kind in tile.kinds if kind in places), next(iter(places)))
-    rows = np.unique(np.linspace(0, len(places[kind]) - 1, min(len(places[kind]), _NUM_LOOKED_UP)).round().astype(int))
+    rows = np.unique(
+        np.linspace(0, len(places[kind]) - 1, min(len(places[kind]), _NUM_LOOKED_UP))
+        .round()
+        .astype(int)
+    )
     for row in rows:
-        for other_id, likeness in atlas.index.rank({kind: places[kind][row]}, config.num_neighbours, among):
+        for other_id, likeness in atlas.index.rank(
+            {kind: places[kind][row]}, config.num_neighbours, among
+        ):
             found.setdefault(other_id, []).append(likeness)
-    scores = {other_id: float(np.median(sorted(values)[-_BEST:])) for other_id, values in found.items()}
+    scores = {
+        other_id: float(np.median(sorted(values)[-_BEST:])) for other_id, values in found.items()
+    }
     yield from sorted(scores.items(), key=lambda pair: -pair[1])[: config.num_neighbours]
 
 
@@ -193,4 +231,7 @@ def _may_overlap(tile: Tile, other: Tile) -> bool:
         return True
     reaches = [float(np.linalg.norm(np.diff(one.box_world, axis=0))) / 2.0 for one in (tile, other)]
     centres = [one.box_world.mean(axis=0) for one in (tile, other)]
-    return float(np.linalg.norm(world_from_other.apply(centres[1]) - centres[0])) <= sum(reaches) + MAX_APART_M
+    return (
+        float(np.linalg.norm(world_from_other.apply(centres[1]) - centres[0]))
+        <= sum(reaches) + MAX_APART_M
+    )

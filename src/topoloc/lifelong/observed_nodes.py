@@ -1,4 +1,5 @@
-"""What a picture shows of a node that is in the map: its landmarks sought where they must be seen."""
+"""What a picture shows of a node that is in the map: its landmarks sought where they must be
+seen."""
 
 from __future__ import annotations
 
@@ -14,7 +15,12 @@ from topoloc.slam.metric_points import keypoint_sigmas
 
 
 def observe_node(
-    node: TopoNode, features: Features, camera: Camera, cam_from_node: Rigid3, config: MapConfig, session_id: int = 0
+    node: TopoNode,
+    features: Features,
+    camera: Camera,
+    cam_from_node: Rigid3,
+    config: MapConfig,
+    session_id: int = 0,
 ) -> Observations:
     """See `observe_points`; `features` are what the picture shows, of the kind of the node's."""
     roots = np.zeros((len(node.features), 3, 3))

@@ -1,4 +1,5 @@
-"""Long sequences changed without reading them: some entries changed and others behind them, some left out, all changed when asked for."""
+"""Long sequences changed without reading them: some entries changed and others behind them, some
+left out, all changed when asked for."""
 
 from __future__ import annotations
 
@@ -9,7 +10,8 @@ T = TypeVar("T")
 
 
 class Overlay(Sequence[T]):
-    """`before` with the entries of `changed` (by their rows) in place of its own, and `added` behind it."""
+    """`before` with the entries of `changed` (by their rows) in place of its own, and `added`
+    behind it."""
 
     def __init__(self, before: Sequence[T], changed: Mapping[int, T], added: Sequence[T]) -> None:
         self._before, self._changed, self._added = before, changed, added
@@ -25,7 +27,9 @@ class Overlay(Sequence[T]):
             raise IndexError(index)
         if row in self._changed:
             return self._changed[row]
-        return self._before[row] if row < len(self._before) else self._added[row - len(self._before)]
+        return (
+            self._before[row] if row < len(self._before) else self._added[row - len(self._before)]
+        )
 
 
 class Selected(Sequence[T]):
@@ -38,7 +42,11 @@ class Selected(Sequence[T]):
         return len(self._rows)
 
     def __getitem__(self, index):  # type: ignore[override]
-        return [self._before[row] for row in self._rows[index]] if isinstance(index, slice) else self._before[self._rows[index]]
+        return (
+            [self._before[row] for row in self._rows[index]]
+            if isinstance(index, slice)
+            else self._before[self._rows[index]]
+        )
 
 
 class Changed(Sequence[T]):
@@ -51,4 +59,8 @@ class Changed(Sequence[T]):
         return len(self._before)
 
     def __getitem__(self, index):  # type: ignore[override]
-        return [self._change(one) for one in self._before[index]] if isinstance(index, slice) else self._change(self._before[index])
+        return (
+            [self._change(one) for one in self._before[index]]
+            if isinstance(index, slice)
+            else self._change(self._before[index])
+        )

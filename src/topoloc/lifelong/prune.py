@@ -1,10 +1,12 @@
-"""A map made smaller: read from `prune_map`. What is gone goes first, then, where it is wanted, descriptors' last digits
-(`coarse_descriptors.py`), then what adds least.
+"""A map made smaller: read from `prune_map`. What is gone goes first, then, where it is wanted,
+descriptors' last digits (`coarse_descriptors.py`), then what adds least.
 
-A landmark is gone where pictures that found their other landmarks again never found this one. For a budget, nodes that others hold are
-left out while else every node would keep few landmarks (`fewer_nodes.py`). Every node that stays then keeps so many as fit: those with
-the best chance to be seen again, spread over the picture, for a landmark beside others tells less
-(submodular coverage: a cell of the picture counts as the root of the chances in it; Krause & Golovin 2014, greedy choice).
+A landmark is gone where pictures that found their other landmarks again never found this one. For a
+budget, nodes that others hold are left out while else every node would keep few landmarks
+(`fewer_nodes.py`). Every node that stays then keeps so many as fit: those with the best chance to
+be seen again, spread over the picture, for a landmark beside others tells less (submodular
+coverage: a cell of the picture counts as the root of the chances in it; Krause & Golovin 2014,
+greedy choice).
 """
 
 from __future__ import annotations
@@ -40,18 +42,21 @@ class PruneConfig:
     """What is taken for gone, and what is never dropped."""
 
     min_expected: Annotated[int, Between(1, 1000)] = 4
-    """Pictures of later sessions that should have shown a landmark, before it can be taken for gone."""
+    """Pictures of later sessions that should have shown a landmark, before it can be taken for
+    gone."""
     min_seen_share: Annotated[float, Between(0, 1)] = 0.3
-    """Only sessions count that saw at least this share of a node's landmarks again: in another light none are seen."""
+    """Only sessions count that saw at least this share of a node's landmarks again: in another
+    light none are seen."""
     max_chance: Annotated[float, Between(1e-9, 1)] = 0.02
-    """A landmark is gone only where one that is there stayed unseen in so many pictures with this chance at most, by the shares that the
-    sessions saw of its node."""
+    """A landmark is gone only where one that is there stayed unseen in so many pictures with this
+    chance at most, by the shares that the sessions saw of its node."""
     cells: Annotated[int, Between(1, 100)] = 8
     """The picture's columns of cells, over which the landmarks that are kept are spread."""
     min_points: Annotated[int, Between(10, 100_000)] = 100
     """Landmarks that a node keeps at least; a budget that asks for fewer is refused."""
     few_points: Annotated[int, Between(10, 100_000)] = 200
-    """Where a budget leaves a node fewer landmarks than so many, nodes that others hold go first ..."""
+    """Where a budget leaves a node fewer landmarks than so many, nodes that others hold go first
+    ..."""
     min_held: Annotated[int, Between(1, 100_000)] = 60
     """... none of whose place another one recognises fewer landmarks than so many."""
     num_compared: Annotated[int, Between(1, 1000)] = 12
@@ -59,17 +64,19 @@ class PruneConfig:
     descriptors: Literal["fine", "coarse"] = "fine"
     """Coarse: rounded to steps of ..."""
     descriptor_step: Annotated[float, Between(0.04, 1.5)] = 0.64
-    """... so many root mean squares of a descriptor's numbers, before any landmark goes that may be there."""
+    """... so many root mean squares of a descriptor's numbers, before any landmark goes that may be
+    there."""
     max_gone_share: Annotated[float, AtLeast(0)] = 0.7
     """Of a node's landmarks at most this share is taken for gone."""
     earlier_asked: Annotated[int, Between(0, 10_000)] = 24
-    """Nodes, at most, that the map is asked before and after, for its history to tell what the edit cost; 0: none."""
+    """Nodes, at most, that the map is asked before and after, for its history to tell what the edit
+    cost; 0: none."""
 
 
 @dataclass(frozen=True)
 class _FileSize:
-    """Bytes of a map's file: all of it, of a landmark of each kind, and what else goes with a node on the average: its template, its walls,
-    its pictures but for one."""
+    """Bytes of a map's file: all of it, of a landmark of each kind, and what else goes with a node
+    on the average: its template, its walls, its pictures but for one."""
 
     size: int
     of_point: dict[str, float]
@@ -79,23 +86,30 @@ class _FileSize:
     def of(path: Path, kinds: Sequence[str]) -> _FileSize:
         lengths = " + ".join(f"total(length({name}))" for name in _POINT_COLUMNS)
         counted = "SELECT count(*), total(length(jpeg)) FROM"
-        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)) as database:
+        with closing(
+            sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
+        ) as database:
             of_point = {}
             for kind in kinds:
                 points = f"SELECT {lengths}, total(num_points) FROM node_points WHERE kind = ?"
                 num_bytes, num = database.execute(points, (kind,)).fetchone()
-                of_sums = database.execute("SELECT total(length(sums)) FROM landmark_sums WHERE kind = ?", (kind,)).fetchone()[0]
+                of_sums = database.execute(
+                    "SELECT total(length(sums)) FROM landmark_sums WHERE kind = ?", (kind,)
+                ).fetchone()[0]
                 of_point[kind] = (num_bytes + of_sums) / max(num, 1)
             num, of_templates = database.execute(f"{counted} node_templates").fetchone()
             num_pictures, of_pictures = database.execute(f"{counted} place_images").fetchone()
             of_walls = database.execute(f"SELECT {lengths} FROM side_node_points").fetchone()[0]
         of_pictures *= max(1.0 - num / max(num_pictures, 1), 0.0)
-        return _FileSize(path.stat().st_size, of_point, (of_templates + of_walls + of_pictures) / max(num, 1))
+        return _FileSize(
+            path.stat().st_size, of_point, (of_templates + of_walls + of_pictures) / max(num, 1)
+        )
 
     def without_points(self, topomap: TopoMetricMap) -> float:
         """Bytes of the map, whose file this is, without its landmarks."""
         return self.size - sum(
-            of_one * sum(len(node.features) for node in topomap.nodes_of(kind)) for kind, of_one in self.of_point.items()
+            of_one * sum(len(node.features) for node in topomap.nodes_of(kind))
+            for kind, of_one in self.of_point.items()
         )
 
 
@@ -117,8 +131,14 @@ class PrunedMap:
     changes: dict[str, Any]
 
 
-def prune_map(topomap: TopoMetricMap, path: Path, max_bytes: int | None = None, config: PruneConfig | None = None) -> PrunedMap:
-    """The map without landmarks that are gone, and, with a budget, with so many a node that its file fits.
+def prune_map(
+    topomap: TopoMetricMap,
+    path: Path,
+    max_bytes: int | None = None,
+    config: PruneConfig | None = None,
+) -> PrunedMap:
+    """The map without landmarks that are gone, and, with a budget, with so many a node that its
+    file fits.
 
     Args:
         path: the map's file, whose bytes the budget is reckoned from.
@@ -144,29 +164,52 @@ def _with_counts_together(topomap: TopoMetricMap, config: PruneConfig) -> TopoMe
     def together(node: TopoNode) -> TopoNode:
         return replace(node, sums=with_counts_together(node.sums, config.min_seen_share))
 
-    if not any(len(list(node.sums)) > len(list(together(node).sums)) for kind in topomap.kinds for node in topomap.nodes_of(kind)):
+    if not any(
+        len(list(node.sums)) > len(list(together(node).sums))
+        for kind in topomap.kinds
+        for node in topomap.nodes_of(kind)
+    ):
         return topomap
     nodes = {kind: Changed(topomap.nodes_of(kind), together) for kind in topomap.kinds}
     return replace(topomap, nodes=nodes.pop(topomap.kind), other_kinds=nodes)
 
 
-def _with_fewer_nodes(topomap: TopoMetricMap, file: _FileSize, max_bytes: int, config: PruneConfig) -> TopoMetricMap:
-    """Without the nodes that go before any keeps fewer than `few_points`; the map itself where none needs to."""
-    left = {kind: np.array([(~_gone(node, config)).sum() for node in topomap.nodes_of(kind)]) for kind in topomap.kinds}
-    with_few = sum((np.minimum(left[kind], config.few_points) * file.of_point[kind] for kind in topomap.kinds), np.zeros(1))
+def _with_fewer_nodes(
+    topomap: TopoMetricMap, file: _FileSize, max_bytes: int, config: PruneConfig
+) -> TopoMetricMap:
+    """Without the nodes that go before any keeps fewer than `few_points`; the map itself where none
+    needs to."""
+    left = {
+        kind: np.array([(~_gone(node, config)).sum() for node in topomap.nodes_of(kind)])
+        for kind in topomap.kinds
+    }
+    with_few = sum(
+        (np.minimum(left[kind], config.few_points) * file.of_point[kind] for kind in topomap.kinds),
+        np.zeros(1),
+    )
     too_much = file.without_points(topomap) + float(with_few.sum()) - max_bytes
     if too_much <= 0:
         return topomap
     of_node, holds = with_few + file.of_node, holds_of(topomap, config.num_compared)
-    chosen = fewest_dropped(holds, config.min_held, lambda rows: float(of_node[rows].sum()) >= too_much)
+    chosen = fewest_dropped(
+        holds, config.min_held, lambda rows: float(of_node[rows].sum()) >= too_much
+    )
     return topomap if chosen is None else without_nodes(topomap, *chosen)
 
 
 def _with_landmarks(
-    before: TopoMetricMap, topomap: TopoMetricMap, path: Path, file: _FileSize, max_bytes: int | None, config: PruneConfig
+    before: TopoMetricMap,
+    topomap: TopoMetricMap,
+    path: Path,
+    file: _FileSize,
+    max_bytes: int | None,
+    config: PruneConfig,
 ) -> PrunedMap:
-    """The map without what is gone, and within its budget; `before` is what it was made of, `file` the size that it has."""
-    gone = {kind: [_gone(node, config) for node in topomap.nodes_of(kind)] for kind in topomap.kinds}
+    """The map without what is gone, and within its budget; `before` is what it was made of, `file`
+    the size that it has."""
+    gone = {
+        kind: [_gone(node, config) for node in topomap.nodes_of(kind)] for kind in topomap.kinds
+    }
     left = {kind: [int((~of_node).sum()) for of_node in gone[kind]] for kind in topomap.kinds}
     largest = max(max(of_kind) for of_kind in left.values())
     most, budget, rest = largest, max_bytes, file.without_points(topomap)
@@ -174,42 +217,72 @@ def _with_landmarks(
     while True:
         if budget is not None:
             most = min(most, _most_points(left, file.of_point, rest, budget, config))
-        if topomap is before and most >= largest and not any(of_node.any() for of_kind in gone.values() for of_node in of_kind):
-            return PrunedMap(before, {"nodes_dropped": 0, "landmarks_gone": 0, "landmarks_dropped": 0})
+        if (
+            topomap is before
+            and most >= largest
+            and not any(of_node.any() for of_kind in gone.values() for of_node in of_kind)
+        ):
+            return PrunedMap(
+                before, {"nodes_dropped": 0, "landmarks_gone": 0, "landmarks_dropped": 0}
+            )
         pruned = _with_fewer(topomap, gone, most, config)
-        if max_bytes is None or budget is None or (written := _as_written(pruned.topomap, path).size + _PAGES) <= max_bytes:
+        if (
+            max_bytes is None
+            or budget is None
+            or (written := _as_written(pruned.topomap, path).size + _PAGES) <= max_bytes
+        ):
             changes = {"nodes_dropped": num_nodes} | pruned.changes
-            return replace(pruned, changes=changes | earlier_recall(before, pruned.topomap, config.earlier_asked))
-        budget -= round(1.1 * (written - max_bytes)) + _PAGES  # how well bytes pack is known only now
+            return replace(
+                pruned,
+                changes=changes | earlier_recall(before, pruned.topomap, config.earlier_asked),
+            )
+        budget -= (
+            round(1.1 * (written - max_bytes)) + _PAGES
+        )  # how well bytes pack is known only now
 
 
-def _with_fewer(topomap: TopoMetricMap, gone: Mapping[str, list[np.ndarray]], most: int, config: PruneConfig) -> PrunedMap:
-    """Without the landmarks that are `gone` (booleans, a node), and with `most` of the others a node."""
+def _with_fewer(
+    topomap: TopoMetricMap, gone: Mapping[str, list[np.ndarray]], most: int, config: PruneConfig
+) -> PrunedMap:
+    """Without the landmarks that are `gone` (booleans, a node), and with `most` of the others a
+    node."""
     pruned, num_gone, num_dropped = {}, 0, 0
     for kind in topomap.kinds:
         changed = {}
         for row, (node, of_node) in enumerate(zip(topomap.nodes_of(kind), gone[kind], strict=True)):
             rows = np.flatnonzero(~of_node)
             kept = rows if len(rows) <= most else rows[_chosen(node, rows, most, config)]
-            num_gone, num_dropped = num_gone + int(of_node.sum()), num_dropped + len(rows) - len(kept)
+            num_gone, num_dropped = (
+                num_gone + int(of_node.sum()),
+                num_dropped + len(rows) - len(kept),
+            )
             if len(kept) < len(of_node):
                 changed[row] = with_points(node, kept)
         pruned[kind] = Overlay(topomap.nodes_of(kind), changed, [])
     nodes = pruned.pop(topomap.kind)
-    smaller = replace(topomap, summaries=[node.summary for node in nodes], nodes=nodes, other_kinds=pruned)
-    return PrunedMap(with_map_facts(smaller), {"landmarks_gone": num_gone, "landmarks_dropped": num_dropped})
+    smaller = replace(
+        topomap, summaries=[node.summary for node in nodes], nodes=nodes, other_kinds=pruned
+    )
+    return PrunedMap(
+        with_map_facts(smaller), {"landmarks_gone": num_gone, "landmarks_dropped": num_dropped}
+    )
 
 
 def with_points(node: TopoNode, kept: Int[np.ndarray, " k"]) -> TopoNode:
-    """The node with these of its landmarks (rows in increasing order) and what sessions know of them."""
+    """The node with these of its landmarks (rows in increasing order) and what sessions know of
+    them."""
     new_row = np.full(len(node.features), -1)
     new_row[kept] = np.arange(len(kept))
     sums = []
     for of_session in node.sums:
         stays = new_row[of_session.rows] >= 0
         if stays.any():
-            parts = (getattr(of_session, name)[stays] for name in ("roots", "pulls", "expected", "seen"))
-            sums.append(LandmarkSums(of_session.session_id, new_row[of_session.rows[stays]], *parts))
+            parts = (
+                getattr(of_session, name)[stays] for name in ("roots", "pulls", "expected", "seen")
+            )
+            sums.append(
+                LandmarkSums(of_session.session_id, new_row[of_session.rows[stays]], *parts)
+            )
     stored = node.stored_descriptors
     return replace(
         node,
@@ -223,8 +296,9 @@ def with_points(node: TopoNode, kept: Int[np.ndarray, " k"]) -> TopoNode:
 
 
 def _gone(node: TopoNode, config: PruneConfig) -> Bool[np.ndarray, " n"]:
-    """The landmarks that later sessions never saw though they saw the rest, and so often that a landmark that is there hardly stays
-    unseen: a session that finds a third of what is in view misses four pictures in a row by chance, one of five times."""
+    """The landmarks that later sessions never saw though they saw the rest, and so often that a
+    landmark that is there hardly stays unseen: a session that finds a third of what is in view
+    misses four pictures in a row by chance, one of five times."""
     num = len(node.features)
     expected, seen, log_missed = np.zeros(num, np.int64), np.zeros(num, np.int64), np.zeros(num)
     for sums in node.sums:
@@ -234,12 +308,15 @@ def _gone(node: TopoNode, config: PruneConfig) -> Bool[np.ndarray, " n"]:
             expected[sums.rows] += sums.expected
             seen[sums.rows] += sums.seen
             log_missed[sums.rows] += sums.expected * np.log1p(-min(share, 0.99))
-    gone = (expected >= config.min_expected) & (seen == 0) & (log_missed <= np.log(config.max_chance))
+    gone = (
+        (expected >= config.min_expected) & (seen == 0) & (log_missed <= np.log(config.max_chance))
+    )
     return gone if gone.sum() <= config.max_gone_share * num else np.zeros(num, bool)
 
 
 def _chances(node: TopoNode) -> Float[np.ndarray, " n"]:
-    """Each landmark's chance to be seen by a picture that should show it, by all that sessions saw (Laplace's rule)."""
+    """Each landmark's chance to be seen by a picture that should show it, by all that sessions saw
+    (Laplace's rule)."""
     expected, seen = np.ones(len(node.features)) * 2.0, np.ones(len(node.features))
     for sums in node.sums:
         expected[sums.rows] += sums.expected
@@ -247,8 +324,11 @@ def _chances(node: TopoNode) -> Float[np.ndarray, " n"]:
     return seen / expected
 
 
-def _chosen(node: TopoNode, rows: Int[np.ndarray, " m"], most: int, config: PruneConfig) -> Int[np.ndarray, " k"]:
-    """Which of these rows a node keeps: chance by chance the one that adds most to what its cell holds already."""
+def _chosen(
+    node: TopoNode, rows: Int[np.ndarray, " m"], most: int, config: PruneConfig
+) -> Int[np.ndarray, " k"]:
+    """Which of these rows a node keeps: chance by chance the one that adds most to what its cell
+    holds already."""
     size = node.camera.width / config.cells
     cell = (node.features.points_img[rows] / size).astype(np.int64)
     key = cell[:, 1] * (config.cells + 1) + cell[:, 0]
@@ -257,19 +337,36 @@ def _chosen(node: TopoNode, rows: Int[np.ndarray, " m"], most: int, config: Prun
         of_cell = np.flatnonzero(key == one)
         best_first = of_cell[np.argsort(-chances[of_cell], kind="stable")]
         total = np.cumsum(chances[best_first])
-        gains[best_first] = np.sqrt(total) - np.sqrt(total - chances[best_first])  # falls from one to the next: greedy is sorting
+        gains[best_first] = np.sqrt(total) - np.sqrt(
+            total - chances[best_first]
+        )  # falls from one to the next: greedy is sorting
     return np.sort(np.argsort(-gains, kind="stable")[:most])
 
 
-def _most_points(left: dict[str, list[int]], of_point: dict[str, float], rest: float, max_bytes: int, config: PruneConfig) -> int:
-    """Landmarks a node of each kind so that a file fits whose bytes without landmarks are `rest`."""
+def _most_points(
+    left: dict[str, list[int]],
+    of_point: dict[str, float],
+    rest: float,
+    max_bytes: int,
+    config: PruneConfig,
+) -> int:
+    """Landmarks a node of each kind so that a file fits whose bytes without landmarks are
+    `rest`."""
 
     def bytes_with(most: int) -> float:
-        return rest + sum(sum(min(n, most) for n in of_kind) * of_point[kind] for kind, of_kind in left.items())
+        return rest + sum(
+            sum(min(n, most) for n in of_kind) * of_point[kind] for kind, of_kind in left.items()
+        )
 
     if bytes_with(config.min_points) > max_bytes:
-        least, num = bytes_with(config.min_points) / 1e6, max(len(of_kind) for of_kind in left.values())
-        raise MapError(f"with {config.min_points} landmarks each its {num} nodes take {least:.2f} MB; nothing is dropped")
+        least, num = (
+            bytes_with(config.min_points) / 1e6,
+            max(len(of_kind) for of_kind in left.values()),
+        )
+        raise MapError(
+            f"with {config.min_points} landmarks each its {num} nodes take {least:.2f} MB; nothing"
+            " is dropped"
+        )
     low, high = config.min_points, max(max(of_kind) for of_kind in left.values())
     while low < high:
         middle = (low + high + 1) // 2

@@ -1,7 +1,9 @@
-"""The metres of a motion that a single camera made in a unit of its own: by what a map answers to some of its pictures.
+"""The metres of a motion that a single camera made in a unit of its own: by what a map answers to
+some of its pictures.
 
-The unit drifts along the way. Its logarithm is taken for a random walk, which the distances between answers hold: least squares over knots
-along the way, which say how well it is known, too. Which answers may be right is first found by one similarity that explains most of them.
+The unit drifts along the way. Its logarithm is taken for a random walk, which the distances between
+answers hold: least squares over knots along the way, which say how well it is known, too. Which
+answers may be right is first found by one similarity that explains most of them.
 """
 
 from __future__ import annotations
@@ -27,7 +29,8 @@ class ScaleConfig:
     max_sigma: Annotated[float, Above(0)] = 0.1
     """Where the unit is less certain than by this share of itself, frames have no pose."""
     max_error: Annotated[float, Above(0)] = 0.05
-    """An answer may be off by this share of the way from another one, for one similarity to explain both."""
+    """An answer may be off by this share of the way from another one, for one similarity to explain
+    both."""
     widened: Annotated[float, Above(0)] = 3.0
     """The map's answers are trusted as if their sigmas were so many times as large."""
     max_pairs: Annotated[int, Between(2, 1000)] = 40
@@ -38,7 +41,8 @@ class ScaleConfig:
 
 @dataclass(frozen=True, eq=False)
 class _Answers:
-    """Where the map puts some frames, and where the motion does: positions, rotations, ways gone up to there, sigmas of the map's."""
+    """Where the map puts some frames, and where the motion does: positions, rotations, ways gone up
+    to there, sigmas of the map's."""
 
     rows: Int[np.ndarray, " k"]
     own: Float[np.ndarray, "k 3"]
@@ -53,35 +57,60 @@ class _Answers:
 
 
 def largest_agreement(
-    own: Mapping[int, Rigid3], localized: Mapping[int, Localization], slack_m: float, slack_deg: float, config: ScaleConfig
+    own: Mapping[int, Rigid3],
+    localized: Mapping[int, Localization],
+    slack_m: float,
+    slack_deg: float,
+    config: ScaleConfig,
 ) -> list[int]:
-    """The frames of the most answers that one similarity of the motion explains but for its drift; fewer than three are none."""
+    """The frames of the most answers that one similarity of the motion explains but for its drift;
+    fewer than three are none."""
     answers = _answers(own, localized)
     num = len(answers.rows)
-    tried = np.unique(np.linspace(0, num - 1, min(num, config.max_pairs)).astype(int)) if num else np.zeros(0, int)
+    tried = (
+        np.unique(np.linspace(0, num - 1, min(num, config.max_pairs)).astype(int))
+        if num
+        else np.zeros(0, int)
+    )
     best: Bool[np.ndarray, " k"] = np.zeros(num, np.bool_)
     for i in tried:
         for j in tried[tried != i]:
             agrees = _explained(answers, int(i), int(j), slack_m, slack_deg, config)
             best = agrees if agrees.sum() > best.sum() else best
-    return [index for index, is_in in zip(localized, best, strict=True) if is_in] if best.sum() > 2 else []
+    return (
+        [index for index, is_in in zip(localized, best, strict=True) if is_in]
+        if best.sum() > 2
+        else []
+    )
 
 
-def _explained(answers: _Answers, i: int, j: int, slack_m: float, slack_deg: float, config: ScaleConfig) -> Bool[np.ndarray, " k"]:
-    """By the similarity that turns the motion as answer i says, and makes it as long as i and j do."""
-    apart, own_apart = (float(np.linalg.norm(places[i] - places[j])) for places in (answers.world, answers.own))
-    if own_apart <= 0.0 or apart <= config.widened * float(np.hypot(answers.sigmas[i], answers.sigmas[j])):
+def _explained(
+    answers: _Answers, i: int, j: int, slack_m: float, slack_deg: float, config: ScaleConfig
+) -> Bool[np.ndarray, " k"]:
+    """By the similarity that turns the motion as answer i says, and makes it as long as i and j
+    do."""
+    apart, own_apart = (
+        float(np.linalg.norm(places[i] - places[j])) for places in (answers.world, answers.own)
+    )
+    if own_apart <= 0.0 or apart <= config.widened * float(
+        np.hypot(answers.sigmas[i], answers.sigmas[j])
+    ):
         return np.zeros(len(answers.rows), np.bool_)
     scale, turn = apart / own_apart, answers.world_rotations[i] @ answers.own_rotations[i].T
-    off = np.linalg.norm(answers.world - answers.world[i] - scale * (answers.own - answers.own[i]) @ turn.T, axis=1)
+    off = np.linalg.norm(
+        answers.world - answers.world[i] - scale * (answers.own - answers.own[i]) @ turn.T, axis=1
+    )
     traces = np.einsum("kij,kij->k", answers.world_rotations, turn @ answers.own_rotations)
     turned = np.degrees(np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0)))
     way = scale * np.abs(answers.ways - answers.ways[i])
     return (off <= slack_m + config.max_error * way) & (turned <= slack_deg + way)
 
 
-def in_metres(own: Mapping[int, Rigid3], localized: Mapping[int, Localization], config: ScaleConfig) -> dict[int, Rigid3]:
-    """The motion with its steps in metres, as answers that agree say; only where these tell its unit. Its world stays the first frame's."""
+def in_metres(
+    own: Mapping[int, Rigid3], localized: Mapping[int, Localization], config: ScaleConfig
+) -> dict[int, Rigid3]:
+    """The motion with its steps in metres, as answers that agree say; only where these tell its
+    unit. Its world stays the first frame's."""
     answers = _answers(own, localized)
     positions = np.array([pose.translation for pose in own.values()])
     ways = ways_of(positions)
@@ -99,17 +128,33 @@ def in_metres(own: Mapping[int, Rigid3], localized: Mapping[int, Localization], 
 
 
 def _profile(
-    ways: Float[np.ndarray, " n"], answers: _Answers, pairs: Int[np.ndarray, "p 2"], config: ScaleConfig
+    ways: Float[np.ndarray, " n"],
+    answers: _Answers,
+    pairs: Int[np.ndarray, "p 2"],
+    config: ScaleConfig,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """The logarithm of the unit at each frame, and its sigma."""
     a, b = answers.select(pairs[:, 0]), answers.select(pairs[:, 1])
-    apart, own_apart = np.linalg.norm(a.world - b.world, axis=1), np.linalg.norm(a.own - b.own, axis=1)
+    apart, own_apart = (
+        np.linalg.norm(a.world - b.world, axis=1),
+        np.linalg.norm(a.own - b.own, axis=1),
+    )
     measured = np.log(apart / own_apart)
     sigmas = config.widened * np.hypot(a.sigmas, b.sigmas) / apart
-    knots = np.unique(ways[np.linspace(0, len(ways) - 1, min(len(ways), config.max_knots)).astype(int)])
+    knots = np.unique(
+        ways[np.linspace(0, len(ways) - 1, min(len(ways), config.max_knots)).astype(int)]
+    )
     metre = float(np.exp(np.median(measured)))
-    mean = np.stack([_interpolation(np.linspace(u, v, 9), knots).mean(axis=0) for u, v in zip(a.ways, b.ways, strict=True)])
-    difference = np.diff(np.eye(len(knots)), axis=0) / (config.drift * np.sqrt(np.maximum(np.diff(knots) * metre, 1e-9)))[:, None]
+    mean = np.stack(
+        [
+            _interpolation(np.linspace(u, v, 9), knots).mean(axis=0)
+            for u, v in zip(a.ways, b.ways, strict=True)
+        ]
+    )
+    difference = (
+        np.diff(np.eye(len(knots)), axis=0)
+        / (config.drift * np.sqrt(np.maximum(np.diff(knots) * metre, 1e-9)))[:, None]
+    )
     matrix = np.concatenate([mean / sigmas[:, None], difference])
     covariance = np.linalg.inv(matrix.T @ matrix + 1e-12 * np.eye(len(knots)))
     logs = covariance @ (matrix[: len(mean)].T @ (measured / sigmas))
@@ -117,14 +162,17 @@ def _profile(
 
 
 def _pairs(answers: _Answers, config: ScaleConfig) -> Int[np.ndarray, "p 2"]:
-    """Answers with the ones 1, 2, 4, ... after them that lie apart for more than what they may be off."""
+    """Answers with the ones 1, 2, 4, ... after them that lie apart for more than what they may be
+    off."""
     num, pairs = len(answers.rows), []
     for offset in (2**power for power in range(16) if 2**power < num):
         first = np.arange(num - offset)
         second = first + offset
         apart = np.linalg.norm(answers.world[first] - answers.world[second], axis=1)
         own_apart = np.linalg.norm(answers.own[first] - answers.own[second], axis=1)
-        clear = apart > 3.0 * config.widened * np.hypot(answers.sigmas[first], answers.sigmas[second])
+        clear = apart > 3.0 * config.widened * np.hypot(
+            answers.sigmas[first], answers.sigmas[second]
+        )
         pairs.append(np.column_stack([first, second])[clear & (own_apart > 0.0)])
     return np.concatenate(pairs) if pairs else np.zeros((0, 2), np.int64)
 
@@ -150,7 +198,9 @@ def ways_of(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
 
 
-def _interpolation(at: Float[np.ndarray, " m"], knots: Float[np.ndarray, " k"]) -> Float[np.ndarray, "m k"]:
+def _interpolation(
+    at: Float[np.ndarray, " m"], knots: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, "m k"]:
     """What each knot counts for a value in between, linearly."""
     right = np.clip(np.searchsorted(knots, at), 1, max(len(knots) - 1, 1))
     share = np.clip((at - knots[right - 1]) / (knots[right] - knots[right - 1]), 0.0, 1.0)

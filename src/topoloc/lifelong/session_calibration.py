@@ -21,14 +21,20 @@ _FAR_OFF = math.log(1.04)
 
 
 def check_calibration(name: str, results: Sequence[Localization | NotLocalized]) -> None:
-    """Hold that what the pictures say together does not contradict the calibration that they came with. Raises CalibrationError."""
+    """Hold that what the pictures say together does not contradict the calibration that they came
+    with. Raises CalibrationError."""
     wrong = next((verdict for verdict in verdicts_of(results) if verdict.contradicts), None)
     if wrong is not None:
-        raise CalibrationError(f"{name}: its calibration is not that of its camera: {wrong}; the map stays as it is")
+        raise CalibrationError(
+            f"{name}: its calibration is not that of its camera: {wrong}; the map stays as it is"
+        )
 
 
-def check_by_other_focal_lengths(sequence: StereoSequence, indices: Sequence[int], localizer: Localizer) -> None:
-    """Of a session that the map recognises too little of: hold that it is not recognised where its focal length is left open.
+def check_by_other_focal_lengths(
+    sequence: StereoSequence, indices: Sequence[int], localizer: Localizer
+) -> None:
+    """Of a session that the map recognises too little of: hold that it is not recognised where its
+    focal length is left open.
 
     Args:
         indices: the frames that were asked, of which a few are asked once more.
@@ -56,6 +62,7 @@ def check_by_other_focal_lengths(sequence: StereoSequence, indices: Sequence[int
         assert said is not None, "it was asked"
         lengths = f"{said.fx * math.exp(middle):.0f} pixels, not {said.fx:.0f}"
         raise CalibrationError(
-            f"{sequence.name}: its calibration is not that of its camera: the map recognises {agreeing} of {len(tried)} pictures where "
-            f"the focal length is about {lengths}; the map stays as it is"
+            f"{sequence.name}: its calibration is not that of its camera: the map recognises"
+            f" {agreeing} of {len(tried)} pictures where the focal length is about {lengths}; the"
+            " map stays as it is"
         )

@@ -1,8 +1,10 @@
-"""Where a new session was taken, in the world of a map: the pictures that the map localizes hold the session's own motion in place.
+"""Where a new session was taken, in the world of a map: the pictures that the map localizes hold
+the session's own motion in place.
 
-The session's motion is that of its poses (given, or SLAM's) in any world of their own; of a single camera without poses, see
-`single_camera_poses.py`. One rigid transform must explain most of what the map answers, but for a drift; the motion and
-the answers are then brought to agree as a pose graph, in which the map stands still, each trusted as far as the session itself shows
+The session's motion is that of its poses (given, or SLAM's) in any world of their own; of a single
+camera without poses, see `single_camera_poses.py`. One rigid transform must explain most of what
+the map answers, but for a drift; the motion and the answers are then brought to agree as a pose
+graph, in which the map stands still, each trusted as far as the session itself shows
 (`motion_trust.py`).
 """
 
@@ -42,10 +44,12 @@ class SessionPosesConfig:
     """How a session is held in place, and when it is refused."""
 
     max_scale: Annotated[float, Above(0)] = 0.03
-    """A metre of the motion may be off by this share of a metre of the map, beside three sigmas of what the answers say of it, and beside
-    the share that one sigma of an answer is of the way between the furthest."""
+    """A metre of the motion may be off by this share of a metre of the map, beside three sigmas of
+    what the answers say of it, and beside the share that one sigma of an answer is of the way
+    between the furthest."""
     max_drift: Annotated[float, Between(0, 1)] = 0.03
-    """Of two answers of the map that agree, the motion between them may be off by this share of the way ..."""
+    """Of two answers of the map that agree, the motion between them may be off by this share of the
+    way ..."""
     max_turn_drift_deg: Annotated[float, AtLeast(0)] = 0.3
     """... and by so many degrees a metre of the way, ..."""
     slack: Annotated[float, Above(0)] = 0.3
@@ -53,33 +57,41 @@ class SessionPosesConfig:
     slack_deg: Annotated[float, Above(0)] = 2.0
     """... and by so many degrees."""
     min_agreeing: Annotated[int, Between(2, 1000)] = 5
-    """Pictures that the map must localize in agreement with the motion; with fewer the session is refused."""
+    """Pictures that the map must localize in agreement with the motion; with fewer the session is
+    refused."""
     min_share: Annotated[float, Between(0, 1)] = 0.5
     """Share of the localized pictures that must agree; with fewer the session is refused."""
     drift: Annotated[float, Above(0)] = 0.01
     """Sigma of the motion from picture to picture, as a share of its way, beside a millimetre."""
     turn_drift: Annotated[float, Above(0)] = 0.002
-    """Sigma of its rotation, radians a metre of the way and a radian of the turn, beside half a milliradian."""
+    """Sigma of its rotation, radians a metre of the way and a radian of the turn, beside half a
+    milliradian."""
     widened: Annotated[float, Above(0)] = 3.0
-    """The map's answers are trusted as if their sigmas were so many times as large: neighbours share errors of the map."""
+    """The map's answers are trusted as if their sigmas were so many times as large: neighbours
+    share errors of the map."""
     motion_factors: Annotated[tuple[float, ...], Above(0)] = (0.5, 1.0, 3.0, 10.0)
-    """Of stereo, RGB-D and given poses it is measured by how many times the motion's sigmas are as large: which of these ..."""
+    """Of stereo, RGB-D and given poses it is measured by how many times the motion's sigmas are as
+    large: which of these ..."""
     answer_factors: Annotated[tuple[float, ...], Above(0)] = (1.0 / 3.0, 1.0)
-    """... and, beside `widened`, which of these for the answers' sigmas agrees best with what the answers say of the motion."""
+    """... and, beside `widened`, which of these for the answers' sigmas agrees best with what the
+    answers say of the motion."""
     rival_share: Annotated[float, Between(0, 1)] = 0.3
-    """Of a single camera, answers that agree about one way are believed if fewer than this share of them agree about another one."""
+    """Of a single camera, answers that agree about one way are believed if fewer than this share of
+    them agree about another one."""
     contradiction: Annotated[float, Above(0)] = 0.1
-    """Where the map and a single camera's motion say places that are further apart than so many D_thresh, beside three of the map's sigmas
-    (widened), a frame has no pose."""
+    """Where the map and a single camera's motion say places that are further apart than so many
+    D_thresh, beside three of the map's sigmas (widened), a frame has no pose."""
     max_sigma: Annotated[float, Above(0)] = 0.1
-    """A frame that no motion holds has the pose that the map answers where that is known to within so many D_thresh (a sigma of its
-    position)."""
+    """A frame that no motion holds has the pose that the map answers where that is known to within
+    so many D_thresh (a sigma of its position)."""
     graph: PoseGraphConfig = field(default_factory=PoseGraphConfig)
-    adjustment: BundleConfig = field(default_factory=lambda: BundleConfig(max_steps=30, min_decrease=1e-5, cauchy_scale=0.5))
+    adjustment: BundleConfig = field(
+        default_factory=lambda: BundleConfig(max_steps=30, min_decrease=1e-5, cauchy_scale=0.5)
+    )
     """Of a single camera's walk as a whole."""
     points_widened: Annotated[float, Above(0)] = 8.0
-    """In it, points that were followed are trusted as if their sigmas were so many times as large: one that slides does so in all of its
-    key frames."""
+    """In it, points that were followed are trusted as if their sigmas were so many times as large:
+    one that slides does so in all of its key frames."""
     bend: BendConfig = field(default_factory=BendConfig)
     """How a single camera's walk is drawn to the map's answers."""
     odometry: SingleCameraConfig = field(default_factory=SingleCameraConfig)
@@ -88,8 +100,9 @@ class SessionPosesConfig:
 
 @dataclass(frozen=True, eq=False)
 class SessionPoses:
-    """world_from_cam of each frame, up to the last with a pose, in the map's world, None where it is not known; what the map answered to
-    the frames that it was asked of, and which of these answers hold the session in place."""
+    """world_from_cam of each frame, up to the last with a pose, in the map's world, None where it
+    is not known; what the map answered to the frames that it was asked of, and which of these
+    answers hold the session in place."""
 
     world_from_cams: list[Rigid3 | None]
     answers: Mapping[int, Localization | None]
@@ -99,9 +112,14 @@ class SessionPoses:
 
 
 def poses_by_motion(
-    sequence: StereoSequence, localizer: Localizer, of_map: MapConfig, config: SessionPosesConfig, progress: Progress
+    sequence: StereoSequence,
+    localizer: Localizer,
+    of_map: MapConfig,
+    config: SessionPosesConfig,
+    progress: Progress,
 ) -> SessionPoses:
-    """Of a session that has poses of its own, in any world, or in several, one a stretch. Frames about as far apart as nodes are asked.
+    """Of a session that has poses of its own, in any world, or in several, one a stretch. Frames
+    about as far apart as nodes are asked.
 
     Raises:
         TrajectoryError: the map recognises too little of it, or not as its poses say.
@@ -113,7 +131,9 @@ def poses_by_motion(
     stretches = (sequence.poses, *(sequence.apart if isinstance(sequence, SequenceView) else ()))
     motions = [own for poses in stretches if (own := _known(poses))]
     if not motions:
-        raise TrajectoryError(f"{sequence.name}: none of its frames has a pose; the map stays as it is")
+        raise TrajectoryError(
+            f"{sequence.name}: none of its frames has a pose; the map stays as it is"
+        )
     asked = [_as_nodes(own, of_map) for own in motions]
     indices = sorted({index for of_motion in asked for index in of_motion})
     results = list[Localization | NotLocalized]()
@@ -122,10 +142,22 @@ def poses_by_motion(
         results.append(localizer.localize(frame.image, frame.camera))
         progress(f"localizing {sequence.name}", done + 1, len(indices))
     check_calibration(sequence.name, results)
-    if config.min_agreeing > sum(result.localized for result in results) and len(indices) >= config.min_agreeing:
+    if (
+        config.min_agreeing > sum(result.localized for result in results)
+        and len(indices) >= config.min_agreeing
+    ):
         check_by_other_focal_lengths(sequence, indices, localizer)
-    answers = {index: result if isinstance(result, Localization) else None for index, result in zip(indices, results, strict=True)}
-    return _all_held(sequence.name, motions, [{index: answers[index] for index in of_motion} for of_motion in asked], d_thresh, config)
+    answers = {
+        index: result if isinstance(result, Localization) else None
+        for index, result in zip(indices, results, strict=True)
+    }
+    return _all_held(
+        sequence.name,
+        motions,
+        [{index: answers[index] for index in of_motion} for of_motion in asked],
+        d_thresh,
+        config,
+    )
 
 
 def _known(poses: Sequence[Rigid3 | None]) -> dict[int, Rigid3]:
@@ -145,8 +177,9 @@ def _all_held(
     d_thresh: float,
     config: SessionPosesConfig,
 ) -> SessionPoses:
-    """Each stretch held by what the map answers to its own pictures; stretches that the map does not hold have no poses. Raises
-    TrajectoryError, that of the first stretch, where it holds none."""
+    """Each stretch held by what the map answers to its own pictures; stretches that the map does
+    not hold have no poses. Raises TrajectoryError, that of the first stretch, where it holds
+    none."""
     held, refused = list[SessionPoses](), list[TrajectoryError]()
     for own, of_motion in zip(motions, answers, strict=True):
         try:
@@ -160,7 +193,9 @@ def _all_held(
         for index, pose in _known(one.world_from_cams).items():
             world_from_cams[index] = pose
     every = {index: answer for of_motion in answers for index, answer in of_motion.items()}
-    return SessionPoses(world_from_cams, every, sorted(index for one in held for index in one.agreeing))
+    return SessionPoses(
+        world_from_cams, every, sorted(index for one in held for index in one.agreeing)
+    )
 
 
 def held_by(
@@ -171,7 +206,8 @@ def held_by(
     config: SessionPosesConfig,
     trust: Trust | None = None,
 ) -> SessionPoses:
-    """A motion of its own world held in place by what a map answers to some of its pictures, all by their numbers.
+    """A motion of its own world held in place by what a map answers to some of its pictures, all by
+    their numbers.
 
     Args:
         trust: how far to trust the two; without, it is measured.
@@ -182,11 +218,18 @@ def held_by(
     localized = {index: result for index, result in answers.items() if result is not None}
     agreeing = _agreeing(name, own, localized, len(answers), d_thresh, config)
     anchors = {k: localized[k] for k in agreeing}
-    return SessionPoses(_held(own, anchors, trust or _trust(own, anchors, config), config), answers, agreeing)
+    return SessionPoses(
+        _held(own, anchors, trust or _trust(own, anchors, config), config), answers, agreeing
+    )
 
 
 def _agreeing(
-    name: str, own: Mapping[int, Rigid3], localized: Mapping[int, Localization], num_asked: int, d_thresh: float, config: SessionPosesConfig
+    name: str,
+    own: Mapping[int, Rigid3],
+    localized: Mapping[int, Localization],
+    num_asked: int,
+    d_thresh: float,
+    config: SessionPosesConfig,
 ) -> list[int]:
     """The largest set of answers that one transform of the motion explains."""
     indices = list(localized)
@@ -194,7 +237,8 @@ def _agreeing(
         raise TrajectoryError(f"{name}: {_too_few(num_asked, config)}; the map stays as it is")
     if len(indices) < config.min_agreeing:
         raise TrajectoryError(
-            f"{name}: the map recognises {len(indices)} of {num_asked} pictures asked: another place, or changed; the map stays as it is"
+            f"{name}: the map recognises {len(indices)} of {num_asked} pictures asked: another"
+            " place, or changed; the map stays as it is"
         )
     _check_scale(name, own, localized, config)
     ways, slack_m = _ways(own), config.slack * d_thresh
@@ -202,7 +246,8 @@ def _agreeing(
     best = agrees[int(np.argmax(agrees.sum(axis=1)))]
     if best.sum() < max(config.min_agreeing, config.min_share * len(indices)):
         raise TrajectoryError(
-            f"{name}: of {len(indices)} pictures that the map localizes {int(best.sum())} agree with its poses; the map stays as it is"
+            f"{name}: of {len(indices)} pictures that the map localizes {int(best.sum())} agree"
+            " with its poses; the map stays as it is"
         )
     return [index for index, is_in in zip(indices, best, strict=True) if is_in]
 
@@ -222,32 +267,48 @@ def _agree_with(
         off = answer.world_from_cam.inverse() @ world_from_own @ own[index]
         way = abs(ways[index] - ways[k])
         near = float(np.linalg.norm(off.translation)) <= slack_m + config.max_drift * way
-        agrees.append(near and np.degrees(off.angle()) <= config.slack_deg + config.max_turn_drift_deg * way)
+        agrees.append(
+            near and np.degrees(off.angle()) <= config.slack_deg + config.max_turn_drift_deg * way
+        )
     return np.array(agrees)
 
 
 def _too_few(num_asked: int, config: SessionPosesConfig) -> str:
     found = f"{num_asked} of its pictures are" if num_asked > 1 else "one of its pictures is"
-    return f"{found} as far apart as nodes of the map, too few to join: it takes {config.min_agreeing}"
+    return (
+        f"{found} as far apart as nodes of the map, too few to join: it takes {config.min_agreeing}"
+    )
 
 
-def _check_scale(name: str, own: Mapping[int, Rigid3], localized: Mapping[int, Localization], config: SessionPosesConfig) -> None:
-    """Hold that a metre of the motion is one of the map, by the distances between what was localized."""
+def _check_scale(
+    name: str,
+    own: Mapping[int, Rigid3],
+    localized: Mapping[int, Localization],
+    config: SessionPosesConfig,
+) -> None:
+    """Hold that a metre of the motion is one of the map, by the distances between what was
+    localized."""
     a = np.array([own[k].translation for k in localized])
     b = np.array([answer.world_from_cam.translation for answer in localized.values()])
     rows, columns = np.triu_indices(len(a), 1)
-    own_lengths, lengths = np.linalg.norm(a[rows] - a[columns], axis=1), np.linalg.norm(b[rows] - b[columns], axis=1)
+    own_lengths, lengths = (
+        np.linalg.norm(a[rows] - a[columns], axis=1),
+        np.linalg.norm(b[rows] - b[columns], axis=1),
+    )
     far = lengths > 0.5 * lengths.max()
     if (own_lengths[far] == 0.0).any():
         return
     ratios = lengths[far] / own_lengths[far]
     scale = float(np.median(ratios))
     spread = 1.4826 * float(np.median(np.abs(ratios - scale)))
-    # the answers are wrong together, too, which their spread does not show; of what hardly moves that is all there is
+    # the answers are wrong together, too, which their spread does not show; of what hardly moves
+    # that is all there is
     sigma_m = float(np.median([answer.position_sigma_m for answer in localized.values()]))
     doubt = 3.0 * spread / np.sqrt(len(a)) + sigma_m / lengths.max()
     if abs(scale - 1.0) > config.max_scale + doubt:
-        raise TrajectoryError(f"{name}: a metre of its poses is {scale:.3g} m of the map; the map stays as it is")
+        raise TrajectoryError(
+            f"{name}: a metre of its poses is {scale:.3g} m of the map; the map stays as it is"
+        )
 
 
 def _ways(own: Mapping[int, Rigid3]) -> dict[int, float]:
@@ -257,18 +318,31 @@ def _ways(own: Mapping[int, Rigid3]) -> dict[int, float]:
     return dict(zip(own, np.concatenate([[0.0], np.cumsum(steps)]).tolist(), strict=True))
 
 
-def _held(own: Mapping[int, Rigid3], anchors: Mapping[int, Localization], trust: Trust, config: SessionPosesConfig) -> list[Rigid3 | None]:
-    """The motion held in place by the anchors: a pose graph whose first node is the map's world, which does not move."""
+def _held(
+    own: Mapping[int, Rigid3],
+    anchors: Mapping[int, Localization],
+    trust: Trust,
+    config: SessionPosesConfig,
+) -> list[Rigid3 | None]:
+    """The motion held in place by the anchors: a pose graph whose first node is the map's world,
+    which does not move."""
     indices = list(own)
     first = min(anchors)
     world_from_own = anchors[first].world_from_cam @ own[first].inverse()
     cam_from_worlds = [Rigid3.identity(), *((world_from_own @ own[k]).inverse() for k in indices)]
     steps = [_motion(own[a], own[b], config) for a, b in pairwise(indices)]
-    edges = [Edge(row, row + 1, step, trust.motion**2 * spread, is_loop=False) for row, (step, spread) in enumerate(steps, 1)]
+    edges = [
+        Edge(row, row + 1, step, trust.motion**2 * spread, is_loop=False)
+        for row, (step, spread) in enumerate(steps, 1)
+    ]
     row_of = {index: row for row, index in enumerate(indices, 1)}
     for index, answer in anchors.items():
-        covariance = (trust.answers * config.widened) ** 2 * covariance_of_inverse(answer.world_from_cam, answer.covariance)
-        edges.append(Edge(0, row_of[index], answer.world_from_cam.inverse(), covariance, is_loop=True))
+        covariance = (trust.answers * config.widened) ** 2 * covariance_of_inverse(
+            answer.world_from_cam, answer.covariance
+        )
+        edges.append(
+            Edge(0, row_of[index], answer.world_from_cam.inverse(), covariance, is_loop=True)
+        )
     optimised = optimise_graph(cam_from_worlds, edges, config.graph)[1:]
     poses: list[Rigid3 | None] = [None] * (max(own) + 1)
     for index, cam_from_world in zip(indices, optimised, strict=True):
@@ -276,8 +350,11 @@ def _held(own: Mapping[int, Rigid3], anchors: Mapping[int, Localization], trust:
     return poses
 
 
-def _trust(own: Mapping[int, Rigid3], anchors: Mapping[int, Localization], config: SessionPosesConfig) -> Trust:
-    """Of the motion from anchor to anchor and of the anchors, not widened: what neighbours share does not scatter."""
+def _trust(
+    own: Mapping[int, Rigid3], anchors: Mapping[int, Localization], config: SessionPosesConfig
+) -> Trust:
+    """Of the motion from anchor to anchor and of the anchors, not widened: what neighbours share
+    does not scatter."""
     seen, moved, spread = list[SeenStep](), Rigid3.identity(), np.zeros((6, 6))
     before = None
     for index, pose in own.items():
@@ -294,9 +371,14 @@ def _trust(own: Mapping[int, Rigid3], anchors: Mapping[int, Localization], confi
     return measured_trust(seen, config.motion_factors, config.answer_factors)
 
 
-def _motion(own_from_a: Rigid3, own_from_b: Rigid3, config: SessionPosesConfig) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
+def _motion(
+    own_from_a: Rigid3, own_from_b: Rigid3, config: SessionPosesConfig
+) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
     """b_from_a, and the covariance of its left perturbation."""
     b_from_a = own_from_b.inverse() @ own_from_a
     way = float(np.linalg.norm(b_from_a.translation))
-    sigma_m, sigma_rad = 0.001 + config.drift * way, 0.0005 + config.turn_drift * (way + b_from_a.angle())
+    sigma_m, sigma_rad = (
+        0.001 + config.drift * way,
+        0.0005 + config.turn_drift * (way + b_from_a.angle()),
+    )
     return b_from_a, np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3)

@@ -1,8 +1,10 @@
-"""Where a session of a single camera was taken: what the map answers to its pictures as a stream holds the camera's own odometry.
+"""Where a session of a single camera was taken: what the map answers to its pictures as a stream
+holds the camera's own odometry.
 
-The map gives a stretch of odometry (`slam/single_camera.py`) its metres and its place; the odometry carries the poses into what the map
-does not know, and answers that contradict it count for nothing. A stretch that too few answers hold has no odometry: of its frames those
-have a pose whose answers agree with one another under it. Where there is no odometry at all, the map is believed as a stream.
+The map gives a stretch of odometry (`slam/single_camera.py`) its metres and its place; the odometry
+carries the poses into what the map does not know, and answers that contradict it count for nothing.
+A stretch that too few answers hold has no odometry: of its frames those have a pose whose answers
+agree with one another under it. Where there is no odometry at all, the map is believed as a stream.
 """
 
 from __future__ import annotations
@@ -32,7 +34,11 @@ _AROUND = 3
 
 
 def poses_by_map(
-    sequence: StereoSequence, tracker: Tracker, of_map: MapConfig, config: SessionPosesConfig, progress: Progress
+    sequence: StereoSequence,
+    tracker: Tracker,
+    of_map: MapConfig,
+    config: SessionPosesConfig,
+    progress: Progress,
 ) -> SessionPoses:
     """Of a session without poses. Frames so far apart as nodes are the answers.
 
@@ -41,32 +47,54 @@ def poses_by_map(
         CalibrationError: it has none, or the pictures contradict it.
         UnreadableImageError, QueryError: from its pictures.
     """
-    by_map, seen, results = dict[int, Rigid3](), dict[int, Localization](), list[Localization | NotLocalized]()
+    by_map, seen, results = (
+        dict[int, Rigid3](),
+        dict[int, Localization](),
+        list[Localization | NotLocalized](),
+    )
     odometry = SingleCameraOdometry(config.odometry)
     for index, t_ns in enumerate(sequence.t_ns):
         frame = sequence[index]
         if frame.camera is None:
-            raise CalibrationError(f"{sequence.name}: a session that the map is asked for needs a calibration (--camera)")
+            raise CalibrationError(
+                f"{sequence.name}: a session that the map is asked for needs a calibration"
+                " (--camera)"
+            )
         odometry.process(index, frame)
         found = tracker.process(frame.image, frame.camera, t_ns)
         results.append(found.result)
-        if found.state in ("localized", "tracked") and found.smoothed is not None and isinstance(found.result, Localization):
+        if (
+            found.state in ("localized", "tracked")
+            and found.smoothed is not None
+            and isinstance(found.result, Localization)
+        ):
             by_map[index], seen[index] = found.smoothed, found.result
         progress(f"localizing {sequence.name}", index + 1, len(sequence))
     check_calibration(sequence.name, results)
     if len(by_map) < config.min_agreeing:
         check_by_other_focal_lengths(sequence, range(len(sequence)), tracker.localizer)
-        raise TrajectoryError(f"{sequence.name}: the map recognises {len(by_map)} of its {len(sequence)} pictures: too few to join")
+        raise TrajectoryError(
+            f"{sequence.name}: the map recognises {len(by_map)} of its {len(sequence)} pictures:"
+            " too few to join"
+        )
     d_thresh = of_map.nodes.d_thresh
     assert d_thresh is not None, "a map's own configuration is resolved"
-    clear = {index for index, answer in seen.items() if answer.position_sigma_m <= config.max_sigma * d_thresh}
-    poses: list[Rigid3 | None] = [by_map[index] if index in clear else None for index in range(len(sequence))]
+    clear = {
+        index
+        for index, answer in seen.items()
+        if answer.position_sigma_m <= config.max_sigma * d_thresh
+    }
+    poses: list[Rigid3 | None] = [
+        by_map[index] if index in clear else None for index in range(len(sequence))
+    ]
     for stretch in odometry.stretches:
         own = stretch.own_from_cams()
         held, agreeing = held_stretch(sequence.name, own, seen, d_thresh, config)
         if held is not None:
             anchors = {index: seen[index] for index in agreeing}
-            adjusted = adjusted_walk(stretch, held, anchors, config.points_widened, config.adjustment)
+            adjusted = adjusted_walk(
+                stretch, held, anchors, config.points_widened, config.adjustment
+            )
             straight = straightened(adjusted, anchors, d_thresh, config.bend)
             held, agreeing = _undisputed(straight, seen, agreeing, d_thresh, config)
         for index in own:
@@ -74,7 +102,9 @@ def poses_by_map(
             if held is None:
                 poses[index] = by_map[index] if index in agreeing and index in clear else None
             else:
-                poses[index] = _not_denied(held[index] if index < len(held) else None, answer, d_thresh, config)
+                poses[index] = _not_denied(
+                    held[index] if index < len(held) else None, answer, d_thresh, config
+                )
     known = [(index, pose) for index, pose in enumerate(poses) if pose is not None]
     if not known:
         raise TrajectoryError(f"{sequence.name}: {_why_not(seen)}; the map stays as it is")
@@ -89,24 +119,42 @@ def _why_not(seen: Mapping[int, Localization]) -> str:
     if not seen:
         return "what the map answers to its pictures does not agree with their motion"
     known_to = float(np.median([answer.position_sigma_m for answer in seen.values()]))
-    return f"the map knows where its pictures were taken to {known_to:.2f} m only, which is too little to tell how long its way is"
+    return (
+        f"the map knows where its pictures were taken to {known_to:.2f} m only, which is too little"
+        " to tell how long its way is"
+    )
 
 
 def held_stretch(
-    name: str, own: Mapping[int, Rigid3], seen: Mapping[int, Localization], d_thresh: float, config: SessionPosesConfig
+    name: str,
+    own: Mapping[int, Rigid3],
+    seen: Mapping[int, Localization],
+    d_thresh: float,
+    config: SessionPosesConfig,
 ) -> tuple[list[Rigid3 | None] | None, list[int]]:
-    """A stretch of odometry in the map's world, world_from_cam by frame, None where too few answers hold it; and the frames of the answers
-    that agree with it. Frames of which the map and the motion say different things, and either may be right, have no pose."""
+    """A stretch of odometry in the map's world, world_from_cam by frame, None where too few answers
+    hold it; and the frames of the answers that agree with it. Frames of which the map and the
+    motion say different things, and either may be right, have no pose."""
     of_it = {index: answer for index, answer in seen.items() if index in own}
-    agreeing = largest_agreement(own, of_it, config.slack * d_thresh, config.slack_deg, config.scale)
+    agreeing = largest_agreement(
+        own, of_it, config.slack * d_thresh, config.slack_deg, config.scale
+    )
     held = None
-    for _ in range(_REFITTED):  # what agrees but for the drift of the unit agrees once that is known
-        metric = in_metres(own, {index: of_it[index] for index in agreeing}, config.scale) if len(agreeing) >= config.min_agreeing else {}
+    for _ in range(
+        _REFITTED
+    ):  # what agrees but for the drift of the unit agrees once that is known
+        metric = (
+            in_metres(own, {index: of_it[index] for index in agreeing}, config.scale)
+            if len(agreeing) >= config.min_agreeing
+            else {}
+        )
         within = {index: answer for index, answer in of_it.items() if index in metric}
         if len(within) < config.min_agreeing:
             return None, _unrivalled(own, of_it, agreeing, d_thresh, config)
         try:
-            held = held_by(name, metric, within, d_thresh, config, Trust())  # the unit's drift is no random walk
+            held = held_by(
+                name, metric, within, d_thresh, config, Trust()
+            )  # the unit's drift is no random walk
         except TrajectoryError:
             return None, _unrivalled(own, of_it, agreeing, d_thresh, config)
         agreeing = held.agreeing
@@ -116,51 +164,89 @@ def held_stretch(
 
 
 def _unrivalled(
-    own: Mapping[int, Rigid3], of_it: Mapping[int, Localization], agreeing: list[int], d_thresh: float, config: SessionPosesConfig
+    own: Mapping[int, Rigid3],
+    of_it: Mapping[int, Localization],
+    agreeing: list[int],
+    d_thresh: float,
+    config: SessionPosesConfig,
 ) -> list[int]:
-    """The agreeing answers, or none of them where others agree with one another about another way: a place that looks like itself from the
-    other end is answered wrongly for as long as it is in view."""
+    """The agreeing answers, or none of them where others agree with one another about another way:
+    a place that looks like itself from the other end is answered wrongly for as long as it is in
+    view."""
     rest = {index: answer for index, answer in of_it.items() if index not in agreeing}
     rivals = largest_agreement(own, rest, config.slack * d_thresh, config.slack_deg, config.scale)
-    return [] if len(rivals) >= max(config.min_agreeing, config.rival_share * len(agreeing)) else agreeing
+    return (
+        []
+        if len(rivals) >= max(config.min_agreeing, config.rival_share * len(agreeing))
+        else agreeing
+    )
 
 
 def _undisputed(
-    poses: Sequence[Rigid3 | None], seen: Mapping[int, Localization], agreeing: Sequence[int], d_thresh: float, config: SessionPosesConfig
+    poses: Sequence[Rigid3 | None],
+    seen: Mapping[int, Localization],
+    agreeing: Sequence[int],
+    d_thresh: float,
+    config: SessionPosesConfig,
 ) -> tuple[list[Rigid3 | None] | None, list[int]]:
-    """The poses and the agreeing answers without those of which the map and the motion say different things, and either may be right; no
-    poses where too few answers are left to hold them."""
-    of_it = {index: answer for index, answer in seen.items() if index < len(poses) and poses[index] is not None}
-    apart = {index for index, answer in of_it.items() if _contradicts(answer, poses[index], d_thresh, config)}
+    """The poses and the agreeing answers without those of which the map and the motion say
+    different things, and either may be right; no poses where too few answers are left to hold
+    them."""
+    of_it = {
+        index: answer
+        for index, answer in seen.items()
+        if index < len(poses) and poses[index] is not None
+    }
+    apart = {
+        index
+        for index, answer in of_it.items()
+        if _contradicts(answer, poses[index], d_thresh, config)
+    }
     disputed = _disputed(list(of_it), apart)
     left = [None if index in disputed else pose for index, pose in enumerate(poses)]
     holding = [index for index in agreeing if index not in apart]
     return (left, holding) if len(holding) >= config.min_agreeing else (None, [])
 
 
-def _not_denied(pose: Rigid3 | None, answer: Localization | None, d_thresh: float, config: SessionPosesConfig) -> Rigid3 | None:
-    """The pose, unless the map says another one: a node there would contradict those that say so."""
+def _not_denied(
+    pose: Rigid3 | None, answer: Localization | None, d_thresh: float, config: SessionPosesConfig
+) -> Rigid3 | None:
+    """The pose, unless the map says another one: a node there would contradict those that say
+    so."""
     if pose is None or answer is None:
         return pose
     apart = answer.world_from_cam.inverse() @ pose
-    is_near = np.linalg.norm(apart.translation) <= config.slack * d_thresh and np.degrees(apart.angle()) <= config.slack_deg
+    is_near = (
+        np.linalg.norm(apart.translation) <= config.slack * d_thresh
+        and np.degrees(apart.angle()) <= config.slack_deg
+    )
     return pose if is_near else None
 
 
-def _contradicts(answer: Localization, pose: Rigid3 | None, d_thresh: float, config: SessionPosesConfig) -> bool:
+def _contradicts(
+    answer: Localization, pose: Rigid3 | None, d_thresh: float, config: SessionPosesConfig
+) -> bool:
     assert pose is not None
     off = float(np.linalg.norm(answer.world_from_cam.translation - pose.translation))
     return off > config.contradiction * d_thresh + 3.0 * config.widened * answer.position_sigma_m
 
 
 def _disputed(answered: list[int], apart: Set[int]) -> set[int]:
-    """The frames of several answers in a row that contradict the motion, or of a single one with none before it, or none after it, that
-    holds the motion; and a few around them, but for those beyond an answer that does. Between two that hold it the motion is right."""
+    """The frames of several answers in a row that contradict the motion, or of a single one with
+    none before it, or none after it, that holds the motion; and a few around them, but for those
+    beyond an answer that does. Between two that hold it the motion is right."""
     frames = set[int]()
-    runs = [(is_apart, list(run)) for is_apart, run in groupby(answered, lambda index: index in apart)]
+    runs = [
+        (is_apart, list(run)) for is_apart, run in groupby(answered, lambda index: index in apart)
+    ]
     for k, (is_apart, run) in enumerate(runs):
         if is_apart and (len(run) > 1 or k in (0, len(runs) - 1)):
             after = runs[k - 1][1][-1] if k > 0 else -1
             before = runs[k + 1][1][0] if k + 1 < len(runs) else run[-1] + 1
-            frames.update(j for index in run for j in range(index - _AROUND, index + _AROUND + 1) if after < j < before)
+            frames.update(
+                j
+                for index in run
+                for j in range(index - _AROUND, index + _AROUND + 1)
+                if after < j < before
+            )
     return frames

@@ -1,5 +1,5 @@
-"""Which tile of an atlas is a recording of? A sample of its pictures is asked of the atlas; what most answers name takes it, clearly or not
-at all."""
+"""Which tile of an atlas is a recording of? A sample of its pictures is asked of the atlas; what
+most answers name takes it, clearly or not at all."""
 
 from __future__ import annotations
 
@@ -31,8 +31,14 @@ class TileChoiceConfig:
     """... and this share of those that are localized in it, or in tiles of one world with it."""
 
 
-def tile_of_recording(localizer: AtlasLocalizer, sequence: StereoSequence, config: TileChoiceConfig, progress: Progress) -> Tile:
-    """The tile that a recording's pictures are of: of several of one world the one in which most of them are localized.
+def tile_of_recording(
+    localizer: AtlasLocalizer,
+    sequence: StereoSequence,
+    config: TileChoiceConfig,
+    progress: Progress,
+) -> Tile:
+    """The tile that a recording's pictures are of: of several of one world the one in which most of
+    them are localized.
 
     Raises:
         ConfigError: a setting is out of its bounds.
@@ -40,7 +46,11 @@ def tile_of_recording(localizer: AtlasLocalizer, sequence: StereoSequence, confi
         UnreadableImageError, QueryError, AtlasError: as of `AtlasLocalizer.localize`.
     """
     check_bounds(config)
-    rows = np.unique(np.linspace(0, max(len(sequence) - 1, 0), min(config.num_asked, len(sequence))).round().astype(int)).tolist()
+    rows = np.unique(
+        np.linspace(0, max(len(sequence) - 1, 0), min(config.num_asked, len(sequence)))
+        .round()
+        .astype(int)
+    ).tolist()
     answers = list[Localization]()
     for done, row in enumerate(rows):
         frame = sequence[row]
@@ -51,21 +61,39 @@ def tile_of_recording(localizer: AtlasLocalizer, sequence: StereoSequence, confi
     return chosen_tile(sequence.name, len(rows), answers, localizer.atlas.manifest.by_id, config)
 
 
-def chosen_tile(name: str, num_asked: int, answers: Sequence[Localization], tiles: Mapping[str, Tile], config: TileChoiceConfig) -> Tile:
-    """The tile that these answers of so many pictures of the recording `name` speak for. Raises TrajectoryError."""
-    counts = Counter(answer.provenance.tile for answer in answers if answer.provenance.tile is not None)
+def chosen_tile(
+    name: str,
+    num_asked: int,
+    answers: Sequence[Localization],
+    tiles: Mapping[str, Tile],
+    config: TileChoiceConfig,
+) -> Tile:
+    """The tile that these answers of so many pictures of the recording `name` speak for. Raises
+    TrajectoryError."""
+    counts = Counter(
+        answer.provenance.tile for answer in answers if answer.provenance.tile is not None
+    )
     if not counts or max(counts.values()) < config.min_answers:
-        raise TrajectoryError(f"{name}: no tile recognises it: {_said(counts)} of {num_asked} pictures asked; the atlas stays as it is")
+        raise TrajectoryError(
+            f"{name}: no tile recognises it: {_said(counts)} of {num_asked} pictures asked; the"
+            " atlas stays as it is"
+        )
     best = min(counts, key=lambda tile_id: (-counts[tile_id], tile_id))
     world = tiles[best].in_joint_world.joint
-    of_world = sum(number for tile_id, number in counts.items() if tiles[tile_id].in_joint_world.joint == world)
+    of_world = sum(
+        number for tile_id, number in counts.items() if tiles[tile_id].in_joint_world.joint == world
+    )
     if of_world < config.min_share * counts.total():
         raise TrajectoryError(
-            f"{name}: it looks like several tiles: {_said(counts)} of {num_asked} pictures asked; the atlas stays as it is"
+            f"{name}: it looks like several tiles: {_said(counts)} of {num_asked} pictures asked;"
+            " the atlas stays as it is"
         )
     return tiles[best]
 
 
 def _said(counts: Counter[str]) -> str:
     """How many pictures each tile knows, the most first."""
-    return ", ".join(f"{tile_id} knows {number}" for tile_id, number in counts.most_common(4)) or "none knows any"
+    return (
+        ", ".join(f"{tile_id} knows {number}" for tile_id, number in counts.most_common(4))
+        or "none knows any"
+    )

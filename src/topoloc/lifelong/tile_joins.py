@@ -1,11 +1,13 @@
 """Do two maps overlap, and how do they lie to each other? Read from `joined`.
 
-Maps of overlapping pieces of one recording have pictures in common, which say it at once (`shared_pictures.py`). Of all others, nodes of
-either are asked of the other as pictures would be, those that look most alike first. Each answer says how the maps lie to each other; what
-enough of them agree on, from pictures of which none counts twice, is taken for true (`transform_consensus.py`) if it stands a test: of the
-nodes that then stand about where one of the other map stands, nearly all must be recognised there, and nearly all that they match before
-a pose is known must agree with it. Two corridors of one plan agree by the centimetre on what they share; but what one of them has and the
-other has not is matched with something else.
+Maps of overlapping pieces of one recording have pictures in common, which say it at once
+(`shared_pictures.py`). Of all others, nodes of either are asked of the other as pictures would be,
+those that look most alike first. Each answer says how the maps lie to each other; what enough of
+them agree on, from pictures of which none counts twice, is taken for true
+(`transform_consensus.py`) if it stands a test: of the nodes that then stand about where one of the
+other map stands, nearly all must be recognised there, and nearly all that they match before a pose
+is known must agree with it. Two corridors of one plan agree by the centimetre on what they share;
+but what one of them has and the other has not is matched with something else.
 """
 
 from __future__ import annotations
@@ -46,29 +48,36 @@ class TileJoinConfig:
     max_pairs: Annotated[int, Between(0, 1_000_000)] = 10_000
     """Pairs of tiles that are compared at most, the most alike first."""
     min_likeness: Annotated[float, Between(-1, 1)] = 0.35
-    """Tiles whose most similar places (the median of the best few) are less like each other than this are not compared."""
+    """Tiles whose most similar places (the median of the best few) are less like each other than
+    this are not compared."""
     num_probed: Annotated[int, Between(1, 1000)] = 8
-    """Nodes of either tile that are asked of the other first; where it recognises none, no further ones are asked."""
+    """Nodes of either tile that are asked of the other first; where it recognises none, no further
+    ones are asked."""
     num_asked: Annotated[int, Between(1, 10_000)] = 32
     """Nodes of either tile that are asked of the other at most."""
-    consensus: ConsensusConfig = field(default_factory=lambda: ConsensusConfig(min_independent=3, rival_share=0.34))
+    consensus: ConsensusConfig = field(
+        default_factory=lambda: ConsensusConfig(min_independent=3, rival_share=0.34)
+    )
     along: DriftConfig = field(default_factory=lambda: DriftConfig(0.01, 0.1))
     """How wrong the way between two nodes of a tile may be."""
     widened: Annotated[float, Above(0)] = 3.0
-    """Answers are trusted as if their sigmas were so many times as large: neighbours share errors of the map."""
+    """Answers are trusted as if their sigmas were so many times as large: neighbours share errors
+    of the map."""
     sigma: Annotated[float, Above(0)] = 0.01
     """Metres by which an answer may be wrong (one sigma), besides, ..."""
     sigma_deg: Annotated[float, Above(0)] = 0.2
     """... and degrees."""
     near: Annotated[float, Above(0)] = 3.0
-    """A node that stands so many D_thresh (distance of Eq. 1) from one of the other tile, or nearer, must be recognised."""
+    """A node that stands so many D_thresh (distance of Eq. 1) from one of the other tile, or
+    nearer, must be recognised."""
     min_near: Annotated[int, AtLeast(1)] = 12
     """Such nodes there must be, of both tiles together; ..."""
     min_recognised: Annotated[float, Between(0, 1)] = 0.9
     """... this share of them must be recognised where the join has them, ..."""
     min_agreeing: Annotated[float, Between(0, 1)] = 0.75
-    """... and of three in four of them this share of the matches that no pose guided must agree with the pose: another place of the same
-    plan matches as many, but what differs is matched with something else."""
+    """... and of three in four of them this share of the matches that no pose guided must agree
+    with the pose: another place of the same plan matches as many, but what differs is matched with
+    something else."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,11 +109,12 @@ class OpenTile:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """How two maps lie to each other; the covariance is that of the left perturbation of `first_from_second` (m, rad).
+    """How two maps lie to each other; the covariance is that of the left perturbation of
+    `first_from_second` (m, rad).
 
-    `num_agreeing` pictures say so: the same ones of both maps (`is_by_shared`), or nodes of either that are recognised in the other. Of
-    these, `num_near` must be recognised and `num_recognised` are; in three in four of them at least the share `agreeing` of the matches
-    agrees with the pose.
+    `num_agreeing` pictures say so: the same ones of both maps (`is_by_shared`), or nodes of either
+    that are recognised in the other. Of these, `num_near` must be recognised and `num_recognised`
+    are; in three in four of them at least the share `agreeing` of the matches agrees with the pose.
     """
 
     first_from_second: Rigid3
@@ -137,23 +147,31 @@ def joined(first: OpenTile, second: OpenTile, config: TileJoinConfig) -> Found |
 
     Raises:
         MapError: a map cannot be read.
-        FeatureKindError, MissingExtraError, WeightsError: the maps' features cannot be compared here.
+        FeatureKindError, MissingExtraError, WeightsError: the maps' features cannot be compared
+            here.
     """
     shared = by_shared_pictures(first.topomap, second.topomap, config.along, config.consensus)
     if shared is not None:
         return Found(*shared, is_by_shared=True)
-    is_of_kinds = any(set(one.topomap.kinds) <= set(other.topomap.kinds) for one, other in ((first, second), (second, first)))
+    is_of_kinds = any(
+        set(one.topomap.kinds) <= set(other.topomap.kinds)
+        for one, other in ((first, second), (second, first))
+    )
     if not is_of_kinds or not first.vectors.keys() & second.vectors.keys():
         return NotJoined("their features are not of the same kinds")
     return _Comparison(first, second, config).verdict()
 
 
 class _Comparison:
-    """Two tiles, and what each has answered so far to the other's nodes, by their rows; None where it does not know the place."""
+    """Two tiles, and what each has answered so far to the other's nodes, by their rows; None where
+    it does not know the place."""
 
     def __init__(self, first: OpenTile, second: OpenTile, config: TileJoinConfig) -> None:
         self._tiles, self._config = (first, second), config
-        self._answers: tuple[dict[int, Localization | None], ...] = ({}, {})  # of the first to the second's nodes, of the second
+        self._answers: tuple[dict[int, Localization | None], ...] = (
+            {},
+            {},
+        )  # of the first to the second's nodes, of the second
 
     def verdict(self) -> Found | NotJoined:
         config = self._config
@@ -166,45 +184,73 @@ class _Comparison:
         if isinstance(found, NotJoined):
             return found
         consensus, ends = found
-        first_from_second = self._tiles[0].world_from_node(ends[0]) @ consensus.a_from_b @ self._tiles[1].world_from_node(ends[1]).inverse()
+        first_from_second = (
+            self._tiles[0].world_from_node(ends[0])
+            @ consensus.a_from_b
+            @ self._tiles[1].world_from_node(ends[1]).inverse()
+        )
         near = self._near(first_from_second)
         self._ask(near)
         tested = self._tested(first_from_second, near)
         to_world = self._tiles[0].world_from_node(ends[0]).adjoint()
         covariance = to_world @ consensus.covariance @ to_world.T
-        joint = Found(first_from_second, 0.5 * (covariance + covariance.T), int(np.count_nonzero(consensus.agrees)), *tested)
+        joint = Found(
+            first_from_second,
+            0.5 * (covariance + covariance.T),
+            int(np.count_nonzero(consensus.agrees)),
+            *tested,
+        )
         return self._judged(joint)
 
     def _judged(self, found: Found) -> Found | NotJoined:
         config = self._config
         if found.num_near < config.min_near:
-            return NotJoined(f"{found.num_agreeing} answers agree, but only {found.num_near} nodes stand near one of the other tile")
+            return NotJoined(
+                f"{found.num_agreeing} answers agree, but only {found.num_near} nodes stand near"
+                " one of the other tile"
+            )
         if found.num_recognised < config.min_recognised * found.num_near:
             return NotJoined(
-                f"{found.num_agreeing} answers agree, but {found.num_near - found.num_recognised} of {found.num_near} nodes that should be "
-                "recognised are not"
+                f"{found.num_agreeing} answers agree, but {found.num_near - found.num_recognised}"
+                f" of {found.num_near} nodes that should be recognised are not"
             )
         if found.agreeing < config.min_agreeing:
-            return NotJoined(f"{found.num_agreeing} answers agree, but {1.0 - found.agreeing:.0%} of what is matched there does not")
+            return NotJoined(
+                f"{found.num_agreeing} answers agree, but {1.0 - found.agreeing:.0%} of what is"
+                " matched there does not"
+            )
         return found
 
     def _likeliest(self) -> list[list[int]]:
-        """The nodes of the second tile, and of the first, by how alike the other's most similar place looks."""
+        """The nodes of the second tile, and of the first, by how alike the other's most similar
+        place looks."""
         first, second = (tile.vectors for tile in self._tiles)
         kind = [kind for kind in first if kind in second][-1]
         alike = first[kind] @ second[kind].T
         return [np.argsort(-alike.max(axis=side), kind="stable").tolist() for side in (0, 1)]
 
     def _ask(self, rows: Sequence[Sequence[int]]) -> None:
-        """Nodes of the second tile of the first, and nodes of the first of the second, where these were not asked before."""
-        for asked, of, known, wanted in zip(self._tiles, self._tiles[::-1], self._answers, rows, strict=True):
+        """Nodes of the second tile of the first, and nodes of the first of the second, where these
+        were not asked before."""
+        for asked, of, known, wanted in zip(
+            self._tiles, self._tiles[::-1], self._answers, rows, strict=True
+        ):
             if set(asked.topomap.kinds) <= set(of.topomap.kinds):
-                known.update(ask_nodes(asked.localizer, of.topomap, [row for row in wanted if row not in known]))
+                known.update(
+                    ask_nodes(
+                        asked.localizer, of.topomap, [row for row in wanted if row not in known]
+                    )
+                )
 
     def _localized(self) -> list[list[_Answer]]:
-        """The answers that have a pose, of the first tile and of the second; an empty list where neither has any."""
+        """The answers that have a pose, of the first tile and of the second; an empty list where
+        neither has any."""
         found = [
-            [_Answer(row, asked.topomap.row_of(result.node_id), result) for row, result in known.items() if result is not None]
+            [
+                _Answer(row, asked.topomap.row_of(result.node_id), result)
+                for row, result in known.items()
+                if result is not None
+            ]
             for asked, known in zip(self._tiles, self._answers, strict=True)
         ]
         return found if any(found) else []
@@ -213,48 +259,82 @@ class _Comparison:
         """How two nodes, one of either tile, lie to each other, and which these are."""
         by_first, by_second = self._localized()
         answers = [*by_first, *by_second]
-        pairs = [(one.by, one.asked) for one in by_first] + [(one.asked, one.by) for one in by_second]
+        pairs = [(one.by, one.asked) for one in by_first] + [
+            (one.asked, one.by) for one in by_second
+        ]
         ends = pairs[int(np.argmax([one.result.num_inliers for one in answers]))]
         estimates, covariances = [], []
         for number, one in enumerate(answers):
             estimate, covariance = self._estimate(one, ends, is_by_second=number >= len(by_first))
             estimates.append(estimate)
             covariances.append(covariance)
-        consensus = find_consensus(estimates, np.stack(covariances), self._config.consensus, np.array(pairs))
-        return NotJoined(f"{len(answers)} nodes are recognised, but do not agree") if consensus is None else (consensus, ends)
+        consensus = find_consensus(
+            estimates, np.stack(covariances), self._config.consensus, np.array(pairs)
+        )
+        return (
+            NotJoined(f"{len(answers)} nodes are recognised, but do not agree")
+            if consensus is None
+            else (consensus, ends)
+        )
 
-    def _estimate(self, one: _Answer, ends: tuple[int, int], is_by_second: bool) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
+    def _estimate(
+        self, one: _Answer, ends: tuple[int, int], is_by_second: bool
+    ) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
         """How the nodes `ends` lie to each other as an answer has it: first_from_second."""
         config, (first, second) = self._config, self._tiles
         by = second if is_by_second else first
         node_from_world = by.world_from_node(one.by).inverse()
         adjoint = node_from_world.adjoint()
         by_from_asked = node_from_world @ one.result.world_from_cam
-        covariance = config.widened**2 * adjoint @ one.result.covariance @ adjoint.T + diagonal_covariance(config.sigma, config.sigma_deg)
+        covariance = (
+            config.widened** 2 * adjoint @ one.result.covariance @ adjoint.T
+            + diagonal_covariance(config.sigma, config.sigma_deg)
+        )
         a, b = one.by, one.asked
         if is_by_second:
-            covariance, by_from_asked = covariance_of_inverse(by_from_asked, covariance), by_from_asked.inverse()
+            covariance, by_from_asked = (
+                covariance_of_inverse(by_from_asked, covariance),
+                by_from_asked.inverse(),
+            )
             a, b = b, a
         to_first = first.world_from_node(ends[0]).inverse() @ first.world_from_node(a)
         from_second = second.world_from_node(b).inverse() @ second.world_from_node(ends[1])
         return carried(to_first, by_from_asked, covariance, from_second, config.along)
 
     def _near(self, first_from_second: Rigid3) -> list[list[int]]:
-        """Nodes of the second tile, and of the first, that the join has near one of the other, at most `num_asked` each, evenly."""
+        """Nodes of the second tile, and of the first, that the join has near one of the other, at
+        most `num_asked` each, evenly."""
         rows = []
-        for asked, of, pose in zip(self._tiles, self._tiles[::-1], (first_from_second, first_from_second.inverse()), strict=True):
+        for asked, of, pose in zip(
+            self._tiles,
+            self._tiles[::-1],
+            (first_from_second, first_from_second.inverse()),
+            strict=True,
+        ):
             d_thresh, lambda_rot = asked.apart
-            apart = [node_distances(pose @ summary.world_from_cam, asked.poses, lambda_rot).min() for summary in of.topomap.summaries]
+            apart = [
+                node_distances(pose @ summary.world_from_cam, asked.poses, lambda_rot).min()
+                for summary in of.topomap.summaries
+            ]
             near = np.flatnonzero(np.array(apart) <= self._config.near * d_thresh)
-            chosen = np.unique(np.linspace(0, len(near) - 1, min(len(near), self._config.num_asked)).round().astype(int))
+            chosen = np.unique(
+                np.linspace(0, len(near) - 1, min(len(near), self._config.num_asked))
+                .round()
+                .astype(int)
+            )
             rows.append(near[chosen].tolist() if len(near) else [])
         return rows
 
-    def _tested(self, first_from_second: Rigid3, near: Sequence[Sequence[int]]) -> tuple[int, int, float]:
-        """How many nodes must be recognised, how many are, and what share of the matches agrees with their pose in three in four of all."""
+    def _tested(
+        self, first_from_second: Rigid3, near: Sequence[Sequence[int]]
+    ) -> tuple[int, int, float]:
+        """How many nodes must be recognised, how many are, and what share of the matches agrees
+        with their pose in three in four of all."""
         num_there, shares = 0, list[float]()
         poses = (first_from_second, first_from_second.inverse())
-        for asked, of, known, rows, pose in zip(self._tiles, self._tiles[::-1], self._answers, near, poses, strict=True):
+        for asked, of, known, rows, pose in zip(
+            self._tiles, self._tiles[::-1], self._answers, near, poses, strict=True
+        ):
             d_thresh, _ = asked.apart
             for row in rows:
                 if row not in known:
@@ -270,7 +350,9 @@ def _is_there(result: Localization | None, world_from_cam: Rigid3, d_thresh: flo
     if result is None:
         return False
     off = result.world_from_cam.inverse() @ world_from_cam
-    return bool(np.linalg.norm(off.translation) <= 0.3 * d_thresh and np.degrees(off.angle()) <= 2.0)
+    return bool(
+        np.linalg.norm(off.translation) <= 0.3 * d_thresh and np.degrees(off.angle()) <= 2.0
+    )
 
 
 def _agreeing_share(result: Localization | None) -> float:

@@ -20,14 +20,17 @@ T = TypeVar("T")
 
 
 def edited_tile(where: str, tile_id: str, edit: Callable[[Path], T]) -> tuple[Tile, T]:
-    """The tile with its map edited, in the same world and with the same joins, and what the edit says.
+    """The tile with its map edited, in the same world and with the same joins, and what the edit
+    says.
 
     Args:
-        edit: edits the map file at a path, a copy, as `map/edit.py` does; the undo file beside it is kept with the tile. It is called again
-            where another writer replaced the tile meanwhile.
+        edit: edits the map file at a path, a copy, as `map/edit.py` does; the undo file beside it
+            is kept with the tile. It is called again where another writer replaced the tile
+            meanwhile.
 
     Raises:
-        AtlasError: there is no such atlas or tile, it cannot be read or written, or others replaced it again and again.
+        AtlasError: there is no such atlas or tile, it cannot be read or written, or others replaced
+            it again and again.
         TopolocError: as of `edit`; the atlas is as it was.
     """
     for _ in range(_MAX_TRIES):
@@ -44,7 +47,10 @@ def edited_tile(where: str, tile_id: str, edit: Callable[[Path], T]) -> tuple[Ti
             after = replace_tile(where, NewTile(tile_id, path, before.world, before.recipe), before)
         if after is not None:
             return after.by_id[tile_id], done
-    raise AtlasError(f"{where}: tile {tile_id} was replaced by others {_MAX_TRIES} times meanwhile; it stays as they left it")
+    raise AtlasError(
+        f"{where}: tile {tile_id} was replaced by others {_MAX_TRIES} times meanwhile; it stays as"
+        " they left it"
+    )
 
 
 def _of_tile(edit: Callable[[Path], T], path: Path, name: str) -> T:
@@ -60,6 +66,11 @@ def _copy(atlas: Atlas, stored: StoredFile, path: Path) -> None:
     try:
         shutil.copyfile(atlas.store.local(stored.name, stored.sha256), path)
     except OSError as error:
-        raise AtlasError(f"cannot copy {stored.name} of {atlas.store.where}: {error.strerror}") from None
+        raise AtlasError(
+            f"cannot copy {stored.name} of {atlas.store.where}: {error.strerror}"
+        ) from None
     if sha256_of(path) != stored.sha256:
-        raise AtlasError(f"{stored.name} of {atlas.store.where} is not the file that was added: its checksum is another")
+        raise AtlasError(
+            f"{stored.name} of {atlas.store.where} is not the file that was added: its checksum is"
+            " another"
+        )

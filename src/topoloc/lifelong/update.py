@@ -1,9 +1,10 @@
 """A new session joins a map: read from `update_map`.
 
-The session is first put where it was taken (`session_poses.py`). Where the map localizes its pictures well, nothing is added but what they
-saw of the landmarks that are there already: these counts tell later what is gone. Where it does not (new places, another light, a changed
-room), the session's own pictures become nodes, as if a map were built of them, and the pictures around teach the coarse localizers
-the way to these nodes. Nothing of what the map had is changed or dropped.
+The session is first put where it was taken (`session_poses.py`). Where the map localizes its
+pictures well, nothing is added but what they saw of the landmarks that are there already: these
+counts tell later what is gone. Where it does not (new places, another light, a changed room), the
+session's own pictures become nodes, as if a map were built of them, and the pictures around teach
+the coarse localizers the way to these nodes. Nothing of what the map had is changed or dropped.
 """
 
 from __future__ import annotations
@@ -25,14 +26,27 @@ from topoloc.lifelong.earlier_recall import earlier_recall
 from topoloc.lifelong.grown_sides import grown_sides, new_walls
 from topoloc.lifelong.observed_nodes import observe_node
 from topoloc.lifelong.overlay import Overlay
-from topoloc.lifelong.session_poses import Progress, SessionPoses, SessionPosesConfig, poses_by_motion
+from topoloc.lifelong.session_poses import (
+    Progress,
+    SessionPoses,
+    SessionPosesConfig,
+    poses_by_motion,
+)
 from topoloc.lifelong.single_camera_poses import poses_by_map
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.building import with_map_facts
 from topoloc.localization.result import Localization
 from topoloc.map.drafts import NodeDraft, draft_node, finish_node, observe
 from topoloc.map.landmarks import Observations, counted_again
-from topoloc.map.mapping_frames import PLACE_QUALITY, MappingFrame, MappingImage, PointLocator, mapping_image, posed_frames, small_jpeg
+from topoloc.map.mapping_frames import (
+    PLACE_QUALITY,
+    MappingFrame,
+    MappingImage,
+    PointLocator,
+    mapping_image,
+    posed_frames,
+    small_jpeg,
+)
 from topoloc.map.nodes import NodePoses, node_distances
 from topoloc.map.sessions import Light, Session, mean_light, path_of
 from topoloc.map.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
@@ -52,15 +66,18 @@ class UpdateConfig:
     min_inliers: Annotated[int, Between(1, 10_000)] = 60
     """A picture that the map localizes with at least so many inliers ..."""
     max_sigma: Annotated[float, Above(0)] = 0.3
-    """... and to within so many D_thresh (a sigma of its position, without what the map's points are wrong by together, which nodes that
-    the map itself holds in place would share) needs no node."""
+    """... and to within so many D_thresh (a sigma of its position, without what the map's points
+    are wrong by together, which nodes that the map itself holds in place would share) needs no
+    node."""
     earlier_asked: Annotated[int, Between(0, 10_000)] = 24
-    """Nodes of earlier sessions, at most, that the map is asked before and after, for its history to tell what the edit cost; 0: none."""
+    """Nodes of earlier sessions, at most, that the map is asked before and after, for its history
+    to tell what the edit cost; 0: none."""
 
 
 @dataclass(frozen=True, eq=False)
 class MapUpdate:
-    """The map with the session in it, the session with its poses in the map's world, and what changed: numbers and texts by their names."""
+    """The map with the session in it, the session with its poses in the map's world, and what
+    changed: numbers and texts by their names."""
 
     topomap: TopoMetricMap
     sequence: StereoSequence
@@ -69,8 +86,8 @@ class MapUpdate:
 
 @dataclass(frozen=True, eq=False)
 class _Joined:
-    """What the session brings: its nodes by kind of features and their side nodes, its pictures with the nodes that they belong to, what it
-    saw of nodes that were there, and its light."""
+    """What the session brings: its nodes by kind of features and their side nodes, its pictures
+    with the nodes that they belong to, what it saw of nodes that were there, and its light."""
 
     nodes: dict[str, list[TopoNode]]
     sides: list[TopoNode]
@@ -91,8 +108,10 @@ def update_map(
     """The map with one more session in it.
 
     Args:
-        sequence: with poses in any metric world, or, where `poses_from` is `map`, pictures of a stream.
-        poses_from: where its poses come from, for the map to remember; `map`: the map is asked for every picture.
+        sequence: with poses in any metric world, or, where `poses_from` is `map`, pictures of a
+            stream.
+        poses_from: where its poses come from, for the map to remember; `map`: the map is asked for
+            every picture.
 
     Raises:
         ConfigError: a setting is out of its bounds.
@@ -117,10 +136,23 @@ def update_map(
     session = _session(session_id, sequence, frames, joined, poses_from)
     taught = taught_places(topomap, joined.views, joined.images)
     changed = replace(_with_session(topomap, session, frames, joined), coarse_models=taught.models)
-    changes = {"session": session_id, "recording": sequence.name, "frames": len(sequence), "frames_with_pose": len(frames)}
-    changes |= {"poses_from": poses_from} | _counts(held, joined, topomap.kind) | {"not_taught": taught.not_taught}
+    changes = {
+        "session": session_id,
+        "recording": sequence.name,
+        "frames": len(sequence),
+        "frames_with_pose": len(frames),
+    }
+    changes |= (
+        {"poses_from": poses_from}
+        | _counts(held, joined, topomap.kind)
+        | {"not_taught": taught.not_taught}
+    )
     changed = with_map_facts(changed, progress)
-    return MapUpdate(changed, posed, changes | earlier_recall(topomap, changed, config.earlier_asked, localizer_config))
+    return MapUpdate(
+        changed,
+        posed,
+        changes | earlier_recall(topomap, changed, config.earlier_asked, localizer_config),
+    )
 
 
 def _counts(held: SessionPoses, joined: _Joined, kind: str) -> dict[str, Any]:
@@ -137,8 +169,8 @@ def _counts(held: SessionPoses, joined: _Joined, kind: str) -> dict[str, Any]:
 
 
 def refuse_known(topomap: TopoMetricMap, sequence: StereoSequence) -> None:
-    """A session that is in the map already is not doubled. Names and clocks may be those of another day: pictures, or paths, decide.
-    Raises SessionKnownError."""
+    """A session that is in the map already is not doubled. Names and clocks may be those of another
+    day: pictures, or paths, decide. Raises SessionKnownError."""
     if len(sequence) == 0:
         return
     times, path = (min(sequence.t_ns), max(sequence.t_ns)), path_of(sequence)
@@ -150,24 +182,41 @@ def refuse_known(topomap: TopoMetricMap, sequence: StereoSequence) -> None:
         is_there = path is not None and path == session.recording
         is_same_file = is_there and (session.start_ns, session.end_ns) == times
         if is_same_file or _shows_the_same(topomap, session.session_id, sequence, is_there):
-            raise SessionKnownError(f"{sequence.name}: it is in the map already, as session {session.session_id}; the map stays as it is")
+            raise SessionKnownError(
+                f"{sequence.name}: it is in the map already, as session {session.session_id}; the"
+                " map stays as it is"
+            )
 
 
-def _shows_the_same(topomap: TopoMetricMap, session_id: int, sequence: StereoSequence, is_there: bool) -> bool:
-    """Whether pictures of one name are one picture, by what the map keeps of them. Of the same folder (`is_there`) other pictures of the
-    same time are the same session, too: every second frame, and then those between."""
+def _shows_the_same(
+    topomap: TopoMetricMap, session_id: int, sequence: StereoSequence, is_there: bool
+) -> bool:
+    """Whether pictures of one name are one picture, by what the map keeps of them. Of the same
+    folder (`is_there`) other pictures of the same time are the same session, too: every second
+    frame, and then those between."""
     rows = {name: index for index, name in enumerate(sequence.names)}
     kept = [image for image in topomap.place_images if image.session_id == session_id]
     common = [image for image in kept if image.name in rows]
     if not common:
         return is_there and bool(kept)
-    tried = [common[k] for k in np.unique(np.linspace(0, len(common) - 1, _PICTURES_COMPARED).astype(int))]
+    tried = [
+        common[k]
+        for k in np.unique(np.linspace(0, len(common) - 1, _PICTURES_COMPARED).astype(int))
+    ]
     side = topomap.config.place_side_px
-    return any(small_jpeg(frame_view(sequence[rows[image.name]], False).picture, side, PLACE_QUALITY) == image.jpeg for image in tried)
+    return any(
+        small_jpeg(frame_view(sequence[rows[image.name]], False).picture, side, PLACE_QUALITY)
+        == image.jpeg
+        for image in tried
+    )
 
 
 def _joined(
-    topomap: TopoMetricMap, frames: Sequence[MappingFrame], held: SessionPoses, config: UpdateConfig, progress: Progress
+    topomap: TopoMetricMap,
+    frames: Sequence[MappingFrame],
+    held: SessionPoses,
+    config: UpdateConfig,
+    progress: Progress,
 ) -> _Joined:
     of_map = topomap.config
     d_thresh, lambda_rot = of_map.nodes.d_thresh, of_map.nodes.lambda_rot
@@ -175,7 +224,11 @@ def _joined(
     assert lambda_rot is not None
     locator = PointLocator(frames, of_map)
     by_index = {frame.index: frame for frame in frames}
-    wanted = [by_index[k] for k, answer in held.answers.items() if k in by_index and not is_well_held(answer, d_thresh, config)]
+    wanted = [
+        by_index[k]
+        for k, answer in held.answers.items()
+        if k in by_index and not is_well_held(answer, d_thresh, config)
+    ]
     with_sides = new_walls(topomap, [frame.world_from_cam for frame in wanted])
     drafts = list[NodeDraft]()
     for done, frame in enumerate(wanted):
@@ -183,29 +236,47 @@ def _joined(
         if len(draft.points[topomap.kind].features) >= of_map.min_node_points:
             drafts.append(draft)
         progress("new nodes", done + 1, len(wanted))
-    covered = {by_index[k] for k in held.answers if k in by_index} - {draft.frame for draft in drafts}
-    joined = _Joined({kind: [] for kind in topomap.kinds}, [], [], {kind: [] for kind in topomap.kinds}, defaultdict(list), [])
+    covered = {by_index[k] for k in held.answers if k in by_index} - {
+        draft.frame for draft in drafts
+    }
+    joined = _Joined(
+        {kind: [] for kind in topomap.kinds},
+        [],
+        [],
+        {kind: [] for kind in topomap.kinds},
+        defaultdict(list),
+        [],
+    )
     old = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
     new = NodePoses.of([draft.image.world_from_cam for draft in drafts]) if drafts else None
     drafted = {draft.frame: draft.image for draft in drafts}
     first_id = topomap.free_ids.node
     for done, frame in enumerate(frames):
         to_old = node_distances(frame.world_from_cam, old, lambda_rot)
-        to_new = np.zeros(0) if new is None else node_distances(frame.world_from_cam, new, lambda_rot)
+        to_new = (
+            np.zeros(0) if new is None else node_distances(frame.world_from_cam, new, lambda_rot)
+        )
         is_of_new = len(to_new) > 0 and (to_new.min() <= max(d_thresh, to_old.min()))
         if is_of_new or frame in covered:
             image = drafted.get(frame) or mapping_image(frame, frame.view(with_depth=False), of_map)
             joined.lights.append(image.light)
             if frame in covered:
-                _see_again(topomap, image, frame.session_id, np.argsort(to_old, kind="stable"), joined)
+                _see_again(
+                    topomap, image, frame.session_id, np.argsort(to_old, kind="stable"), joined
+                )
             if is_of_new:
                 _observe_new(drafts, frame, image, np.argsort(to_new, kind="stable"), topomap)
                 _teach(joined, frame, image, first_id + int(to_new.argmin()))
         progress(f"pictures of {frame.sequence.name}", done + 1, len(frames))
     for kind in topomap.kinds:
-        joined.nodes[kind] = [finish_node(first_id + k, draft, kind, of_map) for k, draft in enumerate(drafts)]
+        joined.nodes[kind] = [
+            finish_node(first_id + k, draft, kind, of_map) for k, draft in enumerate(drafts)
+        ]
     for k, draft in enumerate(drafts):
-        joined.sides.extend(replace(side, summary=replace(side.summary, of_node=first_id + k)) for side in draft.sides)
+        joined.sides.extend(
+            replace(side, summary=replace(side.summary, of_node=first_id + k))
+            for side in draft.sides
+        )
     return joined
 
 
@@ -213,51 +284,98 @@ def is_well_held(answer: Localization | None, d_thresh: float, config: UpdateCon
     """Whether the map needs no node where this answer was given."""
     if answer is None or answer.num_inliers < config.min_inliers:
         return False
-    of_inverse = answer.noise_share * covariance_of_inverse(answer.world_from_cam, answer.covariance)
+    of_inverse = answer.noise_share * covariance_of_inverse(
+        answer.world_from_cam, answer.covariance
+    )
     at_camera = position_covariance(answer.world_from_cam.inverse(), of_inverse)
     return float(np.sqrt(np.linalg.eigvalsh(at_camera)[-1])) <= config.max_sigma * d_thresh
 
 
 def _observe_new(
-    drafts: Sequence[NodeDraft], frame: MappingFrame, image: MappingImage, nearest: Int[np.ndarray, " n"], topomap: TopoMetricMap
+    drafts: Sequence[NodeDraft],
+    frame: MappingFrame,
+    image: MappingImage,
+    nearest: Int[np.ndarray, " n"],
+    topomap: TopoMetricMap,
 ) -> None:
     for k in nearest[: topomap.config.landmarks.nodes_per_image]:
         if frame not in drafts[k].sources:
             drafts[k].add(observe(drafts[k], image, frame.session_id, topomap.config))
 
 
-def _see_again(topomap: TopoMetricMap, image: MappingImage, session_id: int, nearest: Int[np.ndarray, " n"], joined: _Joined) -> None:
+def _see_again(
+    topomap: TopoMetricMap,
+    image: MappingImage,
+    session_id: int,
+    nearest: Int[np.ndarray, " n"],
+    joined: _Joined,
+) -> None:
     """What a picture shows of the nodes that are there."""
     config = topomap.config
     for row in nearest[: config.landmarks.nodes_per_image].tolist():
         cam_from_node = image.world_from_cam.inverse() @ topomap.summaries[row].world_from_cam
         for kind, features in image.features.items():
             node = topomap.nodes_of(kind)[row]
-            joined.seen[kind, row].append(observe_node(node, features, image.camera, cam_from_node, config, session_id))
+            joined.seen[kind, row].append(
+                observe_node(node, features, image.camera, cam_from_node, config, session_id)
+            )
 
 
 def _teach(joined: _Joined, frame: MappingFrame, image: MappingImage, node_id: int) -> None:
-    joined.images.append(PlaceImage(frame.sequence.name, frame.name, node_id, image.world_from_cam, image.place_jpeg, frame.session_id))
+    joined.images.append(
+        PlaceImage(
+            frame.sequence.name,
+            frame.name,
+            node_id,
+            image.world_from_cam,
+            image.place_jpeg,
+            frame.session_id,
+        )
+    )
     for kind, features in image.features.items():
-        joined.views[kind].append(PlaceView(features, image.camera.width, image.camera.height, node_id))
+        joined.views[kind].append(
+            PlaceView(features, image.camera.width, image.camera.height, node_id)
+        )
 
 
-def _session(session_id: int, sequence: StereoSequence, frames: Sequence[MappingFrame], joined: _Joined, poses_from: str) -> Session:
+def _session(
+    session_id: int,
+    sequence: StereoSequence,
+    frames: Sequence[MappingFrame],
+    joined: _Joined,
+    poses_from: str,
+) -> Session:
     t_ns = [frame.t_ns for frame in frames]
     camera = sequence[frames[0].index].camera
-    return Session(session_id, sequence.name, path_of(sequence), poses_from, min(t_ns), max(t_ns), camera, mean_light(joined.lights))
+    return Session(
+        session_id,
+        sequence.name,
+        path_of(sequence),
+        poses_from,
+        min(t_ns),
+        max(t_ns),
+        camera,
+        mean_light(joined.lights),
+    )
 
 
-def _with_session(topomap: TopoMetricMap, session: Session, frames: Sequence[MappingFrame], joined: _Joined) -> TopoMetricMap:
+def _with_session(
+    topomap: TopoMetricMap, session: Session, frames: Sequence[MappingFrame], joined: _Joined
+) -> TopoMetricMap:
     nodes = {kind: _with_nodes(topomap, kind, joined) for kind in topomap.kinds}
     summaries = [*topomap.summaries, *(node.summary for node in joined.nodes[topomap.kind])]
-    steps = [b.world_from_cam.translation - a.world_from_cam.translation for a, b in pairwise(frames)]
+    steps = [
+        b.world_from_cam.translation - a.world_from_cam.translation for a, b in pairwise(frames)
+    ]
     return replace(
         topomap,
         summaries=summaries,
         nodes=nodes.pop(topomap.kind),
         other_kinds=nodes,
-        edges=sorted({*topomap.edges, *_edges(topomap, summaries, frames)}, key=lambda edge: (edge.source_id, edge.target_id)),
+        edges=sorted(
+            {*topomap.edges, *_edges(topomap, summaries, frames)},
+            key=lambda edge: (edge.source_id, edge.target_id),
+        ),
         place_images=Overlay(topomap.place_images, {}, joined.images),
         sides=grown_sides(topomap, joined.sides),
         length_m=topomap.length_m + float(sum(np.linalg.norm(step) for step in steps)),
@@ -266,7 +384,8 @@ def _with_session(topomap: TopoMetricMap, session: Session, frames: Sequence[Map
 
 
 def _with_nodes(topomap: TopoMetricMap, kind: str, joined: _Joined) -> Overlay[TopoNode]:
-    """The nodes of a kind: those that were there, with what the session saw of their points, and the new ones."""
+    """The nodes of a kind: those that were there, with what the session saw of their points, and
+    the new ones."""
     before, changed = topomap.nodes_of(kind), {}
     for (of_kind, row), seen in joined.seen.items():
         if of_kind == kind:
@@ -276,10 +395,15 @@ def _with_nodes(topomap: TopoMetricMap, kind: str, joined: _Joined) -> Overlay[T
     return Overlay(before, changed, joined.nodes[kind])
 
 
-def _edges(topomap: TopoMetricMap, summaries: Sequence[Any], frames: Sequence[MappingFrame]) -> set[Edge]:
+def _edges(
+    topomap: TopoMetricMap, summaries: Sequence[Any], frames: Sequence[MappingFrame]
+) -> set[Edge]:
     """An edge wherever the session went from one node to another."""
     lambda_rot = topomap.config.nodes.lambda_rot
     assert lambda_rot is not None
     poses = NodePoses.of([summary.world_from_cam for summary in summaries])
-    nearest = [summaries[int(node_distances(frame.world_from_cam, poses, lambda_rot).argmin())].node_id for frame in frames]
+    nearest = [
+        summaries[int(node_distances(frame.world_from_cam, poses, lambda_rot).argmin())].node_id
+        for frame in frames
+    ]
     return {Edge(source, target) for source, target in pairwise(nearest) if source != target}

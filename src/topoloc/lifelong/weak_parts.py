@@ -1,8 +1,8 @@
 """Which parts of a map are weakly held, by the map alone: read from `weak_parts`.
 
-Four things make a node weak: the rest of the map does not hold it (`left_out.py`); it has few landmarks; nobody looked the other way
-within its reach; no other session saw it again, nor stood beside it. Weak nodes that are near each other are a part, which is
-what one walks to.
+Four things make a node weak: the rest of the map does not hold it (`left_out.py`); it has few
+landmarks; nobody looked the other way within its reach; no other session saw it again, nor stood
+beside it. Weak nodes that are near each other are a part, which is what one walks to.
 """
 
 from __future__ import annotations
@@ -34,10 +34,12 @@ class WeakPartsConfig:
     max_asked: Annotated[int, AtLeast(0)] = 200
     """Nodes that are asked of the rest of the map, at most, spread over all; 0 asks none."""
     beside: Annotated[float, AtLeast(0)] = 0.0
-    """With a node those of its session are left out that are within so many D_thresh of it (Eq. 1). Nodes of one session are more than one
-    apart, so that by default a node alone is left out, and asked from further away than any picture of the walk is."""
+    """With a node those of its session are left out that are within so many D_thresh of it (Eq. 1).
+    Nodes of one session are more than one apart, so that by default a node alone is left out, and
+    asked from further away than any picture of the walk is."""
     min_inliers: Annotated[int, Between(1, 10_000)] = 60
-    """The rest holds a node that it localizes with so many inliers: a session's picture like that needs no node of its own."""
+    """The rest holds a node that it localizes with so many inliers: a session's picture like that
+    needs no node of its own."""
     min_landmarks: Annotated[int, Between(1, 100_000)] = 100
     """A node with fewer has few."""
     reach: Annotated[float, Above(0)] = 4.0
@@ -45,7 +47,8 @@ class WeakPartsConfig:
     min_turn_deg: Annotated[float, Between(1, 180)] = 120.0
     """... and is turned by at least so much."""
     min_seen_share: Annotated[float, Between(0, 1)] = 0.2
-    """Another session saw a node again where it saw this share of its landmarks, or has a node of its own ..."""
+    """Another session saw a node again where it saw this share of its landmarks, or has a node of
+    its own ..."""
     stood_by: Annotated[float, AtLeast(0)] = 1.5
     """... within so many D_thresh (Eq. 1)."""
     apart: Annotated[float, Above(0)] = 3.0
@@ -54,7 +57,8 @@ class WeakPartsConfig:
 
 @dataclass(frozen=True)
 class NodeHold:
-    """How a node is held. `answer` is None where it was not asked; `seen_share` is the share of its landmarks that other sessions saw."""
+    """How a node is held. `answer` is None where it was not asked; `seen_share` is the share of its
+    landmarks that other sessions saw."""
 
     node_id: int
     name: str
@@ -66,7 +70,11 @@ class NodeHold:
     reasons: tuple[Reason, ...]
 
     def to_json(self) -> dict[str, Any]:
-        asked = None if self.answer is None else {"localized": self.answer.is_localized, "inliers": self.answer.num_inliers}
+        asked = (
+            None
+            if self.answer is None
+            else {"localized": self.answer.is_localized, "inliers": self.answer.num_inliers}
+        )
         return {
             "node_id": self.node_id,
             "name": self.name,
@@ -99,7 +107,8 @@ class WeakPart:
 
 @dataclass(frozen=True, eq=False)
 class WeakParts:
-    """How every node is held, in the map's order, and the weak parts: the worst reason first, of each the largest part first."""
+    """How every node is held, in the map's order, and the weak parts: the worst reason first, of
+    each the largest part first."""
 
     nodes: list[NodeHold]
     parts: list[WeakPart]
@@ -112,7 +121,9 @@ class WeakParts:
     @property
     def weakest(self) -> list[NodeHold]:
         """The nodes that were asked, the one that the rest of the map holds least first."""
-        return sorted(self.asked, key=lambda node: node.answer.num_inliers if node.answer is not None else 0)
+        return sorted(
+            self.asked, key=lambda node: node.answer.num_inliers if node.answer is not None else 0
+        )
 
     @property
     def asked(self) -> list[NodeHold]:
@@ -124,7 +135,9 @@ class WeakParts:
             "num_nodes": len(self.nodes),
             "num_sessions": len(self.session_names),
             "num_asked": len(self.asked),
-            "num_localized": sum(node.answer is not None and node.answer.is_localized for node in self.nodes),
+            "num_localized": sum(
+                node.answer is not None and node.answer.is_localized for node in self.nodes
+            ),
             "weak": {reason: self.count(reason) for reason in REASONS},
             "where_next": self.where_next(),
             "parts": [part.to_json() for part in self.parts],
@@ -134,33 +147,59 @@ class WeakParts:
     def where_next(self) -> str:
         """Where to walk next, in one or two sentences."""
         said = list[str]()
-        of_reason = {reason: [part for part in self.parts if part.reason == reason] for reason in REASONS}
-        poor = sorted(of_reason["not_held"] + of_reason["few_landmarks"], key=lambda part: -len(part.nodes))
+        of_reason = {
+            reason: [part for part in self.parts if part.reason == reason] for reason in REASONS
+        }
+        poor = sorted(
+            of_reason["not_held"] + of_reason["few_landmarks"], key=lambda part: -len(part.nodes)
+        )
         if poor:
             is_one, is_not_held = len(poor[0].nodes) == 1, poor[0].reason == "not_held"
-            why = f"the rest of the map does not hold {'it' if is_one else 'them'}" if is_not_held else "few landmarks are known there"
+            why = (
+                f"the rest of the map does not hold {'it' if is_one else 'them'}"
+                if is_not_held
+                else "few landmarks are known there"
+            )
             said.append(f"Walk again past {self._described(poor[0])}: {why}.")
         if one_way := of_reason["one_direction"]:
             num, of = self.count("one_direction"), len(self.nodes)
-            where = "all of it the other way" if num == of else f"the other way past {self._described(one_way[0])}"
+            where = (
+                "all of it the other way"
+                if num == of
+                else f"the other way past {self._described(one_way[0])}"
+            )
             said.append(f"Walk {where}: {num} of {of} nodes look where nobody looks back.")
         if len(said) < 2 and len(self.session_names) < 2:
-            said.append("All of it is of one session: a walk on another day, or in another light, tells what lasts.")
+            said.append(
+                "All of it is of one session: a walk on another day, or in another light, tells"
+                " what lasts."
+            )
         elif len(said) < 2 and of_reason["single_session"]:
-            said.append(f"Walk again past {self._described(of_reason['single_session'][0])}: seen by one session alone.")
+            said.append(
+                f"Walk again past {self._described(of_reason['single_session'][0])}: seen by one"
+                " session alone."
+            )
         return " ".join(said[:2]) or "No part is weak."
 
     def _described(self, part: WeakPart) -> str:
         first, last = part.nodes[0], part.nodes[-1]
         place = "({:.1f}, {:.1f}, {:.1f}) m".format(*(part.centre.round(1) + 0.0))  # no -0.0
         if first is last:
-            return f"{place}, node {first.node_id} ({first.name} of {self.session_names.get(first.session_id, '?')})"
+            return (
+                f"{place}, node {first.node_id} ({first.name} of"
+                f" {self.session_names.get(first.session_id, '?')})"
+            )
         sessions = sorted({self.session_names.get(node.session_id, "?") for node in part.nodes})
-        return f"{place}, {len(part.nodes)} nodes ({first.name} to {last.name} of {', '.join(sessions)})"
+        return (
+            f"{place}, {len(part.nodes)} nodes ({first.name} to {last.name} of"
+            f" {', '.join(sessions)})"
+        )
 
 
 def weak_parts(
-    localizer: Localizer, config: WeakPartsConfig | None = None, progress: Callable[[str, int, int], None] | None = None
+    localizer: Localizer,
+    config: WeakPartsConfig | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
 ) -> WeakParts:
     """How each node of a map is held by the rest of it.
 
@@ -170,7 +209,10 @@ def weak_parts(
     """
     config = config or WeakPartsConfig()
     check_bounds(config)
-    topomap, rows = localizer.topomap, evenly(range(len(localizer.topomap.summaries)), config.max_asked)
+    topomap, rows = (
+        localizer.topomap,
+        evenly(range(len(localizer.topomap.summaries)), config.max_asked),
+    )
 
     def asked_so_far(done: int, total: int) -> None:
         if progress is not None:
@@ -179,14 +221,26 @@ def weak_parts(
     answers = ask_left_out(localizer, topomap, rows, config.beside, asked_so_far)
     poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
     is_answered = _has_other_way(poses, config.reach * topomap.config.d_thresh, config.min_turn_deg)
-    nodes = [_hold(topomap, row, answers.get(row), bool(is_answered[row]), poses, config) for row in range(len(topomap.summaries))]
+    nodes = [
+        _hold(topomap, row, answers.get(row), bool(is_answered[row]), poses, config)
+        for row in range(len(topomap.summaries))
+    ]
     names = {session.session_id: session.name for session in topomap.sessions}
-    names |= {summary.session_id: summary.recording for summary in topomap.summaries if summary.session_id not in names}
+    names |= {
+        summary.session_id: summary.recording
+        for summary in topomap.summaries
+        if summary.session_id not in names
+    }
     return WeakParts(nodes, _parts(nodes, config.apart * topomap.config.d_thresh), names)
 
 
 def _hold(
-    topomap: TopoMetricMap, row: int, answer: LeftOutAnswer | None, is_answered: bool, poses: NodePoses, config: WeakPartsConfig
+    topomap: TopoMetricMap,
+    row: int,
+    answer: LeftOutAnswer | None,
+    is_answered: bool,
+    poses: NodePoses,
+    config: WeakPartsConfig,
 ) -> NodeHold:
     node, summary = topomap.nodes[row], topomap.summaries[row]
     seen_share, reasons = _seen_share(node), list[Reason]()
@@ -196,10 +250,19 @@ def _hold(
         reasons.append("few_landmarks")
     if not is_answered:
         reasons.append("one_direction")
-    if seen_share < config.min_seen_share and not _has_other_session(topomap, row, poses, config.stood_by):
+    if seen_share < config.min_seen_share and not _has_other_session(
+        topomap, row, poses, config.stood_by
+    ):
         reasons.append("single_session")
     return NodeHold(
-        summary.node_id, summary.name, summary.session_id, summary.world_from_cam, summary.num_points, seen_share, answer, tuple(reasons)
+        summary.node_id,
+        summary.name,
+        summary.session_id,
+        summary.world_from_cam,
+        summary.num_points,
+        seen_share,
+        answer,
+        tuple(reasons),
     )
 
 
@@ -212,20 +275,29 @@ def _seen_share(node: TopoNode) -> float:
     return float(seen.mean()) if len(seen) else 0.0
 
 
-def _has_other_session(topomap: TopoMetricMap, row: int, poses: NodePoses, d_threshs: float) -> bool:
+def _has_other_session(
+    topomap: TopoMetricMap, row: int, poses: NodePoses, d_threshs: float
+) -> bool:
     """Does a node of another session stand beside this one?"""
     summary = topomap.summaries[row]
-    near = np.flatnonzero(node_distances(summary.world_from_cam, poses, topomap.config.lambda_rot) <= d_threshs * topomap.config.d_thresh)
+    near = np.flatnonzero(
+        node_distances(summary.world_from_cam, poses, topomap.config.lambda_rot)
+        <= d_threshs * topomap.config.d_thresh
+    )
     return any(topomap.summaries[int(other)].session_id != summary.session_id for other in near)
 
 
-def _has_other_way(poses: NodePoses, reach_m: float, min_turn_deg: float) -> Bool[np.ndarray, " nodes"]:
+def _has_other_way(
+    poses: NodePoses, reach_m: float, min_turn_deg: float
+) -> Bool[np.ndarray, " nodes"]:
     """Of each node, whether another one within reach looks the other way."""
     axes, found = poses.rotations[:, :, 2], np.zeros(len(poses.centres), bool)
     for start in range(0, len(axes), _AT_ONCE):
         some = slice(start, start + _AT_ONCE)
         away = np.linalg.norm(poses.centres[some, None] - poses.centres[None], axis=2)
-        found[some] = ((away <= reach_m) & (axes[some] @ axes.T <= np.cos(np.deg2rad(min_turn_deg)))).any(axis=1)
+        found[some] = (
+            (away <= reach_m) & (axes[some] @ axes.T <= np.cos(np.deg2rad(min_turn_deg)))
+        ).any(axis=1)
     return found
 
 
@@ -247,7 +319,9 @@ def _groups(nodes: Sequence[NodeHold], apart_m: float) -> list[list[NodeHold]]:
         left[waiting[0]] = False
         while waiting:
             group.append(waiting.pop())
-            near = np.flatnonzero(left & (np.linalg.norm(positions - positions[group[-1]], axis=1) <= apart_m)).tolist()
+            near = np.flatnonzero(
+                left & (np.linalg.norm(positions - positions[group[-1]], axis=1) <= apart_m)
+            ).tolist()
             left[near] = False
             waiting += near
         groups.append([nodes[k] for k in sorted(group)])

@@ -1,4 +1,5 @@
-"""A map as it is asked by one of its kinds of features: with the settings, the fitted weights and the shared errors of that kind."""
+"""A map as it is asked by one of its kinds of features: with the settings, the fitted weights and
+the shared errors of that kind."""
 
 from __future__ import annotations
 
@@ -16,8 +17,9 @@ from topoloc.places.coarse import CoarseLocalizer
 
 @dataclass(frozen=True, eq=False)
 class AskedKind:
-    """`config` has the kind's own thresholds where none are set; `correlated_errors` is rho of the map: the share of a match's variance
-    that its points have in common (see `correlated_errors.py`)."""
+    """`config` has the kind's own thresholds where none are set; `correlated_errors` is rho of the
+    map: the share of a match's variance that its points have in common (see
+    `correlated_errors.py`)."""
 
     map: OpenMap
     config: LocalizerConfig
@@ -26,12 +28,18 @@ class AskedKind:
 
     @staticmethod
     def of(
-        topomap: TopoMetricMap, config: LocalizerConfig, coarse: CoarseLocalizer | None = None, weights: FittedWeights | None = None
+        topomap: TopoMetricMap,
+        config: LocalizerConfig,
+        coarse: CoarseLocalizer | None = None,
+        weights: FittedWeights | None = None,
     ) -> AskedKind:
-        """Of a map's first kind; `weights` instead of those that ship for it. Raises as `OpenMap`."""
+        """Of a map's first kind; `weights` instead of those that ship for it. Raises as
+        `OpenMap`."""
         opened = OpenMap(topomap, coarse or config.coarse)
         c, weights = config.for_kind(opened.kind), weights or _weights_of(opened)
-        rho = correlated_errors_of(topomap, c.guided, c.pose, c.correlated_errors, weights.shared_errors)
+        rho = correlated_errors_of(
+            topomap, c.guided, c.pose, c.correlated_errors, weights.shared_errors
+        )
         return AskedKind(opened, c, weights, rho)
 
 
@@ -43,12 +51,15 @@ def _weights_of(opened: OpenMap) -> FittedWeights:
     return replace(weights, walls=weights_of(sides.kind).walls)
 
 
-def kinds_to_ask(topomap: TopoMetricMap, wanted: tuple[str, ...] | None) -> tuple[list[str], dict[str, str]]:
-    """The kinds of features by which a map is asked, in turn: those that are wanted, else all whose networks are here. And those of the
-    map that are left out, each with what it lacks.
+def kinds_to_ask(
+    topomap: TopoMetricMap, wanted: tuple[str, ...] | None
+) -> tuple[list[str], dict[str, str]]:
+    """The kinds of features by which a map is asked, in turn: those that are wanted, else all whose
+    networks are here. And those of the map that are left out, each with what it lacks.
 
     Raises:
-        MissingExtraError, WeightsError: what a kind that is wanted needs is not here, or what each kind of the map needs.
+        MissingExtraError, WeightsError: what a kind that is wanted needs is not here, or what each
+            kind of the map needs.
     """
     asked, left_out, first = list[str](), dict[str, str](), None
     for kind in wanted or topomap.kinds:

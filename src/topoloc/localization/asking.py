@@ -1,4 +1,5 @@
-"""One picture put to one map, at a glance or by all means; by all means after a glance goes on from there."""
+"""One picture put to one map, at a glance or by all means; by all means after a glance goes on from
+there."""
 
 from __future__ import annotations
 
@@ -16,27 +17,30 @@ from topoloc.localization.refine import best_case, hypothesis_of, say_on
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Proposal, Search
 
-_LEAST_SECOND = 1.4  # log odds of a pose that only the features asked first found: twins of the true place come to 1.2
+# log odds of a pose that only the features asked first found: twins of the true place come to 1.2
+_LEAST_SECOND = 1.4
 
 
 @dataclass(eq=False)
 class Asking:
-    """`searches` are one by each kind of the map's features, in turn; `prior` is about where the camera is (world_from_cam); `completed`
-    adds what else the map says of an answer."""
+    """`searches` are one by each kind of the map's features, in turn; `prior` is about where the
+    camera is (world_from_cam); `completed` adds what else the map says of an answer."""
 
     searches: list[Search]
     prior: Rigid3 | None
     completed: Callable[[Verdict], Verdict]
 
     def best_case(self, least: float) -> Evidence | None:
-        """The most that a glance could say for a pose, by the strongest features of the first kind; None where fewer than `least` of these
-        agree, or nothing speaks for it. Far cheaper than a glance where the picture is of another place."""
+        """The most that a glance could say for a pose, by the strongest features of the first kind;
+        None where fewer than `least` of these agree, or nothing speaks for it. Far cheaper than a
+        glance where the picture is of another place."""
         brief = replace(self.searches[0])
         proposal = propose_briefly(brief, least)
         return best_case(brief, proposal) if proposal is not None else None
 
     def at_a_glance(self) -> Verdict:
-        """What retrieval by the first kind of features says alone: the cheapest question that a clear picture answers."""
+        """What retrieval by the first kind of features says alone: the cheapest question that a
+        clear picture answers."""
         first = self.searches[0]
         _follow_up(first, islice(self._first_proposals, 1))
         return self.completed(answer(first))
@@ -57,8 +61,8 @@ class Asking:
 
     @property
     def least_inliers(self) -> float:
-        """How many of the picture's strongest features of the first kind must agree on a pose elsewhere for it to be a rival of what is
-        believed."""
+        """How many of the picture's strongest features of the first kind must agree on a pose
+        elsewhere for it to be a rival of what is believed."""
         return least_inliers(self.searches[0])
 
     @cached_property
@@ -71,7 +75,11 @@ class Asking:
             _follow_up(search, propose(search, self.prior) if number else self._first_proposals)
             is_last = search.is_stopped or search.is_settled or search.is_last
             verdict = final_answer(search) if is_last else answer(search)
-            if search.is_stopped or (is_last and isinstance(verdict[0], Localization)) or _is_of_another_camera(verdict[0]):
+            if (
+                search.is_stopped
+                or (is_last and isinstance(verdict[0], Localization))
+                or _is_of_another_camera(verdict[0])
+            ):
                 return verdict
             is_open = number == 0 and self.prior is not None and not is_last
             if is_open and verdict[1] and (seconded := self._seconded())[1]:
@@ -84,12 +92,15 @@ class Asking:
         return verdict
 
     def _seconded(self) -> Verdict:
-        """What the first kind of features believes; the last one is heard on it. The pose is that of the one for which more speaks: in
-        other light the first one's points are found by chance, and hold the pose where it is."""
+        """What the first kind of features believes; the last one is heard on it. The pose is that
+        of the one for which more speaks: in other light the first one's points are found by chance,
+        and hold the pose where it is."""
         first, last = self.searches[0], self.searches[-1]
         evidence, weights = first.config.evidence, first.weights.rivals
         seconded, by_last = Belief(), dict[int, Hypothesis]()
-        for one in (one for one in first.belief.hypotheses if one.probability >= evidence.min_probability):
+        for one in (
+            one for one in first.belief.hypotheses if one.probability >= evidence.min_probability
+        ):
             said, of_last = (0.0, None) if one.is_from_walls else say_on(last, one)
             heard = replace(one, log_odds=one.log_odds + said)
             if one.is_from_walls or heard.log_odds >= _LEAST_SECOND:
@@ -100,12 +111,14 @@ class Asking:
         best = seconded.best(weights)
         if not isinstance(verdict[0], Localization) or best is None or id(best) not in by_last:
             return verdict
-        return final_answer(replace(last, belief=Belief().given(by_last[id(best)], evidence, last.weights.rivals)))
+        return final_answer(
+            replace(last, belief=Belief().given(by_last[id(best)], evidence, last.weights.rivals))
+        )
 
 
 def _is_of_another_camera(result: Localization | NotLocalized) -> bool:
-    """Was the pose refused because the picture contradicts its calibration? What other features say of the place, less precisely, is as
-    wrong: the calibration is the same."""
+    """Was the pose refused because the picture contradicts its calibration? What other features say
+    of the place, less precisely, is as wrong: the calibration is the same."""
     return isinstance(result, NotLocalized) and result.seen_camera is not None
 
 
@@ -114,7 +127,9 @@ def _follow_up(search: Search, proposals: Iterable[Proposal]) -> None:
     for proposal in proposals:
         hypothesis = hypothesis_of(search, proposal)
         if hypothesis is not None:
-            search.belief = search.belief.given(hypothesis, search.config.evidence, search.weights.rivals)
+            search.belief = search.belief.given(
+                hypothesis, search.config.evidence, search.weights.rivals
+            )
         if search.query.is_late:
             search.is_stopped = True
             return

@@ -1,11 +1,14 @@
-"""What is believed of a query image: hypotheses with their odds, beside "nowhere in the map"; and the answer that follows.
+"""What is believed of a query image: hypotheses with their odds, beside "nowhere in the map"; and
+the answer that follows.
 
-Every hypothesis excludes the others, and its odds against nothing at all say little of which of them is right: a place that repeats itself
-has most of its things twice. What tells two of them apart is the part of the picture where they differ, in which the wrong one finds
-nothing (the even share found), and that the wrong one, which has only some of the picture to stand on, is less precise (the doubt). So
-between two hypotheses the weights of `RivalWeights` count, in logarithms; where one of them comes from walls, whose evidence is of
-another kind, their odds do. With odds o of the best hypothesis against "nowhere" and odds of e^d against each other one, by which it
-leads that, it is right with the probability 1 / (1 + 1/o + sum of e^-d).
+Every hypothesis excludes the others, and its odds against nothing at all say little of which of
+them is right: a place that repeats itself has most of its things twice. What tells two of them
+apart is the part of the picture where they differ, in which the wrong one finds nothing (the even
+share found), and that the wrong one, which has only some of the picture to stand on, is less
+precise (the doubt). So between two hypotheses the weights of `RivalWeights` count, in logarithms;
+where one of them comes from walls, whose evidence is of another kind, their odds do. With odds o of
+the best hypothesis against "nowhere" and odds of e^d against each other one, by which it leads
+that, it is right with the probability 1 / (1 + 1/o + sum of e^-d).
 """
 
 from __future__ import annotations
@@ -23,7 +26,8 @@ from topoloc.localization.fitted_weights import RivalWeights
 from topoloc.localization.pose_fit import PoseFit
 
 MIN_LEAD = 2.0
-"""By how much the best hypothesis must lead the next one, in logarithms of odds, to be an answer."""
+"""By how much the best hypothesis must lead the next one, in logarithms of odds, to be an
+answer."""
 _CHI_SQUARE_6_AT_95 = 12.592
 
 
@@ -31,8 +35,8 @@ _CHI_SQUARE_6_AT_95 = 12.592
 class Hypothesis:
     """A pose with the evidence for it.
 
-    `covariance` is that of the left perturbation of cam_from_world, `noise_share` of it differs from picture to picture; `log_odds` are
-    those of "here" against "nowhere".
+    `covariance` is that of the left perturbation of cam_from_world, `noise_share` of it differs
+    from picture to picture; `log_odds` are those of "here" against "nowhere".
     """
 
     source: str
@@ -67,7 +71,8 @@ def lead(a: Hypothesis, b: Hypothesis, weights: RivalWeights) -> float:
 
 
 def _leads(hypotheses: tuple[Hypothesis, ...], weights: RivalWeights) -> Float[np.ndarray, "n n"]:
-    """By how much each is likelier than each: by their strengths, or their odds where one of the two comes from walls."""
+    """By how much each is likelier than each: by their strengths, or their odds where one of the
+    two comes from walls."""
     strength = np.array([strength_of(one.evidence, one.log_odds, weights) for one in hypotheses])
     log_odds = np.array([one.log_odds for one in hypotheses])
     from_walls = np.array([one.is_from_walls for one in hypotheses])
@@ -76,21 +81,30 @@ def _leads(hypotheses: tuple[Hypothesis, ...], weights: RivalWeights) -> Float[n
 
 
 def is_same_pose(a: PoseFit, b: PoseFit, config: EvidenceConfig) -> bool:
-    """Do two poses say the same? They do where they are as near as two right ones can be, or stand on the same points of the map.
+    """Do two poses say the same? They do where they are as near as two right ones can be, or stand
+    on the same points of the map.
 
-    A pose that is not precise yet may be far from the one that it will become, but sees the same things in the same features; two places
-    that look alike explain the same features by different points.
+    A pose that is not precise yet may be far from the one that it will become, but sees the same
+    things in the same features; two places that look alike explain the same features by different
+    points.
     """
     way = np.linalg.norm(a.world_from_cam.translation - b.world_from_cam.translation)
-    if way < 2.0 * config.max_translation and _from_to(a, b).angle() < math.radians(2.0 * config.max_rotation_deg):
+    if way < 2.0 * config.max_translation and _from_to(a, b).angle() < math.radians(
+        2.0 * config.max_rotation_deg
+    ):
         return True
     if a.features is not b.features or not a.stands_near(b):
         return False
-    rows_a, rows_b = (fit.matches.query_idx[fit.pose.inliers] for fit in (a, b) if fit.pose is not None)
+    rows_a, rows_b = (
+        fit.matches.query_idx[fit.pose.inliers] for fit in (a, b) if fit.pose is not None
+    )
     _, of_a, of_b = np.intersect1d(rows_a, rows_b, return_indices=True)
     if 2 * len(of_a) < min(len(rows_a), len(rows_b)):
         return False
-    points_a, points_b = a.local_map.points_world[_columns(a)[of_a]], b.local_map.points_world[_columns(b)[of_b]]
+    points_a, points_b = (
+        a.local_map.points_world[_columns(a)[of_a]],
+        b.local_map.points_world[_columns(b)[of_b]],
+    )
     radii = np.maximum(a.local_map.radii[_columns(a)[of_a]], b.local_map.radii[_columns(b)[of_b]])
     return bool(np.mean(np.linalg.norm(points_a - points_b, axis=1) <= radii) > 0.5)
 
@@ -104,8 +118,9 @@ def _columns(fit: PoseFit) -> np.ndarray:
 class Belief:
     """The hypotheses so far, of each pose the one with the most for it.
 
-    `weighed` are all that came, for "the same pose" does not carry over: of a row of three the middle one may say the same as both ends,
-    which differ. So which are left out is decided anew with each, from the strongest down, and the order in which they came counts nothing.
+    `weighed` are all that came, for "the same pose" does not carry over: of a row of three the
+    middle one may say the same as both ends, which differ. So which are left out is decided anew
+    with each, from the strongest down, and the order in which they came counts nothing.
     """
 
     hypotheses: tuple[Hypothesis, ...] = ()
@@ -113,9 +128,13 @@ class Belief:
     _like: tuple[frozenset[int], ...] = ()
     """Of each of these, which of those before it say the same, by their place among them."""
 
-    def given(self, hypothesis: Hypothesis, config: EvidenceConfig, weights: RivalWeights) -> Belief:
+    def given(
+        self, hypothesis: Hypothesis, config: EvidenceConfig, weights: RivalWeights
+    ) -> Belief:
         """With one more hypothesis."""
-        like_it = frozenset(k for k, other in enumerate(self.weighed) if _say_the_same(hypothesis, other, config))
+        like_it = frozenset(
+            k for k, other in enumerate(self.weighed) if _say_the_same(hypothesis, other, config)
+        )
         weighed, like = (*self.weighed, hypothesis), (*self._like, like_it)
         places, kept = {id(one): k for k, one in enumerate(weighed)}, list[int]()
         for k in (places[id(one)] for one in _ranked(weighed, weights)):
@@ -138,7 +157,11 @@ def _ranked(hypotheses: tuple[Hypothesis, ...], weights: RivalWeights) -> list[H
     leads = _leads(hypotheses, weights)
     np.fill_diagonal(leads, np.inf)
     least = {id(one): float(row.min()) for one, row in zip(hypotheses, leads, strict=True)}
-    return sorted(hypotheses, key=lambda one: (one.probability >= 0.5, least[id(one)], one.log_odds), reverse=True)
+    return sorted(
+        hypotheses,
+        key=lambda one: (one.probability >= 0.5, least[id(one)], one.log_odds),
+        reverse=True,
+    )
 
 
 def _say_the_same(a: Hypothesis, b: Hypothesis, config: EvidenceConfig) -> bool:
@@ -146,11 +169,15 @@ def _say_the_same(a: Hypothesis, b: Hypothesis, config: EvidenceConfig) -> bool:
     if is_same_pose(a.fit, b.fit, config):
         return True
     limit = _CHI_SQUARE_6_AT_95 * (a.variance + b.variance)
-    apart = a.world_from_cam.rotation.T @ (b.world_from_cam.translation - a.world_from_cam.translation)
+    apart = a.world_from_cam.rotation.T @ (
+        b.world_from_cam.translation - a.world_from_cam.translation
+    )
     if apart @ apart > limit or (turn := _from_to(a.fit, b.fit)).angle() ** 2 > limit:
         return False  # the vector below is longer than either
     vector = turn.log()
-    return float(vector @ np.linalg.solve(a.covariance + b.covariance, vector)) < _CHI_SQUARE_6_AT_95
+    return (
+        float(vector @ np.linalg.solve(a.covariance + b.covariance, vector)) < _CHI_SQUARE_6_AT_95
+    )
 
 
 def _from_to(a: PoseFit, b: PoseFit) -> Rigid3:

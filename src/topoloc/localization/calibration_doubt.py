@@ -1,9 +1,12 @@
-"""A calibration that the picture contradicts: named, and paid for by the answer's covariance and probability.
+"""A calibration that the picture contradicts: named, and paid for by the answer's covariance and
+probability.
 
-A wrong focal length or principal point gives a pose that is wrong, and as sure as any. What is left of the points' errors shows it
-(`geometry/calibration_check.py`); where it does, the points are sought once more around the pose and the camera that it leads to, until
-nothing changes, so that the camera named is the picture's own and not half way there. It must explain the picture better than the
-calibration does: where the map itself is off, as at a bend that was seen from one lane alone, another camera fits no worse, and no better.
+A wrong focal length or principal point gives a pose that is wrong, and as sure as any. What is left
+of the points' errors shows it (`geometry/calibration_check.py`); where it does, the points are
+sought once more around the pose and the camera that it leads to, until nothing changes, so that the
+camera named is the picture's own and not half way there. It must explain the picture better than
+the calibration does: where the map itself is off, as at a bend that was seen from one lane alone,
+another camera fits no worse, and no better.
 """
 
 from __future__ import annotations
@@ -31,24 +34,35 @@ from topoloc.localization.pose_fit import PoseFit, fit_pose
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Search
 
-_SUSPECT, _NAMED = (3.0, 0.01), (5.0, 0.035)  # sigmas, and share of the focal length or of the picture's width
+_SUSPECT, _NAMED = (
+    (3.0, 0.01),
+    (5.0, 0.035),
+)  # sigmas, and share of the focal length or of the picture's width
 _ROUNDS, _SETTLED = 4, 0.003
-_NEAR_PX, _LEAST_GAIN = (1.0, 2.0), 3.0  # of a picture of 640 pixels; standard deviations by which points so near become more, in all
+_NEAR_PX, _LEAST_GAIN = (
+    (1.0, 2.0),
+    3.0,
+)  # of a picture of 640 pixels; standard deviations by which points so near become more, in all
 
 
 def verdicts_of(results: Iterable[Localization | NotLocalized]) -> list[CalibrationVerdict]:
-    """What the pictures of each camera say of it together; nothing of cameras that too few pictures say anything of."""
+    """What the pictures of each camera say of it together; nothing of cameras that too few pictures
+    say anything of."""
     by_camera: dict[Camera, dict[SeenCamera, None]] = {}
     for result in results:
         if result.seen_camera is not None and result.provenance.camera is not None:
-            by_camera.setdefault(result.provenance.camera, {})[result.seen_camera] = None  # a picture that comes twice says it once
+            by_camera.setdefault(result.provenance.camera, {})[result.seen_camera] = (
+                None  # a picture that comes twice says it once
+            )
     verdicts = (verdict_of_pictures(list(seen), camera) for camera, seen in by_camera.items())
     return [verdict for verdict in verdicts if verdict is not None]
 
 
-def doubt_of_calibration(search: Search, fit: PoseFit) -> tuple[SeenCamera | None, CalibrationDoubt | None]:
-    """What the points of an answer say of its camera (None: nothing, or there was no calibration), and what of that is said against the
-    calibration (None where they agree)."""
+def doubt_of_calibration(
+    search: Search, fit: PoseFit
+) -> tuple[SeenCamera | None, CalibrationDoubt | None]:
+    """What the points of an answer say of its camera (None: nothing, or there was no calibration),
+    and what of that is said against the calibration (None where they agree)."""
     if isinstance(fit.lens, RoughCamera) or fit.pose is None:
         return None, None
     found = _measured(search, fit)
@@ -76,8 +90,11 @@ def doubt_of_calibration(search: Search, fit: PoseFit) -> tuple[SeenCamera | Non
     )
 
 
-def _settled(search: Search, fit: PoseFit, found: PictureCalibration) -> tuple[PoseFit, PictureCalibration]:
-    """The points sought again around what is found, until nothing changes; not at all where the settings seek none around poses."""
+def _settled(
+    search: Search, fit: PoseFit, found: PictureCalibration
+) -> tuple[PoseFit, PictureCalibration]:
+    """The points sought again around what is found, until nothing changes; not at all where the
+    settings seek none around poses."""
     for _ in range(_ROUNDS if search.config.guided.num_nodes else 0):
         around = _around(search, fit, found)
         again = _measured(search, around)
@@ -90,17 +107,25 @@ def _settled(search: Search, fit: PoseFit, found: PictureCalibration) -> tuple[P
 
 
 def _gain(before: PoseFit, after: PoseFit) -> float:
-    """By how many more points lie where they must be seen, in standard deviations of their numbers, summed over how near that is."""
+    """By how many more points lie where they must be seen, in standard deviations of their numbers,
+    summed over how near that is."""
     counts = [(_num_within(before, px), _num_within(after, px)) for px in _NEAR_PX]
     return sum((then - now) / math.sqrt(max(now, 1)) for now, then in counts)
 
 
 def _num_within(fit: PoseFit, px: float) -> int:
-    """How many of the fit's points are seen within so many pixels, in a picture whose longer side is 640, of where they must be."""
+    """How many of the fit's points are seen within so many pixels, in a picture whose longer side
+    is 640, of where they must be."""
     assert fit.pose is not None
     seen = fit.seen_points(1.0)
-    offsets = fit.camera.img_from_cam(fit.pose.cam_from_world.apply(seen.points_world)) - seen.points_img
-    return int(np.count_nonzero(np.linalg.norm(offsets, axis=1) < px * max(fit.camera.width, fit.camera.height) / 640.0))
+    offsets = (
+        fit.camera.img_from_cam(fit.pose.cam_from_world.apply(seen.points_world)) - seen.points_img
+    )
+    return int(
+        np.count_nonzero(
+            np.linalg.norm(offsets, axis=1) < px * max(fit.camera.width, fit.camera.height) / 640.0
+        )
+    )
 
 
 def _measured(search: Search, fit: PoseFit) -> PictureCalibration | None:
@@ -108,19 +133,35 @@ def _measured(search: Search, fit: PoseFit) -> PictureCalibration | None:
         return None
     seen = fit.seen_points(1.0)
     points_img, sigma_px = seen.points_img.astype(np.float64), search.config.pose.key_point_sigma_px
-    return calibration_of_picture(points_img, seen.points_world, seen.covariances, fit.camera, fit.pose.cam_from_world, sigma_px)
+    return calibration_of_picture(
+        points_img,
+        seen.points_world,
+        seen.covariances,
+        fit.camera,
+        fit.pose.cam_from_world,
+        sigma_px,
+    )
 
 
 def _around(search: Search, fit: PoseFit, found: PictureCalibration) -> PoseFit:
     """The points sought again around the pose and the camera that the picture led to."""
-    camera, cam_from_world, config = camera_of_picture(fit.camera, found), found.cam_from_world, search.config
-    local_map = search.map.local_map(search.map.nearest(cam_from_world.inverse(), config.guided.num_nodes))
+    camera, cam_from_world, config = (
+        camera_of_picture(fit.camera, found),
+        found.cam_from_world,
+        search.config,
+    )
+    local_map = search.map.local_map(
+        search.map.nearest(cam_from_world.inverse(), config.guided.num_nodes)
+    )
     matches = match_guided(fit.features, local_map, cam_from_world, camera, config.guided)
     return fit_pose(fit.features, camera, local_map, matches, config.pose, (cam_from_world, camera))
 
 
-def _contradicts(fit: PoseFit, found: PictureCalibration, calibrated: Camera, num_sigmas: float, share: float) -> tuple[bool, bool]:
-    """Are the focal length and the principal point off by more than so many sigmas, and that share (of itself, of the width)?"""
+def _contradicts(
+    fit: PoseFit, found: PictureCalibration, calibrated: Camera, num_sigmas: float, share: float
+) -> tuple[bool, bool]:
+    """Are the focal length and the principal point off by more than so many sigmas, and that share
+    (of itself, of the width)?"""
     camera = camera_of_picture(fit.camera, found)
     sigmas = np.sqrt(np.diag(found.covariance))
     stretch = abs(math.log(camera.fx / calibrated.fx))

@@ -1,4 +1,5 @@
-"""Values out of JSON that may come from anywhere: of the type that is expected and within bounds, or a ResultError that names the key."""
+"""Values out of JSON that may come from anywhere: of the type that is expected and within bounds,
+or a ResultError that names the key."""
 
 from __future__ import annotations
 
@@ -23,7 +24,9 @@ def object_of(line: str | bytes | Mapping[str, Any]) -> Mapping[str, Any]:
         try:
             data = json.loads(line)
         except (ValueError, RecursionError) as error:
-            raise ResultError(f"no result: not JSON ({' '.join(str(error).split())[:100]})") from None
+            raise ResultError(
+                f"no result: not JSON ({' '.join(str(error).split())[:100]})"
+            ) from None
     if not isinstance(data, Mapping):
         raise ResultError(f"no result: a JSON object is expected, not {type(data).__name__}")
     return data
@@ -45,7 +48,12 @@ def wanted(data: Mapping[str, Any], key: str) -> Any:
 
 def number(value: Any, key: str, least: float = -math.inf, most: float = math.inf) -> float:
     """A finite number within bounds."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most or abs(value) > 1e300:  # NaN fails
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int | float)
+        or not least <= value <= most
+        or abs(value) > 1e300
+    ):  # NaN fails
         raise ResultError(f"no result: {key!r} is no number{_within(least, most)}")
     return float(value)
 
@@ -73,10 +81,17 @@ def items(value: Any, key: str) -> list[Any]:
 def rigid(value: Any, key: str) -> Rigid3:
     """``{"translation": [x, y, z], "quat_wxyz": [w, x, y, z]}``."""
     data = value if isinstance(value, Mapping) else {}
-    quat_wxyz = [number(one, f"{key}.quat_wxyz") for one in items(data.get("quat_wxyz"), f"{key}.quat_wxyz")]
-    translation = [number(one, f"{key}.translation") for one in items(data.get("translation"), f"{key}.translation")]
+    quat_wxyz = [
+        number(one, f"{key}.quat_wxyz") for one in items(data.get("quat_wxyz"), f"{key}.quat_wxyz")
+    ]
+    translation = [
+        number(one, f"{key}.translation")
+        for one in items(data.get("translation"), f"{key}.translation")
+    ]
     if len(quat_wxyz) != 4 or len(translation) != 3 or not abs(math.hypot(*quat_wxyz) - 1.0) < 1e-3:
-        raise ResultError(f"no result: {key!r} needs a translation of 3 numbers and a unit quat_wxyz of 4")
+        raise ResultError(
+            f"no result: {key!r} needs a translation of 3 numbers and a unit quat_wxyz of 4"
+        )
     try:
         return Rigid3.from_quat_wxyz(np.array(quat_wxyz), np.array(translation))
     except TrajectoryError as error:
@@ -85,7 +100,10 @@ def rigid(value: Any, key: str) -> Rigid3:
 
 def pose_json(world_from_cam: Rigid3) -> dict[str, list[float]]:
     """A pose as all our JSON has it, metres; what `rigid` reads."""
-    return {"translation": world_from_cam.translation.tolist(), "quat_wxyz": world_from_cam.quat_wxyz().tolist()}
+    return {
+        "translation": world_from_cam.translation.tolist(),
+        "quat_wxyz": world_from_cam.quat_wxyz().tolist(),
+    }
 
 
 def covariance(value: Any, key: str) -> Float[np.ndarray, "6 6"]:
@@ -95,7 +113,9 @@ def covariance(value: Any, key: str) -> Float[np.ndarray, "6 6"]:
         raise ResultError(f"no result: {key!r} is no 6x6 matrix")
     matrix = np.array(rows)
     diagonal = np.diag(matrix)
-    if (diagonal < 0.0).any() or (np.abs(matrix - matrix.T) > 1e-6 * np.sqrt(np.outer(diagonal, diagonal)) + 1e-300).any():
+    if (diagonal < 0.0).any() or (
+        np.abs(matrix - matrix.T) > 1e-6 * np.sqrt(np.outer(diagonal, diagonal)) + 1e-300
+    ).any():
         raise ResultError(f"no result: {key!r} is not symmetric, or has a negative variance")
     return matrix
 

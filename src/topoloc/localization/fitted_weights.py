@@ -1,8 +1,10 @@
-"""What was fitted to data: how much each piece of evidence counts, and what the errors of a map's points have in common.
+"""What was fitted to data: how much each piece of evidence counts, and what the errors of a map's
+points have in common.
 
-These numbers carry every probability and covariance, and belong to one kind of features each: `weights/KIND.json` holds them with the
-corpus and the command that they come from, and the calibration error on places that they were not fitted to. They are no settings.
-A kind without a file answers with those of a kind like it, and says that its probability is not calibrated.
+These numbers carry every probability and covariance, and belong to one kind of features each:
+`weights/KIND.json` holds them with the corpus and the command that they come from, and the
+calibration error on places that they were not fitted to. They are no settings. A kind without a
+file answers with those of a kind like it, and says that its probability is not calibrated.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ from topoloc.features.kinds import KINDS, LEARNED
 
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 STAND_IN, LEARNED_STAND_IN = "surf", LEARNED[0].name
-"""The kinds whose weights others take that have none: where no network is asked, and where one is."""
+"""The kinds whose weights others take that have none: where no network is asked, and where one
+is."""
 
 _T = TypeVar("_T")
 
@@ -28,7 +31,8 @@ _T = TypeVar("_T")
 class EvidenceWeights:
     """Of the evidence for one pose (`evidence.py`), in logarithms of odds.
 
-    A pose with more than `clear_log_odds` for it is clear: only parts of the map that look nearly the same are asked then.
+    A pose with more than `clear_log_odds` for it is clear: only parts of the map that look nearly
+    the same are asked then.
     """
 
     even_share: float
@@ -43,14 +47,23 @@ class EvidenceWeights:
     @property
     def in_order(self) -> tuple[float, ...]:
         """In the order of `score_features`; without the bias."""
-        return (self.even_share, self.chance, self.inliers, self.inlier_share, self.spread, self.doubt)
+        return (
+            self.even_share,
+            self.chance,
+            self.inliers,
+            self.inlier_share,
+            self.spread,
+            self.doubt,
+        )
 
 
 @dataclass(frozen=True)
 class RivalWeights:
-    """How much the odds, the even share found and the doubt count between two poses of one picture (`belief.py`), in logarithms.
+    """How much the odds, the even share found and the doubt count between two poses of one picture
+    (`belief.py`), in logarithms.
 
-    unclear_lead: by how much, in logarithms of odds, a pose that is not clear must lead each one elsewhere.
+    unclear_lead: by how much, in logarithms of odds, a pose that is not clear must lead each one
+    elsewhere.
     """
 
     odds: float
@@ -63,8 +76,9 @@ class RivalWeights:
 class WallWeights:
     """Of the evidence for a pose that the walls let expect (`walls/`), in logarithms of odds.
 
-    sigma_px: standard deviation of a key point found at such a slant. few_points: from n points the covariance is this over n times as
-    large as independent errors would have it: where few are found, guided matching has drawn most of them to the pose itself.
+    sigma_px: standard deviation of a key point found at such a slant. few_points: from n points the
+    covariance is this over n times as large as independent errors would have it: where few are
+    found, guided matching has drawn most of them to the pose itself.
     """
 
     found: float
@@ -89,9 +103,11 @@ class WallWeights:
 
 @dataclass(frozen=True)
 class SharedErrorWeights:
-    """What rho (`correlated_errors.py`) is taken to be, from what comparing neighbouring nodes gives.
+    """What rho (`correlated_errors.py`) is taken to be, from what comparing neighbouring nodes
+    gives.
 
-    factor: what neighbours share cannot be seen by comparing them. unknown: where too few nodes can be compared.
+    factor: what neighbours share cannot be seen by comparing them. unknown: where too few nodes can
+    be compared.
     """
 
     factor: float
@@ -103,8 +119,9 @@ class SharedErrorWeights:
 class FittedWeights:
     """The weights of one kind of features, and where they come from.
 
-    calibration_error: mean difference, over ten bins, of the probability said and the share that was right, on places that the weights
-    were not fitted to; None where they were never fitted to this kind.
+    calibration_error: mean difference, over ten bins, of the probability said and the share that
+    was right, on places that the weights were not fitted to; None where they were never fitted to
+    this kind.
     """
 
     kind: str
@@ -127,13 +144,19 @@ class FittedWeights:
         return {name: whole.pop(name) for name in _SOURCE} | {"weights": whole}
 
 
-_GROUPS = {"evidence": EvidenceWeights, "rivals": RivalWeights, "walls": WallWeights, "shared_errors": SharedErrorWeights}
+_GROUPS = {
+    "evidence": EvidenceWeights,
+    "rivals": RivalWeights,
+    "walls": WallWeights,
+    "shared_errors": SharedErrorWeights,
+}
 _SOURCE = ("kind", "corpus", "date", "command", "calibration_error")
 
 
 @cache
 def weights_of(kind: str) -> FittedWeights:
-    """The weights that ship for this kind of features; those of a kind like it, not calibrated, where there are none.
+    """The weights that ship for this kind of features; those of a kind like it, not calibrated,
+    where there are none.
 
     Raises:
         FeatureKindError: the file is damaged, or of another kind.
@@ -161,7 +184,8 @@ def read_weights(path: Path) -> FittedWeights:
 
 
 def weights_from_json(read: Any) -> FittedWeights:
-    """The opposite of `FittedWeights.to_json`; ValueError where a key is missing, unknown or of the wrong type."""
+    """The opposite of `FittedWeights.to_json`; ValueError where a key is missing, unknown or of the
+    wrong type."""
     _check_keys(read, {*_SOURCE, "weights"}, "the file")
     _check_keys(read["weights"], set(_GROUPS), "weights")
     for name in _SOURCE[:-1]:

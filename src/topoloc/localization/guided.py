@@ -1,8 +1,8 @@
 """Guided matching: once a pose is roughly known, map points are sought where they must be seen.
 
-Matches that the ratio test had to give up among thousands of descriptors are safe within a few pixels, and the nodes can
-be chosen by where the camera stands instead of by looks: the nearest ones, whose points were measured from nearly the
-same place.
+Matches that the ratio test had to give up among thousands of descriptors are safe within a few
+pixels, and the nodes can be chosen by where the camera stands instead of by looks: the nearest
+ones, whose points were measured from nearly the same place.
 """
 
 from __future__ import annotations
@@ -19,45 +19,74 @@ from topoloc.features.features import Features, Matches
 from topoloc.features.kinds import FeatureKind, GuidedThresholds
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.guided_kernels import expected_of_points, match_projections, project_without_lens
+from topoloc.localization.guided_kernels import (
+    expected_of_points,
+    match_projections,
+    project_without_lens,
+)
 from topoloc.localization.local_map import LocalMap
 
 
 @dataclass(frozen=True)
 class GuidedConfig:
-    """Settings of guided matching. A threshold that is None is that of the kind of features (`features/kinds.py`)."""
+    """Settings of guided matching. A threshold that is None is that of the kind of features
+    (`features/kinds.py`)."""
 
     num_nodes: Annotated[int, Between(0, 1000)] = 3
-    """Nodes nearest to the first pose (Eq. 1) whose points are sought; 0 keeps the first pose as it is."""
+    """Nodes nearest to the first pose (Eq. 1) whose points are sought; 0 keeps the first pose as it
+    is."""
     radius_px: Annotated[float, Between(0, 1000)] = 10.0
-    """How far from its projection a map point is sought, in an image whose longer side is 640 pixels; grows with that."""
+    """How far from its projection a map point is sought, in an image whose longer side is 640
+    pixels; grows with that."""
     max_scale: Annotated[float | None, AtLeast(1)] = None
-    """Largest ratio of a key point's size to the one expected, or the other way round. Unset: what suits the kind of features."""
+    """Largest ratio of a key point's size to the one expected, or the other way round. Unset: what
+    suits the kind of features."""
     max_turn: Annotated[float | None, AtLeast(0)] = None
-    """Largest difference of a key point's orientation from the one expected, radians. Unset: what suits the kind of features."""
+    """Largest difference of a key point's orientation from the one expected, radians. Unset: what
+    suits the kind of features."""
     min_similarity: Annotated[float | None, Between(-1, 1)] = None
     """Least scalar product of the two descriptors. Unset: what suits the kind of features."""
     min_margin: Annotated[float | None, Between(0, 2)] = None
     """By how much the best key point must lead the next one within the radius."""
 
-    def resolved(self, kind: FeatureKind, thresholds: GuidedThresholds | None = None) -> GuidedConfig:
-        """With the kind's thresholds (`thresholds`, or those for key points nearby) where none is set.
+    def resolved(
+        self, kind: FeatureKind, thresholds: GuidedThresholds | None = None
+    ) -> GuidedConfig:
+        """With the kind's thresholds (`thresholds`, or those for key points nearby) where none is
+        set.
 
         Sizes and angles that do not follow the picture are never looked at.
         """
-        unset = {name: value for name, value in asdict(thresholds or kind.guided).items() if getattr(self, name) is None}
+        unset = {
+            name: value
+            for name, value in asdict(thresholds or kind.guided).items()
+            if getattr(self, name) is None
+        }
         unset |= {} if kind.has_scale else {"max_scale": math.inf}
         unset |= {} if kind.has_angle else {"max_turn": math.inf}
         return replace(self, **unset)
 
 
-def match_guided(features: Features, local_map: LocalMap, cam_from_world: Rigid3, camera: Camera, config: GuidedConfig) -> Matches:
-    """Matches of key points with map points that `cam_from_world` lets expect nearby: one map point a key point, the most similar."""
-    return match_expected(features, local_map, expected_key_points(local_map, cam_from_world, camera), camera, config)
+def match_guided(
+    features: Features,
+    local_map: LocalMap,
+    cam_from_world: Rigid3,
+    camera: Camera,
+    config: GuidedConfig,
+) -> Matches:
+    """Matches of key points with map points that `cam_from_world` lets expect nearby: one map point
+    a key point, the most similar."""
+    return match_expected(
+        features, local_map, expected_key_points(local_map, cam_from_world, camera), camera, config
+    )
 
 
 def match_expected(
-    features: Features, local_map: LocalMap, expected: Float32[np.ndarray, "n 5"], camera: Camera, config: GuidedConfig
+    features: Features,
+    local_map: LocalMap,
+    expected: Float32[np.ndarray, "n 5"],
+    camera: Camera,
+    config: GuidedConfig,
 ) -> Matches:
     """As `match_guided`, where each map point is expected as `expected_key_points` says."""
     found, similarities = _find(features, local_map, expected, camera, config)
@@ -69,8 +98,15 @@ def match_expected(
     return Matches(query_idx.astype(np.int32), train_idx.astype(np.int32), distances)
 
 
-def count_by_chance(features: Features, local_map: LocalMap, cam_from_world: Rigid3, camera: Camera, config: GuidedConfig) -> int:
-    """How many matches `match_guided` would find were the pose wrong: all map points are sought a third of the picture away."""
+def count_by_chance(
+    features: Features,
+    local_map: LocalMap,
+    cam_from_world: Rigid3,
+    camera: Camera,
+    config: GuidedConfig,
+) -> int:
+    """How many matches `match_guided` would find were the pose wrong: all map points are sought a
+    third of the picture away."""
     expected = expected_key_points(local_map, cam_from_world, camera)
     size = np.array([camera.width, camera.height], np.float32)
     expected[:, :2] = np.mod(expected[:, :2] + size / 3.0, size)
@@ -79,14 +115,21 @@ def count_by_chance(features: Features, local_map: LocalMap, cam_from_world: Rig
 
 
 def _find(
-    features: Features, local_map: LocalMap, expected: Float32[np.ndarray, "n 5"], camera: Camera, config: GuidedConfig
+    features: Features,
+    local_map: LocalMap,
+    expected: Float32[np.ndarray, "n 5"],
+    camera: Camera,
+    config: GuidedConfig,
 ) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
-    """The most similar key point near where each map point is expected, -1 for none; and how similar it is."""
+    """The most similar key point near where each map point is expected, -1 for none; and how
+    similar it is."""
     thresholds = (config.max_scale, config.max_turn, config.min_similarity, config.min_margin)
     numbers = [threshold for threshold in thresholds if threshold is not None]
     assert len(numbers) == 4, "resolve the configuration first"
     max_scale, max_turn, min_similarity, min_margin = numbers
-    seen = np.column_stack([features.points_img, features.sizes_px, np.cos(features.angles), np.sin(features.angles)])
+    seen = np.column_stack(
+        [features.points_img, features.sizes_px, np.cos(features.angles), np.sin(features.angles)]
+    )
     return match_projections(
         expected,
         local_map.descriptors,
@@ -102,41 +145,71 @@ def _find(
     )
 
 
-def visible_points(local_map: LocalMap, cam_from_world: Rigid3, camera: Camera) -> tuple[Int[np.ndarray, " v"], Float[np.ndarray, "v 2"]]:
+def visible_points(
+    local_map: LocalMap, cam_from_world: Rigid3, camera: Camera
+) -> tuple[Int[np.ndarray, " v"], Float[np.ndarray, "v 2"]]:
     """The map points that lie in the camera's view, by their rows, and where they must be seen."""
     _, pixels = _projected(local_map, cam_from_world, camera)
     rows = np.flatnonzero(np.isfinite(pixels[:, 0]))
     return rows, pixels[rows]
 
 
-def _projected(local_map: LocalMap, cam_from_world: Rigid3, camera: Camera) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 2"]]:
+def _projected(
+    local_map: LocalMap, cam_from_world: Rigid3, camera: Camera
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 2"]]:
     """The map points in the camera (metres), and their pixels, NaN where they are out of view."""
     if not camera.is_distorted:
-        rotation, translation = np.ascontiguousarray(cam_from_world.rotation), np.ascontiguousarray(cam_from_world.translation)
+        rotation, translation = (
+            np.ascontiguousarray(cam_from_world.rotation),
+            np.ascontiguousarray(cam_from_world.translation),
+        )
         lens = (camera.fx, camera.fy), (camera.cx, camera.cy)
-        return project_without_lens(local_map.points_world, rotation, translation, *lens, camera.width, camera.height)
+        return project_without_lens(
+            local_map.points_world, rotation, translation, *lens, camera.width, camera.height
+        )
     points_cam = cam_from_world.apply(local_map.points_world)
     pixels = camera.img_from_cam(points_cam)
     with np.errstate(invalid="ignore"):
-        inside = (pixels >= -0.5).all(axis=1) & (pixels[:, 0] < camera.width - 0.5) & (pixels[:, 1] < camera.height - 0.5)
+        inside = (
+            (pixels >= -0.5).all(axis=1)
+            & (pixels[:, 0] < camera.width - 0.5)
+            & (pixels[:, 1] < camera.height - 0.5)
+        )
     return points_cam, np.where(inside[:, None], pixels, np.nan)
 
 
-def expected_key_points(local_map: LocalMap, cam_from_world: Rigid3, camera: Camera) -> Float32[np.ndarray, "n 5"]:
-    """Pixel, size and orientation (cosine, sine) at which each map point must be seen; NaN where it is out of view.
+def expected_key_points(
+    local_map: LocalMap, cam_from_world: Rigid3, camera: Camera
+) -> Float32[np.ndarray, "n 5"]:
+    """Pixel, size and orientation (cosine, sine) at which each map point must be seen; NaN where it
+    is out of view.
 
-    The surface is taken to face the node's camera; `max_scale` and `max_turn` leave room for its slant.
+    The surface is taken to face the node's camera; `max_scale` and `max_turn` leave room for its
+    slant.
     """
     points_cam, pixels = _projected(local_map, cam_from_world, camera)
     rotation = np.ascontiguousarray(cam_from_world.rotation)
-    return expected_of_points(points_cam, pixels, local_map.sizes, local_map.directions, rotation, float(camera.fx))
+    return expected_of_points(
+        points_cam, pixels, local_map.sizes, local_map.directions, rotation, float(camera.fx)
+    )
 
 
-def largest_shift(features: Features, matches: Matches, expected: Float32[np.ndarray, "n 5"], camera: Camera, within_px: float) -> int:
-    """How many of these matches are displaced alike from where they were expected: the most that lie within `within_px` of
-    the displacement of one of them, in an image whose longer side is 640 pixels; grows with that."""
+def largest_shift(
+    features: Features,
+    matches: Matches,
+    expected: Float32[np.ndarray, "n 5"],
+    camera: Camera,
+    within_px: float,
+) -> int:
+    """How many of these matches are displaced alike from where they were expected: the most that
+    lie within `within_px` of the displacement of one of them, in an image whose longer side is 640
+    pixels; grows with that."""
     if len(matches) == 0:
         return 0
     shifts = features.points_img[matches.query_idx] - expected[matches.train_idx, :2]
     apart = np.square(shifts[:, None] - shifts[None]).sum(axis=2)
-    return int(np.count_nonzero(apart < (within_px * max(max(camera.width, camera.height) / 640.0, 0.5)) ** 2, axis=1).max())
+    return int(
+        np.count_nonzero(
+            apart < (within_px * max(max(camera.width, camera.height) / 640.0, 0.5)) ** 2, axis=1
+        ).max()
+    )

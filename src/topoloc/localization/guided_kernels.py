@@ -1,4 +1,5 @@
-"""Numba kernels of guided matching: where must a map point be seen? And which key point lies there, and looks like it?"""
+"""Numba kernels of guided matching: where must a map point be seen? And which key point lies there,
+and looks like it?"""
 
 from __future__ import annotations
 
@@ -9,16 +10,28 @@ from topoloc.compiled import kernel
 
 @kernel(error_model="numpy", fastmath={"reassoc", "contract"})
 def match_projections(
-    expected, map_descriptors, seen, descriptors, width, height, radius, max_scale, min_cosine, min_similarity, min_margin
+    expected,
+    map_descriptors,
+    seen,
+    descriptors,
+    width,
+    height,
+    radius,
+    max_scale,
+    min_cosine,
+    min_similarity,
+    min_margin,
 ):
-    """For every map point the key point within `radius` pixels of where it must be seen that is most similar.
+    """For every map point the key point within `radius` pixels of where it must be seen that is
+    most similar.
 
-    Rows of `expected` and `seen` are (x, y, size, cosine and sine of the angle), float32; NaN where a map point is out of
-    view. Key points whose size differs by more than the factor `max_scale`, or whose angle by more than that of
-    `min_cosine`, are others.
+    Rows of `expected` and `seen` are (x, y, size, cosine and sine of the angle), float32; NaN where
+    a map point is out of view. Key points whose size differs by more than the factor `max_scale`,
+    or whose angle by more than that of `min_cosine`, are others.
 
-    Returns the key point's row for each map point, -1 for none, and the similarity (scalar product). Of several key points
-    within the radius the best must lead by `min_margin`, unless they lie within two pixels of each other: one blob found at two scales.
+    Returns the key point's row for each map point, -1 for none, and the similarity (scalar
+    product). Of several key points within the radius the best must lead by `min_margin`, unless
+    they lie within two pixels of each other: one blob found at two scales.
     """
     num_columns, num_rows = int(width / radius) + 1, int(height / radius) + 1
     num_cells = num_columns * num_rows
@@ -49,7 +62,11 @@ def match_projections(
                     k = order[position]
                     dx, dy = seen[k, 0] - x, seen[k, 1] - y
                     scale = seen[k, 2] / expected[n, 2]
-                    if dx * dx + dy * dy > radius * radius or scale > max_scale or scale * max_scale < 1:
+                    if (
+                        dx * dx + dy * dy > radius * radius
+                        or scale > max_scale
+                        or scale * max_scale < 1
+                    ):
                         continue
                     if seen[k, 3] * expected[n, 3] + seen[k, 4] * expected[n, 4] < min_cosine:
                         continue
@@ -57,10 +74,16 @@ def match_projections(
                     for d in range(descriptors.shape[1]):
                         product += descriptors[k, d] * map_descriptors[n, d]
                     if product > best:
-                        if best_k < 0 or abs(seen[k, 0] - seen[best_k, 0]) + abs(seen[k, 1] - seen[best_k, 1]) > 2:
+                        if (
+                            best_k < 0
+                            or abs(seen[k, 0] - seen[best_k, 0]) + abs(seen[k, 1] - seen[best_k, 1])
+                            > 2
+                        ):
                             second = best
                         best, best_k = product, k
-                    elif product > second and (abs(seen[k, 0] - seen[best_k, 0]) + abs(seen[k, 1] - seen[best_k, 1]) > 2):
+                    elif product > second and (
+                        abs(seen[k, 0] - seen[best_k, 0]) + abs(seen[k, 1] - seen[best_k, 1]) > 2
+                    ):
                         second = product
         if best_k >= 0 and best >= min_similarity and best - second >= min_margin:
             found[n], similarities[n] = best_k, best
@@ -69,12 +92,18 @@ def match_projections(
 
 @kernel(error_model="numpy")
 def project_without_lens(points_world, rotation, translation, focal, centre, width, height):
-    """Points in the camera (n, 3), metres, and their pixels (n, 2), NaN where they are out of view, of a camera without distortion."""
+    """Points in the camera (n, 3), metres, and their pixels (n, 2), NaN where they are out of view,
+    of a camera without distortion."""
     points_cam, pixels = np.empty((len(points_world), 3)), np.empty((len(points_world), 2))
     for n in range(len(points_world)):
         p = points_world[n]
         for i in range(3):
-            points_cam[n, i] = rotation[i, 0] * p[0] + rotation[i, 1] * p[1] + rotation[i, 2] * p[2] + translation[i]
+            points_cam[n, i] = (
+                rotation[i, 0] * p[0]
+                + rotation[i, 1] * p[1]
+                + rotation[i, 2] * p[2]
+                + translation[i]
+            )
         x, y, z = points_cam[n, 0], points_cam[n, 1], points_cam[n, 2]
         u, v = x / z * focal[0] + centre[0], y / z * focal[1] + centre[1]
         is_in_view = z > 1e-9 and u >= -0.5 and v >= -0.5 and u < width - 0.5 and v < height - 0.5
@@ -84,9 +113,11 @@ def project_without_lens(points_world, rotation, translation, focal, centre, wid
 
 @kernel(error_model="numpy")
 def expected_of_points(points_cam, pixels, sizes, directions, rotation, focal):
-    """Rows (x, y, size, cosine and sine of the angle), float32, at which points must be seen whose pixels are known; NaN where these are.
+    """Rows (x, y, size, cosine and sine of the angle), float32, at which points must be seen whose
+    pixels are known; NaN where these are.
 
-    `sizes` (metres) and `directions` (unit vectors, world) are those of what the points' descriptors describe, `focal` is in pixels.
+    `sizes` (metres) and `directions` (unit vectors, world) are those of what the points'
+    descriptors describe, `focal` is in pixels.
     """
     expected = np.full((len(pixels), 5), np.nan, np.float32)
     for n in range(len(pixels)):
@@ -94,9 +125,15 @@ def expected_of_points(points_cam, pixels, sizes, directions, rotation, focal):
             continue
         x, y, z, d = points_cam[n, 0], points_cam[n, 1], points_cam[n, 2], directions[n]
         along = rotation[2, 0] * d[0] + rotation[2, 1] * d[1] + rotation[2, 2] * d[2]
-        right = rotation[0, 0] * d[0] + rotation[0, 1] * d[1] + rotation[0, 2] * d[2] - x / z * along
+        right = (
+            rotation[0, 0] * d[0] + rotation[0, 1] * d[1] + rotation[0, 2] * d[2] - x / z * along
+        )
         down = rotation[1, 0] * d[0] + rotation[1, 1] * d[1] + rotation[1, 2] * d[2] - y / z * along
         length = max(np.sqrt(right * right + down * down), 1e-9)
-        expected[n, 0], expected[n, 1], expected[n, 2] = pixels[n, 0], pixels[n, 1], sizes[n] * focal / z
+        expected[n, 0], expected[n, 1], expected[n, 2] = (
+            pixels[n, 0],
+            pixels[n, 1],
+            sizes[n] * focal / z,
+        )
         expected[n, 3], expected[n, 4] = right / length, down / length
     return expected

@@ -1,12 +1,14 @@
 """Localizing a single image in the topo-metric map: section III-B of the paper, read from the top.
 
-The coarse localizer names the nodes that the image may belong to; the image is patch-normalised and its features are
-matched with those of the nodes; PnP on the matches gives the camera's global pose. Unlike the paper's blind first choice, this is one
-loop of hypotheses (`asking.py`): first poses are proposed (`propose.py`), the cheapest and likeliest first; each is refined in the same
-way, its evidence counted (`refine.py`), and it joins what is believed (`belief.py`), until that is settled. A pose is reported only where
-the evidence for it is strong and nothing else in the map explains the image as well. One candidate, no guided step, no look-alikes,
-viewpoints and walls (`num_candidates=1`, `guided.num_nodes=0`, `look_alikes.max_groups=0`, `viewpoints.num_nodes=0`, `walls.num_places=0`)
-give the paper's own behaviour.
+The coarse localizer names the nodes that the image may belong to; the image is patch-normalised and
+its features are matched with those of the nodes; PnP on the matches gives the camera's global pose.
+Unlike the paper's blind first choice, this is one loop of hypotheses (`asking.py`): first poses are
+proposed (`propose.py`), the cheapest and likeliest first; each is refined in the same way, its
+evidence counted (`refine.py`), and it joins what is believed (`belief.py`), until that is settled.
+A pose is reported only where the evidence for it is strong and nothing else in the map explains the
+image as well. One candidate, no guided step, no look-alikes, viewpoints and walls
+(`num_candidates=1`, `guided.num_nodes=0`, `look_alikes.max_groups=0`, `viewpoints.num_nodes=0`,
+`walls.num_places=0`) give the paper's own behaviour.
 """
 
 from __future__ import annotations
@@ -42,12 +44,13 @@ R = TypeVar("R", bound=Localization | NotLocalized)
 class Localizer:
     """Holds an open map, its coarse localizer and the nodes used lately.
 
-    `left_out` names the map's kinds of features that are not asked because their network, or ONNX Runtime, is not here, each with what it
-    lacks.
+    `left_out` names the map's kinds of features that are not asked because their network, or ONNX
+    Runtime, is not here, each with what it lacks.
 
     Args:
-        coarse: names the candidate nodes instead of one of the map's own coarse localizers: any object with `CoarseLocalizer.rank`
-            (`topoloc/places/coarse.py`), such as retrieval of another kind or a prior from elsewhere. `config.coarse` is then left aside.
+        coarse: names the candidate nodes instead of one of the map's own coarse localizers: any
+            object with `CoarseLocalizer.rank` (`topoloc/places/coarse.py`), such as retrieval of
+            another kind or a prior from elsewhere. `config.coarse` is then left aside.
         weights: what the evidence counts, instead of what ships for the map's kind of features.
 
     Raises:
@@ -55,7 +58,8 @@ class Localizer:
         FeatureKindError: the map's features are of a kind that there is not.
         EmptyMapError: the map has no node.
         MapError: the map has no such coarse localizer.
-        MissingExtraError, WeightsError: a network of features is not here, and the map has no others, or `config.kinds` names them.
+        MissingExtraError, WeightsError: a network of features is not here, and the map has no
+            others, or `config.kinds` names them.
     """
 
     def __init__(
@@ -69,8 +73,17 @@ class Localizer:
         check_bounds(config)
         self.topomap, self.map_id = topomap, map_id_of(topomap)
         kinds, self.left_out = kinds_to_ask(topomap, config.kinds)
-        self._kinds = [AskedKind.of(topomap.by_kind(kind), config, coarse, weights if kind == kinds[0] else None) for kind in kinds]
-        self.map, self.config, self.weights = self._kinds[0].map, self._kinds[0].config, self._kinds[0].weights
+        self._kinds = [
+            AskedKind.of(
+                topomap.by_kind(kind), config, coarse, weights if kind == kinds[0] else None
+            )
+            for kind in kinds
+        ]
+        self.map, self.config, self.weights = (
+            self._kinds[0].map,
+            self._kinds[0].config,
+            self._kinds[0].weights,
+        )
 
     def localize(
         self,
@@ -83,13 +96,15 @@ class Localizer:
     ) -> Localization | NotLocalized:
         """Where was this image (grey or RGB, uint8) taken, by a camera of this calibration?
 
-        Of a camera that is only roughly known, or not at all (None), the focal length is found with the pose; that takes a few times as
-        long, and it is taken for a pinhole.
+        Of a camera that is only roughly known, or not at all (None), the focal length is found with
+        the pose; that takes a few times as long, and it is taken for a pinhole.
 
         Args:
-            prior: about where the camera is (world_from_cam): the nodes nearest to it replace the coarse search. The pose needs the same
-                evidence as any other, of matches that the prior did not guide.
-            max_ms: after so many milliseconds no further hypothesis is sought, instead of `config.max_ms`.
+            prior: about where the camera is (world_from_cam): the nodes nearest to it replace the
+                coarse search. The pose needs the same evidence as any other, of matches that the
+                prior did not guide.
+            max_ms: after so many milliseconds no further hypothesis is sought, instead of
+                `config.max_ms`.
             trace: collects all that is tried.
             t_ns: when it was taken, nanoseconds, for the result to say.
 
@@ -107,34 +122,54 @@ class Localizer:
         max_ms: float | None = None,
         trace: Trace | None = None,
     ) -> Verdict:
-        """As `localize`; also each pose that the result names (its own, or its alternatives) with the points that it stands on."""
+        """As `localize`; also each pose that the result names (its own, or its alternatives) with
+        the points that it stands on."""
         return self.ask(Picture(image, camera), prior, max_ms, trace)
 
-    def ask(self, picture: Picture, prior: Rigid3 | None = None, max_ms: float | None = None, trace: Trace | None = None) -> Verdict:
+    def ask(
+        self,
+        picture: Picture,
+        prior: Rigid3 | None = None,
+        max_ms: float | None = None,
+        trace: Trace | None = None,
+    ) -> Verdict:
         """As `localize_near`, of a picture whose features other maps may have asked for before."""
         return self.asking(picture, prior, max_ms, trace).by_all_means()
 
-    def asking(self, picture: Picture, prior: Rigid3 | None = None, max_ms: float | None = None, trace: Trace | None = None) -> Asking:
+    def asking(
+        self,
+        picture: Picture,
+        prior: Rigid3 | None = None,
+        max_ms: float | None = None,
+        trace: Trace | None = None,
+    ) -> Asking:
         """The same question, to be put at a glance first."""
         searches, camera = self._searches(self._query(picture, max_ms), trace), picture.camera
 
         def completed(verdict: Verdict) -> Verdict:
-            return self.completed(verdict[0], camera), [(self.completed(one, camera), seen) for one, seen in verdict[1]]
+            return self.completed(verdict[0], camera), [
+                (self.completed(one, camera), seen) for one, seen in verdict[1]
+            ]
 
         return Asking(searches, prior, completed)
 
     def without(self, node_ids: Iterable[int]) -> Localizer:
-        """The same map as if nobody had stood at these nodes: a picture that was taken there is then asked of the rest of the map.
+        """The same map as if nobody had stood at these nodes: a picture that was taken there is
+        then asked of the rest of the map.
 
-        At least one node is left; the walls along the way are not asked. Raises KeyError where the map has no node of such an id.
+        At least one node is left; the walls along the way are not asked. Raises KeyError where the
+        map has no node of such an id.
         """
         rows, other = [self.topomap.row_of(node_id) for node_id in node_ids], copy.copy(self)
         other._kinds = [replace(kind, map=kind.map.without(rows)) for kind in self._kinds]
         other.map = other._kinds[0].map
         return other
 
-    def completed(self, result: R, camera: Camera | RoughCamera | None = None, t_ns: int | None = None) -> R:
-        """The result with the map that it is of, where on earth that is, the picture's camera, and its time (nanoseconds)."""
+    def completed(
+        self, result: R, camera: Camera | RoughCamera | None = None, t_ns: int | None = None
+    ) -> R:
+        """The result with the map that it is of, where on earth that is, the picture's camera, and
+        its time (nanoseconds)."""
         if isinstance(camera, RoughCamera):
             focal = result.focal_length_px if isinstance(result, Localization) else None
             camera = None if focal is None else camera.with_focal(focal)
@@ -144,16 +179,25 @@ class Localizer:
         if isinstance(result, NotLocalized):
             alternatives = result.alternatives
             if georeference:
-                alternatives = tuple(replace(one, geopose=georeference.geopose(one.world_from_cam)) for one in alternatives)
+                alternatives = tuple(
+                    replace(one, geopose=georeference.geopose(one.world_from_cam))
+                    for one in alternatives
+                )
             return replace(result, provenance=provenance, alternatives=alternatives)
-        return replace(result, provenance=provenance, geopose=georeference.geopose(result.world_from_cam) if georeference else None)
+        return replace(
+            result,
+            provenance=provenance,
+            geopose=georeference.geopose(result.world_from_cam) if georeference else None,
+        )
 
     def _searches(self, query: Query, trace: Trace | None) -> list[Search]:
         """One by each kind of features, which know those before them."""
         searches = list[Search]()
         for kind in self._kinds:
             of_kind = replace(query, feature_config=kind.map.feature_config)
-            search = Search(of_kind, kind.map, kind.config, kind.weights, kind.correlated_errors, trace)
+            search = Search(
+                of_kind, kind.map, kind.config, kind.weights, kind.correlated_errors, trace
+            )
             if searches:
                 search.before, searches[-1].is_last = searches[-1], False
             searches.append(search)
@@ -161,12 +205,22 @@ class Localizer:
 
     @property
     def correlated_errors(self) -> float:
-        """rho of the map by its first kind of features: the share of a match's variance that its points have in common."""
+        """rho of the map by its first kind of features: the share of a match's variance that its
+        points have in common."""
         return self._kinds[0].correlated_errors
 
     def _query(self, picture: Picture, max_ms: float | None) -> Query:
         image, camera = picture.image, picture.camera
         start, limit = time.perf_counter(), max_ms if max_ms is not None else self.config.max_ms
-        reduced, lens = reduced_image(image, camera, self.map.focal, self.config.max_finer, self.config.max_side_px)
+        reduced, lens = reduced_image(
+            image, camera, self.map.focal, self.config.max_finer, self.config.max_side_px
+        )
         deadline = float("inf") if limit is None else start + limit / 1e3
-        return Query(reduced, lens, image.shape[1] / lens.width, self.map.feature_config, deadline=deadline, shared=picture.features)
+        return Query(
+            reduced,
+            lens,
+            image.shape[1] / lens.width,
+            self.map.feature_config,
+            deadline=deadline,
+            shared=picture.features,
+        )

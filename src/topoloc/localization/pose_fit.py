@@ -1,4 +1,5 @@
-"""Matches of a query image's features with points of the map, and the pose that most of them agree on."""
+"""Matches of a query image's features with points of the map, and the pose that most of them agree
+on."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ from topoloc.localization.local_map import LocalMap
 
 @dataclass(frozen=True, eq=False)
 class SeenPoints:
-    """Row k: the pixel at which a map point was found, its world position (metres) and the covariance of that (m^2)."""
+    """Row k: the pixel at which a map point was found, its world position (metres) and the
+    covariance of that (m^2)."""
 
     points_img: Float32[np.ndarray, "n 2"]
     points_world: Float[np.ndarray, "n 3"]
@@ -33,7 +35,9 @@ class SeenPoints:
 
     def in_image(self, scale: float) -> SeenPoints:
         """The same in a picture that is `scale` times as wide."""
-        points_img = ((self.points_img + np.float32(0.5)) * np.float32(scale) - np.float32(0.5)).astype(np.float32)
+        points_img = (
+            (self.points_img + np.float32(0.5)) * np.float32(scale) - np.float32(0.5)
+        ).astype(np.float32)
         return SeenPoints(points_img, self.points_world, self.covariances)
 
 
@@ -42,7 +46,8 @@ _MIN_MATCHES = 4
 
 @dataclass(frozen=True, eq=False)
 class PoseFit:
-    """`lens` is what is known of the camera, `camera` the same, or, of a rough one, what comes of it with the focal length found."""
+    """`lens` is what is known of the camera, `camera` the same, or, of a rough one, what comes of
+    it with the focal length found."""
 
     features: Features
     lens: Camera | RoughCamera
@@ -60,7 +65,9 @@ class PoseFit:
         """The node that most inliers come from; -1 without any."""
         if self.num_inliers == 0 or self.pose is None:
             return -1
-        node_ids, counts = np.unique(self.local_map.node_ids[self.matches.train_idx[self.pose.inliers]], return_counts=True)
+        node_ids, counts = np.unique(
+            self.local_map.node_ids[self.matches.train_idx[self.pose.inliers]], return_counts=True
+        )
         return int(node_ids[counts.argmax()])
 
     @cached_property
@@ -78,16 +85,26 @@ class PoseFit:
         return (points - radii).min(axis=0), (points + radii).max(axis=0)
 
     def stands_near(self, other: PoseFit) -> bool:
-        """Might inliers of both be the same points of the map? Where even the boxes that they fill are apart they are not."""
+        """Might inliers of both be the same points of the map? Where even the boxes that they fill
+        are apart they are not."""
         (low, high), (other_low, other_high) = self._box, other._box
         return bool(np.all(low <= other_high) and np.all(other_low <= high))
 
     def seen_points(self, scale: float) -> SeenPoints:
-        """The inliers of a fit with a pose, in a picture that is `scale` times as wide as that of the features."""
+        """The inliers of a fit with a pose, in a picture that is `scale` times as wide as that of
+        the features."""
         assert self.pose is not None
-        query_idx, train_idx = self.matches.query_idx[self.pose.inliers], self.matches.train_idx[self.pose.inliers]
-        points_world, covariances = self.local_map.points_world[train_idx], self.local_map.covariances[train_idx]
-        return SeenPoints(self.features.points_img[query_idx], points_world, covariances).in_image(scale)
+        query_idx, train_idx = (
+            self.matches.query_idx[self.pose.inliers],
+            self.matches.train_idx[self.pose.inliers],
+        )
+        points_world, covariances = (
+            self.local_map.points_world[train_idx],
+            self.local_map.covariances[train_idx],
+        )
+        return SeenPoints(self.features.points_img[query_idx], points_world, covariances).in_image(
+            scale
+        )
 
 
 def fit_pose(
@@ -98,16 +115,24 @@ def fit_pose(
     config: AbsolutePoseConfig,
     start: tuple[Rigid3, Camera] | None = None,
 ) -> PoseFit:
-    """Robust PnP on the matches, or the refinement of `start` (cam_from_world and the camera); with the focal length, of a rough camera."""
+    """Robust PnP on the matches, or the refinement of `start` (cam_from_world and the camera); with
+    the focal length, of a rough camera."""
     camera = start[1] if start else usual_camera(lens)
     if len(matches) < _MIN_MATCHES:
         return PoseFit(features, lens, camera, local_map, matches, None)
     points_img = features.points_img[matches.query_idx].astype(np.float64)
-    points_world, covariances = local_map.points_world[matches.train_idx], local_map.covariances[matches.train_idx]
+    points_world, covariances = (
+        local_map.points_world[matches.train_idx],
+        local_map.covariances[matches.train_idx],
+    )
     if isinstance(lens, RoughCamera):
-        found = estimate_pose_and_focal(points_img, points_world, lens, config, point_covariances=covariances, start=start)
+        found = estimate_pose_and_focal(
+            points_img, points_world, lens, config, point_covariances=covariances, start=start
+        )
         pose, camera = found or (None, camera)
     else:
         near = start[0] if start else None
-        pose = estimate_absolute_pose(points_img, points_world, lens, config, point_covariances=covariances, start=near)
+        pose = estimate_absolute_pose(
+            points_img, points_world, lens, config, point_covariances=covariances, start=near
+        )
     return PoseFit(features, lens, camera, local_map, matches, pose)

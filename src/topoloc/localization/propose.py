@@ -1,16 +1,21 @@
-"""First poses for a query image, the cheapest and likeliest first. Who proposes judges nothing: that is `evidence.py`'s and `belief.py`'s.
+"""First poses for a query image, the cheapest and likeliest first. Who proposes judges nothing:
+that is `evidence.py`'s and `belief.py`'s.
 
 - **prior**: the nodes nearest to where the camera is expected to be.
 - **retrieval**: the nodes that the coarse localizer names, their points thrown together.
-- **look-alikes**: the pool of the best candidates hides a second place: where its nodes are in the pool, points that are in both fail the
-  ratio test; where they are not, nobody asks. So nodes that look as much like the image as the best one does, but stand far from what
-  was found, are asked on their own.
-- **viewpoints**: in the dark most true matches fail the ratio test, among thousands of descriptors something is always as similar. A camera
-  near a node sees the same things about where the node saw them, about as large and as upright, and among the few key points that fit so
-  the most similar one is right far more often. So each node that ranks high lends its pose as if it were the camera's. Wrong nodes give
-  matches that are displaced anyhow, the right one matches that are displaced alike: only nodes whose displacements agree are followed up.
+- **look-alikes**: the pool of the best candidates hides a second place: where its nodes are in the
+  pool, points that are in both fail the ratio test; where they are not, nobody asks. So nodes that
+  look as much like the image as the best one does, but stand far from what was found, are asked on
+  their own.
+- **viewpoints**: in the dark most true matches fail the ratio test, among thousands of descriptors
+  something is always as similar. A camera near a node sees the same things about where the node saw
+  them, about as large and as upright, and among the few key points that fit so the most similar one
+  is right far more often. So each node that ranks high lends its pose as if it were the camera's.
+  Wrong nodes give matches that are displaced anyhow, the right one matches that are displaced
+  alike: only nodes whose displacements agree are followed up.
 
-- **repetition**: where a place repeats itself (`repetition.py`), a hypothesis is one of many: the poses shifted so are proposed, too.
+- **repetition**: where a place repeats itself (`repetition.py`), a hypothesis is one of many: the
+  poses shifted so are proposed, too.
 - **walls**: what is seen of the walls along the way, from the other side (`walls/`).
 
 Each proposer looks at what is believed so far and proposes nothing where that is settled.
@@ -42,7 +47,8 @@ _LEAST_FOUND_SHARE = 0.2  # of what is found at a pose, that must be found at on
 
 
 def propose(search: Search, prior: Rigid3 | None) -> Iterator[Proposal]:
-    """All first poses worth a look, each made when it is asked for; only the first of them where another kind of features is asked next."""
+    """All first poses worth a look, each made when it is asked for; only the first of them where
+    another kind of features is asked next."""
     if prior is not None:
         rows = [candidate.node_id for candidate in _near(search, prior)]
         yield _pooled(search, "prior", rows, float(search.config.num_chance_inliers))
@@ -61,20 +67,32 @@ def propose_more(search: Search) -> Iterator[Proposal]:
     viewpoints = [] if search.is_clear else list(_viewpoints(search))
     yield from viewpoints
     assert search.retrieved is not None
-    if search.is_clear or viewpoints or search.retrieved.num_inliers >= search.config.num_chance_inliers:
+    if (
+        search.is_clear
+        or viewpoints
+        or search.retrieved.num_inliers >= search.config.num_chance_inliers
+    ):
         yield from _look_alikes(search)
     yield from _repetitions(search)
     yield from propose_walls(search)
 
 
 def propose_briefly(search: Search, least: float) -> Proposal | None:
-    """What retrieval by the strongest features alone leads to; None where fewer than `least` of them agree."""
-    brief = _matched(search, "retrieval", _matcher(search, _ranked(search)), least, search.config.num_first_features)
+    """What retrieval by the strongest features alone leads to; None where fewer than `least` of
+    them agree."""
+    brief = _matched(
+        search,
+        "retrieval",
+        _matcher(search, _ranked(search)),
+        least,
+        search.config.num_first_features,
+    )
     return brief if brief.fit.num_inliers >= least else None
 
 
 def _ranked(search: Search) -> list[int]:
-    """The rows of the nodes that the coarse localizer names, of which the best are asked together."""
+    """The rows of the nodes that the coarse localizer names, of which the best are asked
+    together."""
     features = search.query.features
     with search.query.clock.stage("coarse"):
         num_ranked = max(search.config.num_candidates, search.config.look_alikes.num_ranked)
@@ -91,7 +109,8 @@ def _near(search: Search, world_from_cam: Rigid3) -> list[NodeScore]:
 
 
 def _pooled(search: Search, source: Source, rows: list[int], least: float) -> Proposal:
-    """These nodes' points together. The strongest features are nearly always enough, or agree in fewer than `least`; else all are tried."""
+    """These nodes' points together. The strongest features are nearly always enough, or agree in
+    fewer than `least`; else all are tried."""
     config, matcher = search.config, _matcher(search, rows)
     proposal = _matched(search, source, matcher, least, config.num_first_features)
     is_open = least <= proposal.fit.num_inliers < config.num_clear_inliers
@@ -104,23 +123,42 @@ def _matcher(search: Search, rows: list[int]) -> tuple[LocalMap, Matcher]:
     """The points of these nodes, and what matches the query's features with them."""
     points = search.map.local_map(rows)
     return points, Matcher(
-        search.query.features.descriptors, points.descriptors, (points.points_world, points.radii), search.config.matching
+        search.query.features.descriptors,
+        points.descriptors,
+        (points.points_world, points.radii),
+        search.config.matching,
     )
 
 
-def _matched(search: Search, source: Source, of_nodes: tuple[LocalMap, Matcher], least: float, max_features: int | None = None) -> Proposal:
-    """Matches with the points of nodes, and robust PnP, where as many as `least` may agree on a pose."""
+def _matched(
+    search: Search,
+    source: Source,
+    of_nodes: tuple[LocalMap, Matcher],
+    least: float,
+    max_features: int | None = None,
+) -> Proposal:
+    """Matches with the points of nodes, and robust PnP, where as many as `least` may agree on a
+    pose."""
     query, (local_map, matcher) = search.query, of_nodes
     with query.clock.stage("matching"):
         matches = matcher.of_first(max_features)
     if len(matches) < max(search.config.min_matches, least):
-        return Proposal(source, PoseFit(query.features, query.lens, query.camera, local_map, matches, None), is_guided=False)
+        return Proposal(
+            source,
+            PoseFit(query.features, query.lens, query.camera, local_map, matches, None),
+            is_guided=False,
+        )
     with query.clock.stage("pnp"):
-        return Proposal(source, fit_pose(query.features, query.lens, local_map, matches, search.config.pose), is_guided=False)
+        return Proposal(
+            source,
+            fit_pose(query.features, query.lens, local_map, matches, search.config.pose),
+            is_guided=False,
+        )
 
 
 def _look_alikes(search: Search) -> Iterator[Proposal]:
-    """Parts of the map far from what is believed that look like the image about as much as the best node does."""
+    """Parts of the map far from what is believed that look like the image about as much as the best
+    node does."""
     config, best, nodes = search.config.look_alikes, search.best, search.map.node_poses
     if not search.ranked or not config.max_groups:
         return
@@ -144,38 +182,53 @@ def _look_alikes(search: Search) -> Iterator[Proposal]:
 
 
 def least_inliers(search: Search) -> float:
-    """With how many of the strongest features another place must agree: more than by chance, not far fewer than what is believed."""
+    """With how many of the strongest features another place must agree: more than by chance, not
+    far fewer than what is believed."""
     best, config, least = search.best, search.config, float(search.config.num_chance_inliers)
     if best is None or best.fit.pose is None or best.probability < config.evidence.min_probability:
         return least
     found = best.fit.matches.query_idx[best.fit.pose.inliers]
     share_of_strongest = np.count_nonzero(found < config.num_first_features) / max(len(found), 1)
-    return max(least, config.look_alikes.min_inlier_share * best.evidence.num_inliers * share_of_strongest)
+    return max(
+        least, config.look_alikes.min_inlier_share * best.evidence.num_inliers * share_of_strongest
+    )
 
 
 def _viewpoints(search: Search) -> Iterator[Proposal]:
-    """What would be seen from where a node stands, for the nodes whose displacements agree, the most agreeing first."""
+    """What would be seen from where a node stands, for the nodes whose displacements agree, the
+    most agreeing first."""
     config, query = search.config.viewpoints, search.query
     found = []
     with query.clock.stage("matching"):
         for candidate in search.ranked[: config.num_nodes]:
             row = candidate.node_id
-            local_map, expected = search.map.local_map([row]), search.map.expected_at_node(row, query.camera)
-            matches = match_expected(query.features, local_map, expected, query.camera, config.matching)
-            num_alike = largest_shift(query.features, matches, expected, query.camera, config.shift_px)
+            local_map, expected = (
+                search.map.local_map([row]),
+                search.map.expected_at_node(row, query.camera),
+            )
+            matches = match_expected(
+                query.features, local_map, expected, query.camera, config.matching
+            )
+            num_alike = largest_shift(
+                query.features, matches, expected, query.camera, config.shift_px
+            )
             if num_alike >= config.min_alike + config.chance_share * len(matches):
                 found.append((num_alike, local_map, matches))
     found.sort(key=lambda one: -one[0])
     quick = replace(search.config.pose, max_iterations=config.max_iterations)
-    # where a place repeats itself, many nodes see the same, and the right one is no better than the others
+    # where a place repeats itself, many nodes see the same, and the right one is no better than the
+    # others
     more = 3 if found and len(search.map.repeats(search.ranked[0].node_id)) else 1
     with query.clock.stage("pnp"):
         fits = [
-            fit_pose(query.features, query.lens, local_map, matches, quick) for _, local_map, matches in found[: more * config.max_fits]
+            fit_pose(query.features, query.lens, local_map, matches, quick)
+            for _, local_map, matches in found[: more * config.max_fits]
         ]
     kept: list[PoseFit] = []
     for fit in sorted(fits, key=lambda fit: -fit.num_inliers):
-        if fit.pose is not None and not any(is_same_pose(fit, other, search.config.evidence) for other in kept):
+        if fit.pose is not None and not any(
+            is_same_pose(fit, other, search.config.evidence) for other in kept
+        ):
             kept.append(fit)
             yield Proposal("viewpoints", fit, is_guided=True)
         if len(kept) == more * config.max_poses:
@@ -188,13 +241,19 @@ def _of_other_features(search: Search) -> Iterator[Proposal]:
     if before is None or search.is_clear:
         return
     for hypothesis in before.belief.ranked(before.weights.rivals)[:_MAX_OTHERS]:
-        fit = _around_pose(search, hypothesis.world_from_cam, hypothesis.fit.camera, float(config.evidence.min_found))
+        fit = _around_pose(
+            search,
+            hypothesis.world_from_cam,
+            hypothesis.fit.camera,
+            float(config.evidence.min_found),
+        )
         if fit is not None:
             yield Proposal("other features", fit, is_guided=True)
 
 
 def _repetitions(search: Search) -> Iterator[Proposal]:
-    """The poses that a repetition of the place allows as well as those that are believed, and theirs in turn."""
+    """The poses that a repetition of the place allows as well as those that are believed, and
+    theirs in turn."""
     config, tried, num_asked = search.config, list[Rigid3](), 0
     waiting = [one for one in search.belief.hypotheses if not one.is_from_walls]
     while waiting and config.guided.num_nodes > 0:
@@ -204,7 +263,10 @@ def _repetitions(search: Search) -> Iterator[Proposal]:
         tried.append(hypothesis.world_from_cam)
         for move in search.map.moves(search.map.topomap.row_of(hypothesis.fit.node_id)):
             world_from_cam = Rigid3(move[:3, :3], move[:3, 3]) @ hypothesis.world_from_cam
-            if _is_beside(world_from_cam, [*tried, *(other.world_from_cam for other in search.belief.hypotheses)]):
+            if _is_beside(
+                world_from_cam,
+                [*tried, *(other.world_from_cam for other in search.belief.hypotheses)],
+            ):
                 continue
             if num_asked == config.max_repetitions:
                 return
@@ -220,21 +282,41 @@ def _repetitions(search: Search) -> Iterator[Proposal]:
 
 def _is_beside(world_from_cam: Rigid3, others: list[Rigid3]) -> bool:
     """Is a pose one of these, not a repetition of it?"""
-    way = np.linalg.norm(np.array([other.translation for other in others]) - world_from_cam.translation, axis=1)
-    return any((world_from_cam.inverse() @ others[k]).angle() < _BESIDE for k in np.flatnonzero(way < LEAST_SHIFT))
+    way = np.linalg.norm(
+        np.array([other.translation for other in others]) - world_from_cam.translation, axis=1
+    )
+    return any(
+        (world_from_cam.inverse() @ others[k]).angle() < _BESIDE
+        for k in np.flatnonzero(way < LEAST_SHIFT)
+    )
 
 
 def _moved(search: Search, world_from_cam: Rigid3, hypothesis: Hypothesis) -> PoseFit | None:
-    """What is found around a pose that is known to a few centimetres; None where it is far less than at the one that it repeats."""
-    return _around_pose(search, world_from_cam, hypothesis.fit.camera, _LEAST_FOUND_SHARE * hypothesis.evidence.num_found)
+    """What is found around a pose that is known to a few centimetres; None where it is far less
+    than at the one that it repeats."""
+    return _around_pose(
+        search,
+        world_from_cam,
+        hypothesis.fit.camera,
+        _LEAST_FOUND_SHARE * hypothesis.evidence.num_found,
+    )
 
 
-def _around_pose(search: Search, world_from_cam: Rigid3, camera: Camera, least: float) -> PoseFit | None:
+def _around_pose(
+    search: Search, world_from_cam: Rigid3, camera: Camera, least: float
+) -> PoseFit | None:
     """What is found around a pose; None where fewer than so many agree."""
     query, config, start = search.query, search.config, (world_from_cam.inverse(), camera)
     with query.clock.stage("matching"):
-        local_map = search.map.local_map(search.map.nearest(world_from_cam, config.guided.num_nodes))
-        matches = match_guided(query.features, local_map, *start, replace(config.guided, radius_px=2.0 * config.guided.radius_px))
+        local_map = search.map.local_map(
+            search.map.nearest(world_from_cam, config.guided.num_nodes)
+        )
+        matches = match_guided(
+            query.features,
+            local_map,
+            *start,
+            replace(config.guided, radius_px=2.0 * config.guided.radius_px),
+        )
     if len(matches) < least:
         return None
     with query.clock.stage("pnp"):

@@ -14,10 +14,12 @@ from topoloc.localization import checked_json as checked
 
 @dataclass(frozen=True)
 class Provenance:
-    """What a result comes from: the map by its id, in which version (the number of its last edit), by which kind of `features`; when the
-    picture was taken (nanoseconds), and with which camera. What is not known is None, or empty. `tile` is what the map is called in the
-    atlas that was asked, `atlas_from_cam` the camera's pose in the atlas's world; None where no atlas was asked, or that is not known.
-    `joint_world` is the name of the world that the tile shares with those joined with it, `joint_from_cam` the pose in that one."""
+    """What a result comes from: the map by its id, in which version (the number of its last edit),
+    by which kind of `features`; when the picture was taken (nanoseconds), and with which camera.
+    What is not known is None, or empty. `tile` is what the map is called in the atlas that was
+    asked, `atlas_from_cam` the camera's pose in the atlas's world; None where no atlas was asked,
+    or that is not known. `joint_world` is the name of the world that the tile shares with those
+    joined with it, `joint_from_cam` the pose in that one."""
 
     map_id: str = ""
     map_version: int = 0
@@ -38,12 +40,20 @@ class Provenance:
             of_atlas["joint_world"] = self.joint_world
         if self.joint_from_cam is not None:
             of_atlas["joint_from_cam"] = checked.pose_json(self.joint_from_cam)
-        return of_atlas | {"map": self.map_id, "version": self.map_version, "t_ns": self.t_ns, "camera": camera, "features": self.features}
+        return of_atlas | {
+            "map": self.map_id,
+            "version": self.map_version,
+            "t_ns": self.t_ns,
+            "camera": camera,
+            "features": self.features,
+        }
 
     @staticmethod
     def from_json(data: Mapping[str, Any]) -> Provenance:
         """Of a result's JSON; results of before there was any have none. Raises ResultError."""
-        t_ns, camera, tile, pose = (data.get(key) for key in ("t_ns", "camera", "tile", "atlas_from_cam"))
+        t_ns, camera, tile, pose = (
+            data.get(key) for key in ("t_ns", "camera", "tile", "atlas_from_cam")
+        )
         joint, joint_pose = data.get("joint_world"), data.get("joint_from_cam")
         if camera is not None and not isinstance(camera, dict):
             raise ResultError("no result: 'camera' is no object")

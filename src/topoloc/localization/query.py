@@ -1,8 +1,10 @@
-"""A query image made ready: of the size at which the map can be asked, with its features when they are first wanted.
+"""A query image made ready: of the size at which the map can be asked, with its features when they
+are first wanted.
 
-Key points have sizes in pixels, and those of a picture with far more pixels a radian than the map's pictures had are mostly smaller
-than any that the map holds: they crowd out the ones that it does. A long lens and a picture of many megapixels are alike in that. Such a
-picture is reduced until its pixels see as much as the map's did; a coarser one stays as it is.
+Key points have sizes in pixels, and those of a picture with far more pixels a radian than the map's
+pictures had are mostly smaller than any that the map holds: they crowd out the ones that it does. A
+long lens and a picture of many megapixels are alike in that. Such a picture is reduced until its
+pixels see as much as the map's did; a coarser one stays as it is.
 """
 
 from __future__ import annotations
@@ -40,14 +42,17 @@ class StageClock:
         try:
             yield
         finally:
-            self._times_ms[name] = self._times_ms.get(name, 0.0) + (time.perf_counter() - start) * 1e3
+            self._times_ms[name] = (
+                self._times_ms.get(name, 0.0) + (time.perf_counter() - start) * 1e3
+            )
 
     def times_ms(self) -> dict[str, float]:
         return self._times_ms | {"total": (time.perf_counter() - self._start) * 1e3}
 
 
 class SharedFeatures:
-    """The features of one picture by its size and their settings, extracted once, whichever of several maps asks for them first."""
+    """The features of one picture by its size and their settings, extracted once, whichever of
+    several maps asks for them first."""
 
     def __init__(self) -> None:
         self._kept: dict[tuple[int, int, FeatureConfig, Hashable], Features] = {}
@@ -65,21 +70,31 @@ class SharedFeatures:
 
 
 class StoredFeatures(SharedFeatures):
-    """Those of a picture of which nothing else is left, by their kinds, such as a node of another map; pixels of `width` columns."""
+    """Those of a picture of which nothing else is left, by their kinds, such as a node of another
+    map; pixels of `width` columns."""
 
     def __init__(self, known: Mapping[str, Features], width: int) -> None:
         super().__init__()
         self._known, self._width = known, width
 
     def of(self, query: Query) -> Features:
-        """As they would be in the picture as it was reduced. Raises KeyError where they are of other kinds."""
-        known, scale = self._known[query.feature_config.kind], np.float32(query.image.shape[1] / self._width)
-        return replace(known, points_img=(known.points_img + np.float32(0.5)) * scale - np.float32(0.5), sizes_px=known.sizes_px * scale)
+        """As they would be in the picture as it was reduced. Raises KeyError where they are of
+        other kinds."""
+        known, scale = (
+            self._known[query.feature_config.kind],
+            np.float32(query.image.shape[1] / self._width),
+        )
+        return replace(
+            known,
+            points_img=(known.points_img + np.float32(0.5)) * scale - np.float32(0.5),
+            sizes_px=known.sizes_px * scale,
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A picture with what is known of its camera, to be asked of one map or of several. Raises as `check_size`."""
+    """A picture with what is known of its camera, to be asked of one map or of several. Raises as
+    `check_size`."""
 
     image: Image
     camera: Camera | RoughCamera
@@ -90,16 +105,23 @@ class Picture:
 
     @staticmethod
     def of_features(known: Mapping[str, Features], camera: Camera) -> Picture:
-        """One of which nothing but local features is left, by their kinds. What looks at the picture itself (other scales and turns of it,
-        walls, what a network says beside its key points) finds nothing in it."""
-        return Picture(np.zeros((camera.height, camera.width), np.uint8), camera, StoredFeatures(known, camera.width))
+        """One of which nothing but local features is left, by their kinds. What looks at the
+        picture itself (other scales and turns of it, walls, what a network says beside its key
+        points) finds nothing in it."""
+        return Picture(
+            np.zeros((camera.height, camera.width), np.uint8),
+            camera,
+            StoredFeatures(known, camera.width),
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """An image with what is known of its camera (`lens`), reduced; the image as it came is `scale` times as wide.
+    """An image with what is known of its camera (`lens`), reduced; the image as it came is `scale`
+    times as wide.
 
-    `deadline` is the time (of `time.perf_counter`) after which no further hypothesis is sought; infinite where there is none.
+    `deadline` is the time (of `time.perf_counter`) after which no further hypothesis is sought;
+    infinite where there is none.
     """
 
     image: Image
@@ -137,16 +159,20 @@ class Query:
 
 
 def check_size(image: Image, camera: Camera | RoughCamera) -> None:
-    """Raises QueryError where the image is no picture of 8 bits, or the camera is of another image size."""
+    """Raises QueryError where the image is no picture of 8 bits, or the camera is of another image
+    size."""
     if problem := picture_problem(image):
         raise QueryError(problem)
     height, width = image.shape[:2]
     if (camera.width, camera.height) != (width, height):
-        raise QueryError(f"the image is {width}x{height}, its camera {camera.width}x{camera.height}")
+        raise QueryError(
+            f"the image is {width}x{height}, its camera {camera.width}x{camera.height}"
+        )
 
 
 def unknown_camera(image: Image) -> RoughCamera:
-    """The camera of a picture of which nothing is known. Raises QueryError where the image is no picture of 8 bits."""
+    """The camera of a picture of which nothing is known. Raises QueryError where the image is no
+    picture of 8 bits."""
     if problem := picture_problem(image):
         raise QueryError(problem)
     return RoughCamera.unknown(image.shape[1], image.shape[0])
@@ -155,11 +181,12 @@ def unknown_camera(image: Image) -> RoughCamera:
 def reduced_image(
     image: Image, camera: Camera | RoughCamera, map_focal: float, max_finer: float, max_side_px: int
 ) -> tuple[np.ndarray, Camera | RoughCamera]:
-    """The image with its camera, smaller where it has over `max_finer` times the map's pixels a radian, or a longer side.
+    """The image with its camera, smaller where it has over `max_finer` times the map's pixels a
+    radian, or a longer side.
 
     Args:
-        map_focal: focal length (pixels) of the map's finest camera: its pixels a radian. A rough camera counts as finer only as
-            far as its whole range is.
+        map_focal: focal length (pixels) of the map's finest camera: its pixels a radian. A rough
+            camera counts as finer only as far as its whole range is.
     """
     height, width = image.shape[:2]
     focal = camera.min_focal if isinstance(camera, RoughCamera) else camera.fx
@@ -169,4 +196,6 @@ def reduced_image(
     if scale >= 1.0:
         return image, camera
     width, height = max(1, round(width * scale)), max(1, round(height * scale))
-    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), camera.rescaled(width, height)
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), camera.rescaled(
+        width, height
+    )

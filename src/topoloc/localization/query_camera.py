@@ -16,13 +16,18 @@ CameraOfSize = Callable[[int, int], Camera | RoughCamera]
 
 
 def camera_of_frame(frame: StereoFrame, of_size: CameraOfSize | None) -> Camera | RoughCamera:
-    """What `--camera` says, else the recording; else what the picture's file says of its focal length, or nothing."""
+    """What `--camera` says, else the recording; else what the picture's file says of its focal
+    length, or nothing."""
     height, width = frame.image.shape[:2]
     if of_size is not None:
         return of_size(width, height)
     if frame.camera is not None:
         return frame.camera
-    return RoughCamera.unknown(width, height) if frame.noted_focal is None else RoughCamera.noted(width, height, frame.noted_focal)
+    return (
+        RoughCamera.unknown(width, height)
+        if frame.noted_focal is None
+        else RoughCamera.noted(width, height, frame.noted_focal)
+    )
 
 
 def named_camera(text: str, topomap: TopoMetricMap | None) -> CameraOfSize:
@@ -37,8 +42,13 @@ def named_camera(text: str, topomap: TopoMetricMap | None) -> CameraOfSize:
 
 def _rescaled(camera: Camera) -> CameraOfSize:
     def of_size(width: int, height: int) -> Camera:
-        if abs(width * camera.height - height * camera.width) > max(camera.width, camera.height):  # more than a pixel's rounding
-            raise QueryError(f"the image is {width}x{height}, the map's camera {camera.width}x{camera.height}: not of one shape")
+        if abs(width * camera.height - height * camera.width) > max(
+            camera.width, camera.height
+        ):  # more than a pixel's rounding
+            raise QueryError(
+                f"the image is {width}x{height}, the map's camera {camera.width}x{camera.height}:"
+                " not of one shape"
+            )
         return camera.rescaled(width, height)
 
     return of_size

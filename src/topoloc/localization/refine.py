@@ -1,7 +1,9 @@
-"""From a first pose to a hypothesis: its points sought once more where they must be seen, the pose estimated again, the evidence counted.
+"""From a first pose to a hypothesis: its points sought once more where they must be seen, the pose
+estimated again, the evidence counted.
 
-The nodes nearest to the first pose are asked, whose points were measured from nearly the same place; matches that the ratio test had
-to give up among thousands of descriptors are safe within a few pixels.
+The nodes nearest to the first pose are asked, whose points were measured from nearly the same
+place; matches that the ratio test had to give up among thousands of descriptors are safe within a
+few pixels.
 """
 
 from __future__ import annotations
@@ -25,21 +27,31 @@ from topoloc.localization.pose_fit import PoseFit, fit_pose
 from topoloc.localization.search import Proposal, Search, Tried
 from topoloc.localization.walls.propose_walls import WallProposal, refine_wall, weigh_wall
 
-_MOST_SAID, _FEW_MATCHES = 3.0, 30.0  # odds, in logarithms, that one kind adds to another's; matches with which it is heard by half
+_MOST_SAID, _FEW_MATCHES = (
+    3.0,
+    30.0,
+)  # odds, in logarithms, that one kind adds to another's; matches with which it is heard by half
 _NUM_COMPARED = 512  # of the points in view that are compared with dense descriptors
-_ALIKE = 0.75  # of the points of a believed pose, within reach of the guided step around another one
+_ALIKE = (
+    0.75  # of the points of a believed pose, within reach of the guided step around another one
+)
 _HOPELESS = -3.0  # odds, in logarithms, that nothing can mend
 
 
 def hypothesis_of(search: Search, proposal: Proposal) -> Hypothesis | None:
-    """The proposal followed up; None where too little was found for any evidence, or nothing new can be."""
-    final, hypothesis = (None, None) if is_found_already(search, proposal) else _followed_up(search, proposal)
+    """The proposal followed up; None where too little was found for any evidence, or nothing new
+    can be."""
+    final, hypothesis = (
+        (None, None) if is_found_already(search, proposal) else _followed_up(search, proposal)
+    )
     if search.first is None:
         search.first = proposal.fit if final is None or final.pose is None else final
     if search.trace is not None:
         milliseconds = search.query.clock.times_ms()["total"]
         kind = search.query.feature_config.kind
-        search.trace.tried.append(Tried(proposal.source, proposal.fit, final, hypothesis, milliseconds, kind))
+        search.trace.tried.append(
+            Tried(proposal.source, proposal.fit, final, hypothesis, milliseconds, kind)
+        )
     return hypothesis
 
 
@@ -53,51 +65,82 @@ def _followed_up(search: Search, proposal: Proposal) -> tuple[PoseFit | None, Hy
 
 
 def is_found_already(search: Search, proposal: Proposal) -> bool:
-    """Does the first pose show the points of a believed one in nearly the same pixels? Then the same would be found around it."""
+    """Does the first pose show the points of a believed one in nearly the same pixels? Then the
+    same would be found around it."""
     fit, config = proposal.fit, search.config
     if fit.pose is None or proposal.repeats is not None or isinstance(proposal, WallProposal):
         return False
     radius_px = config.guided.radius_px * max(max(fit.camera.width, fit.camera.height) / 640.0, 0.5)
     for known in search.belief.hypotheses:
-        if known.is_from_walls or known.probability < config.evidence.min_probability or known.fit.pose is None:
+        if (
+            known.is_from_walls
+            or known.probability < config.evidence.min_probability
+            or known.fit.pose is None
+        ):
             continue
         seen = known.fit.seen_points(1.0)
         with np.errstate(invalid="ignore"):
-            apart = np.linalg.norm(fit.camera.img_from_cam(fit.pose.cam_from_world.apply(seen.points_world)) - seen.points_img, axis=1)
+            apart = np.linalg.norm(
+                fit.camera.img_from_cam(fit.pose.cam_from_world.apply(seen.points_world))
+                - seen.points_img,
+                axis=1,
+            )
         if np.count_nonzero(apart < radius_px) >= _ALIKE * len(apart):
             return True
     return False
 
 
 def refine(search: Search, proposal: Proposal) -> PoseFit:
-    """The pose that follows from what is found around the first one; the first one where nothing is to be found."""
+    """The pose that follows from what is found around the first one; the first one where nothing is
+    to be found."""
     config, first = search.config, proposal.fit
     final = _around(search, first)
-    if first.num_inliers < config.num_clear_inliers:  # it may have been too poor for everything to be found from it at once
+    if (
+        first.num_inliers < config.num_clear_inliers
+    ):  # it may have been too poor for everything to be found from it at once
         final = max(final, _around(search, final), key=lambda fit: fit.num_inliers)
     return final
 
 
 def _around(search: Search, fit: PoseFit) -> PoseFit:
     config, query = search.config, search.query
-    if config.guided.num_nodes == 0 or fit.pose is None or fit.num_inliers < config.evidence.min_inliers:
+    if (
+        config.guided.num_nodes == 0
+        or fit.pose is None
+        or fit.num_inliers < config.evidence.min_inliers
+    ):
         return fit
     cam_from_world = fit.pose.cam_from_world
     with query.clock.stage("matching"):
-        local_map = search.map.local_map(search.map.nearest(cam_from_world.inverse(), config.guided.num_nodes))
+        local_map = search.map.local_map(
+            search.map.nearest(cam_from_world.inverse(), config.guided.num_nodes)
+        )
         matches = match_guided(query.features, local_map, cam_from_world, fit.camera, config.guided)
     with query.clock.stage("pnp"):
-        return fit_pose(query.features, query.lens, local_map, matches, config.pose, (cam_from_world, fit.camera))
+        return fit_pose(
+            query.features,
+            query.lens,
+            local_map,
+            matches,
+            config.pose,
+            (cam_from_world, fit.camera),
+        )
 
 
 def weigh(search: Search, proposal: Proposal, final: PoseFit) -> Hypothesis | None:
     """The hypothesis with its evidence; None where too little was found for any.
 
-    Evidence are matches that no pose guided. The first ones will do where they make the pose clear; where they do not, the nodes around
-    the final pose are asked, which are often nearer than those that the coarse search named.
+    Evidence are matches that no pose guided. The first ones will do where they make the pose clear;
+    where they do not, the nodes around the final pose are asked, which are often nearer than those
+    that the coarse search named.
     """
     config, first = search.config.evidence, proposal.fit
-    if first.pose is None or final.pose is None or first.num_inliers < config.min_inliers or final.num_inliers < config.min_found:
+    if (
+        first.pose is None
+        or final.pose is None
+        or first.num_inliers < config.min_inliers
+        or final.num_inliers < config.min_found
+    ):
         return None
     with search.query.clock.stage("evidence"):
         inflated = inflation(final.num_inliers, search.rho)
@@ -110,33 +153,49 @@ def weigh(search: Search, proposal: Proposal, final: PoseFit) -> Hypothesis | No
 
 
 def best_case(search: Search, proposal: Proposal) -> Evidence | None:
-    """The evidence for the proposal followed up if all that no pose guided agreed with it; None where too little is found for any."""
+    """The evidence for the proposal followed up if all that no pose guided agreed with it; None
+    where too little is found for any."""
     final = refine(search, proposal)
     if final.pose is None or final.num_inliers < search.config.evidence.min_found:
         return None
     with search.query.clock.stage("evidence"):
-        counted = _counted(search, final, inflation(final.num_inliers, search.rho) * final.pose.covariance)
+        counted = _counted(
+            search, final, inflation(final.num_inliers, search.rho) * final.pose.covariance
+        )
         return _at_best(replace(counted, num_by_chance=_by_chance(search, final)), final)
 
 
 def say_on(search: Search, hypothesis: Hypothesis) -> tuple[float, Hypothesis | None]:
-    """What these features say on a pose of others, in logarithms of odds: little where few of them match anything, as in the dark. And the
-    pose that they make of it, None where it is none."""
+    """What these features say on a pose of others, in logarithms of odds: little where few of them
+    match anything, as in the dark. And the pose that they make of it, None where it is none."""
     final = _around(search, hypothesis.fit)
     if final.num_inliers < search.config.evidence.min_found:
         return 0.0, None
     weighed = weigh(search, Proposal("other features", final, is_guided=True), final)
-    num_matches = len(_unguided(search, final).of_first()) if weighed is None else weighed.evidence.num_matches
+    num_matches = (
+        len(_unguided(search, final).of_first())
+        if weighed is None
+        else weighed.evidence.num_matches
+    )
     log_odds = -_MOST_SAID if weighed is None else weighed.log_odds  # None: it is hopeless
-    return float(np.clip(log_odds, -_MOST_SAID, _MOST_SAID)) * num_matches / (num_matches + _FEW_MATCHES), weighed
+    return float(np.clip(log_odds, -_MOST_SAID, _MOST_SAID)) * num_matches / (
+        num_matches + _FEW_MATCHES
+    ), weighed
 
 
-def _evidence(search: Search, proposal: Proposal, final: PoseFit, covariance: Float[np.ndarray, "6 6"]) -> Evidence | None:
+def _evidence(
+    search: Search, proposal: Proposal, final: PoseFit, covariance: Float[np.ndarray, "6 6"]
+) -> Evidence | None:
     """None where it is hopeless."""
     counted, repeats = _counted(search, final, covariance), proposal.repeats
     if repeats is not None:
         unguided = (repeats.num_matches, repeats.num_inliers)
-        return replace(counted, num_by_chance=repeats.num_by_chance, num_matches=unguided[0], num_inliers=unguided[1])
+        return replace(
+            counted,
+            num_by_chance=repeats.num_by_chance,
+            num_matches=unguided[0],
+            num_inliers=unguided[1],
+        )
     assert final.pose is not None
     counted, may_be_hopeless = replace(counted, num_by_chance=_by_chance(search, final)), True
     if not proposal.is_guided:
@@ -145,21 +204,33 @@ def _evidence(search: Search, proposal: Proposal, final: PoseFit, covariance: Fl
         if log_odds > search.weights.evidence.clear_log_odds:
             return evidence
         may_be_hopeless = log_odds < 2.0 * _HOPELESS
-    if log_odds_of(_at_best(counted, final), search.weights) < _HOPELESS:  # whatever the unguided matches say
+    if (
+        log_odds_of(_at_best(counted, final), search.weights) < _HOPELESS
+    ):  # whatever the unguided matches say
         return None
     matcher = _unguided(search, final)
     if may_be_hopeless:
-        of_strongest = _with_unguided(search, counted, _fit_of(final, matcher.of_first(search.config.num_first_features)), final)
-        if log_odds_of(of_strongest, search.weights) < 2.0 * _HOPELESS:  # whatever those of the other features say
+        of_strongest = _with_unguided(
+            search,
+            counted,
+            _fit_of(final, matcher.of_first(search.config.num_first_features)),
+            final,
+        )
+        if (
+            log_odds_of(of_strongest, search.weights) < 2.0 * _HOPELESS
+        ):  # whatever those of the other features say
             return None
     return _with_unguided(search, counted, _fit_of(final, matcher.of_first()), final)
 
 
 def _counted(search: Search, final: PoseFit, covariance: Float[np.ndarray, "6 6"]) -> Evidence:
-    """What is found where it must be seen. `covariance` is that of the left perturbation of cam_from_world."""
+    """What is found where it must be seen. `covariance` is that of the left perturbation of
+    cam_from_world."""
     pose, camera = final.pose, final.camera
     assert pose is not None
-    depths = pose.cam_from_world.apply(final.local_map.points_world[final.matches.train_idx[pose.inliers]])[:, 2]
+    depths = pose.cam_from_world.apply(
+        final.local_map.points_world[final.matches.train_idx[pose.inliers]]
+    )[:, 2]
     found_img = final.features.points_img[final.matches.query_idx[pose.inliers]].astype(np.float64)
     visible, visible_img = visible_points(final.local_map, pose.cam_from_world, camera)
     return Evidence(
@@ -175,20 +246,32 @@ def _counted(search: Search, final: PoseFit, covariance: Float[np.ndarray, "6 6"
 
 
 def _even_share(
-    final: PoseFit, visible: Int[np.ndarray, " v"], visible_img: Float[np.ndarray, "v 2"], found_img: Float[np.ndarray, "f 2"]
+    final: PoseFit,
+    visible: Int[np.ndarray, " v"],
+    visible_img: Float[np.ndarray, "v 2"],
+    found_img: Float[np.ndarray, "f 2"],
 ) -> float:
-    """`Evidence.even_share`: of the points that key points were found for, or that dense descriptors agree with where there are such."""
+    """`Evidence.even_share`: of the points that key points were found for, or that dense
+    descriptors agree with where there are such."""
     camera, dense = final.camera, final.features.dense
     if dense is not None and len(visible) > 0:
         asked = np.unique(np.linspace(0, len(visible) - 1, _NUM_COMPARED).astype(int))
         visible_img = visible_img[asked]
-        found_img = visible_img[dense.agrees(visible_img, final.local_map.descriptors[visible[asked]])]
+        found_img = visible_img[
+            dense.agrees(visible_img, final.local_map.descriptors[visible[asked]])
+        ]
     return even_share_of(found_img, visible_img, camera.width, camera.height)
 
 
 def _by_chance(search: Search, final: PoseFit) -> int:
     assert final.pose is not None
-    return count_by_chance(final.features, final.local_map, final.pose.cam_from_world, final.camera, search.config.guided)
+    return count_by_chance(
+        final.features,
+        final.local_map,
+        final.pose.cam_from_world,
+        final.camera,
+        search.config.guided,
+    )
 
 
 def _at_best(counted: Evidence, final: PoseFit) -> Evidence:
@@ -196,20 +279,32 @@ def _at_best(counted: Evidence, final: PoseFit) -> Evidence:
     return replace(counted, num_matches=final.num_inliers, num_inliers=final.num_inliers)
 
 
-def _with_unguided(search: Search, evidence: Evidence, unguided: PoseFit, final: PoseFit) -> Evidence:
+def _with_unguided(
+    search: Search, evidence: Evidence, unguided: PoseFit, final: PoseFit
+) -> Evidence:
     """The evidence with these matches as those that no pose guided."""
     assert final.pose is not None
-    # points that share errors differ by them from node to node, so that even true matches agree with a pose less well
+    # points that share errors differ by them from node to node, so that even true matches agree
+    # with a pose less well
     agreement_px = search.config.evidence.agreement_px * math.sqrt(1.0 + search.rho)
-    num_agreeing = _num_agreeing(unguided, final.pose.cam_from_world, final.camera, agreement_px, _repeats(search, final))
+    num_agreeing = _num_agreeing(
+        unguided, final.pose.cam_from_world, final.camera, agreement_px, _repeats(search, final)
+    )
     return replace(evidence, num_matches=len(unguided.matches), num_inliers=num_agreeing)
 
 
 def _unguided(search: Search, final: PoseFit) -> Matcher:
     """Of features with the points around the final pose, without any pose's say."""
     points = final.local_map
-    positions = folded(points.points_world, _repeats(search, final))  # copies of a point are no rivals of it
-    return Matcher(final.features.descriptors, points.descriptors, (positions, points.radii), search.config.matching)
+    positions = folded(
+        points.points_world, _repeats(search, final)
+    )  # copies of a point are no rivals of it
+    return Matcher(
+        final.features.descriptors,
+        points.descriptors,
+        (positions, points.radii),
+        search.config.matching,
+    )
 
 
 def _fit_of(final: PoseFit, matches: Matches) -> PoseFit:
@@ -217,13 +312,25 @@ def _fit_of(final: PoseFit, matches: Matches) -> PoseFit:
     return replace(final, matches=matches, pose=None)
 
 
-def _num_agreeing(unguided: PoseFit, cam_from_world: Rigid3, camera: Camera, agreement_px: float, shifts: Float[np.ndarray, "k 3"]) -> int:
-    """How many of these matches agree with a pose that is not theirs, by their point or a copy of it."""
+def _num_agreeing(
+    unguided: PoseFit,
+    cam_from_world: Rigid3,
+    camera: Camera,
+    agreement_px: float,
+    shifts: Float[np.ndarray, "k 3"],
+) -> int:
+    """How many of these matches agree with a pose that is not theirs, by their point or a copy of
+    it."""
     is_near = np.zeros(len(unguided.matches), bool)
     for points_world in copies(unguided.local_map.points_world[unguided.matches.train_idx], shifts):
         with np.errstate(invalid="ignore"):
-            offsets = camera.img_from_cam(cam_from_world.apply(points_world)) - unguided.features.points_img[unguided.matches.query_idx]
-            is_near |= np.linalg.norm(offsets, axis=1) < agreement_px * max(max(camera.width, camera.height) / 640.0, 0.5)
+            offsets = (
+                camera.img_from_cam(cam_from_world.apply(points_world))
+                - unguided.features.points_img[unguided.matches.query_idx]
+            )
+            is_near |= np.linalg.norm(offsets, axis=1) < agreement_px * max(
+                max(camera.width, camera.height) / 640.0, 0.5
+            )
     return int(np.count_nonzero(is_near))
 
 

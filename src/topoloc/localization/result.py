@@ -1,4 +1,5 @@
-"""What a query gets: a pose with its uncertainty, or an honest "not here". Never a fallback pose."""
+"""What a query gets: a pose with its uncertainty, or an honest "not here". Never a fallback
+pose."""
 
 from __future__ import annotations
 
@@ -19,27 +20,33 @@ from topoloc.localization.evidence import Evidence
 from topoloc.localization.provenance import NOTHING_KNOWN, Provenance
 from topoloc.places.coarse import NodeScore
 
-Reason = Literal["too_few_matches", "too_few_inliers", "ambiguous", "not_in_map", "jump", "unreadable"]
+Reason = Literal[
+    "too_few_matches", "too_few_inliers", "ambiguous", "not_in_map", "jump", "unreadable"
+]
 
 
 @dataclass(frozen=True, eq=False)
 class Localization:
     """The image was taken at `world_from_cam`.
 
-    `covariance` (6, 6) is that of the left perturbation xi of world_from_cam, ``true_world_from_cam = exp(xi) @ world_from_cam``:
-    order (translation, rotation), metres and radians, axes of the world. It counts the noise of the image, the uncertainty of each map
-    point, what the map's points are wrong by together (`correlated_errors.py`), and what they are in parts of the picture, such as where
-    things were moved (`geometry/clustered_errors.py`). Its translation part is that of the world's origin,
-    as it is moved by xi; `camera_covariance` is that of the camera itself. `noise_share` of it differs from picture to picture; the rest
-    is the map's, and a picture taken close by shares it.
+    `covariance` (6, 6) is that of the left perturbation xi of world_from_cam, ``true_world_from_cam
+    = exp(xi) @ world_from_cam``: order (translation, rotation), metres and radians, axes of the
+    world. It counts the noise of the image, the uncertainty of each map point, what the map's
+    points are wrong by together (`correlated_errors.py`), and what they are in parts of the
+    picture, such as where things were moved (`geometry/clustered_errors.py`). Its translation part
+    is that of the world's origin, as it is moved by xi; `camera_covariance` is that of the camera
+    itself. `noise_share` of it differs from picture to picture; the rest is the map's, and a
+    picture taken close by shares it.
 
-    `probability` is that of the pose being within 0.25 m and 2 degrees, or within 5 % of the distance of what is seen where that is
-    less than 0.25 m; weighed from `evidence`, with weights that were fitted to this kind of features: `calibrated` is False where none are,
-    and those of another kind stand in. `node_id` is the node that most inliers come from; `times_ms` the milliseconds of each
-    stage; `focal_length_px` the focal length found with the pose, None where the camera was calibrated. `calibration_doubt` is what the
-    picture says against its calibration; covariance and probability have paid for it. `seen_camera` is what the picture says of its camera
-    in any case, for many of them to be heard together (`calibration_verdict.py`). `geopose` is the camera's place on
-    earth, of maps that know theirs (`topoloc georeference`).
+    `probability` is that of the pose being within 0.25 m and 2 degrees, or within 5 % of the
+    distance of what is seen where that is less than 0.25 m; weighed from `evidence`, with weights
+    that were fitted to this kind of features: `calibrated` is False where none are, and those of
+    another kind stand in. `node_id` is the node that most inliers come from; `times_ms` the
+    milliseconds of each stage; `focal_length_px` the focal length found with the pose, None where
+    the camera was calibrated. `calibration_doubt` is what the picture says against its calibration;
+    covariance and probability have paid for it. `seen_camera` is what the picture says of its
+    camera in any case, for many of them to be heard together (`calibration_verdict.py`). `geopose`
+    is the camera's place on earth, of maps that know theirs (`topoloc georeference`).
     """
 
     world_from_cam: Rigid3
@@ -65,12 +72,14 @@ class Localization:
 
     @property
     def is_from_walls(self) -> bool:
-        """Was the place recognised by the walls along the way, of which the nodes around show another side?"""
+        """Was the place recognised by the walls along the way, of which the nodes around show
+        another side?"""
         return self.evidence is not None and self.evidence.is_from_walls
 
     @property
     def position_sigma_m(self) -> float:
-        """Root mean square of the distance from the true position that `camera_covariance` lets expect, metres."""
+        """Root mean square of the distance from the true position that `camera_covariance` lets
+        expect, metres."""
         return float(np.sqrt(np.trace(self.camera_covariance[:3, :3])))
 
     @property
@@ -80,7 +89,8 @@ class Localization:
 
     @property
     def camera_covariance(self) -> Float[np.ndarray, "6 6"]:
-        """`covariance` in the camera's own axes, about its own centre: of xi in ``true_world_from_cam = world_from_cam @ exp(xi)``."""
+        """`covariance` in the camera's own axes, about its own centre: of xi in
+        ``true_world_from_cam = world_from_cam @ exp(xi)``."""
         adjoint = self.world_from_cam.inverse().adjoint()
         return adjoint @ self.covariance @ adjoint.T
 
@@ -100,7 +110,11 @@ class Localization:
             **({} if self.focal_length_px is None else {"focal_length_px": self.focal_length_px}),
             **({} if self.noise_share == 1.0 else {"noise_share": self.noise_share}),
             **({} if self.evidence is None else {"evidence": asdict(self.evidence)}),
-            **({} if self.calibration_doubt is None else {"calibration_doubt": self.calibration_doubt.to_json()}),
+            **(
+                {}
+                if self.calibration_doubt is None
+                else {"calibration_doubt": self.calibration_doubt.to_json()}
+            ),
             **({} if self.geopose is None else {"geopose": self.geopose.to_json()}),
         }
 
@@ -113,8 +127,13 @@ class Localization:
         """
         data = checked.object_of(line)
         if checked.wanted(data, "localized") is not True:
-            raise ResultError("the result of an image that was not localized holds no pose (NotLocalized.from_json reads it)")
-        focal, evidence, doubt = (data.get(key) for key in ("focal_length_px", "evidence", "calibration_doubt"))
+            raise ResultError(
+                "the result of an image that was not localized holds no pose"
+                " (NotLocalized.from_json reads it)"
+            )
+        focal, evidence, doubt = (
+            data.get(key) for key in ("focal_length_px", "evidence", "calibration_doubt")
+        )
         return Localization(
             checked.rigid(checked.wanted(data, "world_from_cam"), "world_from_cam"),
             checked.covariance(checked.wanted(data, "covariance"), "covariance"),
@@ -122,7 +141,9 @@ class Localization:
             checked.whole(checked.wanted(data, "node"), "node"),
             **_evidence_from(data),
             evidence=None if evidence is None else _evidence_of(evidence),
-            focal_length_px=None if focal is None else checked.number(focal, "focal_length_px", 0.0),
+            focal_length_px=(
+                None if focal is None else checked.number(focal, "focal_length_px", 0.0)
+            ),
             noise_share=checked.number(data.get("noise_share", 1.0), "noise_share", 0.0, 1.0),
             calibrated=data.get("calibrated", True) is not False,
             provenance=Provenance.from_json(data),
@@ -133,8 +154,9 @@ class Localization:
 
 @dataclass(frozen=True, eq=False)
 class Alternative:
-    """A pose that may be the image's, and how probable that is; the rest of all is the probability of none of them. `geopose` as of a
-    `Localization`; `tile` names the tile of an atlas in whose world the pose is."""
+    """A pose that may be the image's, and how probable that is; the rest of all is the probability
+    of none of them. `geopose` as of a `Localization`; `tile` names the tile of an atlas in whose
+    world the pose is."""
 
     world_from_cam: Rigid3
     probability: float
@@ -143,7 +165,11 @@ class Alternative:
     tile: str | None = None
 
     def to_json(self) -> dict[str, Any]:
-        pose = {"world_from_cam": pose_json(self.world_from_cam), "probability": self.probability, "node": self.node_id}
+        pose = {
+            "world_from_cam": pose_json(self.world_from_cam),
+            "probability": self.probability,
+            "node": self.node_id,
+        }
         pose |= {} if self.tile is None else {"tile": self.tile}
         return pose if self.geopose is None else pose | {"geopose": self.geopose.to_json()}
 
@@ -185,7 +211,13 @@ class NotLocalized:
     def to_json(self, query: str) -> dict[str, Any]:
         """One line of the result file, see docs/cli.md."""
         alternatives = [one.to_json() for one in self.alternatives]
-        refusal = {"query": query, "localized": False, "reason": self.reason, "detail": self.detail, "alternatives": alternatives}
+        refusal = {
+            "query": query,
+            "localized": False,
+            "reason": self.reason,
+            "detail": self.detail,
+            "alternatives": alternatives,
+        }
         return refusal | _evidence_json(self)
 
     @staticmethod
@@ -197,7 +229,10 @@ class NotLocalized:
         """
         data = checked.object_of(line)
         if checked.wanted(data, "localized") is not False:
-            raise ResultError("the result of an image that was localized is no refusal (Localization.from_json reads it)")
+            raise ResultError(
+                "the result of an image that was localized is no refusal (Localization.from_json"
+                " reads it)"
+            )
         reason = checked.wanted(data, "reason")
         if reason not in get_args(Reason):
             raise ResultError(f"no result: the reason is none of {', '.join(get_args(Reason))}")
@@ -205,7 +240,10 @@ class NotLocalized:
             reason,
             **_evidence_from(data),
             detail=checked.text(data.get("detail", ""), "detail"),
-            alternatives=tuple(Alternative.from_json(one) for one in checked.items(data.get("alternatives", []), "alternatives")),
+            alternatives=tuple(
+                Alternative.from_json(one)
+                for one in checked.items(data.get("alternatives", []), "alternatives")
+            ),
             provenance=Provenance.from_json(data),
         )
 
@@ -216,7 +254,11 @@ R = TypeVar("R", bound=Localization | NotLocalized)
 def result_from_json(line: str | bytes | Mapping[str, Any]) -> Localization | NotLocalized:
     """Either of the two. Raises ResultError where it is no result."""
     data = checked.object_of(line)
-    return Localization.from_json(data) if data.get("localized") is True else NotLocalized.from_json(data)
+    return (
+        Localization.from_json(data)
+        if data.get("localized") is True
+        else NotLocalized.from_json(data)
+    )
 
 
 def at_time(result: R, t_ns: int) -> R:
@@ -247,7 +289,9 @@ def _evidence_of(value: Any) -> Evidence:
     for one in fields(Evidence):
         is_missing = one.name in ("num_distinct", "num_lesser_side") and data.get(one.name) is None
         read = checked.whole if one.name.startswith("num_") else checked.number
-        values[one.name] = None if is_missing else read(checked.wanted(data, one.name), f"evidence.{one.name}")
+        values[one.name] = (
+            None if is_missing else read(checked.wanted(data, one.name), f"evidence.{one.name}")
+        )
     return Evidence(**values)
 
 
@@ -261,7 +305,9 @@ def _doubt_of(value: Any) -> CalibrationDoubt:
         return np.array(values)
 
     of = checked.items(checked.wanted(data, "of"), "of")
-    focal, sigma, calibrated = (checked.number(checked.wanted(data, key), key, 0.0) for key in DOUBT_LENGTHS)
+    focal, sigma, calibrated = (
+        checked.number(checked.wanted(data, key), key, 0.0) for key in DOUBT_LENGTHS
+    )
     return CalibrationDoubt(
         focal,
         sigma,
@@ -275,14 +321,20 @@ def _doubt_of(value: Any) -> CalibrationDoubt:
 
 
 def _evidence_from(data: Mapping[str, Any]) -> dict[str, Any]:
-    pairs = [checked.items(pair, "candidates") for pair in checked.items(checked.wanted(data, "candidates"), "candidates")]
+    pairs = [
+        checked.items(pair, "candidates")
+        for pair in checked.items(checked.wanted(data, "candidates"), "candidates")
+    ]
     if any(len(pair) != 2 for pair in pairs):
         raise ResultError("no result: 'candidates' are pairs of a node and its score")
     times_ms = checked.wanted(data, "times_ms")
     if not isinstance(times_ms, Mapping):
         raise ResultError("no result: 'times_ms' are milliseconds by the names of stages")
     return {
-        "candidates": [NodeScore(checked.whole(node_id, "candidates"), checked.number(score, "candidates")) for node_id, score in pairs],
+        "candidates": [
+            NodeScore(checked.whole(node_id, "candidates"), checked.number(score, "candidates"))
+            for node_id, score in pairs
+        ],
         "num_matches": checked.whole(checked.wanted(data, "num_matches"), "num_matches"),
         "num_inliers": checked.whole(checked.wanted(data, "num_inliers"), "num_inliers"),
         "times_ms": {str(stage): checked.number(ms, "times_ms") for stage, ms in times_ms.items()},

@@ -1,4 +1,5 @@
-"""What the search for one query image shares: the image, the map, the settings, what is believed so far; and what it is fed with."""
+"""What the search for one query image shares: the image, the map, the settings, what is believed so
+far; and what it is fed with."""
 
 from __future__ import annotations
 
@@ -19,9 +20,9 @@ from topoloc.places.coarse import NodeScore
 class Tried:
     """A first pose and what became of it.
 
-    `refined` is the pose found around the first one (None: the first was not followed up, as where that pose was found already),
-    `hypothesis` that with its evidence (None: too little was found for any), `milliseconds` the time since the query began, `features`
-    the kind that was asked.
+    `refined` is the pose found around the first one (None: the first was not followed up, as where
+    that pose was found already), `hypothesis` that with its evidence (None: too little was found
+    for any), `milliseconds` the time since the query began, `features` the kind that was asked.
     """
 
     source: str
@@ -39,15 +40,18 @@ class Trace:
     tried: list[Tried] = field(default_factory=list)
 
 
-Source = Literal["prior", "retrieval", "other features", "look-alikes", "viewpoints", "repetition", "walls"]
+Source = Literal[
+    "prior", "retrieval", "other features", "look-alikes", "viewpoints", "repetition", "walls"
+]
 
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
     """A first pose (`fit.pose`, None where the matches agree on none), and where it comes from.
 
-    `is_guided`: were the matches sought where a pose expects them? Then they are no evidence for it. `repeats`: the evidence for the pose
-    that this one repeats; matches that no pose guided speak for both.
+    `is_guided`: were the matches sought where a pose expects them? Then they are no evidence for
+    it. `repeats`: the evidence for the pose that this one repeats; matches that no pose guided
+    speak for both.
     """
 
     source: Source
@@ -58,7 +62,8 @@ class Proposal:
 
 @dataclass(eq=False)
 class Search:
-    """`rho` are the map's correlated errors, `ranked` is what the coarse localizer names, the best first, by rows."""
+    """`rho` are the map's correlated errors, `ranked` is what the coarse localizer names, the best
+    first, by rows."""
 
     query: Query
     map: OpenMap
@@ -98,15 +103,19 @@ class Search:
 
     @property
     def is_clear(self) -> bool:
-        """Is there so much for one hypothesis that only parts of the map that look nearly the same are asked still?"""
+        """Is there so much for one hypothesis that only parts of the map that look nearly the same
+        are asked still?"""
         best = self.best
         return best is not None and best.log_odds > self.weights.evidence.clear_log_odds
 
     @property
     def is_settled(self) -> bool:
-        """Is it clear, and every other hypothesis as far behind as nowhere is? A twin of the place that this kind of features believes may
-        be told from it by another one."""
+        """Is it clear, and every other hypothesis as far behind as nowhere is? A twin of the place
+        that this kind of features believes may be told from it by another one."""
         if not self.is_clear:
             return False
         best, *others = self.belief.ranked(self.weights.rivals)
-        return all(lead(best, other, self.weights.rivals) > self.weights.evidence.clear_log_odds for other in others)
+        return all(
+            lead(best, other, self.weights.rivals) > self.weights.evidence.clear_log_odds
+            for other in others
+        )

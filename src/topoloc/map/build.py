@@ -1,7 +1,8 @@
 """Constructing the topo-metric map: section III-A of the paper, read from the top.
 
-The trajectory is discretised into nodes (Eq. 1). Each node keeps its template image, its global pose, and its features
-with their 3-D positions. All mapping images, labelled with their node, teach the coarse localizer.
+The trajectory is discretised into nodes (Eq. 1). Each node keeps its template image, its global
+pose, and its features with their 3-D positions. All mapping images, labelled with their node, teach
+the coarse localizer.
 """
 
 from __future__ import annotations
@@ -22,7 +23,14 @@ from topoloc.map.config import MapConfig
 from topoloc.map.drafts import Drafts, NodeDraft, draft_node, finish_node, observe
 from topoloc.map.entries import Edge, PlaceImage, TopoNode
 from topoloc.map.landmarks import Observations
-from topoloc.map.mapping_frames import MappingFrame, MappingImage, PointLocator, mapping_image, posed_frames, view_of
+from topoloc.map.mapping_frames import (
+    MappingFrame,
+    MappingImage,
+    PointLocator,
+    mapping_image,
+    posed_frames,
+    view_of,
+)
 from topoloc.map.nodes import NearestNodes, NodeConfig, NodePoses, place_nodes
 from topoloc.map.schema import SCHEMA_VERSION
 from topoloc.map.sessions import Edit, Light, Session, mean_light, path_of, poses_source_of, today
@@ -44,11 +52,12 @@ def build_map(
     progress: Progress | None = None,
     poses_from: Sequence[str] | None = None,
 ) -> TopoMetricMap:
-    """Build a topo-metric map from one or several recordings of one place whose poses share one world.
+    """Build a topo-metric map from one or several recordings of one place whose poses share one
+    world.
 
     Args:
-        poses_from: where the poses of each recording come from (`truth`, `slam`, a file), for the map to remember; else what is
-            known of that.
+        poses_from: where the poses of each recording come from (`truth`, `slam`, a file), for the
+            map to remember; else what is known of that.
 
     Raises:
         ConfigError: a value of `config` is out of its bounds.
@@ -61,7 +70,11 @@ def build_map(
     config = replace(config, other_kinds=tuple(config.kinds[1:]))
     progress = progress or (lambda stage, done, total: None)
     sequences = [sequences] if isinstance(sequences, StereoSequence) else sequences
-    frames = [frame for session_id, sequence in enumerate(sequences) for frame in posed_frames(sequence, session_id)]
+    frames = [
+        frame
+        for session_id, sequence in enumerate(sequences)
+        for frame in posed_frames(sequence, session_id)
+    ]
     locator = PointLocator(frames, config)
     node_config = _resolve_node_config(frames, locator, config)
     drafts = _draft_nodes(frames, locator, node_config, config, progress)
@@ -78,7 +91,10 @@ def build_map(
         config=replace(config, nodes=node_config),
         length_m=_trajectory_length(frames),
         sides=gather_sides(sides, config.kind_of_sides, config.sides),
-        sessions=[_session(k, sequence, frames, lights, poses_from[k], drafts.cameras) for k, sequence in enumerate(sequences)],
+        sessions=[
+            _session(k, sequence, frames, lights, poses_from[k], drafts.cameras)
+            for k, sequence in enumerate(sequences)
+        ],
         edits=[Edit(1, "build", today(), SCHEMA_VERSION)],
         other_kinds=of_kind,
     )
@@ -92,36 +108,63 @@ def _session(
     poses_from: str,
     cameras: dict[int, Camera],
 ) -> Session:
-    """What the map remembers of a recording; `lights` are those of the frames, `cameras` those of the sessions."""
+    """What the map remembers of a recording; `lights` are those of the frames, `cameras` those of
+    the sessions."""
     of_session = [k for k, frame in enumerate(frames) if frame.session_id == session_id]
     t_ns = [frames[k].t_ns for k in of_session]
     light = mean_light([lights[k] for k in of_session])
     camera = cameras.get(session_id)
-    return Session(session_id, sequence.name, path_of(sequence), poses_from, min(t_ns), max(t_ns), camera, light)
+    return Session(
+        session_id,
+        sequence.name,
+        path_of(sequence),
+        poses_from,
+        min(t_ns),
+        max(t_ns),
+        camera,
+        light,
+    )
 
 
-def _resolve_node_config(frames: list[MappingFrame], locator: PointLocator, config: BuildConfig) -> NodeConfig:
+def _resolve_node_config(
+    frames: list[MappingFrame], locator: PointLocator, config: BuildConfig
+) -> NodeConfig:
     """D_thresh from the scene, where the user named none."""
     if config.nodes.d_thresh is not None:
         return config.nodes.resolved(0.0)
-    samples, first = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, 7).astype(int))], replace(config, other_kinds=())
+    samples, first = (
+        [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, 7).astype(int))],
+        replace(config, other_kinds=()),
+    )
 
     def depths(read: tuple[MappingFrame, StereoFrame]) -> Float[np.ndarray, " n"]:
         frame, view = read[0], view_of(read[1])
-        located = locator.locate(frame, view, mapping_image(frame, view, first))[0][config.features.kind]
+        located = locator.locate(frame, view, mapping_image(frame, view, first))[0][
+            config.features.kind
+        ]
         return located.points_cam[located.valid, 2]
 
     all_depths = np.concatenate(list(locator.for_each(depths, samples)))
     if len(all_depths) == 0:
-        raise EmptyMapError(f"{frames[0].sequence.name}: no feature with a 3-D position in {len(samples)} pictures tried")
+        raise EmptyMapError(
+            f"{frames[0].sequence.name}: no feature with a 3-D position in {len(samples)} pictures"
+            " tried"
+        )
     return config.nodes.resolved(float(np.median(all_depths)))
 
 
 def _draft_nodes(
-    frames: list[MappingFrame], locator: PointLocator, node_config: NodeConfig, config: BuildConfig, progress: Progress
+    frames: list[MappingFrame],
+    locator: PointLocator,
+    node_config: NodeConfig,
+    config: BuildConfig,
+    progress: Progress,
 ) -> Drafts:
-    """The trajectory discretised by Eq. 1; a picture with too few points (dark, blurred, blank) becomes no node."""
-    chosen = [frames[i] for i in place_nodes([frame.world_from_cam for frame in frames], node_config)]
+    """The trajectory discretised by Eq. 1; a picture with too few points (dark, blurred, blank)
+    becomes no node."""
+    chosen = [
+        frames[i] for i in place_nodes([frame.world_from_cam for frame in frames], node_config)
+    ]
     kind = find_kind(config.features.kind)
     rows = nodes_with_sides([frame.world_from_cam for frame in chosen], node_config, config.sides)
     with_sides = {chosen[row] for row in rows}
@@ -135,20 +178,32 @@ def _draft_nodes(
             drafts.append(draft)
         progress("nodes", done + 1, len(chosen))
     if not drafts.rows:
-        raise EmptyMapError(f"{frames[0].sequence.name}: no picture has {config.min_node_points} features with a 3-D position")
+        raise EmptyMapError(
+            f"{frames[0].sequence.name}: no picture has {config.min_node_points} features with a"
+            " 3-D position"
+        )
     return drafts
 
 
 def _visit_all_images(
-    frames: list[MappingFrame], drafts: Drafts, node_config: NodeConfig, config: BuildConfig, progress: Progress
+    frames: list[MappingFrame],
+    drafts: Drafts,
+    node_config: NodeConfig,
+    config: BuildConfig,
+    progress: Progress,
 ) -> tuple[list[PlaceImage], list[Light], list[CoarseModel]]:
-    """Label every mapping image with its nearest node, let it observe the points of the nodes around, and teach the
-    coarse localizer of each kind of features with it; its light is measured on the way."""
+    """Label every mapping image with its nearest node, let it observe the points of the nodes
+    around, and teach the coarse localizer of each kind of features with it; its light is measured
+    on the way."""
     assert node_config.lambda_rot is not None
     words = {kind: _words(drafts, kind, config) for kind in config.kinds}
     nodes = NearestNodes(NodePoses.of(drafts.world_from_nodes), node_config.lambda_rot)
     images: list[PlaceImage] = []
-    lights, vlads, cells = [], {kind: Shelf[np.ndarray]() for kind in config.kinds}, {kind: [] for kind in config.kinds}
+    lights, vlads, cells = (
+        [],
+        {kind: Shelf[np.ndarray]() for kind in config.kinds},
+        {kind: [] for kind in config.kinds},
+    )
     read = ((frame, None if frame in drafts.rows else frame.read_left()) for frame in frames)
     visits = in_order(lambda one: _visit(*one, drafts, nodes, words, config), read)
     for done, (frame, visit) in enumerate(zip(frames, visits, strict=True)):
@@ -160,19 +215,39 @@ def _visit_all_images(
         for kind, features in image.features.items():
             vlads[kind].append(visit.vlads[kind])
             cells[kind].append(features.cells)
-        of_image = (visit.nearest, image.world_from_cam, image.place_jpeg, frame.session_id, done + 1)
+        of_image = (
+            visit.nearest,
+            image.world_from_cam,
+            image.place_jpeg,
+            frame.session_id,
+            done + 1,
+        )
         images.append(PlaceImage(frame.sequence.name, frame.name, *of_image))
         lights.append(image.light)
         progress("images", done + 1, len(frames))
     node_ids = np.array([image.node_id for image in images])
-    learnt = {kind: (words[kind], vlads[kind], node_ids, config.vlad_of(kind), cells[kind]) for kind in config.kinds}
-    first, models = config.features.kind, {kind: SurfVlad.fit(*of_kind).to_model() for kind, of_kind in learnt.items()}
-    return images, lights, [model if kind == first else replace(model, name=f"{model.name}@{kind}") for kind, model in models.items()]
+    learnt = {
+        kind: (words[kind], vlads[kind], node_ids, config.vlad_of(kind), cells[kind])
+        for kind in config.kinds
+    }
+    first, models = (
+        config.features.kind,
+        {kind: SurfVlad.fit(*of_kind).to_model() for kind, of_kind in learnt.items()},
+    )
+    return (
+        images,
+        lights,
+        [
+            model if kind == first else replace(model, name=f"{model.name}@{kind}")
+            for kind, model in models.items()
+        ],
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class _Visit:
-    """What a mapping image gives: its nearest node's row, what it sees of the nodes around, by their rows, and its VLADs by kind."""
+    """What a mapping image gives: its nearest node's row, what it sees of the nodes around, by
+    their rows, and its VLADs by kind."""
 
     image: MappingImage
     nearest: int
@@ -188,20 +263,41 @@ def _visit(
     words: dict[str, Float32[np.ndarray, "k d"]],
     config: BuildConfig,
 ) -> _Visit:
-    """`read` is None for a frame that is a node: what it shows is known already. Changes nothing, so that several may run at a time."""
-    image = drafts.image(frame) if read is None else mapping_image(frame, view_of(read, with_depth=False), config)
+    """`read` is None for a frame that is a node: what it shows is known already. Changes nothing,
+    so that several may run at a time."""
+    image = (
+        drafts.image(frame)
+        if read is None
+        else mapping_image(frame, view_of(read, with_depth=False), config)
+    )
     nearest = nodes.rows(image.world_from_cam, max(1, config.landmarks.nodes_per_image)).tolist()
     around = {row: drafts.shelf[row] for row in nearest[: config.landmarks.nodes_per_image]}
-    observed = {row: observe(draft, image, frame.session_id, config) for row, draft in around.items() if frame not in draft.sources}
-    placed_of = {kind: placed(of, image.camera.width, image.camera.height, config.vlad_of(kind)) for kind, of in image.features.items()}
-    return _Visit(image, nearest[0], observed, {kind: vlad(described, words[kind]) for kind, described in placed_of.items()})
+    observed = {
+        row: observe(draft, image, frame.session_id, config)
+        for row, draft in around.items()
+        if frame not in draft.sources
+    }
+    placed_of = {
+        kind: placed(of, image.camera.width, image.camera.height, config.vlad_of(kind))
+        for kind, of in image.features.items()
+    }
+    return _Visit(
+        image,
+        nearest[0],
+        observed,
+        {kind: vlad(described, words[kind]) for kind, described in placed_of.items()},
+    )
 
 
 def _words(drafts: Drafts, kind: str, config: BuildConfig) -> Float32[np.ndarray, "k d"]:
-    return learn_words_of(drafts.num_points[kind], lambda row: drafts.shelf[row].described(kind, config), config.vlad)
+    return learn_words_of(
+        drafts.num_points[kind], lambda row: drafts.shelf[row].described(kind, config), config.vlad
+    )
 
 
-def _finished(drafts: Drafts, config: BuildConfig) -> tuple[dict[str, Sequence[TopoNode]], Sequence[TopoNode]]:
+def _finished(
+    drafts: Drafts, config: BuildConfig
+) -> tuple[dict[str, Sequence[TopoNode]], Sequence[TopoNode]]:
     """The nodes by their kinds of features, and all side nodes; each draft is looked at once."""
     of_kind, sides = {kind: Shelf[TopoNode]() for kind in config.kinds}, Shelf[TopoNode]()
 
@@ -220,10 +316,18 @@ def _finished(drafts: Drafts, config: BuildConfig) -> tuple[dict[str, Sequence[T
 def _edges_along(frames: list[MappingFrame], node_ids: list[int]) -> list[Edge]:
     """An edge wherever a recording went from one node to another."""
     steps = pairwise(zip(frames, node_ids, strict=True))
-    edges = {(source, target) for (a, source), (b, target) in steps if a.sequence is b.sequence and source != target}
+    edges = {
+        (source, target)
+        for (a, source), (b, target) in steps
+        if a.sequence is b.sequence and source != target
+    }
     return [Edge(source, target) for source, target in sorted(edges)]
 
 
 def _trajectory_length(frames: list[MappingFrame]) -> float:
-    steps = [b.world_from_cam.translation - a.world_from_cam.translation for a, b in pairwise(frames) if a.sequence is b.sequence]
+    steps = [
+        b.world_from_cam.translation - a.world_from_cam.translation
+        for a, b in pairwise(frames)
+        if a.sequence is b.sequence
+    ]
     return float(sum(np.linalg.norm(step) for step in steps))

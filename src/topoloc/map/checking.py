@@ -1,5 +1,5 @@
-"""A map file looked at from end to end: every row's checksum, the digest over all of them, and every entry as it is read for an answer;
-and what it says of its coarse localizers."""
+"""A map file looked at from end to end: every row's checksum, the digest over all of them, and
+every entry as it is read for an answer; and what it says of its coarse localizers."""
 
 from __future__ import annotations
 
@@ -34,8 +34,13 @@ def list_coarse(path: Path) -> list[dict[str, Any]]:
     file = MapFile(path)
     try:
         with file.reading() as database:
-            query = "SELECT name, settings, length(arrays) FROM coarse_models ORDER BY name LIMIT 1000"
-            return [_facts(name, json_of(settings), num_bytes) for name, settings, num_bytes in database.execute(query)]
+            query = (
+                "SELECT name, settings, length(arrays) FROM coarse_models ORDER BY name LIMIT 1000"
+            )
+            return [
+                _facts(name, json_of(settings), num_bytes)
+                for name, settings, num_bytes in database.execute(query)
+            ]
     finally:
         file.close()
 
@@ -67,7 +72,10 @@ def _of_entries(topomap: TopoMetricMap) -> Iterator[str]:
     known = {summary.node_id for summary in topomap.summaries}
     for edge in topomap.edges:
         if not {edge.source_id, edge.target_id} <= known:
-            yield f"an edge from node {edge.source_id} to node {edge.target_id}, one of which is missing"
+            yield (
+                f"an edge from node {edge.source_id} to node {edge.target_id}, one of which is"
+                " missing"
+            )
     for name in topomap.coarse_models:
         yield from _tried(lambda name=name: open_coarse_of(topomap, name))[1]
     if topomap.sides is not None:
@@ -101,4 +109,6 @@ def _facts(name: str, settings: Any, num_bytes: int) -> dict[str, Any]:
     if not isinstance(settings, dict):
         raise Damage(f"the settings of coarse localizer {name} are none")
     facts = {"name": name, "bytes": num_bytes}
-    return facts | {key: settings[key] for key in ("backbone", "weights", "trained") if key in settings}
+    return facts | {
+        key: settings[key] for key in ("backbone", "weights", "trained") if key in settings
+    }

@@ -1,4 +1,5 @@
-"""The configuration of a map: what it is built with, and what it says of itself afterwards; typed and versioned."""
+"""The configuration of a map: what it is built with, and what it says of itself afterwards; typed
+and versioned."""
 
 from __future__ import annotations
 
@@ -28,8 +29,9 @@ class MapConfig:
     nodes: NodeConfig = field(default_factory=NodeConfig)
     features: FeatureConfig = field(default_factory=FeatureConfig)
     other_kinds: tuple[str, ...] | None = None
-    """Further kinds of features that the same nodes are described with: a query asks them where the first one leaves its pose unclear.
-    Unset: beside SURF the learned ones whose network is here, if any is."""
+    """Further kinds of features that the same nodes are described with: a query asks them where the
+    first one leaves its pose unclear. Unset: beside SURF the learned ones whose network is here, if
+    any is."""
     points: MetricPointsConfig = field(default_factory=MetricPointsConfig)
     motion: MotionPointsConfig = field(default_factory=MotionPointsConfig)
     landmarks: LandmarkConfig = field(default_factory=LandmarkConfig)
@@ -42,7 +44,8 @@ class MapConfig:
     template_side_px: Annotated[int, Between(16, 4096)] = 240
     """Shorter side of the template picture that a node keeps, at most."""
     place_side_px: Annotated[int, Between(16, 4096)] = 160
-    """Shorter side of the other mapping images, at most: what the coarse localizers of section III-B are trained with."""
+    """Shorter side of the other mapping images, at most: what the coarse localizers of section
+    III-B are trained with."""
 
     @property
     def kinds(self) -> list[str]:
@@ -56,18 +59,26 @@ class MapConfig:
 
     @property
     def kind_of_sides(self) -> str:
-        """The kind of features that side nodes are described with: that of a kind that a network gives, where the map has one."""
+        """The kind of features that side nodes are described with: that of a kind that a network
+        gives, where the map has one."""
         kinds = [find_kind(kind) for kind in self.kinds]
         return next((kind for kind in kinds if kind.network is not None), kinds[0]).kind_of_sides
 
     def features_of(self, kind: str) -> FeatureConfig:
-        """The settings of the features of this kind: those of `features`, but for the picture's normalization, which suits the kind."""
-        return self.features if kind == self.features.kind else replace(self.features, kind=kind, normalization=None)
+        """The settings of the features of this kind: those of `features`, but for the picture's
+        normalization, which suits the kind."""
+        return (
+            self.features
+            if kind == self.features.kind
+            else replace(self.features, kind=kind, normalization=None)
+        )
 
     def vlad_of(self, kind: str) -> VladConfig:
         """The settings of surf-vlad by features of this kind."""
         weight = self.vlad.position_weight
-        return replace(self.vlad, position_weight=find_kind(kind).position_weight if weight is None else weight)
+        return replace(
+            self.vlad, position_weight=find_kind(kind).position_weight if weight is None else weight
+        )
 
     @property
     def d_thresh(self) -> float:
@@ -91,7 +102,8 @@ def config_to_text(config: MapConfig) -> str:
 
 
 def config_from_text(text: str, version: int | None) -> MapConfig:
-    """The inverse of `config_to_text`; files of schema 1 named no version. Raises ConfigError, which names the key."""
+    """The inverse of `config_to_text`; files of schema 1 named no version. Raises ConfigError,
+    which names the key."""
     data = json_of(text)
     if version is not None and isinstance(data, dict) and data.pop("version", None) != version:
         raise ConfigError(f"config: of another version than {version}, which is known")

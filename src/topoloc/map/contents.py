@@ -1,4 +1,5 @@
-"""What a map holds, as `reading.py` finds it in a file and `writing.py` writes it. Data only; `topomap.py` makes a map of it."""
+"""What a map holds, as `reading.py` finds it in a file and `writing.py` writes it. Data only;
+`topomap.py` makes a map of it."""
 
 from __future__ import annotations
 
@@ -8,7 +9,15 @@ from typing import no_type_check
 
 from topoloc.geometry.geodesy import Georeference
 from topoloc.map.config import MapConfig
-from topoloc.map.entries import Edge, NodeSummary, PlaceImage, Repetitions, SharedErrors, SideNodes, TopoNode
+from topoloc.map.entries import (
+    Edge,
+    NodeSummary,
+    PlaceImage,
+    Repetitions,
+    SharedErrors,
+    SideNodes,
+    TopoNode,
+)
 from topoloc.map.nodes import digest_of_nodes
 from topoloc.map.sessions import Edit, Session
 from topoloc.places.coarse import CoarseModel
@@ -31,14 +40,15 @@ _MAP_ID = b"map id"
 @no_type_check  # at run time: it would read from the file to look at entries' types
 @dataclass(frozen=True, eq=False)
 class MapContents:
-    """All of a map. `summaries[i]` describes `nodes[i]`; their ids are in increasing order. `config` is the effective configuration it
-    was built with, `length_m` the metres of trajectory that were mapped. `default_coarse` names the coarse localizer that answers
-    where the user names none. `shared_errors` and `repetitions` are None where nobody has measured
-    them, `sides` where no mapping picture is wide enough to show the walls along the way. `edits` begins with the build.
-    `map_id` stays what it is whatever becomes of the map; None until it is saved, and in older files. `georeference` says where on earth
-    the map's world lies, where that is known.
-    `other_kinds` are the same nodes with points of further kinds of features, by the kind's name, and `other_shared_errors` what
-    `shared_errors` are of these.
+    """All of a map. `summaries[i]` describes `nodes[i]`; their ids are in increasing order.
+    `config` is the effective configuration it was built with, `length_m` the metres of trajectory
+    that were mapped. `default_coarse` names the coarse localizer that answers where the user names
+    none. `shared_errors` and `repetitions` are None where nobody has measured them, `sides` where
+    no mapping picture is wide enough to show the walls along the way. `edits` begins with the
+    build. `map_id` stays what it is whatever becomes of the map; None until it is saved, and in
+    older files. `georeference` says where on earth the map's world lies, where that is known.
+    `other_kinds` are the same nodes with points of further kinds of features, by the kind's name,
+    and `other_shared_errors` what `shared_errors` are of these.
     """
 
     summaries: Sequence[NodeSummary]
@@ -75,13 +85,18 @@ class MapContents:
         """Ids that nothing in the map has or had; place images get theirs when they are written."""
         return replace(
             self.next_ids,
-            session=max([self.next_ids.session, *(session.session_id + 1 for session in self.sessions)]),
+            session=max(
+                [self.next_ids.session, *(session.session_id + 1 for session in self.sessions)]
+            ),
             node=max([self.next_ids.node, *(summary.node_id + 1 for summary in self.summaries)]),
             edit=max([self.next_ids.edit, *(edit.edit_id + 1 for edit in self.edits)]),
         )
 
-    def nodes_of(self, kind: str):  # no return type: at run time an entry would be read to look at it
-        """The nodes with their points of one of the map's kinds of features. Raises KeyError where it holds no such features."""
+    def nodes_of(
+        self, kind: str
+    ):  # no return type: at run time an entry would be read to look at it
+        """The nodes with their points of one of the map's kinds of features. Raises KeyError where
+        it holds no such features."""
         return self.nodes if kind == self.kind else self.other_kinds[kind]
 
     @property
@@ -91,5 +106,6 @@ class MapContents:
 
 
 def map_id_of(contents: MapContents) -> str:
-    """The map's id, 16 hexadecimal digits; of one that was not saved yet, or by an older version, what its nodes make of it."""
+    """The map's id, 16 hexadecimal digits; of one that was not saved yet, or by an older version,
+    what its nodes make of it."""
     return contents.map_id or digest_of_nodes(contents.summaries, _MAP_ID)

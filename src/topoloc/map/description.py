@@ -49,4 +49,8 @@ def describe_map(topomap: TopoMetricMap, path: Path) -> dict[str, Any]:
 
 def _session_facts(session: Session) -> dict[str, Any]:
     camera = None if session.camera is None else session.camera.to_json()
-    return asdict(session) | {"camera": camera, "start_date": session.start_date, "end_date": session.end_date}
+    return asdict(session) | {
+        "camera": camera,
+        "start_date": session.start_date,
+        "end_date": session.end_date,
+    }

@@ -1,4 +1,5 @@
-"""Nodes in the making: points as first measured, what other mapping images saw of them since, and the node that comes of both."""
+"""Nodes in the making: points as first measured, what other mapping images saw of them since, and
+the node that comes of both."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ from topoloc.slam.metric_points import keypoint_sigmas
 
 @dataclass(frozen=True, eq=False)
 class DraftPoints:
-    """Points of a node in the making as first measured, and what other images saw of them so far."""
+    """Points of a node in the making as first measured, and what other images saw of them so
+    far."""
 
     features: Features
     points_cam: Float[np.ndarray, "n 3"]
@@ -33,7 +35,8 @@ class DraftPoints:
 
 @dataclass(frozen=True, eq=False)
 class NodeDraft:
-    """A node in the making, its points by their kinds of features; `sources` are the frames that these were first measured in."""
+    """A node in the making, its points by their kinds of features; `sources` are the frames that
+    these were first measured in."""
 
     frame: MappingFrame
     image: MappingImage
@@ -48,14 +51,21 @@ class NodeDraft:
             self.points[kind].observations.append(observations)
 
     def described(self, kind: str, config: MapConfig) -> Float32[np.ndarray, "n d"]:
-        """The descriptors of its points of a kind, as the coarse localizer takes them (`placed`)."""
-        return placed(self.points[kind].features, self.image.camera.width, self.image.camera.height, config.vlad_of(kind))
+        """The descriptors of its points of a kind, as the coarse localizer takes them
+        (`placed`)."""
+        return placed(
+            self.points[kind].features,
+            self.image.camera.width,
+            self.image.camera.height,
+            config.vlad_of(kind),
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Drafts:
-    """The nodes of a map in the making, by their rows; most of them lie on disk (`shelf`). `rows` are those of the frames that they come
-    from, `cameras` the first one of each session, and `num_points` how many points each has, by kind."""
+    """The nodes of a map in the making, by their rows; most of them lie on disk (`shelf`). `rows`
+    are those of the frames that they come from, `cameras` the first one of each session, and
+    `num_points` how many points each has, by kind."""
 
     shelf: Shelf[NodeDraft]
     world_from_nodes: list[Rigid3] = field(default_factory=list)
@@ -76,45 +86,83 @@ class Drafts:
         return self.shelf[self.rows[frame]].image
 
 
-def draft_node(frame: MappingFrame, view: FrameView, locator: PointLocator, with_sides: bool, config: MapConfig) -> NodeDraft:
+def draft_node(
+    frame: MappingFrame, view: FrameView, locator: PointLocator, with_sides: bool, config: MapConfig
+) -> NodeDraft:
     """A node of this frame, of which `view` is what was read."""
     image = locator.image(frame, view)
     located, sources = locator.locate(frame, view, image)
     points = {}
     for kind, features in image.features.items():
         rows = np.flatnonzero(located[kind].valid)
-        points[kind] = DraftPoints(features.select(rows), located[kind].points_cam[rows], located[kind].covariances[rows], [])
+        points[kind] = DraftPoints(
+            features.select(rows),
+            located[kind].points_cam[rows],
+            located[kind].covariances[rows],
+            [],
+        )
     template_jpeg = small_jpeg(view.picture, config.template_side_px, quality=75)
-    summary = NodeSummary(-1, frame.sequence.name, frame.name, frame.t_ns, image.world_from_cam, 0, frame.session_id)
+    summary = NodeSummary(
+        -1, frame.sequence.name, frame.name, frame.t_ns, image.world_from_cam, 0, frame.session_id
+    )
     sides = (
-        describe_sides(summary, view, config.features_of(config.kind_of_sides), config.points, config.sides)
+        describe_sides(
+            summary, view, config.features_of(config.kind_of_sides), config.points, config.sides
+        )
         if with_sides and not sources
         else []
     )
     return NodeDraft(frame, image, template_jpeg, points, sides, [frame, *sources])
 
 
-def observe(draft: NodeDraft, image: MappingImage, session_id: int, config: MapConfig) -> dict[str, Observations]:
+def observe(
+    draft: NodeDraft, image: MappingImage, session_id: int, config: MapConfig
+) -> dict[str, Observations]:
     """What an image sees of a draft's points, by their kinds."""
     cam_from_node = image.world_from_cam.inverse() @ draft.image.world_from_cam
     observed = {}
     for kind, features in image.features.items():
         points, sigmas_px = draft.points[kind], keypoint_sigmas(features, config.points)
-        known, seen_by = (points.features, points.points_cam, points.covariances), (features, sigmas_px, image.camera, cam_from_node)
+        known, seen_by = (
+            (points.features, points.points_cam, points.covariances),
+            (features, sigmas_px, image.camera, cam_from_node),
+        )
         observed[kind] = observe_points(*known, *seen_by, config.landmarks, session_id)
     return observed
 
 
 def finish_node(node_id: int, draft: NodeDraft, kind: str, config: MapConfig) -> TopoNode:
-    """Refine the points of a kind by what was observed; keep those seen again first, the strongest among them."""
+    """Refine the points of a kind by what was observed; keep those seen again first, the strongest
+    among them."""
     points, frame, image = draft.points[kind], draft.frame, draft.image
-    refined = refine_points(points.points_cam, points.covariances, points.observations, config.landmarks)
+    refined = refine_points(
+        points.points_cam, points.covariances, points.observations, config.landmarks
+    )
     rows = np.flatnonzero(refined.agrees)
-    rows = np.sort(rows[np.argsort(-np.minimum(refined.num_observations[rows], 2), kind="stable")][: config.max_node_points])
+    rows = np.sort(
+        rows[np.argsort(-np.minimum(refined.num_observations[rows], 2), kind="stable")][
+            : config.max_node_points
+        ]
+    )
     sqrt_covs = np.linalg.cholesky(refined.covariances[rows])[:, *np.tril_indices(3)]
-    sums = session_sums(refined.points_cam, points.points_cam, points.covariances, points.observations, rows, frame.session_id)
+    sums = session_sums(
+        refined.points_cam,
+        points.points_cam,
+        points.covariances,
+        points.observations,
+        rows,
+        frame.session_id,
+    )
     return TopoNode(
-        NodeSummary(node_id, frame.sequence.name, frame.name, frame.t_ns, image.world_from_cam, len(rows), frame.session_id),
+        NodeSummary(
+            node_id,
+            frame.sequence.name,
+            frame.name,
+            frame.t_ns,
+            image.world_from_cam,
+            len(rows),
+            frame.session_id,
+        ),
         image.camera,
         points.features.select(rows),
         refined.points_cam[rows].astype(np.float32),

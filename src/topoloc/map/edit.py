@@ -1,7 +1,8 @@
-"""Edits of a map file: each is one transaction with a name and a date, and the last ones can be taken back, to the byte.
+"""Edits of a map file: each is one transaction with a name and a date, and the last ones can be
+taken back, to the byte.
 
-The file is replaced whole: whoever reads it keeps what he opened, and a process that is killed leaves the map before its edit or the one
-after it.
+The file is replaced whole: whoever reads it keeps what he opened, and a process that is killed
+leaves the map before its edit or the one after it.
 """
 
 from __future__ import annotations
@@ -41,7 +42,9 @@ class MapEdit:
     path: Path
     topomap: TopoMetricMap
 
-    def commit(self, changed: TopoMetricMap, name: str, changes: Mapping[str, Any] | None = None) -> Edit:
+    def commit(
+        self, changed: TopoMetricMap, name: str, changes: Mapping[str, Any] | None = None
+    ) -> Edit:
         """Replace the file by the changed map, at once or not at all, with an entry in its history.
 
         Args:
@@ -71,7 +74,9 @@ def editing(path: str | Path, waits: Waits | None = None) -> Iterator[MapEdit]:
     """
     path = Path(os.path.realpath(path))
     with _locked(path, waits):
-        if not os.access(path, os.W_OK) or not path.stat().st_mode & _WRITABLE:  # nobody's to write, though root may
+        if (
+            not os.access(path, os.W_OK) or not path.stat().st_mode & _WRITABLE
+        ):  # nobody's to write, though root may
             raise MapError(f"cannot write map {path}: it is read-only")
         with TopoMetricMap.load(path) as topomap:
             yield MapEdit(path, topomap)
@@ -81,14 +86,19 @@ def undo_edit(path: str | Path, waits: Waits | None = None) -> Edit:
     """Take the last edit of a map file back, to the byte; it is what is returned.
 
     Raises:
-        MapError: there is nothing to take back; the undo file is damaged; the map cannot be written. The map is as it was.
+        MapError: there is nothing to take back; the undo file is damaged; the map cannot be
+            written. The map is as it was.
     """
     with editing(path, waits) as edit:
         assert edit.topomap.file is not None, "a map that was just opened"
         last = max(edit.topomap.edits, key=lambda one: one.edit_id, default=None)
         entries = entries_for(path_of_log(edit.path), edit.topomap.file.digest)
         if last is None or not entries:
-            why = "it is as built" if last is None or last.edit_id <= 1 else f"what was before {last.name!r} is not kept"
+            why = (
+                "it is as built"
+                if last is None or last.edit_id <= 1
+                else f"what was before {last.name!r} is not kept"
+            )
             raise MapError(f"map {path}: nothing to undo: {why}")
         try:
             with replaced_file(edit.path) as temporary:
@@ -101,7 +111,8 @@ def undo_edit(path: str | Path, waits: Waits | None = None) -> Edit:
 
 
 def undoable_edits(path: str | Path, log: Path | None = None) -> int:
-    """How many of the last edits of a map file can be taken back, by the undo file beside it or another one. Raises MapError."""
+    """How many of the last edits of a map file can be taken back, by the undo file beside it or
+    another one. Raises MapError."""
     path = Path(os.path.realpath(path))
     with closing(MapFile(path)) as file:
         return len(entries_for(log or path_of_log(path), file.digest))
@@ -140,6 +151,12 @@ def _wait_for_lock(descriptor: int, waits: Waits | None) -> None:
 def _check(file_before: Path, digest: str, log: Path) -> None:
     """Hold that an undone map is the one that it should be, row by row."""
     with closing(MapFile(file_before)) as file:
-        rows = digest if file.version == 1 else digest_of({table: file.checksums(table) for table in TABLES})
+        rows = (
+            digest
+            if file.version == 1
+            else digest_of({table: file.checksums(table) for table in TABLES})
+        )
         if not digest == rows == file.digest:
-            raise MapError(f"{log} is damaged: it does not lead back to the map before; the map stays as it is")
+            raise MapError(
+                f"{log} is damaged: it does not lead back to the map before; the map stays as it is"
+            )

@@ -1,7 +1,8 @@
 """The map file opened: rows of its tables, each checked before anybody sees it.
 
-The file may come from anywhere. Its tables must be ours to the letter, so that no view, trigger or virtual table runs; the lengths of
-a row are looked at before its bytes are read, its types and its checksum after; SQLite itself runs within limits of time and size.
+The file may come from anywhere. Its tables must be ours to the letter, so that no view, trigger or
+virtual table runs; the lengths of a row are looked at before its bytes are read, its types and its
+checksum after; SQLite itself runs within limits of time and size.
 """
 
 from __future__ import annotations
@@ -17,7 +18,14 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
-from topoloc.errors import CalibrationError, ConfigError, FeatureKindError, GeoreferenceError, MapError, MapVersionError
+from topoloc.errors import (
+    CalibrationError,
+    ConfigError,
+    FeatureKindError,
+    GeoreferenceError,
+    MapError,
+    MapVersionError,
+)
 from topoloc.map.schema import (
     APPLICATION_ID,
     ORDER,
@@ -33,11 +41,13 @@ from topoloc.map.schema import (
 from topoloc.map.validation import Damage, counts_from
 
 MAX_SECONDS = 5.0
-"""What one reading may take: the slowest honest one, all node summaries of a large map, takes a tenth of a second."""
+"""What one reading may take: the slowest honest one, all node summaries of a large map, takes a
+tenth of a second."""
 MAX_ROWS = 1_000_000
 MAX_BYTES = 50_000_000
 MAX_ARRAYS_BYTES = 800_000_000
-"""Of one value: a picture, a node's points, a text; and of a coarse localizer's arrays (VGG-11 whole has 258 MB)."""
+"""Of one value: a picture, a node's points, a text; and of a coarse localizer's arrays (VGG-11
+whole has 258 MB)."""
 _PYTHON_TYPES = {"INTEGER": int, "TEXT": str, "BLOB": bytes}
 _LIMITS = {
     sqlite3.SQLITE_LIMIT_LENGTH: MAX_ARRAYS_BYTES + 1_000_000,
@@ -68,15 +78,23 @@ class MapFile:
         self._kept: dict[str, Any] = {}
         self.version = check_header(path)
         with self._reading():
-            # The file is never changed in place, so SQLite needs no locks on it (and works on read-only media).
+            # The file is never changed in place, so SQLite needs no locks on it (and works on
+            # read-only media).
             address = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
-            self._database = sqlite3.connect(address, uri=True, check_same_thread=False, isolation_level=None)
+            self._database = sqlite3.connect(
+                address, uri=True, check_same_thread=False, isolation_level=None
+            )
             for category, limit in _LIMITS.items():
                 self._database.setlimit(category, limit)
             self._database.set_progress_handler(lambda: time.monotonic() > self._deadline, 20_000)
         try:
             with self.reading() as database:
-                for pragma in ("trusted_schema = OFF", "cell_size_check = ON", "mmap_size = 0", "temp_store = MEMORY"):
+                for pragma in (
+                    "trusted_schema = OFF",
+                    "cell_size_check = ON",
+                    "mmap_size = 0",
+                    "temp_store = MEMORY",
+                ):
                     database.execute(f"PRAGMA {pragma}")
                 tables = self._check_tables(database)
                 if self.version == 1:
@@ -100,7 +118,8 @@ class MapFile:
 
     @contextmanager
     def reading(self) -> Iterator[sqlite3.Connection]:
-        """The database, for one reading; what is wrong with the file becomes a MapError. Our own mistakes do not."""
+        """The database, for one reading; what is wrong with the file becomes a MapError. Our own
+        mistakes do not."""
         with self._reading():
             if self._database is None:
                 raise MapError(f"map {self.path} is closed")
@@ -114,12 +133,25 @@ class MapFile:
                 yield
         except (sqlite3.ProgrammingError, sqlite3.InterfaceError):  # a call of ours that is wrong
             raise
-        except (sqlite3.Error, zlib.error, Damage, ConfigError, FeatureKindError, CalibrationError, GeoreferenceError) as error:
-            raise MapError(f"map {self.path} is damaged: {' '.join(str(error).split())[:300]}") from error
+        except (
+            sqlite3.Error,
+            zlib.error,
+            Damage,
+            ConfigError,
+            FeatureKindError,
+            CalibrationError,
+            GeoreferenceError,
+        ) as error:
+            raise MapError(
+                f"map {self.path} is damaged: {' '.join(str(error).split())[:300]}"
+            ) from error
 
     def rows(self, table: str, columns: Sequence[str] | None = None) -> list[dict[str, Any]]:
-        """All rows of a table of small ones, in its order. With `columns` only these, without their checksum."""
-        wanted = TABLES[table] if columns is None else {name: TABLES[table][name] for name in columns}
+        """All rows of a table of small ones, in its order. With `columns` only these, without their
+        checksum."""
+        wanted = (
+            TABLES[table] if columns is None else {name: TABLES[table][name] for name in columns}
+        )
         with self.reading() as database:
             self._check_count(table)
             if columns is not None:
@@ -129,11 +161,14 @@ class MapFile:
             return [self._checked(table, row) for row in database.execute(query)]
 
     def row(self, table: str, **key: int | str) -> dict[str, Any] | None:
-        """One row, with its lengths looked at before it is read, and its checksum; None where there is none."""
+        """One row, with its lengths looked at before it is read, and its checksum; None where there
+        is none."""
         wanted, where = TABLES[table], " AND ".join(f"{name} = ?" for name in key)
         with self.reading() as database:
             lengths = ", ".join(f"length({name})" for name in wanted)
-            found = database.execute(f"SELECT {lengths} FROM {table} WHERE {where}", tuple(key.values())).fetchone()
+            found = database.execute(
+                f"SELECT {lengths} FROM {table} WHERE {where}", tuple(key.values())
+            ).fetchone()
             if found is None:
                 return None
             for name, length in zip(wanted, found, strict=True):
@@ -146,21 +181,24 @@ class MapFile:
         """Those of all rows in their order, but for that of the digest itself."""
         with self.reading() as database:
             where = " WHERE key != 'digest'" if table == "map" else ""
-            found = database.execute(f"SELECT checksum FROM {table}{where} ORDER BY {ORDER[table]} LIMIT {MAX_ROWS}").fetchall()
+            found = database.execute(
+                f"SELECT checksum FROM {table}{where} ORDER BY {ORDER[table]} LIMIT {MAX_ROWS}"
+            ).fetchall()
             if not all(type(checksum) is bytes for (checksum,) in found):
                 raise Damage(f"a checksum of {table} is missing")
             return [checksum for (checksum,) in found]
 
     def kept(self, name: str, make: Callable[[], Any]) -> Any:
-        """What `make` gave when it was first asked for under this name. The lock is that of reading: with two, threads could wait for
-        each other."""
+        """What `make` gave when it was first asked for under this name. The lock is that of
+        reading: with two, threads could wait for each other."""
         with self._lock:
             if name not in self._kept:
                 self._kept[name] = make()
             return self._kept[name]
 
     def count(self, table: str) -> int:
-        """Rows of a table, as the file says of itself; schema 1 said nothing, so they are counted."""
+        """Rows of a table, as the file says of itself; schema 1 said nothing, so they are
+        counted."""
         if self.counts is not None:
             return self.counts[table]
         with self.reading() as database:
@@ -192,15 +230,26 @@ class MapFile:
     def _check_tables(self, database: sqlite3.Connection) -> set[str]:
         """Hold that the file has our tables and nothing else that SQLite would run. Their names."""
         wanted = SCHEMA_1 if self.version == 1 else {table: creation_of(table) for table in TABLES}
-        entries = database.execute("SELECT type, name, tbl_name, sql FROM sqlite_master LIMIT 100").fetchall()
+        entries = database.execute(
+            "SELECT type, name, tbl_name, sql FROM sqlite_master LIMIT 100"
+        ).fetchall()
         found = set()
         for kind, name, of_table, sql in entries:
-            if kind == "index" and sql is None and str(name).startswith("sqlite_autoindex_") and of_table in wanted:
+            if (
+                kind == "index"
+                and sql is None
+                and str(name).startswith("sqlite_autoindex_")
+                and of_table in wanted
+            ):
                 continue
             if kind != "table" or name not in wanted or sql != wanted[name]:
-                raise Damage(f"{str(kind)[:20]} {str(name)[:60]!r} is none of a map of schema {self.version}")
+                raise Damage(
+                    f"{str(kind)[:20]} {str(name)[:60]!r} is none of a map of schema {self.version}"
+                )
             found.add(name)
-        optional = {name for name in wanted if name.startswith(SIDE)} if self.version == 1 else set()
+        optional = (
+            {name for name in wanted if name.startswith(SIDE)} if self.version == 1 else set()
+        )
         missing = set(wanted) - found - (optional if not found & optional else set())
         if missing:
             raise Damage(f"table {min(missing)} is missing")
@@ -208,7 +257,8 @@ class MapFile:
 
 
 def check_header(path: Path) -> int:
-    """The 100 bytes that every SQLite file begins with: is it one, is it ours, is it whole, is it of a schema that we know? Which one?"""
+    """The 100 bytes that every SQLite file begins with: is it one, is it ours, is it whole, is it
+    of a schema that we know? Which one?"""
     try:
         with path.open("rb") as file:
             header = file.read(100)
@@ -219,13 +269,20 @@ def check_header(path: Path) -> int:
     except (OSError, ValueError) as error:  # ValueError: a name with a null character
         raise MapError(f"cannot open map {path}: {getattr(error, 'strerror', error)}") from error
     if len(header) < 100 or not header.startswith(b"SQLite format 3\0"):
-        raise MapError(f"{path} is not a topoloc map" + (" (the file is empty)" if num_bytes == 0 else ""))
+        raise MapError(
+            f"{path} is not a topoloc map" + (" (the file is empty)" if num_bytes == 0 else "")
+        )
     if int.from_bytes(header[68:72], "big") != APPLICATION_ID:
         raise MapError(f"{path} is an SQLite database but not a topoloc map")
     version = int.from_bytes(header[60:64], "big")
     if not 1 <= version <= SCHEMA_VERSION:
-        newer = "a newer topoloc" if version > SCHEMA_VERSION else "an older topoloc; build it again"
-        raise MapVersionError(f"map {path} has schema {version}, this topoloc reads schemas 1 to {SCHEMA_VERSION}: written by {newer}")
+        newer = (
+            "a newer topoloc" if version > SCHEMA_VERSION else "an older topoloc; build it again"
+        )
+        raise MapVersionError(
+            f"map {path} has schema {version}, this topoloc reads schemas 1 to {SCHEMA_VERSION}:"
+            f" written by {newer}"
+        )
     page_size = int.from_bytes(header[16:18], "big")
     expected = int.from_bytes(header[28:32], "big") * (65536 if page_size == 1 else page_size)
     if num_bytes < expected:

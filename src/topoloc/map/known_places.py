@@ -1,4 +1,5 @@
-"""Places that are known on earth, from text files: of pictures by their names or times (GNSS), and of points of the world."""
+"""Places that are known on earth, from text files: of pictures by their names or times (GNSS), and
+of points of the world."""
 
 from __future__ import annotations
 
@@ -29,38 +30,60 @@ class KnownPlaces:
 
 
 def read_points(path: Path) -> KnownPlaces:
-    """Lines of ``x, y, z, lat, lon, h``: metres of the map's world, degrees, metres above the ellipsoid. A line of titles may come first.
+    """Lines of ``x, y, z, lat, lon, h``: metres of the map's world, degrees, metres above the
+    ellipsoid. A line of titles may come first.
 
     Raises:
-        GeoreferenceError: missing, empty, columns missing, no numbers, no place on earth; with the line.
+        GeoreferenceError: missing, empty, columns missing, no numbers, no place on earth; with the
+            line.
     """
     rows = _rows(path, 6, 0, "x, y, z, lat, lon, h")
     numbers = [_numbers(path, line, columns[:6]) for line, columns in rows]
-    places = [_place(path, line, values[3:]) for (line, _), values in zip(rows, numbers, strict=True)]
-    return KnownPlaces(np.array([values[:3] for values in numbers]), places, [f"line {line}" for line, _ in rows])
+    places = [
+        _place(path, line, values[3:]) for (line, _), values in zip(rows, numbers, strict=True)
+    ]
+    return KnownPlaces(
+        np.array([values[:3] for values in numbers]), places, [f"line {line}" for line, _ in rows]
+    )
 
 
 def read_gnss(path: Path, topomap: MapContents) -> KnownPlaces:
-    """Lines of ``name, lat, lon, h`` or ``time, lat, lon, h``: where mapping pictures of that name, or the camera at that time, were.
+    """Lines of ``name, lat, lon, h`` or ``time, lat, lon, h``: where mapping pictures of that name,
+    or the camera at that time, were.
 
-    Times are seconds, or nanoseconds by their size, of the recordings' clock; between two fixes a place is interpolated.
+    Times are seconds, or nanoseconds by their size, of the recordings' clock; between two fixes a
+    place is interpolated.
 
     Raises:
-        GeoreferenceError: missing, empty, columns missing, no numbers, no place on earth, or nothing of it is of the map; with the line.
+        GeoreferenceError: missing, empty, columns missing, no numbers, no place on earth, or
+            nothing of it is of the map; with the line.
     """
     rows = _rows(path, 4, 1, "time or name, lat, lon, h")
     places = [_place(path, line, _numbers(path, line, columns[1:4])) for line, columns in rows]
     positions = _positions_by_name(topomap)
-    named = [(columns[0], place) for (_, columns), place in zip(rows, places, strict=True) if columns[0] in positions]
+    named = [
+        (columns[0], place)
+        for (_, columns), place in zip(rows, places, strict=True)
+        if columns[0] in positions
+    ]
     if named:
-        return KnownPlaces(np.array([positions[name] for name, _ in named]), [place for _, place in named], [name for name, _ in named])
+        return KnownPlaces(
+            np.array([positions[name] for name, _ in named]),
+            [place for _, place in named],
+            [name for name, _ in named],
+        )
     if not all(_is_number(columns[0]) for _, columns in rows):
         example = next(iter(positions), "none")
-        raise GeoreferenceError(f"{path}: no line begins with a time, or the name of a mapping picture, such as {example}")
+        raise GeoreferenceError(
+            f"{path}: no line begins with a time, or the name of a mapping picture, such as"
+            f" {example}"
+        )
     return _at_times(path, topomap, parse_times(rows, path, GeoreferenceError), places)
 
 
-def _at_times(path: Path, topomap: MapContents, t_ns: Sequence[int], places: Sequence[GeoPoint]) -> KnownPlaces:
+def _at_times(
+    path: Path, topomap: MapContents, t_ns: Sequence[int], places: Sequence[GeoPoint]
+) -> KnownPlaces:
     """The nodes' places at their times."""
     origin = places[0].ecef_from_enu()
     points_enu = np.array([origin.inverse().apply(place.ecef()) for place in places])
@@ -74,16 +97,29 @@ def _at_times(path: Path, topomap: MapContents, t_ns: Sequence[int], places: Seq
             point_enu = (1.0 - share) * points_enu[after - 1] + share * points_enu[after]
         else:
             continue
-        found.append((summary.world_from_cam.translation, GeoPoint.from_ecef(origin.apply(point_enu)), summary.name))
+        found.append(
+            (
+                summary.world_from_cam.translation,
+                GeoPoint.from_ecef(origin.apply(point_enu)),
+                summary.name,
+            )
+        )
     if not found:
         times = [summary.t_ns for summary in topomap.summaries]
-        spans = " and ".join(f"{min(span) / 1e9:.3f} to {max(span) / 1e9:.3f} s" for span in (t_ns, times))
+        spans = " and ".join(
+            f"{min(span) / 1e9:.3f} to {max(span) / 1e9:.3f} s" for span in (t_ns, times)
+        )
         raise GeoreferenceError(f"{path}: no fix is of a time of the map ({spans})")
-    return KnownPlaces(np.array([point for point, _, _ in found]), [place for _, place, _ in found], [name for _, _, name in found])
+    return KnownPlaces(
+        np.array([point for point, _, _ in found]),
+        [place for _, place, _ in found],
+        [name for _, _, name in found],
+    )
 
 
 def _positions_by_name(topomap: MapContents) -> dict[str, Float[np.ndarray, "3"]]:
-    """Of mapping pictures by their names, whole or the file's alone, with their recording's before where they are of several."""
+    """Of mapping pictures by their names, whole or the file's alone, with their recording's before
+    where they are of several."""
     positions, twice = dict[str, np.ndarray](), set[str]()
     for image in (*topomap.place_images, *topomap.summaries):
         for name in {image.name, Path(image.name).name, f"{image.recording}/{image.name}"}:
@@ -94,7 +130,9 @@ def _positions_by_name(topomap: MapContents) -> dict[str, Float[np.ndarray, "3"]
     return {name: position for name, position in positions.items() if name not in twice}
 
 
-def _rows(path: Path, num_columns: int, first_number: int, wanted: str) -> list[tuple[int, list[str]]]:
+def _rows(
+    path: Path, num_columns: int, first_number: int, wanted: str
+) -> list[tuple[int, list[str]]]:
     """Line numbers and columns, without a line of titles at the top."""
     if path.exists() and not path.is_file():
         raise GeoreferenceError(f"{path}: no file")
@@ -103,7 +141,9 @@ def _rows(path: Path, num_columns: int, first_number: int, wanted: str) -> list[
         rows = rows[1:]
     for line, columns in rows:
         if len(columns) < num_columns:
-            raise GeoreferenceError(f"{path}, line {line}: {len(columns)} columns; {wanted} are needed")
+            raise GeoreferenceError(
+                f"{path}, line {line}: {len(columns)} columns; {wanted} are needed"
+            )
     if not rows:
         raise GeoreferenceError(f"{path}: nothing in this file but titles")
     return rows

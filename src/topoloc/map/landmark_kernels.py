@@ -6,9 +6,21 @@ from topoloc.compiled import kernel
 
 
 @kernel(error_model="numpy")
-def add_observations(points, rows, normalized, sigmas, rotation, translation, cauchy_scale, information, gradient, squares):
-    """Point `rows[m]` is seen at `normalized[m]` (plane z = 1) by a camera of this pose, within `sigmas[m]`; adds to the last three, of
-    which there is one for each point. A point behind the camera adds to its square alone."""
+def add_observations(
+    points,
+    rows,
+    normalized,
+    sigmas,
+    rotation,
+    translation,
+    cauchy_scale,
+    information,
+    gradient,
+    squares,
+):
+    """Point `rows[m]` is seen at `normalized[m]` (plane z = 1) by a camera of this pose, within
+    `sigmas[m]`; adds to the last three, of which there is one for each point. A point behind the
+    camera adds to its square alone."""
     jacobian = np.empty((2, 3))
     residual = np.empty(2)
     for m in range(len(rows)):
@@ -20,7 +32,9 @@ def add_observations(points, rows, normalized, sigmas, rotation, translation, ca
             continue
         square = 0.0
         for k in range(2):
-            projected = (rotation[k, 0] * x + rotation[k, 1] * y + rotation[k, 2] * z + translation[k]) / depth
+            projected = (
+                rotation[k, 0] * x + rotation[k, 1] * y + rotation[k, 2] * z + translation[k]
+            ) / depth
             residual[k] = projected - normalized[m, k]
             square += (residual[k] / sigma) ** 2
             for i in range(3):

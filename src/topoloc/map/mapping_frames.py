@@ -1,7 +1,7 @@
 """The frames that a map is made of: read, described, and their features given 3-D positions.
 
-A stereo pair or a depth image locates its features itself. Those of a single picture are located by the pictures around it, under the
-poses that all of them have.
+A stereo pair or a depth image locates its features itself. Those of a single picture are located by
+the pictures around it, under the poses that all of them have.
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ from topoloc.slam.motion_points import OtherPicture, choose_pictures, locate_by_
 R = TypeVar("R")
 
 PLACE_QUALITY = 60  # of the place images' JPEG
-_KEPT_IMAGES = 48  # single pictures locate the points of several nodes; their features are found once
+_KEPT_IMAGES = (
+    48  # single pictures locate the points of several nodes; their features are found once
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +53,8 @@ class MappingFrame:
         return self.sequence[self.index]
 
     def read_left(self) -> StereoFrame:
-        """As `read`, but for the right or depth picture: whoever only describes the frame needs none."""
+        """As `read`, but for the right or depth picture: whoever only describes the frame needs
+        none."""
         return left_frame(self.sequence, self.index)
 
     def view(self, with_depth: bool = True) -> FrameView:
@@ -60,8 +63,8 @@ class MappingFrame:
 
 @dataclass(frozen=True, eq=False)
 class MappingImage:
-    """What the map needs of a frame once its pixels are let go: its features, by their kinds. The pose is that of `camera`, which
-    rectification may have turned."""
+    """What the map needs of a frame once its pixels are let go: its features, by their kinds. The
+    pose is that of `camera`, which rectification may have turned."""
 
     camera: Camera
     world_from_cam: Rigid3
@@ -71,7 +74,8 @@ class MappingImage:
 
 
 def view_of(frame: StereoFrame, with_depth: bool = True) -> FrameView:
-    """A frame that was read, made ready for measuring; a single picture has no depth in any case."""
+    """A frame that was read, made ready for measuring; a single picture has no depth in any
+    case."""
     return frame_view(frame, with_depth and not _is_single(frame))
 
 
@@ -87,13 +91,20 @@ def posed_frames(sequence: StereoSequence, session_id: int) -> list[MappingFrame
     """
     if not has_scale(sequence):
         raise TrajectoryError(
-            f"{sequence.name}: a model of pictures alone has no scale; give --scale METRES (a unit of the model in metres), "
-            "or --trajectory FILE with metric poses"
+            f"{sequence.name}: a model of pictures alone has no scale; give --scale METRES (a unit"
+            " of the model in metres), or --trajectory FILE with metric poses"
         )
     described = enumerate(zip(sequence.names, sequence.t_ns, sequence.poses, strict=True))
-    frames = [MappingFrame(sequence, session_id, i, name, t_ns, pose) for i, (name, t_ns, pose) in described if pose is not None]
+    frames = [
+        MappingFrame(sequence, session_id, i, name, t_ns, pose)
+        for i, (name, t_ns, pose) in described
+        if pose is not None
+    ]
     if not frames:
-        raise TrajectoryError(f"{sequence.name}: no frame has a pose; give a trajectory (TUM or KITTI rows) of this recording")
+        raise TrajectoryError(
+            f"{sequence.name}: no frame has a pose; give a trajectory (TUM or KITTI rows) of this"
+            " recording"
+        )
     return frames
 
 
@@ -101,7 +112,9 @@ def mapping_image(frame: MappingFrame, view: FrameView, config: MapConfig) -> Ma
     """A frame that has been read, described by all kinds of features."""
     jpeg = small_jpeg(view.picture, config.place_side_px, PLACE_QUALITY)
     world_from_view = frame.world_from_cam @ view.view_from_cam.inverse()
-    features = {kind: extract_features(view.grey, config.features_of(kind)) for kind in config.kinds}
+    features = {
+        kind: extract_features(view.grey, config.features_of(kind)) for kind in config.kinds
+    }
     return MappingImage(view.camera, world_from_view, features, jpeg, light_of(view.picture))
 
 
@@ -114,18 +127,25 @@ def small_jpeg(picture: Image, side_px: int, quality: int) -> bytes:
 
 
 class PointLocator:
-    """Gives the features of mapping frames their 3-D positions; keeps the last pictures that it looked at for others."""
+    """Gives the features of mapping frames their 3-D positions; keeps the last pictures that it
+    looked at for others."""
 
     def __init__(self, frames: Sequence[MappingFrame], config: MapConfig) -> None:
         self._config = config
         self._sessions: dict[int, list[MappingFrame]] = {}
         for frame in frames:
             self._sessions.setdefault(frame.session_id, []).append(frame)
-        self._steps = {number: usual_step([frame.world_from_cam for frame in of_it]) for number, of_it in self._sessions.items()}
+        self._steps = {
+            number: usual_step([frame.world_from_cam for frame in of_it])
+            for number, of_it in self._sessions.items()
+        }
         self._images: OrderedDict[int, MappingImage] = OrderedDict()
 
-    def for_each(self, work: Callable[[tuple[MappingFrame, StereoFrame]], R], frames: Sequence[MappingFrame]) -> Iterator[R]:
-        """What work(frame, as read) gives, in their order; several frames at a time, but for single pictures, for which others are read."""
+    def for_each(
+        self, work: Callable[[tuple[MappingFrame, StereoFrame]], R], frames: Sequence[MappingFrame]
+    ) -> Iterator[R]:
+        """What work(frame, as read) gives, in their order; several frames at a time, but for single
+        pictures, for which others are read."""
         for _, of_session in groupby(frames, lambda frame: frame.session_id):
             read = ((frame, frame.read()) for frame in of_session)
             first = next(read)
@@ -143,13 +163,21 @@ class PointLocator:
         self._images.move_to_end(id(frame))
         return self._images[id(frame)]
 
-    def locate(self, frame: MappingFrame, view: FrameView, image: MappingImage) -> tuple[dict[str, MetricPoints], list[MappingFrame]]:
-        """The positions of a frame's features, by their kinds, and the other frames that these stand on."""
+    def locate(
+        self, frame: MappingFrame, view: FrameView, image: MappingImage
+    ) -> tuple[dict[str, MetricPoints], list[MappingFrame]]:
+        """The positions of a frame's features, by their kinds, and the other frames that these
+        stand on."""
         if view.right_grey is not None or view.depth is not None:
-            return {kind: locate_points(features, view, self._config.points) for kind, features in image.features.items()}, []
+            return {
+                kind: locate_points(features, view, self._config.points)
+                for kind, features in image.features.items()
+            }, []
         frames = self._sessions[frame.session_id]
         poses = [other.world_from_cam for other in frames]
-        chosen = choose_pictures(poses, frames.index(frame), self._steps[frame.session_id], self._config.motion)
+        chosen = choose_pictures(
+            poses, frames.index(frame), self._steps[frame.session_id], self._config.motion
+        )
         others = [frames[k] for k in chosen]
         images = [self.image(other, other.view()) for other in others]
         points = {}
@@ -157,9 +185,16 @@ class PointLocator:
             sigmas = keypoint_sigmas(features, self._config.points)
             pictures = [self._other(of_other, kind, image) for of_other in images]
             relative = self._config.points.max_relative_sigma
-            points[kind] = locate_by_motion(features, sigmas, image.camera, pictures, relative, self._config.motion)
+            points[kind] = locate_by_motion(
+                features, sigmas, image.camera, pictures, relative, self._config.motion
+            )
         return points, others
 
     def _other(self, other: MappingImage, kind: str, image: MappingImage) -> OtherPicture:
         sigmas = keypoint_sigmas(other.features[kind], self._config.points)
-        return OtherPicture(other.features[kind], sigmas, other.camera, other.world_from_cam.inverse() @ image.world_from_cam)
+        return OtherPicture(
+            other.features[kind],
+            sigmas,
+            other.camera,
+            other.world_from_cam.inverse() @ image.world_from_cam,
+        )

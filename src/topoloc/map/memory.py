@@ -1,4 +1,5 @@
-"""Nodes read from maps and made ready to be matched with, kept while there is room: one budget for all open maps of a process."""
+"""Nodes read from maps and made ready to be matched with, kept while there is room: one budget for
+all open maps of a process."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ DEFAULT_BYTES = 256_000_000
 
 
 class NodeMemory:
-    """The entries used last, of several owners, up to a number of bytes in all. Threads may share it."""
+    """The entries used last, of several owners, up to a number of bytes in all. Threads may share
+    it."""
 
     def __init__(self, max_bytes: int = DEFAULT_BYTES) -> None:
         self._lock = threading.Lock()
@@ -45,7 +47,8 @@ class NodeMemory:
             return entry[0]
 
     def put(self, owner: int, row: int, value: Any, num_bytes: int) -> None:
-        """Keep an entry, and let go of those used longest ago where that is too much; one beyond the whole budget is not kept."""
+        """Keep an entry, and let go of those used longest ago where that is too much; one beyond
+        the whole budget is not kept."""
         with self._lock:
             _, before = self._entries.pop((owner, row), (None, 0))
             self._entries[owner, row] = value, num_bytes
@@ -53,7 +56,8 @@ class NodeMemory:
             self._shrink()
 
     def forget(self, owner: int) -> None:
-        """Let go of all entries of an owner. Garbage collection may call this anywhere, also while this thread holds the lock."""
+        """Let go of all entries of an owner. Garbage collection may call this anywhere, also while
+        this thread holds the lock."""
         self._gone.append(owner)
         if self._lock.acquire(blocking=False):
             try:
@@ -75,12 +79,14 @@ NODES = NodeMemory()
 
 
 def set_node_memory(max_bytes: int) -> None:
-    """How many bytes of nodes all open maps of this process keep in memory together (256 MB where nobody says)."""
+    """How many bytes of nodes all open maps of this process keep in memory together (256 MB where
+    nobody says)."""
     NODES.resize(max_bytes)
 
 
 class RememberedNodes(Generic[T]):
-    """Calls `read` for a row of a map, or gives what it gave before where that is still in memory."""
+    """Calls `read` for a row of a map, or gives what it gave before where that is still in
+    memory."""
 
     _next_owner = 0
     _owner_lock = threading.Lock()

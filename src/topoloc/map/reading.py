@@ -1,4 +1,5 @@
-"""A map from its file: its nodes, images and coarse localizers are read one by one, when they are asked for."""
+"""A map from its file: its nodes, images and coarse localizers are read one by one, when they are
+asked for."""
 
 from __future__ import annotations
 
@@ -19,13 +20,29 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.geodesy import Georeference
 from topoloc.map.config import CONFIG_VERSION, MapConfig, config_from_text
 from topoloc.map.contents import MapContents, NextIds
-from topoloc.map.entries import Edge, NodeSummary, PlaceImage, Repetitions, SharedErrors, SideNodes, TopoNode
+from topoloc.map.entries import (
+    Edge,
+    NodeSummary,
+    PlaceImage,
+    Repetitions,
+    SharedErrors,
+    SideNodes,
+    TopoNode,
+)
 from topoloc.map.file import MapFile
 from topoloc.map.points import points_from
 from topoloc.map.schema import ORDER, SIDE
 from topoloc.map.sessions import Edit, Session
 from topoloc.map.sums import LandmarkSums, sums_from
-from topoloc.map.validation import MAX_POINTS, Damage, arrays_from, camera_from, count_within, json_of, pose_from
+from topoloc.map.validation import (
+    MAX_POINTS,
+    Damage,
+    arrays_from,
+    camera_from,
+    count_within,
+    json_of,
+    pose_from,
+)
 from topoloc.places.coarse import CoarseModel
 
 T = TypeVar("T")
@@ -65,11 +82,17 @@ def _contents_of(file: MapFile) -> MapContents:
     kinds = _kinds_of(facts, config)
     sides = None
     if file.count(f"{SIDE}nodes") > 0:
-        kind = value_from(str, json_of(facts["kind_of_sides"]), "kind_of_sides") if "kind_of_sides" in facts else config.features.kind
+        kind = (
+            value_from(str, json_of(facts["kind_of_sides"]), "kind_of_sides")
+            if "kind_of_sides" in facts
+            else config.features.kind
+        )
         if kind not in {*kinds, *(find_kind(one).kind_of_sides for one in kinds)}:
             raise Damage(f"kind_of_sides: the map has no features {kind!r}")
         models = _Keyed(file, f"{SIDE}coarse_models", _model_of)
-        sides = SideNodes(_stored_summaries(file, SIDE), _stored_nodes(file, kind, SIDE), models, kind)
+        sides = SideNodes(
+            _stored_summaries(file, SIDE), _stored_nodes(file, kind, SIDE), models, kind
+        )
     return MapContents(
         summaries=_stored_summaries(file),
         nodes=_stored_nodes(file, config.features.kind),
@@ -78,24 +101,47 @@ def _contents_of(file: MapFile) -> MapContents:
         coarse_models=_Keyed(file, "coarse_models", _model_of),
         config=config,
         length_m=value_from(float, json_of(facts["length_m"]), "length_m"),
-        default_coarse=value_from(str, json_of(facts.get("default_coarse", '"surf-vlad"')), "default_coarse"),
+        default_coarse=value_from(
+            str, json_of(facts.get("default_coarse", '"surf-vlad"')), "default_coarse"
+        ),
         shared_errors=_shared_errors_of(facts, "shared_errors"),
-        other_shared_errors={kind: found for kind in kinds if (found := _shared_errors_of(facts, f"shared_errors@{kind}"))},
-        repetitions=Repetitions(facts["repetitions"], _Keyed(file, "repetitions", _moves_of)) if "repetitions" in facts else None,
+        other_shared_errors={
+            kind: found
+            for kind in kinds
+            if (found := _shared_errors_of(facts, f"shared_errors@{kind}"))
+        },
+        repetitions=(
+            Repetitions(facts["repetitions"], _Keyed(file, "repetitions", _moves_of))
+            if "repetitions" in facts
+            else None
+        ),
         sides=sides,
         sessions=list(_sessions_of(file).values()),
         edits=_edits_of(file),
         next_ids=settings_from(NextIds, json_of(facts.get("next_ids", "{}")), "next_ids"),
         map_id=_map_id_of(facts),
-        georeference=Georeference.from_json(json_of(facts["georeference"])) if "georeference" in facts else None,
-        other_kinds={kind: _stored_nodes(file, kind, is_default=False) for kind in kinds if kind != config.features.kind},
+        georeference=(
+            Georeference.from_json(json_of(facts["georeference"]))
+            if "georeference" in facts
+            else None
+        ),
+        other_kinds={
+            kind: _stored_nodes(file, kind, is_default=False)
+            for kind in kinds
+            if kind != config.features.kind
+        },
     )
 
 
 def _kinds_of(facts: Mapping[str, str], config: MapConfig) -> list[str]:
     """The kinds of features that the map holds, the one that answers first."""
     kinds = json_of(facts["kinds"]) if "kinds" in facts else [config.features.kind]
-    if not isinstance(kinds, list) or not all(isinstance(kind, str) for kind in kinds) or len(kinds) > 8 or len(set(kinds)) < len(kinds):
+    if (
+        not isinstance(kinds, list)
+        or not all(isinstance(kind, str) for kind in kinds)
+        or len(kinds) > 8
+        or len(set(kinds)) < len(kinds)
+    ):
         raise Damage("kinds: a list of names is expected")
     if kinds[:1] != [config.features.kind]:
         raise Damage(f"kinds: {kinds} do not begin with that of the configuration")
@@ -122,13 +168,17 @@ def _shared_errors_of(facts: Mapping[str, str], key: str) -> SharedErrors | None
 
 def _edits_of(file: MapFile) -> list[Edit]:
     changes = json_of(file.facts.get("changes", "{}"))
-    if not isinstance(changes, dict) or not all(isinstance(of_edit, dict) for of_edit in changes.values()):
+    if not isinstance(changes, dict) or not all(
+        isinstance(of_edit, dict) for of_edit in changes.values()
+    ):
         raise Damage("changes: what each edit changed is expected")
     return [Edit(**row, changes=changes.get(str(row["edit_id"]))) for row in file.rows("edits")]
 
 
 def _sessions_of(file: MapFile) -> dict[int, Session]:
-    return file.kept("sessions", lambda: {row["session_id"]: _session(row) for row in file.rows("sessions")})
+    return file.kept(
+        "sessions", lambda: {row["session_id"]: _session(row) for row in file.rows("sessions")}
+    )
 
 
 def _session_of(file: MapFile, session_id: int) -> Session:
@@ -143,7 +193,9 @@ def _session(row: Mapping[str, Any]) -> Session:
     if not isinstance(facts, dict):
         raise Damage("a session that says nothing of itself")
     camera = facts.pop("camera", None)
-    session = settings_from(Session, facts | {"session_id": row["session_id"], "name": row["name"]}, "session")
+    session = settings_from(
+        Session, facts | {"session_id": row["session_id"], "name": row["name"]}, "session"
+    )
     return session if camera is None else replace(session, camera=Camera.from_json(camera))
 
 
@@ -172,8 +224,11 @@ def _stored_summaries(file: MapFile, prefix: str = ""):
 
 
 def _stored_nodes(file: MapFile, kind: str, prefix: str = "", is_default: bool = True):
-    """Nodes with their points of one kind; of that which answers first, summaries tell the number."""
-    return _Stored(partial(file.count, f"{prefix}nodes"), partial(_node_at, file, kind, prefix, is_default))
+    """Nodes with their points of one kind; of that which answers first, summaries tell the
+    number."""
+    return _Stored(
+        partial(file.count, f"{prefix}nodes"), partial(_node_at, file, kind, prefix, is_default)
+    )
 
 
 def _summary_at(file: MapFile, prefix: str, row: int) -> NodeSummary:
@@ -190,53 +245,95 @@ def _summaries(file: MapFile, prefix: str) -> list[NodeSummary]:
     return file.kept(f"{prefix}summaries", read)
 
 
-def _summary(row: Mapping[str, Any], file: MapFile, nodes: Mapping[int, NodeSummary] | None) -> NodeSummary:
+def _summary(
+    row: Mapping[str, Any], file: MapFile, nodes: Mapping[int, NodeSummary] | None
+) -> NodeSummary:
     """A node's, or, with `nodes`, a side node's, which is of the session of its node."""
     node_id = count_within(row["node_id"], 0, MAX_ID, "a node's id")
-    num_points = count_within(row["num_points"], 0, MAX_POINTS, f"the number of points of node {node_id}")
+    num_points = count_within(
+        row["num_points"], 0, MAX_POINTS, f"the number of points of node {node_id}"
+    )
     if nodes is not None and row["of_node"] not in nodes:
         raise Damage(f"side node {node_id} is of node {row['of_node']}, which is missing")
     session_id = row["session_id"] if nodes is None else nodes[row["of_node"]].session_id
     recording, pose = _session_of(file, session_id).name, pose_from(row["world_from_cam"])
-    return NodeSummary(node_id, recording, row["name"], row["t_ns"], pose, num_points, session_id, row.get("of_node"))
+    return NodeSummary(
+        node_id,
+        recording,
+        row["name"],
+        row["t_ns"],
+        pose,
+        num_points,
+        session_id,
+        row.get("of_node"),
+    )
 
 
 def _node_at(file: MapFile, kind: str, prefix: str, is_default: bool, row: int) -> TopoNode:
-    """The node of a row with its points of a kind; with the prefix `SIDE` a side node, which has no template. Raises MapError."""
+    """The node of a row with its points of a kind; with the prefix `SIDE` a side node, which has no
+    template. Raises MapError."""
     with file.reading():
         summary = _summaries(file, prefix)[row]
         node_id, what = summary.node_id, f"{prefix}node {summary.node_id}"
-        points = _found(file.row(f"{prefix}node_points", node_id=node_id, kind=kind), f"the points of {what}")
-        template = b"" if prefix else _found(file.row("node_templates", node_id=node_id), f"the template of {what}")["jpeg"]
+        points = _found(
+            file.row(f"{prefix}node_points", node_id=node_id, kind=kind), f"the points of {what}"
+        )
+        template = (
+            b""
+            if prefix
+            else _found(file.row("node_templates", node_id=node_id), f"the template of {what}")[
+                "jpeg"
+            ]
+        )
         features, points_cam, sqrt_covs, stored = points_from(points, kind, file.version, what)
         n = len(features)
         if is_default and summary.num_points != n:
             raise Damage(f"node {node_id} has {n} points")
         summary = summary if summary.num_points == n else replace(summary, num_points=n)
         sums = () if prefix else _StoredSums(file, node_id, kind, n)
-        return TopoNode(summary, _camera_of(file, prefix, node_id), features, points_cam, sqrt_covs, template, sums, stored)
+        return TopoNode(
+            summary,
+            _camera_of(file, prefix, node_id),
+            features,
+            points_cam,
+            sqrt_covs,
+            template,
+            sums,
+            stored,
+        )
 
 
 def _camera_of(file: MapFile, prefix: str, node_id: int) -> Camera:
     rows = partial(file.rows, f"{prefix}nodes", ("node_id", "camera_id"))
-    camera_id = file.kept(f"{prefix}camera_ids", lambda: {row["node_id"]: row["camera_id"] for row in rows()})[node_id]
+    camera_id = file.kept(
+        f"{prefix}camera_ids", lambda: {row["node_id"]: row["camera_id"] for row in rows()}
+    )[node_id]
 
     def read() -> Camera:
-        return camera_from(_found(file.row("cameras", camera_id=camera_id), f"camera {camera_id}")["json"])
+        return camera_from(
+            _found(file.row("cameras", camera_id=camera_id), f"camera {camera_id}")["json"]
+        )
 
     return file.kept(f"camera {camera_id}", read)
 
 
 class _StoredSums:
-    """What each session knows of a node's points; no answer needs it, so it is read when asked for."""
+    """What each session knows of a node's points; no answer needs it, so it is read when asked
+    for."""
 
     def __init__(self, file: MapFile, node_id: int, kind: str, num_points: int) -> None:
         self._file, self._node_id, self._kind, self._num_points = file, node_id, kind, num_points
 
     def _sessions(self) -> list[int]:
         with self._file.reading() as database:
-            query = "SELECT session_id FROM landmark_sums WHERE node_id = ? AND kind = ? ORDER BY session_id LIMIT 100000"
-            return [value_from(int, row[0], "landmark_sums.session_id") for row in database.execute(query, (self._node_id, self._kind))]
+            query = (
+                "SELECT session_id FROM landmark_sums WHERE node_id = ? AND kind = ? ORDER BY"
+                " session_id LIMIT 100000"
+            )
+            return [
+                value_from(int, row[0], "landmark_sums.session_id")
+                for row in database.execute(query, (self._node_id, self._kind))
+            ]
 
     def __iter__(self) -> Iterator[LandmarkSums]:
         with self._file.reading():
@@ -245,17 +342,38 @@ class _StoredSums:
 
     def _of(self, session_id: int) -> LandmarkSums:
         what = f"the sums of node {self._node_id}"
-        row = _found(self._file.row("landmark_sums", node_id=self._node_id, kind=self._kind, session_id=session_id), what)
-        return sums_from(session_id, row["sums"], count_within(row["num_rows"], 0, self._num_points, what), self._num_points)
+        row = _found(
+            self._file.row(
+                "landmark_sums", node_id=self._node_id, kind=self._kind, session_id=session_id
+            ),
+            what,
+        )
+        return sums_from(
+            session_id,
+            row["sums"],
+            count_within(row["num_rows"], 0, self._num_points, what),
+            self._num_points,
+        )
 
 
 def _image_at(file: MapFile, row: int) -> PlaceImage:
     with file.reading():
-        image_id = file.kept("image_ids", lambda: [row["image_id"] for row in file.rows("place_images", ("image_id",))])[row]
+        image_id = file.kept(
+            "image_ids",
+            lambda: [row["image_id"] for row in file.rows("place_images", ("image_id",))],
+        )[row]
         found = _found(file.row("place_images", image_id=image_id), f"place image {image_id}")
         session = _session_of(file, found["session_id"])
         pose = pose_from(found["world_from_cam"])
-        return PlaceImage(session.name, found["name"], found["node_id"], pose, found["jpeg"], session.session_id, image_id)
+        return PlaceImage(
+            session.name,
+            found["name"],
+            found["node_id"],
+            pose,
+            found["jpeg"],
+            session.session_id,
+            image_id,
+        )
 
 
 class _Keyed(Mapping[K, V]):
@@ -266,7 +384,10 @@ class _Keyed(Mapping[K, V]):
         self._key = ORDER[table]
 
     def _keys(self) -> dict[K, None]:
-        return self._file.kept(self._table, lambda: {row[self._key]: None for row in self._file.rows(self._table, (self._key,))})
+        return self._file.kept(
+            self._table,
+            lambda: {row[self._key]: None for row in self._file.rows(self._table, (self._key,))},
+        )
 
     def __len__(self) -> int:
         return len(self._keys())
@@ -278,7 +399,9 @@ class _Keyed(Mapping[K, V]):
         if key not in self._keys():
             raise KeyError(key)
         with self._file.reading():
-            return self._read(_found(self._file.row(self._table, **{self._key: key}), f"{self._table} {key}"))
+            return self._read(
+                _found(self._file.row(self._table, **{self._key: key}), f"{self._table} {key}")
+            )
 
 
 def _model_of(row: dict[str, Any]) -> CoarseModel:
@@ -289,9 +412,13 @@ def _model_of(row: dict[str, Any]) -> CoarseModel:
 
 
 def _moves_of(row: dict[str, Any]) -> np.ndarray:
-    num_moves = count_within(row["num_moves"], 1, _MAX_MOVES, f"the repetitions of node {row['node_id']}")
+    num_moves = count_within(
+        row["num_moves"], 1, _MAX_MOVES, f"the repetitions of node {row['node_id']}"
+    )
     size = len(row["moves"]) // num_moves
-    return np.array([pose_from(row["moves"][k * size : (k + 1) * size]).matrix() for k in range(num_moves)])
+    return np.array(
+        [pose_from(row["moves"][k * size : (k + 1) * size]).matrix() for k in range(num_moves)]
+    )
 
 
 def _found(row: dict[str, Any] | None, what: str) -> dict[str, Any]:

@@ -1,4 +1,5 @@
-"""The tables of a map file (docs/map-format.md), what makes one row of them checkable, and what older files are read as."""
+"""The tables of a map file (docs/map-format.md), what makes one row of them checkable, and what
+older files are read as."""
 
 from __future__ import annotations
 
@@ -23,7 +24,11 @@ _POINTS: Columns = {
     "points_cam": "BLOB NOT NULL",
     "sqrt_covs": "BLOB NOT NULL",
 }
-_MODEL: Columns = {"name": "TEXT PRIMARY KEY", "settings": "TEXT NOT NULL", "arrays": "BLOB NOT NULL"}
+_MODEL: Columns = {
+    "name": "TEXT PRIMARY KEY",
+    "settings": "TEXT NOT NULL",
+    "arrays": "BLOB NOT NULL",
+}
 _NODE: Columns = {
     "name": "TEXT NOT NULL",
     "t_ns": "INTEGER NOT NULL",
@@ -35,10 +40,23 @@ _NODE: Columns = {
 # table -> column -> how SQL declares it. Each row also has the column `checksum`.
 TABLES: dict[str, Columns] = {
     "map": {"key": "TEXT PRIMARY KEY", "value": "TEXT NOT NULL"},
-    "edits": {"edit_id": "INTEGER PRIMARY KEY", "name": "TEXT NOT NULL", "date": "TEXT NOT NULL", "schema": "INTEGER NOT NULL"},
-    "sessions": {"session_id": "INTEGER PRIMARY KEY", "name": "TEXT NOT NULL", "json": "TEXT NOT NULL"},
+    "edits": {
+        "edit_id": "INTEGER PRIMARY KEY",
+        "name": "TEXT NOT NULL",
+        "date": "TEXT NOT NULL",
+        "schema": "INTEGER NOT NULL",
+    },
+    "sessions": {
+        "session_id": "INTEGER PRIMARY KEY",
+        "name": "TEXT NOT NULL",
+        "json": "TEXT NOT NULL",
+    },
     "cameras": {"camera_id": "INTEGER PRIMARY KEY", "json": "TEXT NOT NULL UNIQUE"},
-    "nodes": {"node_id": "INTEGER PRIMARY KEY", "session_id": "INTEGER NOT NULL REFERENCES sessions", **_NODE},
+    "nodes": {
+        "node_id": "INTEGER PRIMARY KEY",
+        "session_id": "INTEGER NOT NULL REFERENCES sessions",
+        **_NODE,
+    },
     "node_points": {"node_id": "INTEGER NOT NULL REFERENCES nodes", **_POINTS},
     "landmark_sums": {
         "node_id": "INTEGER NOT NULL REFERENCES nodes",
@@ -48,8 +66,15 @@ TABLES: dict[str, Columns] = {
         "sums": "BLOB NOT NULL",
     },
     "node_templates": {"node_id": "INTEGER PRIMARY KEY REFERENCES nodes", "jpeg": "BLOB NOT NULL"},
-    "repetitions": {"node_id": "INTEGER PRIMARY KEY REFERENCES nodes", "num_moves": "INTEGER NOT NULL", "moves": "BLOB NOT NULL"},
-    "edges": {"source_id": "INTEGER NOT NULL REFERENCES nodes", "target_id": "INTEGER NOT NULL REFERENCES nodes"},
+    "repetitions": {
+        "node_id": "INTEGER PRIMARY KEY REFERENCES nodes",
+        "num_moves": "INTEGER NOT NULL",
+        "moves": "BLOB NOT NULL",
+    },
+    "edges": {
+        "source_id": "INTEGER NOT NULL REFERENCES nodes",
+        "target_id": "INTEGER NOT NULL REFERENCES nodes",
+    },
     "place_images": {
         "image_id": "INTEGER PRIMARY KEY",
         "session_id": "INTEGER NOT NULL REFERENCES sessions",
@@ -59,7 +84,11 @@ TABLES: dict[str, Columns] = {
         "jpeg": "BLOB NOT NULL",
     },
     "coarse_models": dict(_MODEL),
-    "side_nodes": {"node_id": "INTEGER PRIMARY KEY", "of_node": "INTEGER NOT NULL REFERENCES nodes", **_NODE},
+    "side_nodes": {
+        "node_id": "INTEGER PRIMARY KEY",
+        "of_node": "INTEGER NOT NULL REFERENCES nodes",
+        **_NODE,
+    },
     "side_node_points": {"node_id": "INTEGER NOT NULL REFERENCES side_nodes", **_POINTS},
     "side_coarse_models": dict(_MODEL),
 }
@@ -81,34 +110,47 @@ ORDER = {table: next(iter(columns)) for table, columns in TABLES.items()} | {
 SCHEMA_1 = {
     "map": "CREATE TABLE map (key TEXT PRIMARY KEY, value TEXT NOT NULL)",
     "cameras": "CREATE TABLE cameras (camera_id INTEGER PRIMARY KEY, json TEXT NOT NULL UNIQUE)",
-    "node_templates": "CREATE TABLE node_templates (node_id INTEGER PRIMARY KEY REFERENCES nodes, jpeg BLOB NOT NULL)",
-    "edges": "CREATE TABLE edges (source_id INTEGER NOT NULL REFERENCES nodes, target_id INTEGER NOT NULL REFERENCES nodes)",
-    "place_images": """CREATE TABLE place_images (image_id INTEGER PRIMARY KEY, recording TEXT NOT NULL, name TEXT NOT NULL,
-    node_id INTEGER NOT NULL REFERENCES nodes, world_from_cam BLOB NOT NULL, jpeg BLOB NOT NULL)""",
+    "node_templates": (
+        "CREATE TABLE node_templates (node_id INTEGER PRIMARY KEY REFERENCES nodes, jpeg BLOB NOT"
+        " NULL)"
+    ),
+    "edges": (
+        "CREATE TABLE edges (source_id INTEGER NOT NULL REFERENCES nodes, target_id INTEGER NOT"
+        " NULL REFERENCES nodes)"
+    ),
+    "place_images": (
+        """CREATE TABLE place_images (image_id INTEGER PRIMARY KEY, recording TEXT NOT NULL, name TEXT NOT NULL,
+    node_id INTEGER NOT NULL REFERENCES nodes, world_from_cam BLOB NOT NULL, jpeg BLOB NOT NULL)"""  # noqa: E501
+    ),
 }
 for _prefix in ("", SIDE):
     SCHEMA_1[f"{_prefix}nodes"] = (
-        f"CREATE TABLE {_prefix}nodes (node_id INTEGER PRIMARY KEY, recording TEXT NOT NULL, name TEXT NOT NULL, t_ns INTEGER NOT NULL,\n"
-        "    camera_id INTEGER NOT NULL REFERENCES cameras, world_from_cam BLOB NOT NULL, num_points INTEGER NOT NULL)"
+        f"CREATE TABLE {_prefix}nodes (node_id INTEGER PRIMARY KEY, recording TEXT NOT NULL, name"
+        " TEXT NOT NULL, t_ns INTEGER NOT NULL,\n    camera_id INTEGER NOT NULL REFERENCES"
+        " cameras, world_from_cam BLOB NOT NULL, num_points INTEGER NOT NULL)"
     )
     SCHEMA_1[f"{_prefix}node_points"] = (
-        f"CREATE TABLE {_prefix}node_points (node_id INTEGER PRIMARY KEY REFERENCES {_prefix}nodes, descriptor_size INTEGER NOT NULL,\n"
-        "    points_img BLOB NOT NULL, shapes BLOB NOT NULL, descriptors BLOB NOT NULL, points_cam BLOB NOT NULL, sqrt_covs BLOB NOT NULL)"
+        f"CREATE TABLE {_prefix}node_points (node_id INTEGER PRIMARY KEY REFERENCES {_prefix}nodes,"
+        " descriptor_size INTEGER NOT NULL,\n    points_img BLOB NOT NULL, shapes BLOB NOT NULL,"
+        " descriptors BLOB NOT NULL, points_cam BLOB NOT NULL, sqrt_covs BLOB NOT NULL)"
     )
     SCHEMA_1[f"{_prefix}coarse_models"] = (
-        f"CREATE TABLE {_prefix}coarse_models (name TEXT PRIMARY KEY, settings TEXT NOT NULL, arrays BLOB NOT NULL)"
+        f"CREATE TABLE {_prefix}coarse_models (name TEXT PRIMARY KEY, settings TEXT NOT NULL,"
+        " arrays BLOB NOT NULL)"
     )
 
 
 def creation_of(table: str) -> str:
-    """The statement that makes a table, to the letter: a file with other tables than these is not read."""
+    """The statement that makes a table, to the letter: a file with other tables than these is not
+    read."""
     declared = [f"{name} {declaration}" for name, declaration in TABLES[table].items()]
     constraint = [_CONSTRAINTS[table]] if table in _CONSTRAINTS else []
     return f"CREATE TABLE {table} ({', '.join([*declared, _CHECKSUM, *constraint])})"
 
 
 def checksum_of(table: str, row: Sequence[Any]) -> bytes:
-    """8 bytes (BLAKE2b) that change with the table's name and every bit of its row, columns in the order of `TABLES`."""
+    """8 bytes (BLAKE2b) that change with the table's name and every bit of its row, columns in the
+    order of `TABLES`."""
     digest = blake2b(table.encode(), digest_size=8)
     for value in row:
         data = value if isinstance(value, bytes) else str(value).encode("utf-8", "surrogatepass")
@@ -117,9 +159,12 @@ def checksum_of(table: str, row: Sequence[Any]) -> bytes:
     return digest.digest()
 
 
-# Maps of schema 1, shown to the reader as schema 2: views of the connection's own stand before the file's tables; nothing is written, and
-# `save` makes a file of schema 2 of what they show. Sessions follow from the names of the recordings (two of one name cannot be told
-# apart any more), a side node's node from recording and picture; there are no checksums, no counts and no landmark sums.
+# Maps of schema 1, shown to the reader as schema 2: views of the connection's own stand before the
+# file's tables; nothing is written, and `save` makes a file of schema 2 of what they show. Sessions
+# follow from the names of the recordings (two of one name cannot be told apart any more), a side
+# node's node from recording and
+# picture; there are no checksums, no counts
+# and no landmark sums.
 _ALWAYS = """
 CREATE TEMP TABLE sessions (session_id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE, json TEXT NOT NULL, checksum BLOB);
 INSERT INTO sessions (session_id, name, json)
@@ -138,27 +183,28 @@ CREATE TEMP VIEW place_images AS SELECT image_id, session_id, i.name AS name, no
     FROM main.place_images AS i LEFT JOIN sessions AS s ON s.name = i.recording;
 CREATE TEMP VIEW landmark_sums AS SELECT 0 AS node_id, '' AS kind, 0 AS session_id, 0 AS num_rows, x'' AS sums, NULL AS checksum WHERE 0;
 CREATE TEMP VIEW repetitions AS SELECT 0 AS node_id, 0 AS num_moves, x'' AS moves, NULL AS checksum WHERE 0;
-"""
-# Of nodes and of side nodes. Every map of schema 1 has one kind of features, named in its configuration.
+"""  # noqa: E501
+# Of nodes and of side nodes. Every map of schema 1 has one kind of features, named in its
+# configuration.
 _POINTS_OF = """
 CREATE TEMP VIEW {0}node_points AS SELECT node_id, k.kind AS kind, num_points, descriptor_size, points_img, shapes, descriptors, points_cam,
     sqrt_covs, NULL AS checksum FROM main.{0}node_points JOIN main.{0}nodes USING (node_id) JOIN kinds AS k;
 CREATE TEMP VIEW {0}coarse_models AS SELECT name, settings, arrays, NULL AS checksum FROM main.{0}coarse_models;
-"""
+"""  # noqa: E501
 _KINDS = """
 CREATE TEMP TABLE kinds (kind TEXT);
 INSERT INTO kinds SELECT json_extract(value, '$.features.kind') FROM main.map WHERE key = 'config' AND json_valid(value);
-"""
+"""  # noqa: E501
 _SIDES = """
 CREATE TEMP TABLE pictures (recording TEXT, name TEXT, node_id INTEGER, PRIMARY KEY (recording, name));
 INSERT OR REPLACE INTO pictures SELECT recording, name, node_id FROM main.nodes ORDER BY node_id;
 CREATE TEMP VIEW side_nodes AS SELECT s.node_id AS node_id, p.node_id AS of_node, s.name AS name, t_ns, camera_id, world_from_cam,
     num_points, NULL AS checksum FROM main.side_nodes AS s LEFT JOIN pictures AS p ON p.recording = s.recording AND p.name = s.name;
-"""
+"""  # noqa: E501
 _NO_SIDES = """
 CREATE TEMP VIEW side_nodes AS SELECT 0 AS node_id, 0 AS of_node, '' AS name, 0 AS t_ns, 0 AS camera_id, x'' AS world_from_cam,
     0 AS num_points, NULL AS checksum WHERE 0;
-"""
+"""  # noqa: E501
 
 SHOW_AS_SCHEMA_2 = {
     False: _KINDS + _ALWAYS + _POINTS_OF.format("") + _NO_SIDES,

@@ -1,4 +1,5 @@
-"""Where a map comes from: the sessions in which its pictures were taken, and the edits that made it what it is."""
+"""Where a map comes from: the sessions in which its pictures were taken, and the edits that made it
+what it is."""
 
 from __future__ import annotations
 
@@ -22,9 +23,9 @@ _YEAR_2000_NS = 946_684_800 * 1_000_000_000
 class Light:
     """The light of a session as its pictures show it, means over them; grey levels are 0 to 1.
 
-    `level` is the mean grey level, `contrast` the standard deviation of the grey levels within a picture, `dark` and `bright`
-    the shares of pixels below 1/16 and above 15/16. `red` and `blue` are the mean levels of these colours divided by that of green, 1
-    in grey pictures.
+    `level` is the mean grey level, `contrast` the standard deviation of the grey levels within a
+    picture, `dark` and `bright` the shares of pixels below 1/16 and above 15/16. `red` and `blue`
+    are the mean levels of these colours divided by that of green, 1 in grey pictures.
     """
 
     level: float
@@ -39,9 +40,11 @@ class Light:
 class Session:
     """One recording that the map was made from.
 
-    `session_id` never changes and is never used again; two sessions may have one name. `recording` is the folder or file, as far as known.
-    `poses_from` is `truth`, `slam`, the name of a trajectory file, or `given` where the caller brought the poses. Times are those of
-    the first and the last mapping image, nanoseconds of the recording's clock. `light` is measured, `light_name` what the user calls it.
+    `session_id` never changes and is never used again; two sessions may have one name. `recording`
+    is the folder or file, as far as known. `poses_from` is `truth`, `slam`, the name of a
+    trajectory file, or `given` where the caller brought the poses. Times are those of the first and
+    the last mapping image, nanoseconds of the recording's clock. `light` is measured, `light_name`
+    what the user calls it.
     """
 
     session_id: int
@@ -66,8 +69,8 @@ class Session:
 
 @dataclass(frozen=True)
 class Edit:
-    """One change of the map: its name, the day (ISO, UTC), the schema of the file that it was written in, and what it changed: numbers
-    and texts by their names."""
+    """One change of the map: its name, the day (ISO, UTC), the schema of the file that it was
+    written in, and what it changed: numbers and texts by their names."""
 
     edit_id: int
     name: str
@@ -77,7 +80,8 @@ class Edit:
 
 
 def today() -> str:
-    """The day (ISO, UTC); SOURCE_DATE_EPOCH (seconds), where it is set, stands for now: builds can then be repeated to the byte."""
+    """The day (ISO, UTC); SOURCE_DATE_EPOCH (seconds), where it is set, stands for now: builds can
+    then be repeated to the byte."""
     epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
     now = datetime.fromtimestamp(int(epoch), UTC) if epoch.isdigit() else datetime.now(UTC)
     return now.date().isoformat()
@@ -94,7 +98,10 @@ def poses_source_of(sequence: StereoSequence) -> str:
     """`truth` where the poses are those that the recording came with, else `given`."""
     if isinstance(sequence, SequenceView):
         before = sequence.base.poses
-        is_same = all(pose is before[index] for index, pose in zip(sequence.indices, sequence.poses, strict=True))
+        is_same = all(
+            pose is before[index]
+            for index, pose in zip(sequence.indices, sequence.poses, strict=True)
+        )
         return poses_source_of(sequence.base) if is_same else "given"
     return "truth" if isinstance(sequence, Recording) else "given"
 
@@ -103,21 +110,31 @@ def light_of(image: Image) -> Light:
     """The light in one picture (uint8), of every fourth pixel each way."""
     sample = image[::4, ::4].astype(np.float64) / 255.0
     grey = sample if sample.ndim == 2 else sample @ np.array([0.299, 0.587, 0.114])
-    red, green, blue = (1.0, 1.0, 1.0) if sample.ndim == 2 else sample.reshape(-1, 3).mean(axis=0) + 1e-3
+    red, green, blue = (
+        (1.0, 1.0, 1.0) if sample.ndim == 2 else sample.reshape(-1, 3).mean(axis=0) + 1e-3
+    )
     dark, bright = float((grey < 1 / 16).mean()), float((grey > 15 / 16).mean())
-    return Light(float(grey.mean()), float(grey.std()), dark, bright, float(red / green), float(blue / green))
+    return Light(
+        float(grey.mean()), float(grey.std()), dark, bright, float(red / green), float(blue / green)
+    )
 
 
 def mean_light(lights: Sequence[Light]) -> Light | None:
     """The mean of many, rounded to what is worth reading."""
     if not lights:
         return None
-    rows = np.array([[light.level, light.contrast, light.dark, light.bright, light.red, light.blue] for light in lights])
+    rows = np.array(
+        [
+            [light.level, light.contrast, light.dark, light.bright, light.red, light.blue]
+            for light in lights
+        ]
+    )
     return Light(*(round(float(value), 4) for value in rows.mean(axis=0)))
 
 
 def sessions_named(names: Sequence[str]) -> list[Session]:
-    """A session for each distinct name, in the order of their first mention: all that an older map knows of them."""
+    """A session for each distinct name, in the order of their first mention: all that an older map
+    knows of them."""
     return [Session(number, name) for number, name in enumerate(dict.fromkeys(names))]
 
 

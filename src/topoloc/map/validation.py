@@ -1,4 +1,5 @@
-"""What a map file says, held against what can be: shapes, types, bounds. What is not is a `Damage`, before any kernel sees it."""
+"""What a map file says, held against what can be: shapes, types, bounds. What is not is a `Damage`,
+before any kernel sees it."""
 
 from __future__ import annotations
 
@@ -30,7 +31,9 @@ def array_from(data: bytes, dtype: str, shape: tuple[int, ...], what: str) -> np
     if len(data) != math.prod(shape) * np.dtype(dtype).itemsize:
         raise Damage(f"{what}: {len(data)} bytes are not {' x '.join(map(str, shape))} {dtype}")
     array = np.frombuffer(data, dtype).reshape(shape)
-    if array.dtype.kind == "f" and array.size and not (float(np.abs(array).max()) <= _FAR):  # NaN compares as false
+    if (
+        array.dtype.kind == "f" and array.size and not (float(np.abs(array).max()) <= _FAR)
+    ):  # NaN compares as false
         raise Damage(f"{what}: a number that is not finite or beyond {_FAR:g}")
     return array
 
@@ -47,8 +50,14 @@ def pose_from(data: bytes) -> Rigid3:
 def camera_from(text: str) -> Camera:
     """A camera of a size that pictures have. Raises CalibrationError, Damage."""
     camera = Camera.from_json(json_of(text))
-    if max(camera.width, camera.height) > MAX_SIDE_PX or max(map(abs, camera.params)) > _FAR or min(camera.fx, camera.fy) < 1.0:
-        raise CalibrationError(f"a camera of {camera.width}x{camera.height} pixels, f = {camera.fx:g}, is none")
+    if (
+        max(camera.width, camera.height) > MAX_SIDE_PX
+        or max(map(abs, camera.params)) > _FAR
+        or min(camera.fx, camera.fy) < 1.0
+    ):
+        raise CalibrationError(
+            f"a camera of {camera.width}x{camera.height} pixels, f = {camera.fx:g}, is none"
+        )
     return camera
 
 
@@ -69,7 +78,11 @@ def count_within(value: int, least: int, most: int, what: str) -> int:
 def counts_from(text: str | None, tables: Iterable[str]) -> dict[str, int]:
     """Rows of each table, from the JSON that a map keeps."""
     counts = json_of(text) if text is not None else None
-    if not isinstance(counts, dict) or set(counts) != set(tables) - {"map"} or not all(type(n) is int and n >= 0 for n in counts.values()):
+    if (
+        not isinstance(counts, dict)
+        or set(counts) != set(tables) - {"map"}
+        or not all(type(n) is int and n >= 0 for n in counts.values())
+    ):
         raise Damage("the numbers of rows are missing")
     return counts
 
@@ -87,16 +100,31 @@ def unpacked(data: bytes, num_bytes: int, what: str) -> bytes:
 
 
 def arrays_from(data: bytes, what: str) -> dict[str, np.ndarray]:
-    """The arrays of a NumPy `.npz` as we write it: stored, not compressed, so that they are no larger than their bytes; no objects."""
+    """The arrays of a NumPy `.npz` as we write it: stored, not compressed, so that they are no
+    larger than their bytes; no objects."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = archive.infolist()
             if len(members) > 2000 or sum(member.file_size for member in members) > len(data):
                 raise Damage(f"{what}: larger than it can be")
-            if any(member.compress_type != zipfile.ZIP_STORED or member.flag_bits & 1 for member in members):
+            if any(
+                member.compress_type != zipfile.ZIP_STORED or member.flag_bits & 1
+                for member in members
+            ):
                 raise Damage(f"{what}: of a compression that no map has")
-            return {member.filename.removesuffix(".npy"): _array_of(archive.read(member), what) for member in members}
-    except (zipfile.BadZipFile, EOFError, OSError, ValueError, NotImplementedError, LookupError, OverflowError) as error:
+            return {
+                member.filename.removesuffix(".npy"): _array_of(archive.read(member), what)
+                for member in members
+            }
+    except (
+        zipfile.BadZipFile,
+        EOFError,
+        OSError,
+        ValueError,
+        NotImplementedError,
+        LookupError,
+        OverflowError,
+    ) as error:
         raise Damage(f"{what}: {' '.join(str(error).split())[:100]}") from error
 
 
@@ -104,12 +132,20 @@ def _array_of(data: bytes, what: str) -> np.ndarray:
     """One `.npy`, whose header must agree with its length before anything is made of it."""
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
-    read_header: Any = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
+    read_header: Any = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }.get(version)
     if read_header is None:
         raise Damage(f"{what}: an array of an unknown version")
     try:
         shape, is_fortran, dtype = read_header(stream, max_header_size=2000)
-    except (SyntaxError, TypeError, RecursionError, MemoryError) as error:  # of Python's own parser, on what is no header
+    except (
+        SyntaxError,
+        TypeError,
+        RecursionError,
+        MemoryError,
+    ) as error:  # of Python's own parser, on what is no header
         raise Damage(f"{what}: an array without a header") from error
     left = len(data) - stream.tell()
     if (

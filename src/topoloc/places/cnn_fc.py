@@ -1,7 +1,8 @@
 """cnn-fc: a network whose output layer has one unit a node, trained on the mapping images.
 
-The paper's first classifier (section III-A): VGG-11 with its last layer replaced, or a smaller backbone. Each image is labelled
-with its nearest node by Eq. 1 (position and heading). Scores are probabilities, calibrated on images held out of the training.
+The paper's first classifier (section III-A): VGG-11 with its last layer replaced, or a smaller
+backbone. Each image is labelled with its nearest node by Eq. 1 (position and heading). Scores are
+probabilities, calibrated on images held out of the training.
 """
 
 from __future__ import annotations
@@ -26,8 +27,9 @@ _SQUEEZED, _ROWS, _COLUMNS = 64, 4, 5
 
 
 class NodeClassifier(nn.Module):
-    """Images to one number a node. VGG keeps its classifier but for the last layer; the mean over the picture, which the
-    small networks end with, forgets where things are in it: their features are squeezed and pooled in cells instead."""
+    """Images to one number a node. VGG keeps its classifier but for the last layer; the mean over
+    the picture, which the small networks end with, forgets where things are in it: their features
+    are squeezed and pooled in cells instead."""
 
     def __init__(self, backbone: BackboneName, num_nodes: int) -> None:
         super().__init__()
@@ -50,19 +52,38 @@ class CnnFc:
     def __init__(self, model: CoarseModel) -> None:
         self._picture = setting(model, "config", ClassifierNetwork).picture
         self._shape = PictureShape(*setting(model, "picture_shape", tuple[int, int]))
-        self._temperature, num_outputs = setting(model, "temperature", float), setting(model, "num_nodes", int)
+        self._temperature, num_outputs = (
+            setting(model, "temperature", float),
+            setting(model, "num_nodes", int),
+        )
         if not 0 < num_outputs <= MAX_OUTPUTS or self._temperature <= 0.0:
-            raise MapError(f"the map's coarse localizer {NAME!r} is damaged: {num_outputs} outputs, temperature {self._temperature}")
+            raise MapError(
+                f"the map's coarse localizer {NAME!r} is damaged: {num_outputs} outputs,"
+                f" temperature {self._temperature}"
+            )
         try:
-            self._predict = Predictor(from_arrays(NodeClassifier(setting(model, "backbone", BackboneName), num_outputs), model.arrays))
+            self._predict = Predictor(
+                from_arrays(
+                    NodeClassifier(setting(model, "backbone", BackboneName), num_outputs),
+                    model.arrays,
+                )
+            )
         except (KeyError, RuntimeError, ValueError) as error:
-            raise MapError(f"the map's coarse localizer {NAME!r} is damaged: {' '.join(str(error).split())[:200]}") from error
+            raise MapError(
+                f"the map's coarse localizer {NAME!r} is damaged:"
+                f" {' '.join(str(error).split())[:200]}"
+            ) from error
         # the node of each output, as its row in the map; -1 of nodes that are no more
         has_rows = "node_ids" in model.arrays
-        self._rows = model_array(model, "node_ids", "iu", (num_outputs,)) if has_rows else np.arange(num_outputs)
+        self._rows = (
+            model_array(model, "node_ids", "iu", (num_outputs,))
+            if has_rows
+            else np.arange(num_outputs)
+        )
 
     def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
-        """See `CoarseLocalizer.rank`; scores are probabilities. The local features are not looked at."""
+        """See `CoarseLocalizer.rank`; scores are probabilities. The local features are not looked
+        at."""
         return self.rank_batch([image], num_candidates)[0]
 
     def rank_batch(self, images: Sequence[Image], num_candidates: int) -> list[list[NodeScore]]:
@@ -71,12 +92,16 @@ class CnnFc:
         for row in self.probabilities(images):
             outputs = np.argsort(-row, kind="stable")
             outputs = outputs[self._rows[outputs] >= 0][:num_candidates]
-            ranked.append([NodeScore(int(self._rows[output]), float(row[output])) for output in outputs])
+            ranked.append(
+                [NodeScore(int(self._rows[output]), float(row[output])) for output in outputs]
+            )
         return ranked
 
     def probabilities(self, images: Sequence[Image]) -> Float32[np.ndarray, "n nodes"]:
         """Of each node, for each image."""
-        outputs = self._predict(network_pictures(images, self._shape, self._picture)) / np.float32(self._temperature)
+        outputs = self._predict(network_pictures(images, self._shape, self._picture)) / np.float32(
+            self._temperature
+        )
         powers = np.exp(outputs - outputs.max(axis=1, keepdims=True))
         return powers / powers.sum(axis=1, keepdims=True)
 
@@ -85,5 +110,12 @@ open_model = CnnFc
 
 
 def _cell_head(num_channels: int, num_nodes: int) -> nn.Sequential:
-    squeeze = [nn.Conv2d(num_channels, _SQUEEZED, 1), nn.ReLU(True), nn.AdaptiveAvgPool2d((_ROWS, _COLUMNS)), nn.Flatten()]
-    return nn.Sequential(*squeeze, nn.Dropout(0.3), nn.Linear(_SQUEEZED * _ROWS * _COLUMNS, num_nodes))
+    squeeze = [
+        nn.Conv2d(num_channels, _SQUEEZED, 1),
+        nn.ReLU(True),
+        nn.AdaptiveAvgPool2d((_ROWS, _COLUMNS)),
+        nn.Flatten(),
+    ]
+    return nn.Sequential(
+        *squeeze, nn.Dropout(0.3), nn.Linear(_SQUEEZED * _ROWS * _COLUMNS, num_nodes)
+    )

@@ -1,7 +1,8 @@
 """Coarse localization: which node of the map is this image of?
 
-Every coarse localizer answers the same question behind `CoarseLocalizer.rank`; what it has learnt travels in a
-`CoarseModel`, which the map file stores. Names are the paper's; `surf-vlad` needs neither weights nor torch.
+Every coarse localizer answers the same question behind `CoarseLocalizer.rank`; what it has learnt
+travels in a `CoarseModel`, which the map file stores. Names are the paper's; `surf-vlad` needs
+neither weights nor torch.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ Image = UInt8[np.ndarray, "h w"] | UInt8[np.ndarray, "h w 3"]
 class NodeScore:
     """A candidate node; a higher score is a better one, comparable within one localizer only.
 
-    `node_id` is the node's id in what is reported, and its row in the open map while a query is answered (`CoarseLocalizer.rank`).
+    `node_id` is the node's id in what is reported, and its row in the open map while a query is
+    answered (`CoarseLocalizer.rank`).
     """
 
     node_id: int
@@ -38,27 +40,42 @@ class NodeScore:
 
 @dataclass(frozen=True, eq=False)
 class CoarseModel:
-    """A coarse localizer as the map keeps it: its settings and its arrays (vocabulary, vectors, node of each vector ...)."""
+    """A coarse localizer as the map keeps it: its settings and its arrays (vocabulary, vectors,
+    node of each vector ...)."""
 
     name: str
     settings: Mapping[str, Any]
     arrays: Mapping[str, np.ndarray]
 
 
-def model_array(model: CoarseModel, name: str, kinds: str, shape: tuple[int | None, ...]) -> np.ndarray:
-    """An array of a stored model, of this shape (None: any length but 0) and of one of these kinds of numbers (NumPy's letters).
+def model_array(
+    model: CoarseModel, name: str, kinds: str, shape: tuple[int | None, ...]
+) -> np.ndarray:
+    """An array of a stored model, of this shape (None: any length but 0) and of one of these kinds
+    of numbers (NumPy's letters).
 
     Raises:
         MapError: it is missing, of another shape or type, or not finite.
     """
     array = model.arrays.get(name)
     fits = array is not None and array.dtype.kind in kinds and array.ndim == len(shape)
-    if array is None or not fits or any(n == 0 or (m is not None and n != m) for n, m in zip(array.shape, shape, strict=True)):
+    if (
+        array is None
+        or not fits
+        or any(
+            n == 0 or (m is not None and n != m) for n, m in zip(array.shape, shape, strict=True)
+        )
+    ):
         found = "missing" if array is None else f"{array.dtype} {array.shape}"
         expected = " x ".join("any" if length is None else str(length) for length in shape)
-        raise MapError(f"the map's coarse localizer {model.name!r} is damaged: {name} is {found}, not {expected} numbers")
+        raise MapError(
+            f"the map's coarse localizer {model.name!r} is damaged: {name} is {found}, not"
+            f" {expected} numbers"
+        )
     if array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise MapError(f"the map's coarse localizer {model.name!r} is damaged: {name} is not finite")
+        raise MapError(
+            f"the map's coarse localizer {model.name!r} is damaged: {name} is not finite"
+        )
     return array
 
 
@@ -67,8 +84,8 @@ class CoarseLocalizer(Protocol):
     """Names the nodes that an image may belong to."""
 
     def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
-        """Up to `num_candidates` distinct nodes by their rows in the map, best first. `features` are those of `image` that the fine
-        step uses too."""
+        """Up to `num_candidates` distinct nodes by their rows in the map, best first. `features`
+        are those of `image` that the fine step uses too."""
         ...
 
 
@@ -85,7 +102,9 @@ class ByVectors(CoarseLocalizer, Protocol):
 class GrowsByPictures(CoarseLocalizer, Protocol):
     """One that learns a picture by its vector alone."""
 
-    def with_pictures(self, pictures: Sequence[Image], node_ids: Int[np.ndarray, " n"]) -> CoarseModel:
+    def with_pictures(
+        self, pictures: Sequence[Image], node_ids: Int[np.ndarray, " n"]
+    ) -> CoarseModel:
         """The stored model with these pictures, each of the node with this id."""
         ...
 
@@ -99,17 +118,23 @@ def open_coarse(model: CoarseModel) -> CoarseLocalizer:
     """
     name = model.name.partition("@")[0]  # behind it stands the kind of features that it ranks by
     if name not in COARSE_NAMES:
-        raise MapError(f"the map's coarse localizer {model.name!r} is not known to this version (known: {', '.join(COARSE_NAMES)})")
+        raise MapError(
+            f"the map's coarse localizer {model.name!r} is not known to this version (known:"
+            f" {', '.join(COARSE_NAMES)})"
+        )
     try:
         return importlib.import_module(f"topoloc.places.{_MODULES[name]}").open_model(model)
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise
-        raise MissingExtraError(f"the coarse localizer {model.name!r} needs PyTorch: pip install 'topoloc[deep]'") from error
+        raise MissingExtraError(
+            f"the coarse localizer {model.name!r} needs PyTorch: pip install 'topoloc[deep]'"
+        ) from error
     except ConfigError as error:
         raise MapError(f"the map's coarse localizer {model.name!r} is damaged: {error}") from error
 
 
 def setting(model: CoarseModel, name: str, of: Any) -> Any:
-    """A setting of a stored model, of this type, without the keys of other versions. Raises ConfigError."""
+    """A setting of a stored model, of this type, without the keys of other versions. Raises
+    ConfigError."""
     return value_from(of, model.settings.get(name), name, is_strict=False)

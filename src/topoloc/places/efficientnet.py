@@ -1,6 +1,8 @@
-"""EfficientNet-lite0 (Tan & Le 2019, the variant without squeeze and excitation): the layers of a backbone, in PyTorch.
+"""EfficientNet-lite0 (Tan & Le 2019, the variant without squeeze and excitation): the layers of a
+backbone, in PyTorch.
 
-Batch normalisation is worked into the convolutions, as it is when such a network answers: what is read of published weights are these.
+Batch normalisation is worked into the convolutions, as it is when such a network answers: what is
+read of published weights are these.
 """
 
 from __future__ import annotations
@@ -12,30 +14,55 @@ from torch.nn.functional import pad, relu6
 NUM_CHANNELS = 1280
 _STEM, _EXPANSION = 32, 6
 # Of each stage: blocks, kernel, stride of the first block, channels.
-_STAGES = ((1, 3, 1, 16), (2, 3, 2, 24), (2, 5, 2, 40), (3, 3, 2, 80), (3, 5, 1, 112), (4, 5, 2, 192), (1, 3, 1, 320))
+_STAGES = (
+    (1, 3, 1, 16),
+    (2, 3, 2, 24),
+    (2, 5, 2, 40),
+    (3, 3, 2, 80),
+    (3, 5, 1, 112),
+    (4, 5, 2, 192),
+    (1, 3, 1, 320),
+)
 # Its pictures are (RGB bytes - 127) / 128; ours come normalised by ImageNet's mean and deviation.
 _MEAN, _DEVIATION = 127.0, 128.0
 
 
 def efficientnet_features(mean: tuple[float, ...], deviation: tuple[float, ...]) -> nn.Sequential:
-    """The stem, 16 blocks, and the last convolution. `mean` and `deviation` (RGB in [0, 1]) are what pictures are normalised by."""
+    """The stem, 16 blocks, and the last convolution. `mean` and `deviation` (RGB in [0, 1]) are
+    what pictures are normalised by."""
     layers: list[nn.Module] = [_Stem(mean, deviation)]
     num_channels = _STEM
     for num_blocks, kernel, stride, width in _STAGES:
         for number in range(num_blocks):
-            layers.append(_Block(num_channels, width, kernel, stride if number == 0 else 1, 1 if len(layers) == 1 else _EXPANSION))
+            layers.append(
+                _Block(
+                    num_channels,
+                    width,
+                    kernel,
+                    stride if number == 0 else 1,
+                    1 if len(layers) == 1 else _EXPANSION,
+                )
+            )
             num_channels = width
-    return nn.Sequential(*layers, nn.Sequential(nn.Conv2d(num_channels, NUM_CHANNELS, 1), nn.ReLU6()))
+    return nn.Sequential(
+        *layers, nn.Sequential(nn.Conv2d(num_channels, NUM_CHANNELS, 1), nn.ReLU6())
+    )
 
 
 class SameConv(nn.Conv2d):
-    """A convolution padded as TensorFlow does: of an odd number of pixels the larger half comes after."""
+    """A convolution padded as TensorFlow does: of an odd number of pixels the larger half comes
+    after."""
 
     def forward(self, input: Tensor) -> Tensor:
         sizes = zip(input.shape[-2:], self.kernel_size, self.stride, strict=True)
-        missing = [max((-(-length // stride) - 1) * stride + kernel - length, 0) for length, kernel, stride in sizes]
+        missing = [
+            max((-(-length // stride) - 1) * stride + kernel - length, 0)
+            for length, kernel, stride in sizes
+        ]
         rows, columns = missing
-        return super().forward(pad(input, (columns // 2, columns - columns // 2, rows // 2, rows - rows // 2)))
+        return super().forward(
+            pad(input, (columns // 2, columns - columns // 2, rows // 2, rows - rows // 2))
+        )
 
 
 class _Stem(nn.Module):
@@ -47,15 +74,19 @@ class _Stem(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         scale, shift = (
-            torch.tensor(values, dtype=images.dtype, device=images.device)[:, None, None] for values in (self._scale, self._shift)
+            torch.tensor(values, dtype=images.dtype, device=images.device)[:, None, None]
+            for values in (self._scale, self._shift)
         )
         return relu6(self.convolution(images * scale + shift))
 
 
 class _Block(nn.Module):
-    """Channels spread, each filtered by itself, and drawn together; beside it what came in, where both are of one shape."""
+    """Channels spread, each filtered by itself, and drawn together; beside it what came in, where
+    both are of one shape."""
 
-    def __init__(self, num_inputs: int, num_outputs: int, kernel: int, stride: int, expansion: int) -> None:
+    def __init__(
+        self, num_inputs: int, num_outputs: int, kernel: int, stride: int, expansion: int
+    ) -> None:
         super().__init__()
         width = expansion * num_inputs
         self.expand = None if expansion == 1 else nn.Conv2d(num_inputs, width, 1)

@@ -1,7 +1,9 @@
-"""Running a trained network on single pictures and on batches, in the way that this machine's processor does fastest.
+"""Running a trained network on single pictures and on batches, in the way that this machine's
+processor does fastest.
 
-What that is was measured (docs/journal.md): bfloat16 where the processor multiplies it in hardware, else single precision
-with the network frozen into TorchScript, whose fused calls save a third of a small network's time.
+What that is was measured (docs/journal.md): bfloat16 where the processor multiplies it in hardware,
+else single precision with the network frozen into TorchScript, whose fused calls save a third of a
+small network's time.
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ BATCH_SIZE = 16
 
 
 def has_bfloat16() -> bool:
-    """Whether the processor multiplies bfloat16 in hardware (AVX512-BF16, AMX); elsewhere it is emulated, many times slower."""
+    """Whether the processor multiplies bfloat16 in hardware (AVX512-BF16, AMX); elsewhere it is
+    emulated, many times slower."""
     cpu = torch.cpu
     checks = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
     return any(bool(getattr(cpu, name)()) for name in checks if hasattr(cpu, name))
@@ -48,15 +51,19 @@ class Predictor:
         rows = []
         with torch.inference_mode():
             for start in range(0, len(pictures), BATCH_SIZE):
-                images = normalize_pictures(torch.from_numpy(pictures[start : start + BATCH_SIZE])).to(self._dtype)
+                images = normalize_pictures(
+                    torch.from_numpy(pictures[start : start + BATCH_SIZE])
+                ).to(self._dtype)
                 outputs = self._single(images) if len(images) == 1 else self._network(images)
                 rows.append(outputs.float().numpy())
         return np.concatenate(rows)
 
     def _single(self, image: Tensor) -> Tensor:
-        """One picture through the frozen network, which is made at the first call: in small networks calls cost as much as arithmetic."""
+        """One picture through the frozen network, which is made at the first call: in small
+        networks calls cost as much as arithmetic."""
         shape = tuple(image.shape)
-        # By default one: the last digits follow from the number, and on a busy machine several wait for one another many times as long.
+        # By default one: the last digits follow from the number, and on a busy machine several wait
+        # for one another many times as long.
         with threads(num_threads(1)):
             with self._freezing:
                 if shape not in self._frozen:
@@ -65,10 +72,12 @@ class Predictor:
 
 
 class _Threads:
-    """`with threads(number)`: this many threads for PyTorch's operations; afterwards as many as before.
+    """`with threads(number)`: this many threads for PyTorch's operations; afterwards as many as
+    before.
 
-    PyTorch has one number for the process and one for each thread of Python. Several of these may be in here at once: what each leaves is
-    the process's number from before the first came, not the one that another thread has set meanwhile.
+    PyTorch has one number for the process and one for each thread of Python. Several of these may
+    be in here at once: what each leaves is the process's number from before the first came, not the
+    one that another thread has set meanwhile.
     """
 
     def __init__(self) -> None:
@@ -79,7 +88,9 @@ class _Threads:
     def __call__(self, number: int) -> Iterator[None]:
         outer: int | None = getattr(self._here, "number", None)
         with self._lock:
-            own = torch.get_num_threads()  # always asked: it makes a new thread take the process's number, which would else happen later
+            # always asked: it makes a new thread take the process's number, which would else happen
+            # later
+            own = torch.get_num_threads()
             if self._num_users == 0:
                 self._own = own
             self._num_users += 1
@@ -108,7 +119,8 @@ def _freeze(network: nn.Module, image: Tensor) -> torch.jit.ScriptModule:
 
 
 def in_channels_last(network: nn.Module) -> nn.Module:
-    """The same network with its convolutions' weights laid out as they are fastest: channels last."""
+    """The same network with its convolutions' weights laid out as they are fastest: channels
+    last."""
     for value in network.state_dict(keep_vars=True).values():
         if value.ndim == 4:
             value.data = value.data.contiguous(memory_format=torch.channels_last)
@@ -116,11 +128,21 @@ def in_channels_last(network: nn.Module) -> nn.Module:
 
 
 def from_arrays(network: nn.Module, arrays: Mapping[str, np.ndarray]) -> nn.Module:
-    """Puts the weights that a map keeps, half floats under names that begin with ``network.``, into `network`.
+    """Puts the weights that a map keeps, half floats under names that begin with ``network.``, into
+    `network`.
 
     Raises:
         KeyError, RuntimeError: they do not fit.
     """
-    state = {name.removeprefix("network."): torch.from_numpy(value) for name, value in arrays.items() if name.startswith("network.")}
-    network.load_state_dict({name: value.float() if value.is_floating_point() else value for name, value in state.items()})
+    state = {
+        name.removeprefix("network."): torch.from_numpy(value)
+        for name, value in arrays.items()
+        if name.startswith("network.")
+    }
+    network.load_state_dict(
+        {
+            name: value.float() if value.is_floating_point() else value
+            for name, value in state.items()
+        }
+    )
     return network

@@ -1,4 +1,5 @@
-"""What a map says of the networks of its learned coarse localizers. It stands apart from them so that reading it needs no torch."""
+"""What a map says of the networks of its learned coarse localizers. It stands apart from them so
+that reading it needs no torch."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ BackboneName = Literal["squeezenet1_1", "vgg11", "vgg16", "efficientnet_lite0", 
 
 @dataclass(frozen=True)
 class PictureConfig:
-    """How a picture is brought to the network: cut to the mapping pictures' shape, reduced, and stretched to one size."""
+    """How a picture is brought to the network: cut to the mapping pictures' shape, reduced, and
+    stretched to one size."""
 
     width_px: Annotated[int, Between(32, 2048)] = 224
     """Width that the network sees."""
@@ -33,13 +35,16 @@ class PooledNetwork:
 
     picture: PictureConfig = field(default_factory=PictureConfig)
     depth: Annotated[int | None, Between(1, 100)] = None
-    """Layers of the backbone's `features` that are used (None: what measured best for each backbone)."""
+    """Layers of the backbone's `features` that are used (None: what measured best for each
+    backbone)."""
     grid_rows: Annotated[int, Between(1, 32)] = 2
-    """Features are pooled in cells, since neighbouring nodes see the same things at other places of the picture."""
+    """Features are pooled in cells, since neighbouring nodes see the same things at other places of
+    the picture."""
     grid_columns: Annotated[int, Between(1, 32)] = 3
     """The same, across."""
     power: Annotated[float, Between(1, 100)] = 3.0
-    """Exponent of the generalised mean (Radenovic et al. 2018): 1 is the mean, infinity the maximum."""
+    """Exponent of the generalised mean (Radenovic et al. 2018): 1 is the mean, infinity the
+    maximum."""
 
 
 @dataclass(frozen=True)
@@ -48,4 +53,5 @@ class VladNetworkConfig:
 
     picture: PictureConfig = field(default_factory=PictureConfig)
     depth: Annotated[int | None, Between(1, 100)] = None
-    """Layers of the backbone's `features` that are used (None: what measured best for each backbone)."""
+    """Layers of the backbone's `features` that are used (None: what measured best for each
+    backbone)."""

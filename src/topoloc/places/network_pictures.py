@@ -19,13 +19,15 @@ RgbPictures = UInt8[np.ndarray, "_ _ _ 3"]
 
 @dataclass(frozen=True)
 class PictureShape:
-    """The mapping pictures' size: queries are cut and reduced to it before they are stretched to the network's."""
+    """The mapping pictures' size: queries are cut and reduced to it before they are stretched to
+    the network's."""
 
     width: int
     height: int
 
     def fit(self, image: Image) -> RgbPicture:
-        """The middle of the image in this shape, reduced to this size where it is larger; colour."""
+        """The middle of the image in this shape, reduced to this size where it is larger;
+        colour."""
         height, width = image.shape[:2]
         scale = min(width / self.width, height / self.height)
         rows, columns = max(1, round(self.height * scale)), max(1, round(self.width * scale))
@@ -44,8 +46,11 @@ def decode_picture(jpeg: bytes) -> RgbPicture:
     return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
 
 
-def network_pictures(images: Sequence[Image], shape: PictureShape, config: PictureConfig) -> RgbPictures:
-    """Images as a network takes them: all in the mapping pictures' shape, stretched to the network's size."""
+def network_pictures(
+    images: Sequence[Image], shape: PictureShape, config: PictureConfig
+) -> RgbPictures:
+    """Images as a network takes them: all in the mapping pictures' shape, stretched to the
+    network's size."""
     size = (config.width_px, config.height_px)
     return np.stack([_stretched(shape.fit(image), size) for image in images])
 

@@ -1,4 +1,5 @@
-"""cnn-nn and vlad-nn as they answer: a network turns a picture into a vector; the nodes of the nearest mapping images answer."""
+"""cnn-nn and vlad-nn as they answer: a network turns a picture into a vector; the nodes of the
+nearest mapping images answer."""
 
 from __future__ import annotations
 
@@ -29,11 +30,20 @@ class VectorSearch:
 
     def __init__(self, model: CoarseModel, network: nn.Module, picture: PictureConfig) -> None:
         try:
-            self._picture, self._shape = picture, PictureShape(*setting(model, "picture_shape", tuple[int, int]))
+            self._picture, self._shape = (
+                picture,
+                PictureShape(*setting(model, "picture_shape", tuple[int, int])),
+            )
             self._predict = Predictor(from_arrays(network, model.arrays))
         except (KeyError, RuntimeError, ValueError) as error:
-            raise MapError(f"the map's coarse localizer {model.name!r} is damaged: {' '.join(str(error).split())[:200]}") from error
-        self._model, mean = model, model_array(model, "mean", "f", (None,)).astype(np.float32, copy=False)
+            raise MapError(
+                f"the map's coarse localizer {model.name!r} is damaged:"
+                f" {' '.join(str(error).split())[:200]}"
+            ) from error
+        self._model, mean = (
+            model,
+            model_array(model, "mean", "f", (None,)).astype(np.float32, copy=False),
+        )
         projection = model_array(model, "projection", "f", (None, len(mean))).astype(np.float32)
         vectors = model_array(model, "vectors", "f", (None, len(projection))).astype(np.float32)
         self._whitening = Whitening(mean, projection)
@@ -47,11 +57,15 @@ class VectorSearch:
         """`rank` of many images, which go through the network together."""
         return [self._index.rank_nodes(vector, num_candidates) for vector in self.vectors(images)]
 
-    def with_pictures(self, pictures: Sequence[Image], node_ids: Int[np.ndarray, " n"]) -> CoarseModel:
+    def with_pictures(
+        self, pictures: Sequence[Image], node_ids: Int[np.ndarray, " n"]
+    ) -> CoarseModel:
         """See `GrowsByPictures`: their vectors join, under the whitening that is there."""
         known = self._model.arrays
         parts = [self.vectors(pictures[k : k + _CHUNK]) for k in range(0, len(pictures), _CHUNK)]
-        vectors = np.concatenate([known["vectors"], *(part.astype(known["vectors"].dtype) for part in parts)])
+        vectors = np.concatenate(
+            [known["vectors"], *(part.astype(known["vectors"].dtype) for part in parts)]
+        )
         of_nodes = np.concatenate([known["node_ids"], node_ids.astype(known["node_ids"].dtype)])
         return replace(self._model, arrays={**known, "vectors": vectors, "node_ids": of_nodes})
 
@@ -59,5 +73,8 @@ class VectorSearch:
         """The images' unit vectors."""
         raw = self._predict(network_pictures(images, self._shape, self._picture))
         if raw.shape[1] != len(self._whitening.mean):
-            raise MapError(f"the map's coarse localizer {self._model.name!r} is damaged: its whitening is not that of its network")
+            raise MapError(
+                f"the map's coarse localizer {self._model.name!r} is damaged: its whitening is not"
+                " that of its network"
+            )
         return self._whitening.apply(raw)

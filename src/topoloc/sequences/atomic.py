@@ -1,8 +1,11 @@
-"""Files written at once or not at all: a reader sees the old file or the new one, and a failure leaves nothing behind.
+"""Files written at once or not at all: a reader sees the old file or the new one, and a failure
+leaves nothing behind.
 
-What is written goes to a file beside the target, of a name that nobody else has, and is renamed over it when it is whole and on the disk.
-Its writer holds a lock on it (`flock`), which ends with the process however that ends: a temporary file whose lock can be had belongs to
-nobody, and the next writer of the same target removes it. Several writers, also of other containers, do not meet; the last one wins whole.
+What is written goes to a file beside the target, of a name that nobody else has, and is renamed
+over it when it is whole and on the disk. Its writer holds a lock on it (`flock`), which ends with
+the process however that ends: a temporary file whose lock can be had belongs to nobody, and the
+next writer of the same target removes it. Several writers, also of other containers, do not meet;
+the last one wins whole.
 """
 
 from __future__ import annotations
@@ -40,7 +43,8 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 @contextmanager
 def replaced_file(path: Path) -> Iterator[Path]:
-    """An empty file beside `path` to write to; it is renamed over `path` when all went well, and removed when not.
+    """An empty file beside `path` to write to; it is renamed over `path` when all went well, and
+    removed when not.
 
     Raises:
         OSError: the folder or the file cannot be written.
@@ -54,14 +58,17 @@ def replaced_file(path: Path) -> Iterator[Path]:
         os.replace(temporary, path)
         _sync(path.parent)
     finally:
-        with suppress(OSError):  # renamed already, or the folder is gone: the error that led here says more
+        with suppress(
+            OSError
+        ):  # renamed already, or the folder is gone: the error that led here says more
             temporary.unlink()
         os.close(lock)
 
 
 @contextmanager
 def scratch_file(path: Path) -> Iterator[Path]:
-    """An empty file beside `path` that is removed afterwards; those of writers that were killed are removed by the next one.
+    """An empty file beside `path` that is removed afterwards; those of writers that were killed are
+    removed by the next one.
 
     It must be written to as it is: what is renamed over it is nobody's.
 
@@ -81,8 +88,8 @@ def scratch_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def scratch_folder(prefix: str) -> Iterator[Path]:
-    """A new folder among this machine's temporary files, its name beginning so, that is removed afterwards; those of owners that were
-    killed go, too. Raises OSError where none can be made."""
+    """A new folder among this machine's temporary files, its name beginning so, that is removed
+    afterwards; those of owners that were killed go, too. Raises OSError where none can be made."""
     for left in Path(tempfile.gettempdir()).glob(f"{prefix}*"):
         _remove_unowned(left)
     folder, lock = _own_folder(prefix)
@@ -128,7 +135,11 @@ def _check_replaceable(path: Path, files: Mapping[str, bytes]) -> None:
     """Hold that no file is lost that nobody means to write anew."""
     if path.exists() and not path.is_dir():
         raise TopolocError(f"cannot write {path}: it is no folder")
-    found = (one.relative_to(path).as_posix() for one in path.rglob("*") if one.is_symlink() or not one.is_dir())
+    found = (
+        one.relative_to(path).as_posix()
+        for one in path.rglob("*")
+        if one.is_symlink() or not one.is_dir()
+    )
     other = next((name for name in found if name not in files), None)
     if other is not None:
         raise TopolocError(f"cannot write {path}: this folder holds other things, such as {other}")
@@ -140,7 +151,8 @@ def _target(path: Path) -> Path:
 
 
 def remove_leftovers(path: Path) -> None:
-    """Remove what writers of `path` left beside it that were killed; what a living process writes stays."""
+    """Remove what writers of `path` left beside it that were killed; what a living process writes
+    stays."""
     path = _target(path)
     prefix = _prefix(path)
     try:
@@ -158,9 +170,14 @@ def remove_leftovers(path: Path) -> None:
 
 
 def remove_all_leftovers(folder: Path) -> None:
-    """Remove what killed writers of whatever file left in a folder; what a living process writes stays."""
+    """Remove what killed writers of whatever file left in a folder; what a living process writes
+    stays."""
     try:
-        names = [entry.name for entry in os.scandir(folder) if entry.name.startswith(".") and entry.name.endswith(".part")]
+        names = [
+            entry.name
+            for entry in os.scandir(folder)
+            if entry.name.startswith(".") and entry.name.endswith(".part")
+        ]
     except OSError:
         return
     for name in names:
@@ -168,8 +185,13 @@ def remove_all_leftovers(folder: Path) -> None:
 
 
 def _prefix(path: Path) -> str:
-    """What the names of all temporary files of `path` begin with; short enough for any file system."""
-    name = path.name if len(os.fsencode(path.name)) <= 200 else blake2b(os.fsencode(path.name), digest_size=16).hexdigest()
+    """What the names of all temporary files of `path` begin with; short enough for any file
+    system."""
+    name = (
+        path.name
+        if len(os.fsencode(path.name)) <= 200
+        else blake2b(os.fsencode(path.name), digest_size=16).hexdigest()
+    )
     return f".{name}."
 
 

@@ -1,7 +1,9 @@
-"""What a calibration is given as: a file of one of the known kinds, or four numbers; and recordings with a calibration from outside.
+"""What a calibration is given as: a file of one of the known kinds, or four numbers; and recordings
+with a calibration from outside.
 
-`camera.json`, YAML of OpenCV or Kalibr, or ``fx,fy,cx,cy`` in pixels. Four numbers and some of the files do not say of which picture
-size they are, so a calibration is asked for with that of the pictures.
+`camera.json`, YAML of OpenCV or Kalibr, or ``fx,fy,cx,cy`` in pixels. Four numbers and some of the
+files do not say of which picture size they are, so a calibration is asked for with that of the
+pictures.
 """
 
 from __future__ import annotations
@@ -23,7 +25,8 @@ from topoloc.sequences.video import Video
 
 CalibrationOfSize = Callable[[int, int], CameraFile]
 """The calibration of pictures of this width and height (pixels). Raises CalibrationError."""
-# Principal points of lenses lie within a few percent of the centre; further off they are those of another size or of a part of a picture.
+# Principal points of lenses lie within a few percent of the centre; further off they are those of
+# another size or of a part of a picture.
 _SIZE_TOLERANCE, _SAME_SCALE = 0.12, 0.08
 
 
@@ -48,55 +51,87 @@ def calibration_of_numbers(text: str) -> CalibrationOfSize:
     try:
         fx, fy, cx, cy = map(float, text.split(","))
     except ValueError:
-        raise CalibrationError(f"{text[:80]}: neither a file nor four numbers fx,fy,cx,cy") from None
+        raise CalibrationError(
+            f"{text[:80]}: neither a file nor four numbers fx,fy,cx,cy"
+        ) from None
     Camera.pinhole(1, 1, fx, fy, cx, cy)  # complains before the first picture is read
     return lambda width, height: CameraFile(camera_of_numbers(fx, fy, cx, cy, width, height))
 
 
-def camera_of_numbers(fx: float, fy: float, cx: float, cy: float, width: int, height: int) -> Camera:
+def camera_of_numbers(
+    fx: float, fy: float, cx: float, cy: float, width: int, height: int
+) -> Camera:
     """The pinhole camera of four numbers (pixels).
 
     Raises:
-        CalibrationError: the principal point is that of a picture of another size, or of one turned by 90 degrees.
+        CalibrationError: the principal point is that of a picture of another size, or of one turned
+            by 90 degrees.
     """
     camera = Camera.pinhole(width, height, fx, fy, cx, cy)
     across, down = (2.0 * cx + 1.0) / width, (2.0 * cy + 1.0) / height
     if min(across, down) > 0.0 and max(abs(across - 1.0), abs(down - 1.0)) > _SIZE_TOLERANCE:
-        numbers, picture = f"fx,fy,cx,cy = {fx:g},{fy:g},{cx:g},{cy:g}", f"this one has {width}x{height}"
+        numbers, picture = (
+            f"fx,fy,cx,cy = {fx:g},{fy:g},{cx:g},{cy:g}",
+            f"this one has {width}x{height}",
+        )
         own = "a camera.json says for which size it is, where this is meant"
-        if _near(2.0 * cx + 1.0, height, _SIZE_TOLERANCE) and _near(2.0 * cy + 1.0, width, _SIZE_TOLERANCE):
-            raise CalibrationError(f"{numbers} are those of a picture turned by 90 degrees, of about {height}x{width}; {picture} ({own})")
+        if _near(2.0 * cx + 1.0, height, _SIZE_TOLERANCE) and _near(
+            2.0 * cy + 1.0, width, _SIZE_TOLERANCE
+        ):
+            raise CalibrationError(
+                f"{numbers} are those of a picture turned by 90 degrees, of about {height}x{width};"
+                f" {picture} ({own})"
+            )
         if _near(across, down, _SAME_SCALE) or not (0.0 < cx < width and 0.0 < cy < height):
             about = f"about {2.0 * cx + 1.0:.0f}x{2.0 * cy + 1.0:.0f} pixels"
-            raise CalibrationError(f"{numbers} are those of a picture of {about}; {picture} ({own})")
+            raise CalibrationError(
+                f"{numbers} are those of a picture of {about}; {picture} ({own})"
+            )
     return camera
 
 
 def find_calibration(folder: Path) -> CalibrationOfSize | None:
-    """The calibration that lies in a recording's folder: camera.json, else the only YAML file that holds one.
+    """The calibration that lies in a recording's folder: camera.json, else the only YAML file that
+    holds one.
 
     Raises:
         CalibrationError: it is not usable, or there are several.
     """
     if (folder / FILE_NAME).is_file():
         return calibration_of(folder / FILE_NAME)
-    found = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in YAML_SUFFIXES and path.is_file() and is_calibration(path)]
+    found = [
+        path
+        for path in sorted(folder.iterdir())
+        if path.suffix.lower() in YAML_SUFFIXES and path.is_file() and is_calibration(path)
+    ]
     if len(found) > 1:
-        raise CalibrationError(f"{folder}: several calibrations ({', '.join(path.name for path in found)}); name one with --camera")
+        raise CalibrationError(
+            f"{folder}: several calibrations ({', '.join(path.name for path in found)}); name one"
+            " with --camera"
+        )
     return calibration_of(found[0]) if found else None
 
 
 def completed(given: CalibrationOfSize, folder: Path) -> CalibrationOfSize:
-    """A calibration from outside; what it does not say of a rectified pair's baseline and of depth is as in the recording's folder."""
+    """A calibration from outside; what it does not say of a rectified pair's baseline and of depth
+    is as in the recording's folder."""
 
     def of_size(width: int, height: int) -> CameraFile:
         calibration = given(width, height)
         with suppress(CalibrationError):
             if own := find_calibration(folder):
                 of_folder = own(width, height)
-                pair = of_folder.rig if of_folder.rig is not None and of_folder.rig.is_rectified else None
-                rig = calibration.rig or (StereoRig.rectified(calibration.camera, pair.baseline) if pair else None)
-                return CameraFile(calibration.camera, rig, calibration.depth_factor or of_folder.depth_factor)
+                pair = (
+                    of_folder.rig
+                    if of_folder.rig is not None and of_folder.rig.is_rectified
+                    else None
+                )
+                rig = calibration.rig or (
+                    StereoRig.rectified(calibration.camera, pair.baseline) if pair else None
+                )
+                return CameraFile(
+                    calibration.camera, rig, calibration.depth_factor or of_folder.depth_factor
+                )
         return calibration
 
     return of_size
@@ -108,33 +143,46 @@ def recalibrated(sequence: StereoSequence, calibration: CalibrationOfSize) -> St
     A single camera takes the place of both of a rectified pair, and of that of registered depth.
 
     Raises:
-        CalibrationError: the calibration is not usable, or is of one camera and the pair is not rectified.
+        CalibrationError: the calibration is not usable, or is of one camera and the pair is not
+            rectified.
         RecordingError: a recording of a kind that keeps its own.
     """
     if isinstance(sequence, Video):
         camera = calibration(*sequence.size).camera
         if (camera.width, camera.height) != sequence.size:
             raise CalibrationError(
-                f"{sequence.name}: of {sequence.size[0]}x{sequence.size[1]}, the camera of {camera.width}x{camera.height}"
+                f"{sequence.name}: of {sequence.size[0]}x{sequence.size[1]}, the camera of"
+                f" {camera.width}x{camera.height}"
             )
         return replace(sequence, camera=camera)
     if not isinstance(sequence, Recording):
-        raise RecordingError(f"{sequence.name}: a recording of this kind keeps its own calibration; --camera does not go with it")
+        raise RecordingError(
+            f"{sequence.name}: a recording of this kind keeps its own calibration; --camera does"
+            " not go with it"
+        )
     given = calibration(*size_of_first([sequence.root / name for name in sequence.names]))
     right, depth = sequence.right, sequence.depth
     if right is not None:
         if given.rig is None and not right.rig.is_rectified:
-            raise CalibrationError(f"{sequence.name}: its stereo pair is not rectified, so that both cameras' calibrations are needed")
-        right = replace(right, rig=given.rig or StereoRig.rectified(given.camera, right.rig.baseline))
+            raise CalibrationError(
+                f"{sequence.name}: its stereo pair is not rectified, so that both cameras'"
+                " calibrations are needed"
+            )
+        right = replace(
+            right, rig=given.rig or StereoRig.rectified(given.camera, right.rig.baseline)
+        )
     if depth is not None:
         registered = depth.camera is not None and depth.camera == sequence.camera
         units = given.depth_factor or depth.units_per_metre
-        depth = replace(depth, camera=given.camera if registered else depth.camera, units_per_metre=units)
+        depth = replace(
+            depth, camera=given.camera if registered else depth.camera, units_per_metre=units
+        )
     return replace(sequence, camera=given.camera, cameras=None, right=right, depth=depth)
 
 
 def size_of_first(pictures: Sequence[Path]) -> tuple[int, int]:
-    """Width and height of the first picture that can be read; (0, 0) where none can, which is said when they are asked for."""
+    """Width and height of the first picture that can be read; (0, 0) where none can, which is said
+    when they are asked for."""
     for path in pictures:
         with suppress(UnreadableImageError):
             return image_size(path)

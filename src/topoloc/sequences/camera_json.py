@@ -1,4 +1,5 @@
-"""``camera.json``: the calibration of a recording whose format has none of its own, or of a query."""
+"""``camera.json``: the calibration of a recording whose format has none of its own, or of a
+query."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ FILE_NAME = "camera.json"
 
 @dataclass(frozen=True)
 class CameraFile:
-    """A camera; of a stereo pair the left one, with its `rig`. `depth_factor` is that of depth pictures: file units a metre."""
+    """A camera; of a stereo pair the left one, with its `rig`. `depth_factor` is that of depth
+    pictures: file units a metre."""
 
     camera: Camera
     rig: StereoRig | None = None
@@ -24,8 +26,9 @@ class CameraFile:
 
 
 def read_camera_json(path: Path) -> CameraFile:
-    """Read a camera.json: one camera, with a "baseline" (metres) where it is the left one of a rectified pair; or two of any
-    calibration, "left" and "right", with "right_from_left" (4x4, metres).
+    """Read a camera.json: one camera, with a "baseline" (metres) where it is the left one of a
+    rectified pair; or two of any calibration, "left" and "right", with "right_from_left" (4x4,
+    metres).
 
     Raises:
         CalibrationError: missing, not JSON, a key is missing or out of range; names the file.
@@ -39,7 +42,11 @@ def read_camera_json(path: Path) -> CameraFile:
             rig = _two_cameras(data)
             return CameraFile(rig.left, rig, depth_factor)
         camera, baseline = Camera.from_json(data), _positive(data, "baseline")
-        return CameraFile(camera, None if baseline is None else StereoRig.rectified(camera, baseline), depth_factor)
+        return CameraFile(
+            camera,
+            None if baseline is None else StereoRig.rectified(camera, baseline),
+            depth_factor,
+        )
     except CalibrationError as error:
         raise CalibrationError(f"{path}: {error}") from None
 
@@ -47,7 +54,10 @@ def read_camera_json(path: Path) -> CameraFile:
 def _two_cameras(data: dict[str, Any]) -> StereoRig:
     for key in ("left", "right", "right_from_left"):
         if key not in data:
-            raise CalibrationError(f'{key!r} is missing; a stereo pair has "left", "right" and "right_from_left" (4x4, metres)')
+            raise CalibrationError(
+                f'{key!r} is missing; a stereo pair has "left", "right" and "right_from_left" (4x4,'
+                " metres)"
+            )
     right_from_left = json_rigid(data["right_from_left"], "right_from_left", CalibrationError)
     return StereoRig(_named(data, "left"), _named(data, "right"), right_from_left)
 

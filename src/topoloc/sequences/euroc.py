@@ -1,7 +1,9 @@
-"""EuRoC / ASL recordings (Burri et al., IJRR 2016): ``mav0/cam0``, ``mav0/cam1``, distorted and unrectified.
+"""EuRoC / ASL recordings (Burri et al., IJRR 2016): ``mav0/cam0``, ``mav0/cam1``, distorted and
+unrectified.
 
-Pairs are the pictures of equal time stamp; a picture without its partner is left out, as some of the published recordings lack frames
-of one camera. Truth is ``state_groundtruth_estimate0`` (or ``mocap0``): poses of the body, brought to the left camera.
+Pairs are the pictures of equal time stamp; a picture without its partner is left out, as some of
+the published recordings lack frames of one camera. Truth is ``state_groundtruth_estimate0`` (or
+``mocap0``): poses of the body, brought to the left camera.
 """
 
 from __future__ import annotations
@@ -40,14 +42,18 @@ def recognises(path: Path) -> bool:
 
 
 def open_euroc(path: Path) -> Recording:
-    """Open a recording by its folder or its mav0; a plain recording of the left camera where there is no cam1.
+    """Open a recording by its folder or its mav0; a plain recording of the left camera where there
+    is no cam1.
 
     Raises:
         RecordingError: no data.csv, a malformed one, or no two pictures of the same time.
         CalibrationError: a sensor.yaml is missing or not usable.
         TrajectoryError: the truth is malformed, or fits no frame.
     """
-    mav = next((folder for folder in (path / "mav0", path) if (folder / "cam0" / "data.csv").is_file()), None)
+    mav = next(
+        (folder for folder in (path / "mav0", path) if (folder / "cam0" / "data.csv").is_file()),
+        None,
+    )
     if mav is None:
         raise RecordingError(f"{path}: not an EuRoC recording, which has {LOOKS_FOR}")
     left = _read_csv(mav / "cam0" / "data.csv")
@@ -59,9 +65,12 @@ def open_euroc(path: Path) -> Recording:
         t_ns = [time for time in t_ns if time in right_by_time]
         if not t_ns:
             raise RecordingError(
-                f"{mav}: none of the {len(left)} pictures of cam0 has a partner of its time among {len(right_by_time)} of cam1"
+                f"{mav}: none of the {len(left)} pictures of cam0 has a partner of its time among"
+                f" {len(right_by_time)} of cam1"
             )
-        right = RightPictures([right_by_time[time] for time in t_ns], _rig(mav, sensor, right_sensor))
+        right = RightPictures(
+            [right_by_time[time] for time in t_ns], _rig(mav, sensor, right_sensor)
+        )
     names = [left[time].relative_to(path).as_posix() for time in t_ns]
     name = mav.resolve().parent.name if mav.resolve().name == "mav0" else path.resolve().name
     return Recording(name, path, names, t_ns, _truth(mav, t_ns, sensor), sensor.camera, right)
@@ -76,16 +85,23 @@ def read_sensor(path: Path) -> Sensor:
     text = read_yaml(path)
     camera = kalibr_camera(path, text)
     try:
-        return Sensor(camera, Rigid3.from_matrix(np.array(needed_numbers(path, text, 16, "T_BS")).reshape(4, 4)))
+        return Sensor(
+            camera,
+            Rigid3.from_matrix(np.array(needed_numbers(path, text, 16, "T_BS")).reshape(4, 4)),
+        )
     except TrajectoryError as error:
         raise CalibrationError(f"{path}: {error}") from None
 
 
 def _rig(mav: Path, left: Sensor, right: Sensor) -> StereoRig:
     try:
-        return StereoRig(left.camera, right.camera, right.body_from_cam.inverse() @ left.body_from_cam)
+        return StereoRig(
+            left.camera, right.camera, right.body_from_cam.inverse() @ left.body_from_cam
+        )
     except CalibrationError as error:
-        raise CalibrationError(f"{mav / 'cam1' / 'sensor.yaml'}: with that of cam0, {error}") from None
+        raise CalibrationError(
+            f"{mav / 'cam1' / 'sensor.yaml'}: with that of cam0, {error}"
+        ) from None
 
 
 def _read_csv(path: Path) -> dict[int, Path]:
@@ -95,10 +111,16 @@ def _read_csv(path: Path) -> dict[int, Path]:
 
 
 def _truth(mav: Path, t_ns: list[int], sensor: Sensor) -> list[Rigid3 | None]:
-    path = next((mav / name / "data.csv" for name in _TRUTH_FOLDERS if (mav / name / "data.csv").is_file()), None)
+    path = next(
+        (mav / name / "data.csv" for name in _TRUTH_FOLDERS if (mav / name / "data.csv").is_file()),
+        None,
+    )
     if path is None:
         return [None] * len(t_ns)
     poses = poses_at(read_asl_poses(path), t_ns, MAX_TRUTH_GAP)
     if all(world_from_body is None for world_from_body in poses):
         raise TrajectoryError(f"{path}: none of the {len(t_ns)} frames has a pose")
-    return [world_from_body @ sensor.body_from_cam if world_from_body is not None else None for world_from_body in poses]
+    return [
+        world_from_body @ sensor.body_from_cam if world_from_body is not None else None
+        for world_from_body in poses
+    ]

@@ -1,8 +1,9 @@
 """A plain folder of pictures, or one picture; with a calibration in it also a stereo pair or RGB-D.
 
-Stereo: ``left/ right/``, ``image_0/ image_1/`` or ``cam0/ cam1/`` with a ``camera.json`` of a "baseline" (m) or of two cameras, or with
-YAML of OpenCV or Kalibr. RGB-D: ``rgb/`` or ``color/``, ``depth/`` registered to it, and a "depth_factor" (units a metre).
-Else the pictures of the folder itself, or of ``rgb/``, ``color/``, ``left/``, ``image_0/``, ``cam0/`` or ``images/`` in it.
+Stereo: ``left/ right/``, ``image_0/ image_1/`` or ``cam0/ cam1/`` with a ``camera.json`` of a
+"baseline" (m) or of two cameras, or with YAML of OpenCV or Kalibr. RGB-D: ``rgb/`` or ``color/``,
+``depth/`` registered to it, and a "depth_factor" (units a metre). Else the pictures of the folder
+itself, or of ``rgb/``, ``color/``, ``left/``, ``image_0/``, ``cam0/`` or ``images/`` in it.
 ``times.txt``, ``truth.tum`` and ``poses.txt`` (KITTI rows) are read where they are there.
 """
 
@@ -12,10 +13,22 @@ from pathlib import Path
 
 from topoloc.errors import CalibrationError, RecordingError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.sequences.calibration import CalibrationOfSize, calibration_of, completed, find_calibration, size_of_first
+from topoloc.sequences.calibration import (
+    CalibrationOfSize,
+    calibration_of,
+    completed,
+    find_calibration,
+    size_of_first,
+)
 from topoloc.sequences.camera_json import FILE_NAME, CameraFile
 from topoloc.sequences.pictures import PICTURE_SUFFIXES
-from topoloc.sequences.recording import DepthPictures, Recording, RightPictures, check_pairs, list_pictures
+from topoloc.sequences.recording import (
+    DepthPictures,
+    Recording,
+    RightPictures,
+    check_pairs,
+    list_pictures,
+)
 from topoloc.sequences.trajectory import read_times, read_truth
 
 LOOKS_FOR = "pictures, or left/ and right/, or rgb/ and depth/ with camera.json"
@@ -25,14 +38,16 @@ _MONO = ("rgb", "color", "left", "image_0", "cam0", "images")
 
 
 def recognises(path: Path) -> bool:
-    """Whether this is a picture, or a folder with pictures in it or in one of the known folders below it."""
+    """Whether this is a picture, or a folder with pictures in it or in one of the known folders
+    below it."""
     if path.is_file():
         return path.suffix.lower() in PICTURE_SUFFIXES
     return any(_has_pictures(folder) for folder in (path, *(path / name for name in _MONO)))
 
 
 def open_folder(path: Path, calibration: CalibrationOfSize | None = None) -> Recording:
-    """Open a folder of pictures, or a single picture as a recording of one frame. Without a calibration the camera is unknown.
+    """Open a folder of pictures, or a single picture as a recording of one frame. Without a
+    calibration the camera is unknown.
 
     Args:
         calibration: instead of the one in the folder.
@@ -61,25 +76,36 @@ def open_folder(path: Path, calibration: CalibrationOfSize | None = None) -> Rec
     return _recording(path, pictures, _sized(calibration, pictures))
 
 
-def _open_stereo(path: Path, left: str, right: str, calibration: CalibrationOfSize | None) -> Recording:
+def _open_stereo(
+    path: Path, left: str, right: str, calibration: CalibrationOfSize | None
+) -> Recording:
     left_paths, right_paths = list_pictures(path / left), list_pictures(path / right)
     camera_file = _sized(calibration, left_paths)
     if camera_file is None or camera_file.rig is None:
         raise CalibrationError(
-            f'{path / FILE_NAME}: a stereo pair ({left}/, {right}/) needs this file, with a "baseline" in metres or two cameras, '
-            "or the YAML of OpenCV or Kalibr"
+            f"{path / FILE_NAME}: a stereo pair ({left}/, {right}/) needs this file, with a"
+            ' "baseline" in metres or two cameras, or the YAML of OpenCV or Kalibr'
         )
     check_pairs(left_paths, right_paths)
-    return _recording(path, left_paths, camera_file, right=RightPictures(right_paths, camera_file.rig))
+    return _recording(
+        path, left_paths, camera_file, right=RightPictures(right_paths, camera_file.rig)
+    )
 
 
-def _open_rgbd(path: Path, colour: str, depth: str, calibration: CalibrationOfSize | None) -> Recording:
+def _open_rgbd(
+    path: Path, colour: str, depth: str, calibration: CalibrationOfSize | None
+) -> Recording:
     colour_paths, depth_paths = list_pictures(path / colour), list_pictures(path / depth)
     camera_file = _sized(calibration, colour_paths)
     if camera_file is None or camera_file.depth_factor is None:
-        raise CalibrationError(f'{path / FILE_NAME}: RGB-D ({colour}/, {depth}/) needs this file, with a "depth_factor" in units a metre')
+        raise CalibrationError(
+            f"{path / FILE_NAME}: RGB-D ({colour}/, {depth}/) needs this file, with a"
+            ' "depth_factor" in units a metre'
+        )
     check_pairs(colour_paths, depth_paths)
-    pictures = DepthPictures(depth_paths, camera_file.depth_factor, camera_file.camera, Rigid3.identity())
+    pictures = DepthPictures(
+        depth_paths, camera_file.depth_factor, camera_file.camera, Rigid3.identity()
+    )
     return _recording(path, colour_paths, camera_file, depth=pictures)
 
 
@@ -102,4 +128,6 @@ def _sized(calibration: CalibrationOfSize | None, pictures: list[Path]) -> Camer
 
 
 def _has_pictures(folder: Path) -> bool:
-    return folder.is_dir() and any(path.suffix.lower() in PICTURE_SUFFIXES for path in folder.iterdir())
+    return folder.is_dir() and any(
+        path.suffix.lower() in PICTURE_SUFFIXES for path in folder.iterdir()
+    )

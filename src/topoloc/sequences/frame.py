@@ -1,4 +1,5 @@
-"""One moment of a recording, in one type whatever the format: a stereo pair, or an image with depth."""
+"""One moment of a recording, in one type whatever the format: a stereo pair, or an image with
+depth."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ Image = UInt8[np.ndarray, "h w"] | UInt8[np.ndarray, "h w 3"]
 
 @dataclass(frozen=True, eq=False)
 class DepthImage:
-    """Depth along z in metres, NaN where unknown, as its own camera sees it; registered if `cam_from_depth` is the identity."""
+    """Depth along z in metres, NaN where unknown, as its own camera sees it; registered if
+    `cam_from_depth` is the identity."""
 
     depth: Float32[np.ndarray, "h w"]
     camera: Camera
@@ -26,11 +28,12 @@ class DepthImage:
 
 @dataclass(frozen=True, eq=False)
 class StereoFrame:
-    """A frame of a recording. `image` is the left (or colour) picture: grey (H, W) or RGB (H, W, 3), uint8, seen by `camera`.
+    """A frame of a recording. `image` is the left (or colour) picture: grey (H, W) or RGB (H, W,
+    3), uint8, seen by `camera`.
 
     Either `right` and `rig` are there (stereo), or `depth` (RGB-D), or neither (a plain picture).
-    `world_from_cam` is the truth or an attached trajectory: the pose of the camera of `image`. `noted_focal`
-    (pixels) is what the picture's file says of a camera that is not known otherwise.
+    `world_from_cam` is the truth or an attached trajectory: the pose of the camera of `image`.
+    `noted_focal` (pixels) is what the picture's file says of a camera that is not known otherwise.
     """
 
     name: str
@@ -46,7 +49,8 @@ class StereoFrame:
 
 @runtime_checkable
 class StereoSequence(Protocol):
-    """A recording, read lazily: nothing but names, times and poses is in memory until a frame is asked for."""
+    """A recording, read lazily: nothing but names, times and poses is in memory until a frame is
+    asked for."""
 
     @property
     def name(self) -> str:

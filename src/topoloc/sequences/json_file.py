@@ -16,14 +16,17 @@ from topoloc.sequences.text_rows import read_text
 
 
 def read_json(path: Path, error: type[TopolocError], missing: str = "no such file") -> Any:
-    """What a JSON file holds. Raises `error`, which names it, where it is missing, no JSON, or nested without end."""
+    """What a JSON file holds. Raises `error`, which names it, where it is missing, no JSON, or
+    nested without end."""
     try:
         return json.loads(read_text(path, error, missing))
     except (ValueError, RecursionError) as failure:
         raise error(f"{path}: not a JSON file ({str(failure)[:120]})") from None
 
 
-def json_numbers(value: Any, count: int, where: str, error: type[TopolocError]) -> Float[np.ndarray, " n"]:
+def json_numbers(
+    value: Any, count: int, where: str, error: type[TopolocError]
+) -> Float[np.ndarray, " n"]:
     """A list of `count` finite numbers. Raises `error`, which says `where`."""
     try:
         numbers = np.array(value, dtype=np.float64).ravel()
@@ -37,7 +40,11 @@ def json_numbers(value: Any, count: int, where: str, error: type[TopolocError]) 
 def json_number(value: Any, where: str, error: type[TopolocError]) -> float:
     """A finite number. Raises `error`, which says `where`."""
     try:
-        number = math.nan if isinstance(value, bool) or not isinstance(value, int | float) else float(value)
+        number = (
+            math.nan
+            if isinstance(value, bool) or not isinstance(value, int | float)
+            else float(value)
+        )
     except OverflowError:  # an integer of hundreds of digits
         number = math.inf
     if not math.isfinite(number):
@@ -60,6 +67,13 @@ def json_rigid(value: Any, where: str, error: type[TopolocError]) -> Rigid3:
 def name_below(name: Any, where: str, error: type[TopolocError]) -> str:
     """A file name that stays below its folder. Raises `error`, which says `where`."""
     path = PurePath(name) if isinstance(name, str) else None
-    if path is None or not path.parts or path.is_absolute() or ".." in path.parts or "\0" in str(path) or "\\" in str(path):
+    if (
+        path is None
+        or not path.parts
+        or path.is_absolute()
+        or ".." in path.parts
+        or "\0" in str(path)
+        or "\\" in str(path)
+    ):
         raise error(f"{where}: {str(name)[:80]!r} is no picture below this folder")
     return path.as_posix()

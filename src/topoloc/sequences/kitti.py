@@ -1,7 +1,8 @@
 """KITTI odometry (Geiger et al., CVPR 2012), and any folder of the same layout.
 
-``image_0/ image_1/`` (or, where these are missing, the colour ``image_2/ image_3/``), ``calib.txt`` and ``times.txt``. Truth is
-``truth.tum`` or ``poses.txt`` in the folder, or KITTI's own ``poses/<name>.txt`` beside ``sequences/``.
+``image_0/ image_1/`` (or, where these are missing, the colour ``image_2/ image_3/``), ``calib.txt``
+and ``times.txt``. Truth is ``truth.tum`` or ``poses.txt`` in the folder, or KITTI's own
+``poses/<name>.txt`` beside ``sequences/``.
 """
 
 from __future__ import annotations
@@ -25,13 +26,15 @@ _PAIRS = ((0, 1), (2, 3))
 
 
 def recognises(path: Path) -> bool:
-    """Whether this folder has KITTI's picture folders; with a camera.json instead of a calib.txt it is a plain folder."""
+    """Whether this folder has KITTI's picture folders; with a camera.json instead of a calib.txt it
+    is a plain folder."""
     has_pictures = any((path / f"image_{left}").is_dir() for left, _ in _PAIRS)
     return has_pictures and ((path / "calib.txt").is_file() or not (path / "camera.json").is_file())
 
 
 def open_kitti(path: Path) -> Recording:
-    """Open a KITTI-like folder; a plain recording of the left camera where there is no right folder.
+    """Open a KITTI-like folder; a plain recording of the left camera where there is no right
+    folder.
 
     Raises:
         RecordingError: no pictures, or left, right and times differ in number.
@@ -63,7 +66,11 @@ def read_calib(path: Path) -> dict[str, Float[np.ndarray, "3 4"]]:
     Raises:
         CalibrationError: missing, or a P line is not 12 finite numbers.
     """
-    lines = read_text(path, CalibrationError, "no calibration here; a camera.json with a baseline beside it would do as well").splitlines()
+    lines = read_text(
+        path,
+        CalibrationError,
+        "no calibration here; a camera.json with a baseline beside it would do as well",
+    ).splitlines()
     projections = {}
     for number, line in enumerate(lines, start=1):
         key, _, values = line.partition(":")
@@ -74,25 +81,41 @@ def read_calib(path: Path) -> dict[str, Float[np.ndarray, "3 4"]]:
         except ValueError:
             raise CalibrationError(f"{path}, line {number}: {key} is not 12 numbers") from None
         is_finite = np.all(np.isfinite(matrix))
-        if not is_finite or matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or np.linalg.matrix_rank(matrix[:, :3]) < 3:
+        if (
+            not is_finite
+            or matrix[0, 0] <= 0
+            or matrix[1, 1] <= 0
+            or np.linalg.matrix_rank(matrix[:, :3]) < 3
+        ):
             raise CalibrationError(f"{path}, line {number}: {key} is not a projection matrix")
         projections[key] = matrix
     return projections
 
 
-def _camera(path: Path, projections: dict[str, np.ndarray], number: int, size: tuple[int, int]) -> Camera:
+def _camera(
+    path: Path, projections: dict[str, np.ndarray], number: int, size: tuple[int, int]
+) -> Camera:
     if f"P{number}" not in projections:
         raise CalibrationError(f"{path / 'calib.txt'}: no line P{number} for image_{number}")
     p = projections[f"P{number}"]
     return Camera.pinhole(*size, p[0, 0], p[1, 1], p[0, 2], p[1, 2])
 
 
-def _rig(path: Path, projections: dict[str, np.ndarray], pair: tuple[int, int], size: tuple[int, int]) -> StereoRig:
+def _rig(
+    path: Path, projections: dict[str, np.ndarray], pair: tuple[int, int], size: tuple[int, int]
+) -> StereoRig:
     left, right = (_camera(path, projections, number, size) for number in pair)
-    # The colour cameras' P has some millimetres in y and z as well; the pictures are rectified to equal rows all the same.
-    shift = _cam_from_cam0(projections[f"P{pair[1]}"])[0] - _cam_from_cam0(projections[f"P{pair[0]}"])[0]
+    # The colour cameras' P has some millimetres in y and z as well; the pictures are rectified to
+    # equal rows all the same.
+    shift = (
+        _cam_from_cam0(projections[f"P{pair[1]}"])[0]
+        - _cam_from_cam0(projections[f"P{pair[0]}"])[0]
+    )
     if shift >= 0:
-        raise CalibrationError(f"{path / 'calib.txt'}: P{pair[1]} puts the right camera {shift:g} m to the left of the left one")
+        raise CalibrationError(
+            f"{path / 'calib.txt'}: P{pair[1]} puts the right camera {shift:g} m to the left of the"
+            " left one"
+        )
     return StereoRig(left, right, Rigid3(np.eye(3), np.array([shift, 0.0, 0.0])))
 
 

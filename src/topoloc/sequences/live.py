@@ -1,7 +1,9 @@
-"""Pictures of a camera that is running now: a webcam, an RTSP or HTTP stream, a GStreamer pipeline, by OpenCV.
+"""Pictures of a camera that is running now: a webcam, an RTSP or HTTP stream, a GStreamer pipeline,
+by OpenCV.
 
-A thread reads the source all the time and keeps the newest picture only, so that who is slower than the camera gets each picture
-late by one picture at most, and misses others. Who wants them all (a recording) makes the thread wait instead.
+A thread reads the source all the time and keeps the newest picture only, so that who is slower than
+the camera gets each picture late by one picture at most, and misses others. Who wants them all (a
+recording) makes the thread wait instead.
 """
 
 from __future__ import annotations
@@ -27,7 +29,8 @@ _CLOSING_S = 1.0
 
 
 def is_live(source: str) -> bool:
-    """Whether this names a live source and no file: a device number or ``/dev/video0``, a URL, a pipeline with `` ! ``."""
+    """Whether this names a live source and no file: a device number or ``/dev/video0``, a URL, a
+    pipeline with `` ! ``."""
     if _URL.fullmatch(source) or " ! " in source or source.startswith("/dev/video"):
         return True
     return bool(_DEVICE.fullmatch(source)) and not os.path.exists(source)
@@ -35,8 +38,8 @@ def is_live(source: str) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class LivePicture:
-    """A picture as it arrived: grey (H, W) or RGB (H, W, 3), uint8; `t_ns` is the clock's time then, nanoseconds; `number` counts all that
-    the source gave, also those that nobody took."""
+    """A picture as it arrived: grey (H, W) or RGB (H, W, 3), uint8; `t_ns` is the clock's time
+    then, nanoseconds; `number` counts all that the source gave, also those that nobody took."""
 
     image: Image
     t_ns: int
@@ -44,7 +47,8 @@ class LivePicture:
 
 
 class LiveSource:
-    """An open source; iterating gives its pictures until it ends or `stop` is set. A context manager that closes it.
+    """An open source; iterating gives its pictures until it ends or `stop` is set. A context
+    manager that closes it.
 
     Args:
         source: see `is_live`; a video file is read as if it were live.
@@ -56,7 +60,13 @@ class LiveSource:
         RecordingError: it cannot be opened; while iterating: it has stalled.
     """
 
-    def __init__(self, source: str, keep_all: bool = False, size: tuple[int, int] | None = None, stall_s: float = 10.0) -> None:
+    def __init__(
+        self,
+        source: str,
+        keep_all: bool = False,
+        size: tuple[int, int] | None = None,
+        stall_s: float = 10.0,
+    ) -> None:
         self.source, self.keep_all, self.stall_s = source, keep_all, stall_s
         self.num_read, self.stop = 0, threading.Event()
         self._capture = _open(source, size, stall_s)
@@ -118,16 +128,26 @@ def _open(source: str, size: tuple[int, int] | None, stall_s: float) -> Any:
     """An OpenCV capture. Raises RecordingError."""
     is_pipeline = " ! " in source
     if is_pipeline and not cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER):
-        raise RecordingError(f"{source}: OpenCV is built without GStreamer here; rtsp://, http:// and device numbers go without")
+        raise RecordingError(
+            f"{source}: OpenCV is built without GStreamer here; rtsp://, http:// and device numbers"
+            " go without"
+        )
     with opencv_silent():
         if is_pipeline:
             capture = cv2.VideoCapture(source, cv2.CAP_GSTREAMER)
         elif _URL.fullmatch(source):
             limit_ms = round(1e3 * stall_s)
-            limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, limit_ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC, 2 * limit_ms]
+            limits = [
+                cv2.CAP_PROP_OPEN_TIMEOUT_MSEC,
+                limit_ms,
+                cv2.CAP_PROP_READ_TIMEOUT_MSEC,
+                2 * limit_ms,
+            ]
             capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, limits)
         else:
-            capture = cv2.VideoCapture(int(source) if source.isdigit() and not os.path.exists(source) else source)
+            capture = cv2.VideoCapture(
+                int(source) if source.isdigit() and not os.path.exists(source) else source
+            )
         if capture.isOpened() and size is not None:
             capture.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])

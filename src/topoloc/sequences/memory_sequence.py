@@ -1,4 +1,5 @@
-"""Frames that are in memory, as a recording: what a program has read itself is mapped as a file would be."""
+"""Frames that are in memory, as a recording: what a program has read itself is mapped as a file
+would be."""
 
 from __future__ import annotations
 
@@ -12,12 +13,15 @@ from topoloc.sequences.frame_checks import frame_problem, times_problem
 
 
 class MemorySequence:
-    """A recording of frames in memory: stereo pairs, pictures with depth, or single pictures, with poses or without.
+    """A recording of frames in memory: stereo pairs, pictures with depth, or single pictures, with
+    poses or without.
 
-    The frames are looked at once, so that a picture of another type, size or unit is named before anything is built of it.
+    The frames are looked at once, so that a picture of another type, size or unit is named before
+    anything is built of it.
 
     Raises:
-        RecordingError: no frames, or one whose parts do not fit together; names the frame and what would mend it.
+        RecordingError: no frames, or one whose parts do not fit together; names the frame and what
+            would mend it.
     """
 
     def __init__(self, frames: Iterable[StereoFrame], name: str = "memory") -> None:
@@ -27,10 +31,19 @@ class MemorySequence:
             raise RecordingError(f"{name}: no frames")
         for number, frame in enumerate(self._frames):
             if not isinstance(frame, StereoFrame):
-                raise RecordingError(f"{name}, frame {number}: a StereoFrame is expected, not {type(frame).__name__}")
+                raise RecordingError(
+                    f"{name}, frame {number}: a StereoFrame is expected, not {type(frame).__name__}"
+                )
             problem = frame_problem(frame)
-            if problem is None and frame.camera is None and frame.image.shape[:2] != self._frames[0].image.shape[:2]:
-                problem = "its picture is of another size than the first frame's, and neither has a camera"
+            if (
+                problem is None
+                and frame.camera is None
+                and frame.image.shape[:2] != self._frames[0].image.shape[:2]
+            ):
+                problem = (
+                    "its picture is of another size than the first frame's, and neither has a"
+                    " camera"
+                )
             if problem is not None:
                 raise RecordingError(f"{name}, frame {number} ({frame.name}): {problem}")
         self._frames = [replace(frame, t_ns=int(frame.t_ns)) for frame in self._frames]

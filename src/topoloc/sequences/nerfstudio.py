@@ -1,9 +1,12 @@
-"""nerfstudio's ``transforms.json``, as its own tools, Polycam by way of them, and many phone programs write it.
+"""nerfstudio's ``transforms.json``, as its own tools, Polycam by way of them, and many phone
+programs write it.
 
-``transform_matrix`` is world_from_cam of a camera that looks along -z with y up (OpenGL's axes), in metres where the program knows them;
-`applied_scale` is taken out again. `fl_x fl_y cx cy w h` and the distortion of OpenCV stand in the file or in each frame; as in COLMAP
-the centre of the top-left pixel is (0.5, 0.5). Depth is along z, of the picture's view, in units of `depth_unit_scale_factor` metres:
-0.001 where the file says nothing, as nerfstudio's loader takes it. Frames come by name, as there, and have no times: 10 a second.
+``transform_matrix`` is world_from_cam of a camera that looks along -z with y up (OpenGL's axes), in
+metres where the program knows them; `applied_scale` is taken out again. `fl_x fl_y cx cy w h` and
+the distortion of OpenCV stand in the file or in each frame; as in COLMAP the centre of the top-left
+pixel is (0.5, 0.5). Depth is along z, of the picture's view, in units of `depth_unit_scale_factor`
+metres: 0.001 where the file says nothing, as nerfstudio's loader takes it. Frames come by name, as
+there, and have no times: 10 a second.
 """
 
 from __future__ import annotations
@@ -26,7 +29,15 @@ DEPTH_UNIT = 0.001
 """Metres: nerfstudio's own default of `depth_unit_scale_factor`."""
 CV_FROM_GL = np.diag([1.0, -1.0, -1.0])
 """Axes of OpenCV (y down, z forward) from those of OpenGL (y up, z back), of one camera."""
-_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV", "perspective")
+_PERSPECTIVE = (
+    "OPENCV",
+    "PINHOLE",
+    "SIMPLE_PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "FULL_OPENCV",
+    "perspective",
+)
 _FISHEYE = ("OPENCV_FISHEYE", "fisheye")
 
 
@@ -39,22 +50,35 @@ def open_nerfstudio(path: Path) -> Recording:
     """Open a folder with a transforms.json, or the file itself; RGB-D where its frames have depth.
 
     Raises:
-        RecordingError: no frames, malformed, depth for some of them only, or a name that leads out of the folder.
-        CalibrationError: a key of the camera is missing or not usable, or a model that is not known here.
+        RecordingError: no frames, malformed, depth for some of them only, or a name that leads out
+            of the folder.
+        CalibrationError: a key of the camera is missing or not usable, or a model that is not known
+            here.
         TrajectoryError: a matrix is no pose.
     """
     file = path if path.is_file() else path / FILE_NAME
     data = read_json(file, RecordingError)
     frames = data.get("frames") if isinstance(data, dict) else None
-    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
-        raise RecordingError(f"{file}: no list of frames, which a transforms.json of nerfstudio has")
-    named = [(name_below(frame.get("file_path"), f"{file}, frame {k}", RecordingError), frame) for k, frame in enumerate(frames)]
+    if (
+        not isinstance(frames, list)
+        or not frames
+        or not all(isinstance(frame, dict) for frame in frames)
+    ):
+        raise RecordingError(
+            f"{file}: no list of frames, which a transforms.json of nerfstudio has"
+        )
+    named = [
+        (name_below(frame.get("file_path"), f"{file}, frame {k}", RecordingError), frame)
+        for k, frame in enumerate(frames)
+    ]
     named.sort(key=lambda pair: natural_key(pair[0]))
     names = [_with_suffix(file.parent, name) for name, _ in named]
     where = [f"{file}, {name}" for name in names]
     ordered = [frame for _, frame in named]
     scale = _positive(data, "applied_scale", 1.0, str(file))
-    poses: list[Rigid3 | None] = [_pose(frame, scale, at) for frame, at in zip(ordered, where, strict=True)]
+    poses: list[Rigid3 | None] = [
+        _pose(frame, scale, at) for frame, at in zip(ordered, where, strict=True)
+    ]
     cameras = [_camera(data, frame, at) for frame, at in zip(ordered, where, strict=True)]
     depth = _depth(data, ordered, file, where)
     name, t_ns = file.parent.resolve().name, times_by_rate(len(names))
@@ -71,7 +95,9 @@ def rigid_from_gl(world_from_gl: Rigid3) -> Rigid3:
 def _pose(frame: dict[str, Any], scale: float, where: str) -> Rigid3:
     if "transform_matrix" not in frame:
         raise TrajectoryError(f"{where}: no transform_matrix")
-    world_from_gl = json_rigid(frame["transform_matrix"], f"{where}: transform_matrix", TrajectoryError)
+    world_from_gl = json_rigid(
+        frame["transform_matrix"], f"{where}: transform_matrix", TrajectoryError
+    )
     return rigid_from_gl(Rigid3(world_from_gl.rotation, world_from_gl.translation / scale))
 
 
@@ -80,23 +106,34 @@ def _camera(data: dict[str, Any], frame: dict[str, Any], where: str) -> Camera:
     values = frame | data
     model = values.get("camera_model", "OPENCV")
     if model not in _PERSPECTIVE + _FISHEYE:
-        raise CalibrationError(f"{where}: camera_model {str(model)[:40]!r} is not known here; perspective and fisheye lenses are")
+        raise CalibrationError(
+            f"{where}: camera_model {str(model)[:40]!r} is not known here; perspective and fisheye"
+            " lenses are"
+        )
     missing = [key for key in ("fl_x", "cx", "cy", "w", "h") if key not in values]
     if missing:
-        raise CalibrationError(f"{where}: {', '.join(missing)} is missing, in the file and in this frame")
+        raise CalibrationError(
+            f"{where}: {', '.join(missing)} is missing, in the file and in this frame"
+        )
     keys = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4")
     defaults = dict.fromkeys(keys, 0.0) | {"fl_y": values["fl_x"]}
     w, h, fx, fy, cx, cy, k1, k2, p1, p2, k3, k4 = (
-        json_number(values.get(key, defaults[key]), f"{where}: {key}", CalibrationError) for key in keys
+        json_number(values.get(key, defaults[key]), f"{where}: {key}", CalibrationError)
+        for key in keys
     )
     params = (fx, fy, cx, cy)
     try:
         if model in _FISHEYE:
             return Camera.from_colmap("OPENCV_FISHEYE", int(w), int(h), (*params, k1, k2, k3, k4))
-        if k4 != 0.0:  # nerfstudio's fourth radial coefficient is none of OpenCV's model, whose k4 is a divisor
+        if (
+            k4 != 0.0
+            # nerfstudio's fourth radial coefficient is none of OpenCV's model, whose k4 is a divisor  # noqa: E501
+        ):
             raise CalibrationError("a fourth radial coefficient is not known here")
         if k3 != 0.0:
-            return Camera.from_colmap("FULL_OPENCV", int(w), int(h), (*params, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
+            return Camera.from_colmap(
+                "FULL_OPENCV", int(w), int(h), (*params, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
+            )
         if (k1, k2, p1, p2) == (0.0, 0.0, 0.0, 0.0):
             return Camera.from_colmap("PINHOLE", int(w), int(h), params)
         return Camera.from_colmap("OPENCV", int(w), int(h), (*params, k1, k2, p1, p2))
@@ -104,14 +141,22 @@ def _camera(data: dict[str, Any], frame: dict[str, Any], where: str) -> Camera:
         raise CalibrationError(f"{where}: {error}") from None
 
 
-def _depth(data: dict[str, Any], frames: list[dict[str, Any]], file: Path, where: list[str]) -> DepthPictures | None:
+def _depth(
+    data: dict[str, Any], frames: list[dict[str, Any]], file: Path, where: list[str]
+) -> DepthPictures | None:
     with_depth = sum("depth_file_path" in frame for frame in frames)
     if with_depth == 0:
         return None
     if with_depth != len(frames):
-        raise RecordingError(f"{file}: {len(frames)} frames but {with_depth} with a depth_file_path; all of them need one, or none")
+        raise RecordingError(
+            f"{file}: {len(frames)} frames but {with_depth} with a depth_file_path; all of them"
+            " need one, or none"
+        )
     pairs = zip(frames, where, strict=True)
-    paths = [file.parent / name_below(frame["depth_file_path"], f"{at}: depth_file_path", RecordingError) for frame, at in pairs]
+    paths = [
+        file.parent / name_below(frame["depth_file_path"], f"{at}: depth_file_path", RecordingError)
+        for frame, at in pairs
+    ]
     unit = _positive(data, "depth_unit_scale_factor", DEPTH_UNIT, str(file))
     return DepthPictures(paths, 1.0 / unit, None, Rigid3.identity())
 

@@ -1,7 +1,9 @@
-"""Picture files: checked by their headers, decoded once by Pillow, and brought to this house's types.
+"""Picture files: checked by their headers, decoded once by Pillow, and brought to this house's
+types.
 
-A broken file must not become a half-grey picture, nor a small file fill the memory: size and type are known before anything is decoded,
-and files that end early are refused. A picture is turned as its EXIF orientation says, and its size is that of the turned picture.
+A broken file must not become a half-grey picture, nor a small file fill the memory: size and type
+are known before anything is decoded, and files that end early are refused. A picture is turned as
+its EXIF orientation says, and its size is that of the turned picture.
 """
 
 from __future__ import annotations
@@ -37,7 +39,9 @@ from PIL import Image as Pillow
 from topoloc.errors import UnreadableImageError
 from topoloc.sequences.frame import Image
 
-PICTURE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp", ".heic", ".heif"})
+PICTURE_SUFFIXES = frozenset(
+    {".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp", ".heic", ".heif"}
+)
 MAX_PIXELS = 100_000_000
 _TYPES = ("PNG", "JPEG", "BMP", "PPM", "TIFF", "WEBP")
 # Pillow warns of odd metadata, and of pictures larger than it likes; the limit here is ours.
@@ -47,12 +51,24 @@ _MM_OF_UNIT = {2: 25.4, 3: 10.0, 4: 1.0}  # inch, centimetre, millimetre
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _TURNED = (5, 6, 7, 8)  # EXIF orientations that lay a picture on its side
 # What Pillow raises about damaged files of one kind or another.
-_DAMAGED = (OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, OverflowError, EOFError, struct.error, zlib.error)
+_DAMAGED = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    TypeError,
+    KeyError,
+    IndexError,
+    OverflowError,
+    EOFError,
+    struct.error,
+    zlib.error,
+)
 
 
 @dataclass(frozen=True)
 class PictureBytes:
-    """An encoded picture that is no file of its own, such as a message's; `name` is what errors call it."""
+    """An encoded picture that is no file of its own, such as a message's; `name` is what errors
+    call it."""
 
     name: str
     data: bytes
@@ -63,10 +79,12 @@ class PictureBytes:
 
 
 def read_image(path: Path | PictureBytes) -> Image:
-    """A picture as grey (H, W) or RGB (H, W, 3), uint8; alpha is dropped, 16 bits are scaled down to 8.
+    """A picture as grey (H, W) or RGB (H, W, 3), uint8; alpha is dropped, 16 bits are scaled down
+    to 8.
 
     Raises:
-        UnreadableImageError: missing, empty, truncated, damaged, no picture, or of more than 100 megapixels.
+        UnreadableImageError: missing, empty, truncated, damaged, no picture, or of more than 100
+            megapixels.
     """
     with _decoded(path) as picture:
         if picture.mode in _GREY:
@@ -91,7 +109,9 @@ def read_depth(path: Path | PictureBytes, units_per_metre: float) -> Float32[np.
     """
     with _decoded(path) as picture:
         if picture.mode not in _GREY_16:
-            raise UnreadableImageError(f"{path}: depth must be one channel of 16 bits, not pixels of {picture.mode}")
+            raise UnreadableImageError(
+                f"{path}: depth must be one channel of 16 bits, not pixels of {picture.mode}"
+            )
         units = np.array(picture).astype(np.uint16)
     depth = units.astype(np.float32) / np.float32(units_per_metre)
     depth[(units == 0) | (units == 65535)] = np.nan
@@ -112,14 +132,19 @@ def image_size(path: Path | PictureBytes) -> tuple[int, int]:
     """
     with _opened(path) as picture:
         width, height = picture.size
-        return (height, width) if picture.getexif().get(ExifTags.Base.Orientation) in _TURNED else (width, height)
+        return (
+            (height, width)
+            if picture.getexif().get(ExifTags.Base.Orientation) in _TURNED
+            else (width, height)
+        )
 
 
 def exif_focal_length(path: Path | PictureBytes, width: int, height: int) -> float | None:
-    """Focal length in pixels of a picture of this size, by its EXIF data; None where the file says nothing usable.
+    """Focal length in pixels of a picture of this size, by its EXIF data; None where the file says
+    nothing usable.
 
-    The focal length equivalent on 35 mm film counts first (its diagonal stands for the picture's), then the one in millimetres with the
-    resolution of the sensor (EXIF 2.32, JEITA CP-3451).
+    The focal length equivalent on 35 mm film counts first (its diagonal stands for the picture's),
+    then the one in millimetres with the resolution of the sensor (EXIF 2.32, JEITA CP-3451).
     """
     try:
         with _opened(path) as picture:
@@ -131,8 +156,15 @@ def exif_focal_length(path: Path | PictureBytes, width: int, height: int) -> flo
     if not focal > 0.0:
         mm_a_unit = _MM_OF_UNIT.get(int(tags[ExifTags.Base.FocalPlaneResolutionUnit]), 25.4)
         exif_width = tags[ExifTags.Base.ExifImageWidth]
-        scale = max(width, height) / exif_width if exif_width > 0.0 else 1.0  # the width as taken, before it was turned
-        focal = tags[ExifTags.Base.FocalLength] * tags[ExifTags.Base.FocalPlaneXResolution] / mm_a_unit * scale
+        scale = (
+            max(width, height) / exif_width if exif_width > 0.0 else 1.0
+        )  # the width as taken, before it was turned
+        focal = (
+            tags[ExifTags.Base.FocalLength]
+            * tags[ExifTags.Base.FocalPlaneXResolution]
+            / mm_a_unit
+            * scale
+        )
     side = max(width, height)
     return focal if 0.1 * side < focal < 50.0 * side else None
 
@@ -150,7 +182,9 @@ def _read_bytes(path: Path | PictureBytes) -> bytes:
     try:
         if isinstance(path, PictureBytes):
             return path.data
-        if not stat.S_ISREG(path.stat().st_mode) and not path.is_dir():  # a FIFO would be waited for
+        if (
+            not stat.S_ISREG(path.stat().st_mode) and not path.is_dir()
+        ):  # a FIFO would be waited for
             raise UnreadableImageError(f"{path}: not a file")
         data = path.read_bytes()
     except FileNotFoundError:
@@ -166,7 +200,8 @@ def _read_bytes(path: Path | PictureBytes) -> bytes:
 
 @contextmanager
 def _opened(path: Path | PictureBytes) -> Iterator[ImageFile.ImageFile]:
-    """The picture with its header read. What the body raises of a damaged file comes as UnreadableImageError, too."""
+    """The picture with its header read. What the body raises of a damaged file comes as
+    UnreadableImageError, too."""
     data = _read_bytes(path)
     try:
         types = _known_types(path)
@@ -177,13 +212,19 @@ def _opened(path: Path | PictureBytes) -> Iterator[ImageFile.ImageFile]:
     except Pillow.UnidentifiedImageError:
         raise UnreadableImageError(f"{path}: {_not_a_picture(data)}") from None
     except Pillow.DecompressionBombError:
-        raise UnreadableImageError(f"{path}: more than {MAX_PIXELS // 1_000_000} megapixels") from None
+        raise UnreadableImageError(
+            f"{path}: more than {MAX_PIXELS // 1_000_000} megapixels"
+        ) from None
     except _DAMAGED as error:
-        raise UnreadableImageError(f"{path}: not a picture, or damaged ({_one_line(error)})") from None
+        raise UnreadableImageError(
+            f"{path}: not a picture, or damaged ({_one_line(error)})"
+        ) from None
     with picture:
         width, height = picture.size
         if width * height > MAX_PIXELS:
-            raise UnreadableImageError(f"{path}: {width}x{height} is more than {MAX_PIXELS // 1_000_000} megapixels")
+            raise UnreadableImageError(
+                f"{path}: {width}x{height} is more than {MAX_PIXELS // 1_000_000} megapixels"
+            )
         try:
             yield picture
         except _DAMAGED as error:
@@ -208,7 +249,9 @@ def _known_types(path: Path | PictureBytes) -> tuple[str, ...]:
     try:
         import pi_heif  # pyright: ignore[reportMissingImports]
     except ImportError:
-        raise UnreadableImageError(f"{path}: HEIC pictures need the extra heic: pip install 'topoloc[heic]'") from None
+        raise UnreadableImageError(
+            f"{path}: HEIC pictures need the extra heic: pip install 'topoloc[heic]'"
+        ) from None
     pi_heif.register_heif_opener()
     return (*_TYPES, "HEIF")
 
@@ -218,7 +261,14 @@ def _one_line(error: Exception) -> str:
 
 
 def _not_a_picture(data: bytes) -> str:
-    starts = {b"\x89PNG": "PNG", b"\xff\xd8": "JPEG", b"BM": "BMP", b"RIFF": "WebP", b"II*\0": "TIFF", b"MM\0*": "TIFF"}
+    starts = {
+        b"\x89PNG": "PNG",
+        b"\xff\xd8": "JPEG",
+        b"BM": "BMP",
+        b"RIFF": "WebP",
+        b"II*\0": "TIFF",
+        b"MM\0*": "TIFF",
+    }
     known = next((name for start, name in starts.items() if data.startswith(start)), None)
     if known is not None:
         return f"damaged or truncated {known} file"

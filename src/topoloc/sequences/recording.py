@@ -1,4 +1,5 @@
-"""The one sequence type behind every format: lists in memory, pictures on disk until they are asked for."""
+"""The one sequence type behind every format: lists in memory, pictures on disk until they are asked
+for."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ from topoloc.sequences.pictures import PICTURE_SUFFIXES, exif_focal_length, read
 
 # Recordings without times are taken to be of this rate.
 DEFAULT_RATE_HZ = 10
-# Numbers of up to 18 digits: longer ones name no frame, and Python refuses to read those of thousands.
+# Numbers of up to 18 digits: longer ones name no frame, and Python refuses to read those of
+# thousands.
 _SLICE = re.compile(r"(-?\d{1,18})?:(-?\d{1,18})?(?::([1-9]\d{0,17})?)?")
 _BLOCK = re.compile(r"(\d{1,18})-(\d{1,18})/([1-9]\d{0,17})")
 _INDEX = re.compile(r"-?\d{1,18}")
@@ -36,7 +38,8 @@ class RightPictures:
 
 @dataclass(frozen=True, eq=False)
 class DepthPictures:
-    """The depth picture of each frame: its scale (file units a metre), its camera, and where that camera sits.
+    """The depth picture of each frame: its scale (file units a metre), its camera, and where that
+    camera sits.
 
     Without a camera it shows what the frame's own picture shows, in pixels of any size.
     """
@@ -49,10 +52,11 @@ class DepthPictures:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A StereoSequence on disk. `names` are picture paths relative to `root`; `camera` is that of the left or colour picture.
+    """A StereoSequence on disk. `names` are picture paths relative to `root`; `camera` is that of
+    the left or colour picture.
 
-    `cameras` are those of the frames one by one, where they are not of one camera. Poses of a model of pictures alone are in no metres
-    (`has_scale`).
+    `cameras` are those of the frames one by one, where they are not of one camera. Poses of a model
+    of pictures alone are in no metres (`has_scale`).
     """
 
     name: str
@@ -90,10 +94,21 @@ class Recording:
     def left_frame(self, index: int) -> StereoFrame:
         """Read one frame but for its right or depth picture. Raises as the whole frame does."""
         path = self.root / self.names[index]
-        camera, rig = self.camera if self.cameras is None else self.cameras[index], None if self.right is None else self.right.rig
+        camera, rig = (
+            self.camera if self.cameras is None else self.cameras[index],
+            None if self.right is None else self.right.rig,
+        )
         image = _read_as(path, camera)
         focal = exif_focal_length(path, image.shape[1], image.shape[0]) if camera is None else None
-        return StereoFrame(self.names[index], self.t_ns[index], image, camera, rig=rig, world_from_cam=self.poses[index], noted_focal=focal)
+        return StereoFrame(
+            self.names[index],
+            self.t_ns[index],
+            image,
+            camera,
+            rig=rig,
+            world_from_cam=self.poses[index],
+            noted_focal=focal,
+        )
 
 
 @runtime_checkable
@@ -118,8 +133,8 @@ class _PartlyRead(Protocol):
 class SequenceView:
     """Some frames of another sequence, in this order, with these poses.
 
-    `apart` are poses of stretches of which nobody knows how they lie to the others: each in a world of its own, a pose a frame, None
-    outside of the stretch.
+    `apart` are poses of stretches of which nobody knows how they lie to the others: each in a world
+    of its own, a pose a frame, None outside of the stretch.
     """
 
     base: StereoSequence
@@ -153,7 +168,10 @@ def has_scale(sequence: StereoSequence) -> bool:
     """Whether the poses are in metres, as far as is known."""
     while isinstance(sequence, SequenceView):
         before = sequence.base.poses
-        if any(pose is not before[index] for index, pose in zip(sequence.indices, sequence.poses, strict=True)):
+        if any(
+            pose is not before[index]
+            for index, pose in zip(sequence.indices, sequence.poses, strict=True)
+        ):
             return True  # poses from elsewhere
         sequence = sequence.base
     return not isinstance(sequence, Recording) or sequence.has_scale
@@ -161,7 +179,10 @@ def has_scale(sequence: StereoSequence) -> bool:
 
 def scaled(sequence: StereoSequence, metres: float) -> StereoSequence:
     """The same recording with poses of which a unit is so many metres."""
-    poses = [None if pose is None else Rigid3(pose.rotation, metres * pose.translation) for pose in sequence.poses]
+    poses = [
+        None if pose is None else Rigid3(pose.rotation, metres * pose.translation)
+        for pose in sequence.poses
+    ]
     return SequenceView(sequence, list(range(len(sequence))), poses)
 
 
@@ -173,20 +194,29 @@ def single_pictures(sequence: StereoSequence) -> StereoSequence:
 
 
 def left_frame(sequence: StereoSequence, index: int) -> StereoFrame:
-    """A frame of which only the left (or colour) picture is asked: right and depth pictures are not read, where that is possible. A
-    pair's rig is there, for it says how the left picture is rectified. Raises as the sequence does."""
+    """A frame of which only the left (or colour) picture is asked: right and depth pictures are not
+    read, where that is possible. A pair's rig is there, for it says how the left picture is
+    rectified. Raises as the sequence does."""
     if type(sequence) is SequenceView:  # one that reads otherwise is asked itself
-        return replace(left_frame(sequence.base, sequence.indices[index]), world_from_cam=sequence.poses[index])
+        return replace(
+            left_frame(sequence.base, sequence.indices[index]), world_from_cam=sequence.poses[index]
+        )
     return sequence.left_frame(index) if isinstance(sequence, _PartlyRead) else sequence[index]
 
 
 def notes_of(sequence: StereoSequence) -> list[str]:
-    """What a user should know of a recording that could be opened all the same: what was cut off, what was guessed."""
-    return notes_of(sequence.base) if isinstance(sequence, SequenceView) else list(getattr(sequence, "notes", ()))
+    """What a user should know of a recording that could be opened all the same: what was cut off,
+    what was guessed."""
+    return (
+        notes_of(sequence.base)
+        if isinstance(sequence, SequenceView)
+        else list(getattr(sequence, "notes", ()))
+    )
 
 
 def sequence_subset(sequence: StereoSequence, indices: Sequence[int]) -> StereoSequence:
-    """These frames of a sequence, in this order, with their poses; pictures are still read one by one.
+    """These frames of a sequence, in this order, with their poses; pictures are still read one by
+    one.
 
     Raises:
         IndexError: an index lies outside the sequence.
@@ -196,10 +226,11 @@ def sequence_subset(sequence: StereoSequence, indices: Sequence[int]) -> StereoS
 
 
 def parse_selection(text: str, num_frames: int) -> list[int]:
-    """Frame numbers, increasing and once each, of a selection such as ``0::2``, ``0:10,50:60``, ``-1`` or ``0-59/100``.
+    """Frame numbers, increasing and once each, of a selection such as ``0::2``, ``0:10,50:60``,
+    ``-1`` or ``0-59/100``.
 
-    A slice is Python's, with a positive step; ``FIRST-LAST/PERIOD`` are the frames whose number modulo PERIOD lies in
-    FIRST to LAST, both included.
+    A slice is Python's, with a positive step; ``FIRST-LAST/PERIOD`` are the frames whose number
+    modulo PERIOD lies in FIRST to LAST, both included.
 
     Raises:
         RecordingError: it is none of these, or a single number lies outside the recording.
@@ -208,7 +239,11 @@ def parse_selection(text: str, num_frames: int) -> list[int]:
     for part in text.split(","):
         part = part.strip()
         if bounds := _SLICE.fullmatch(part):
-            chosen.update(range(num_frames)[slice(*(int(bound) if bound else None for bound in bounds.groups()))])
+            chosen.update(
+                range(num_frames)[
+                    slice(*(int(bound) if bound else None for bound in bounds.groups()))
+                ]
+            )
         elif block := _BLOCK.fullmatch(part):
             first, last, period = (int(number) for number in block.groups())
             chosen.update(index for index in range(num_frames) if first <= index % period <= last)
@@ -217,18 +252,25 @@ def parse_selection(text: str, num_frames: int) -> list[int]:
                 raise RecordingError(f"frame {part} of a recording of {num_frames}")
             chosen.add(int(part) % num_frames)
         else:
-            raise RecordingError(f"{part!r} chooses no frames; write START:STOP:STEP, a number, or FIRST-LAST/PERIOD")
+            raise RecordingError(
+                f"{part!r} chooses no frames; write START:STOP:STEP, a number, or FIRST-LAST/PERIOD"
+            )
     return sorted(chosen)
 
 
 def list_pictures(folder: Path, suffix: str = "") -> list[Path]:
-    """The picture files of a folder in natural order (2 before 10), those only whose name ends in `suffix` if given.
+    """The picture files of a folder in natural order (2 before 10), those only whose name ends in
+    `suffix` if given.
 
     Raises:
         RecordingError: the folder is missing or holds no picture.
     """
     try:
-        paths = [path for path in folder.iterdir() if path.suffix.lower() in PICTURE_SUFFIXES and path.stem.endswith(suffix)]
+        paths = [
+            path
+            for path in folder.iterdir()
+            if path.suffix.lower() in PICTURE_SUFFIXES and path.stem.endswith(suffix)
+        ]
     except OSError as error:
         raise RecordingError(f"{folder}: {error.strerror}") from None
     paths = [path for path in paths if not path.name.startswith(".")]
@@ -238,24 +280,33 @@ def list_pictures(folder: Path, suffix: str = "") -> list[Path]:
 
 
 def natural_key(name: str) -> list[tuple[int, str]]:
-    """A sort key by which numbers inside names compare as numbers, however many digits they have."""
+    """A sort key by which numbers inside names compare as numbers, however many digits they
+    have."""
     parts = re.split(r"([0-9]+)", name)
-    return [(len(number := part.lstrip("0")), number) if part.isdigit() else (-1, part) for part in parts]
+    return [
+        (len(number := part.lstrip("0")), number) if part.isdigit() else (-1, part)
+        for part in parts
+    ]
 
 
 def check_pairs(left: Sequence[Path], right: Sequence[Path]) -> None:
     """Hold that two lists of pictures go together, frame by frame.
 
     Raises:
-        RecordingError: of unequal lengths, or the numbers in two names that would go together differ.
+        RecordingError: of unequal lengths, or the numbers in two names that would go together
+            differ.
     """
     if len(left) != len(right):
         raise RecordingError(
-            f"{left[0].parent}: {len(left)} pictures here but {len(right)} in {right[0].parent.name}; every picture needs its partner"
+            f"{left[0].parent}: {len(left)} pictures here but {len(right)} in"
+            f" {right[0].parent.name}; every picture needs its partner"
         )
     for path, other in zip(left, right, strict=True):
         if re.findall(r"\d+", path.stem)[-1:] != re.findall(r"\d+", other.stem)[-1:]:
-            raise RecordingError(f"{path}: its partner in {other.parent.name} is missing (the next there is {other.name})")
+            raise RecordingError(
+                f"{path}: its partner in {other.parent.name} is missing (the next there is"
+                f" {other.name})"
+            )
 
 
 def nearest_rows(times: np.ndarray, others: np.ndarray) -> list[int]:
@@ -263,7 +314,9 @@ def nearest_rows(times: np.ndarray, others: np.ndarray) -> list[int]:
     after = np.clip(np.searchsorted(others, times), 1, max(len(others) - 1, 1))
     before = after - 1
     after = np.minimum(after, len(others) - 1)
-    return [int(row) for row in np.where(times - others[before] <= others[after] - times, before, after)]
+    return [
+        int(row) for row in np.where(times - others[before] <= others[after] - times, before, after)
+    ]
 
 
 def times_by_rate(num_frames: int, rate_hz: int = DEFAULT_RATE_HZ) -> list[int]:
@@ -291,4 +344,7 @@ def _read_as(path: Path, camera: Camera | None) -> Image:
 
 def _check_size(path: Path, shape: tuple[int, ...], camera: Camera) -> None:
     if shape[:2] != (camera.height, camera.width):
-        raise UnreadableImageError(f"{path}: {shape[1]}x{shape[0]} pixels, but its camera is of {camera.width}x{camera.height}")
+        raise UnreadableImageError(
+            f"{path}: {shape[1]}x{shape[0]} pixels, but its camera is of"
+            f" {camera.width}x{camera.height}"
+        )

@@ -1,4 +1,5 @@
-"""Numba kernels of depth registration: one pass over a depth picture's pixels each, no array in between but the points."""
+"""Numba kernels of depth registration: one pass over a depth picture's pixels each, no array in
+between but the points."""
 
 from __future__ import annotations
 
@@ -11,7 +12,8 @@ from topoloc.compiled import kernel
 def back_project(depth, normalized, rotation, translation, points):
     """Fill `points` (n, 3) with what the known pixels see, in the other camera's frame; returns n.
 
-    `normalized` (h * w, 2) are the pixels on the depth camera's plane z = 1; `points` has room for every pixel.
+    `normalized` (h * w, 2) are the pixels on the depth camera's plane z = 1; `points` has room for
+    every pixel.
     """
     height, width = depth.shape
     count = 0
@@ -22,7 +24,12 @@ def back_project(depth, normalized, rotation, translation, points):
                 continue
             x, y = normalized[row * width + column, 0] * z, normalized[row * width + column, 1] * z
             for axis in range(3):
-                points[count, axis] = rotation[axis, 0] * x + rotation[axis, 1] * y + rotation[axis, 2] * z + translation[axis]
+                points[count, axis] = (
+                    rotation[axis, 0] * x
+                    + rotation[axis, 1] * y
+                    + rotation[axis, 2] * z
+                    + translation[axis]
+                )
             count += 1
     return count
 
@@ -39,8 +46,9 @@ def _keep(x, y, depth, registered):
 
 @kernel(error_model="numpy")
 def register_without_lens(depth, normalized, rotation, translation, focal, centre, registered):
-    """`back_project`, the pixels of a camera without distortion (focal lengths and principal point, x and y) and `keep_nearest` in one
-    pass, without the points in between; the same numbers to the bit."""
+    """`back_project`, the pixels of a camera without distortion (focal lengths and principal point,
+    x and y) and `keep_nearest` in one pass, without the points in between; the same numbers to the
+    bit."""
     height, width = depth.shape
     for row in range(height):
         for column in range(width):
@@ -52,11 +60,14 @@ def register_without_lens(depth, normalized, rotation, translation, focal, centr
             py = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation[1]
             pz = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation[2]
             if pz > 1e-9:
-                _keep(px / pz * focal[0] + centre[0], py / pz * focal[1] + centre[1], pz, registered)
+                _keep(
+                    px / pz * focal[0] + centre[0], py / pz * focal[1] + centre[1], pz, registered
+                )
 
 
 @kernel(error_model="numpy")
 def keep_nearest(pixels, points, registered):
-    """Write each point's z into `registered` at its rounded pixel (NaN: none), where nothing nearer is."""
+    """Write each point's z into `registered` at its rounded pixel (NaN: none), where nothing nearer
+    is."""
     for i in range(len(pixels)):
         _keep(pixels[i, 0], pixels[i, 1], points[i, 2], registered)

@@ -1,4 +1,5 @@
-"""Stereolabs' SVO files, through their SDK: rectified pairs, with the calibration that goes with them."""
+"""Stereolabs' SVO files, through their SDK: rectified pairs, with the calibration that goes with
+them."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ SVO_SUFFIXES = frozenset({".svo", ".svo2"})
 
 @dataclass(eq=False)
 class SvoRecording:
-    """A StereoSequence in an SVO file. Frames are decoded in their order; to ask for another one seeks."""
+    """A StereoSequence in an SVO file. Frames are decoded in their order; to ask for another one
+    seeks."""
 
     name: str
     path: Path
@@ -61,8 +63,16 @@ class SvoRecording:
             raise UnreadableImageError(f"{self.path}, frame {index}: cannot be decoded")
         self._position[0] = index + 1
         view = self.sdk.VIEW
-        frame = StereoFrame(self.names[index], self.t_ns[index], self._view(view.LEFT), self.rig.left, world_from_cam=self.poses[index])
-        return replace(frame, right=self._view(view.RIGHT), rig=self.rig) if self.with_right else frame
+        frame = StereoFrame(
+            self.names[index],
+            self.t_ns[index],
+            self._view(view.LEFT),
+            self.rig.left,
+            world_from_cam=self.poses[index],
+        )
+        return (
+            replace(frame, right=self._view(view.RIGHT), rig=self.rig) if self.with_right else frame
+        )
 
     def _view(self, view: Any) -> Image:
         return picture_of(self.sdk, self.camera, view)
@@ -79,8 +89,9 @@ def open_svo(path: Path) -> SvoRecording:
         sl = sdk("an SVO file")
     except MissingExtraError:
         raise MissingExtraError(
-            f"{path}: SVO files need pyzed of Stereolabs' ZED SDK; without it export the rectified pairs on a machine that has it "
-            "(its sample svo_export, mode 2) into left/ and right/ with a camera.json"
+            f"{path}: SVO files need pyzed of Stereolabs' ZED SDK; without it export the rectified"
+            " pairs on a machine that has it (its sample svo_export, mode 2) into left/ and right/"
+            " with a camera.json"
         ) from None
     settings = sl.InitParameters()
     settings.set_from_svo_file(str(path))
@@ -105,7 +116,9 @@ def sdk(what: str) -> Any:
     try:
         import pyzed.sl as sl  # pyright: ignore[reportMissingImports]
     except ImportError:
-        raise MissingExtraError(f"{what} needs pyzed of Stereolabs' ZED SDK, which is not installed") from None
+        raise MissingExtraError(
+            f"{what} needs pyzed of Stereolabs' ZED SDK, which is not installed"
+        ) from None
     return sl
 
 

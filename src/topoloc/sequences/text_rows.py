@@ -13,9 +13,12 @@ from jaxtyping import Float
 from topoloc.errors import TopolocError
 
 NANOSECONDS = 1_000_000_000
-# Above this a time is taken for nanoseconds (ORB-SLAM3 writes EuRoC's so): as seconds it would be 30 000 years.
+# Above this a time is taken for nanoseconds (ORB-SLAM3 writes EuRoC's so): as seconds it would be
+# 30 000 years.
 _MAX_SECONDS = 10**12
-_MAX_DIGITS = 25  # before the decimal point; no clock counts further, and an integer of a million digits takes minutes
+# before the decimal point; no clock counts further, and an integer of a million digits takes
+# minutes
+_MAX_DIGITS = 25
 
 
 def read_text(path: Path, error: type[TopolocError], missing: str = "no such file") -> str:
@@ -31,12 +34,17 @@ def read_text(path: Path, error: type[TopolocError], missing: str = "no such fil
 
 
 def read_rows(path: Path, error: type[TopolocError]) -> list[tuple[int, list[str]]]:
-    """Line number and columns (split at spaces and commas) of each line; blank lines and comments (``#``) are left out.
+    """Line number and columns (split at spaces and commas) of each line; blank lines and comments
+    (``#``) are left out.
 
     Raises:
         error: the file is missing, no text, or holds no row; names it.
     """
-    rows = [(number, columns) for number, line in enumerate(_lines(path, error), start=1) if (columns := line.split())]
+    rows = [
+        (number, columns)
+        for number, line in enumerate(_lines(path, error), start=1)
+        if (columns := line.split())
+    ]
     if not rows:
         raise error(f"{path}: nothing in this file")
     return rows
@@ -45,7 +53,11 @@ def read_rows(path: Path, error: type[TopolocError]) -> list[tuple[int, list[str
 def _lines(path: Path, error: type[TopolocError]) -> list[str]:
     """The file's lines without comments, commas as spaces."""
     text = read_text(path, error).replace(",", " ")
-    return text.splitlines() if "#" not in text else [line.partition("#")[0] for line in text.splitlines()]
+    return (
+        text.splitlines()
+        if "#" not in text
+        else [line.partition("#")[0] for line in text.splitlines()]
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +69,8 @@ class PlainTable:
 
 
 def read_plain_table(path: Path, error: type[TopolocError]) -> PlainTable | None:
-    """A file of finite numbers alone, equally many a line (comments are left out), read at once; None where it is another.
+    """A file of finite numbers alone, equally many a line (comments are left out), read at once;
+    None where it is another.
 
     Raises:
         error: the file is missing or no text.
@@ -69,14 +82,21 @@ def read_plain_table(path: Path, error: type[TopolocError]) -> PlainTable | None
         numbers = np.loadtxt(lines, comments=None, ndmin=2)
     except ValueError:
         return None
-    return PlainTable(numbers, lines) if len(numbers) == len(lines) and np.isfinite(numbers).all() else None
+    return (
+        PlainTable(numbers, lines)
+        if len(numbers) == len(lines) and np.isfinite(numbers).all()
+        else None
+    )
 
 
 def plain_times(lines: Sequence[str]) -> list[int] | None:
-    """As `parse_times`, of lines whose times are all written alike, such as ``1403636579.763555584``; None of any other."""
+    """As `parse_times`, of lines whose times are all written alike, such as
+    ``1403636579.763555584``; None of any other."""
     width = len(lines[0].split(None, 1)[0])
     try:
-        characters = np.frombuffer("".join([line[: width + 1] for line in lines]).encode("ascii"), np.uint8)
+        characters = np.frombuffer(
+            "".join([line[: width + 1] for line in lines]).encode("ascii"), np.uint8
+        )
     except UnicodeEncodeError:
         return None
     if characters.size != len(lines) * (width + 1):
@@ -87,7 +107,9 @@ def plain_times(lines: Sequence[str]) -> list[int] | None:
     dots = [number for number, column in enumerate(columns) if column[0] == ord(".")]
     at = dots[0] if dots else width
     digits = columns[:at] + columns[at + 1 :]
-    if (dots and (columns[at] != ord(".")).any()) or not 1 <= at <= 10 or len(digits) - at > 9:  # ten digits: seconds, no nanoseconds
+    if (
+        (dots and (columns[at] != ord(".")).any()) or not 1 <= at <= 10 or len(digits) - at > 9
+    ):  # ten digits: seconds, no nanoseconds
         return None
     t_ns = np.zeros(len(lines), dtype=np.int64)
     for column in digits:
@@ -98,8 +120,11 @@ def plain_times(lines: Sequence[str]) -> list[int] | None:
     return t_ns.tolist() if (np.diff(t_ns) > 0).all() else None
 
 
-def parse_times(rows: Sequence[tuple[int, list[str]]], path: Path, error: type[TopolocError]) -> list[int]:
-    """Integer nanoseconds of the first column, exact to the last decimal; it is in seconds, or nanoseconds where one is above 1e12.
+def parse_times(
+    rows: Sequence[tuple[int, list[str]]], path: Path, error: type[TopolocError]
+) -> list[int]:
+    """Integer nanoseconds of the first column, exact to the last decimal; it is in seconds, or
+    nanoseconds where one is above 1e12.
 
     Raises:
         error: not a finite number, or the times do not increase strictly; names file and line.
@@ -125,7 +150,8 @@ def read_file_list(path: Path, error: type[TopolocError]) -> tuple[list[int], li
     """Times in nanoseconds and file names of a list of pictures, which lie below the list's folder.
 
     Raises:
-        error: as `read_rows` and `parse_times`, a line has no second column, or a name leads out of the folder.
+        error: as `read_rows` and `parse_times`, a line has no second column, or a name leads out of
+            the folder.
     """
     rows = read_rows(path, error)
     for line, columns in rows:

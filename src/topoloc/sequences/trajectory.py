@@ -1,8 +1,8 @@
 """Trajectories: TUM files and KITTI rows, read, written, and looked up at the times of frames.
 
-TUM (Sturm et al., IROS 2012): a line is ``t tx ty tz qx qy qz qw``, seconds, comments start with ``#``.
-KITTI (Geiger et al., CVPR 2012): a line is the upper 3x4 of a pose matrix, row by row, one line a frame.
-Both are world_from_cam, in metres.
+TUM (Sturm et al., IROS 2012): a line is ``t tx ty tz qx qy qz qw``, seconds, comments start with
+``#``. KITTI (Geiger et al., CVPR 2012): a line is the upper 3x4 of a pose matrix, row by row, one
+line a frame. Both are world_from_cam, in metres.
 """
 
 from __future__ import annotations
@@ -23,7 +23,13 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.atomic import write_text
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.recording import SequenceView, times_by_rate
-from topoloc.sequences.text_rows import NANOSECONDS, parse_times, plain_times, read_plain_table, read_rows
+from topoloc.sequences.text_rows import (
+    NANOSECONDS,
+    parse_times,
+    plain_times,
+    read_plain_table,
+    read_rows,
+)
 
 # Times written with few decimals still mean the frame they were made from.
 _SAME_TIME_NS = 1_000_000
@@ -35,7 +41,8 @@ _Rows = Sequence[tuple[int, list[str]]]
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Poses in order of time. `t_ns` are their times, strictly increasing, or None where a pose goes with a frame by its row."""
+    """Poses in order of time. `t_ns` are their times, strictly increasing, or None where a pose
+    goes with a frame by its row."""
 
     world_from_cam: Sequence[Rigid3]
     t_ns: list[int] | None = None
@@ -45,16 +52,19 @@ class Trajectory:
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """Read a TUM file (8 columns; times in seconds, or nanoseconds by their size) or KITTI rows (12 columns).
+    """Read a TUM file (8 columns; times in seconds, or nanoseconds by their size) or KITTI rows (12
+    columns).
 
     Raises:
-        TrajectoryError: missing, empty, a wrong number of columns, NaN, no rotation, or times that do not increase; with the line.
+        TrajectoryError: missing, empty, a wrong number of columns, NaN, no rotation, or times that
+            do not increase; with the line.
     """
     return _plain_trajectory(path) or _trajectory_of_rows(path)
 
 
 def _plain_trajectory(path: Path) -> Trajectory | None:
-    """A file of numbers alone, all of them good, read at once; None of any other, which is then read line by line."""
+    """A file of numbers alone, all of them good, read at once; None of any other, which is then
+    read line by line."""
     table = read_plain_table(path, TrajectoryError)
     if table is None or table.numbers.shape[1] not in (8, 12):
         return None
@@ -70,10 +80,14 @@ def _trajectory_of_rows(path: Path) -> Trajectory:
     rows = read_rows(path, TrajectoryError)
     num_columns = len(rows[0][1])
     if num_columns not in (8, 12):
-        raise TrajectoryError(f"{path}, line {rows[0][0]}: {num_columns} columns; a TUM line has 8, a KITTI line 12")
+        raise TrajectoryError(
+            f"{path}, line {rows[0][0]}: {num_columns} columns; a TUM line has 8, a KITTI line 12"
+        )
     for line, tokens in rows:
         if len(tokens) != num_columns:
-            raise TrajectoryError(f"{path}, line {line}: {len(tokens)} columns, the lines before have {num_columns}")
+            raise TrajectoryError(
+                f"{path}, line {line}: {len(tokens)} columns, the lines before have {num_columns}"
+            )
     if num_columns == 12:
         poses, is_rotation = poses_of_matrices(_numbers(path, rows, range(12)), _ROTATION_TOLERANCE)
         _check(is_rotation, "not a rotation", path, rows)
@@ -82,17 +96,20 @@ def _trajectory_of_rows(path: Path) -> Trajectory:
 
 
 def _timed_trajectory(path: Path, rows: _Rows, columns: Iterable[int]) -> Trajectory:
-    """Of rows that begin with a time, and whose other columns are, in this order, x, y, z (metres) and a quaternion (x, y, z, w)."""
+    """Of rows that begin with a time, and whose other columns are, in this order, x, y, z (metres)
+    and a quaternion (x, y, z, w)."""
     t_ns, numbers = parse_times(rows, path, TrajectoryError), _numbers(path, rows, columns)
     _check(_are_of_unit_length(numbers[:, 3:]), "not a rotation", path, rows)
     return Trajectory(LazyPoses(numbers, pose_of_quaternion), t_ns)
 
 
 def read_asl_poses(path: Path) -> Trajectory:
-    """Read the poses of an ASL ground truth data.csv: ``t [ns], px, py, pz, qw, qx, qy, qz``, and columns beyond, which are left.
+    """Read the poses of an ASL ground truth data.csv: ``t [ns], px, py, pz, qw, qx, qy, qz``, and
+    columns beyond, which are left.
 
     Raises:
-        TrajectoryError: missing, empty, columns missing, NaN, no rotation, or times that do not increase; with the line.
+        TrajectoryError: missing, empty, columns missing, NaN, no rotation, or times that do not
+            increase; with the line.
     """
     rows = read_rows(path, TrajectoryError)
     for line, tokens in rows:
@@ -116,14 +133,22 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
 def tum_text(trajectory: Trajectory) -> str:
     """A TUM file's lines, of a trajectory with times."""
     assert trajectory.t_ns is not None
-    rows = (tum_line(t_ns, pose) for t_ns, pose in zip(trajectory.t_ns, trajectory.world_from_cam, strict=True))
+    rows = (
+        tum_line(t_ns, pose)
+        for t_ns, pose in zip(trajectory.t_ns, trajectory.world_from_cam, strict=True)
+    )
     return "\n".join([TUM_HEADER, *rows]) + "\n"
 
 
 def tum_line(t_ns: int, world_from_cam: Rigid3) -> str:
     """One line of a TUM file, without its end."""
     w, x, y, z = world_from_cam.quat_wxyz()
-    return " ".join([f"{Decimal(t_ns).scaleb(-9):.9f}", *(f"{value:.12g}" for value in (*world_from_cam.translation, x, y, z, w))])
+    return " ".join(
+        [
+            f"{Decimal(t_ns).scaleb(-9):.9f}",
+            *(f"{value:.12g}" for value in (*world_from_cam.translation, x, y, z, w)),
+        ]
+    )
 
 
 def kitti_text(trajectory: Trajectory) -> str:
@@ -132,22 +157,29 @@ def kitti_text(trajectory: Trajectory) -> str:
     return "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows)
 
 
-def poses_at(trajectory: Trajectory, t_ns: Sequence[int], max_gap: float = 0.2) -> list[Rigid3 | None]:
-    """The pose at each time: interpolated where its neighbours are at most `max_gap` seconds apart, else the pose within 1 ms, else None.
+def poses_at(
+    trajectory: Trajectory, t_ns: Sequence[int], max_gap: float = 0.2
+) -> list[Rigid3 | None]:
+    """The pose at each time: interpolated where its neighbours are at most `max_gap` seconds apart,
+    else the pose within 1 ms, else None.
 
     Raises:
         TrajectoryError: the trajectory has no times.
     """
     if trajectory.t_ns is None:
         raise TrajectoryError("these poses have no times, they go with frames row by row")
-    return [_pose_at(trajectory.t_ns, trajectory.world_from_cam, time, round(max_gap * NANOSECONDS)) for time in t_ns]
+    return [
+        _pose_at(trajectory.t_ns, trajectory.world_from_cam, time, round(max_gap * NANOSECONDS))
+        for time in t_ns
+    ]
 
 
 def frame_poses(trajectory: Trajectory, t_ns: Sequence[int], path: Path) -> list[Rigid3 | None]:
     """The pose of each frame: by time, or by row where the trajectory has no times.
 
     Raises:
-        TrajectoryError: rows and frames differ in number, or no frame has a pose; names `path`, and where the clocks seem to differ, how.
+        TrajectoryError: rows and frames differ in number, or no frame has a pose; names `path`, and
+            where the clocks seem to differ, how.
     """
     if trajectory.t_ns is None:
         if len(trajectory) != len(t_ns):
@@ -157,12 +189,18 @@ def frame_poses(trajectory: Trajectory, t_ns: Sequence[int], path: Path) -> list
     if t_ns and all(pose is None for pose in poses):
         span = f"{trajectory.t_ns[0] / 1e9:.3f} to {trajectory.t_ns[-1] / 1e9:.3f} s"
         frames = f"the frames {t_ns[0] / 1e9:.3f} to {t_ns[-1] / 1e9:.3f} s"
-        raise TrajectoryError(f"{path}: no frame has a pose; it covers {span}, {frames}{_clock_hint(trajectory.t_ns, t_ns)}")
+        raise TrajectoryError(
+            f"{path}: no frame has a pose; it covers {span},"
+            f" {frames}{_clock_hint(trajectory.t_ns, t_ns)}"
+        )
     return poses
 
 
-def with_trajectory(sequence: StereoSequence, path: Path, reading: PoseReading | None = None) -> StereoSequence:
-    """The same recording with the poses of a trajectory file: TUM by time, KITTI rows frame by frame.
+def with_trajectory(
+    sequence: StereoSequence, path: Path, reading: PoseReading | None = None
+) -> StereoSequence:
+    """The same recording with the poses of a trajectory file: TUM by time, KITTI rows frame by
+    frame.
 
     Rows for a part of a recording may be those of the part or of the whole.
 
@@ -170,7 +208,11 @@ def with_trajectory(sequence: StereoSequence, path: Path, reading: PoseReading |
         TrajectoryError: the file is malformed, or fits no frame.
     """
     trajectory, reading = read_trajectory(path), reading or PoseReading()
-    if trajectory.t_ns is None and isinstance(sequence, SequenceView) and len(trajectory) == len(sequence.base) != len(sequence):
+    if (
+        trajectory.t_ns is None
+        and isinstance(sequence, SequenceView)
+        and len(trajectory) == len(sequence.base) != len(sequence)
+    ):
         rows = frame_poses(trajectory, sequence.base.t_ns, path)
         poses = [rows[index] for index in sequence.indices]
     else:
@@ -186,11 +228,17 @@ def as_read(sequence: StereoSequence, reading: PoseReading) -> StereoSequence:
     """
     if reading == PoseReading():
         return sequence
-    posed = [(pose, t_ns) for pose, t_ns in zip(sequence.poses, sequence.t_ns, strict=True) if pose is not None]
+    posed = [
+        (pose, t_ns)
+        for pose, t_ns in zip(sequence.poses, sequence.t_ns, strict=True)
+        if pose is not None
+    ]
     poses = sequence.poses
     if posed and (reading.shift_s or reading.clock != 1.0):
         trajectory = Trajectory([pose for pose, _ in posed], [t_ns for _, t_ns in posed])
-        poses = frame_poses(_on_the_frames_clock(trajectory, reading), sequence.t_ns, Path(sequence.name))
+        poses = frame_poses(
+            _on_the_frames_clock(trajectory, reading), sequence.t_ns, Path(sequence.name)
+        )
     return _with_poses(sequence, [pose and reading.mend(pose) for pose in poses])
 
 
@@ -203,14 +251,20 @@ def _on_the_frames_clock(trajectory: Trajectory, reading: PoseReading) -> Trajec
         return trajectory
     shift_ns = round(reading.shift_s * NANOSECONDS)
     return replace(
-        trajectory, t_ns=[(time if reading.clock == 1.0 else round(time * reading.clock)) - shift_ns for time in trajectory.t_ns]
+        trajectory,
+        t_ns=[
+            (time if reading.clock == 1.0 else round(time * reading.clock)) - shift_ns
+            for time in trajectory.t_ns
+        ],
     )
 
 
 def _clock_hint(of_poses: Sequence[int], of_frames: Sequence[int]) -> str:
     """How the clocks of poses and frames seem to differ: by a unit, or by when they began."""
     for factor in (1e-9, 1e-6, 1e-3, 1e3, 1e6, 1e9):
-        overlap = min(of_poses[-1] * factor, of_frames[-1]) - max(of_poses[0] * factor, of_frames[0])
+        overlap = min(of_poses[-1] * factor, of_frames[-1]) - max(
+            of_poses[0] * factor, of_frames[0]
+        )
         if overlap > _SAME_SPAN * (of_frames[-1] - of_frames[0]):
             return f"; its times seem to be in another unit: --poses clock={factor:g}"
     lasts, frames_last = of_poses[-1] - of_poses[0], of_frames[-1] - of_frames[0]
@@ -221,7 +275,8 @@ def _clock_hint(of_poses: Sequence[int], of_frames: Sequence[int]) -> str:
 
 
 def read_truth(tum: Path, kitti_rows: list[Path], t_ns: list[int]) -> list[Rigid3 | None]:
-    """The pose of each frame from the first of these files that is there: TUM by time, KITTI rows one a frame.
+    """The pose of each frame from the first of these files that is there: TUM by time, KITTI rows
+    one a frame.
 
     Raises:
         TrajectoryError: the file is malformed, or fits no frame.
@@ -246,7 +301,9 @@ def read_times(path: Path, num_frames: int) -> list[int]:
     return t_ns
 
 
-def _pose_at(times: list[int], poses: Sequence[Rigid3], time: int, max_gap_ns: int) -> Rigid3 | None:
+def _pose_at(
+    times: list[int], poses: Sequence[Rigid3], time: int, max_gap_ns: int
+) -> Rigid3 | None:
     after = bisect.bisect_left(times, time)
     if after < len(times) and times[after] == time:
         return poses[after]
@@ -255,14 +312,20 @@ def _pose_at(times: list[int], poses: Sequence[Rigid3], time: int, max_gap_ns: i
         return poses[after - 1].interpolate(poses[after], fraction)
     neighbours = [index for index in (after - 1, after) if 0 <= index < len(times)]
     nearest = min(neighbours, key=lambda index: abs(times[index] - time), default=None)
-    return poses[nearest] if nearest is not None and abs(times[nearest] - time) <= _SAME_TIME_NS else None
+    return (
+        poses[nearest]
+        if nearest is not None and abs(times[nearest] - time) <= _SAME_TIME_NS
+        else None
+    )
 
 
 def _numbers(path: Path, rows: _Rows, columns: Iterable[int]) -> Float[np.ndarray, "n c"]:
     """These columns of the rows."""
     wanted = list(columns)
     try:
-        numbers = np.array([float(tokens[column]) for _, tokens in rows for column in wanted]).reshape(len(rows), -1)
+        numbers = np.array(
+            [float(tokens[column]) for _, tokens in rows for column in wanted]
+        ).reshape(len(rows), -1)
     except ValueError:
         for line, tokens in rows:
             for column in wanted:
@@ -282,7 +345,10 @@ def _number(path: Path, line: int, token: str) -> float:
 def _are_of_unit_length(quaternions: Float[np.ndarray, "n 4"]) -> Bool[np.ndarray, " n"]:
     """But for rounding."""
     with np.errstate(over="ignore", invalid="ignore"):
-        return np.abs(np.sqrt(np.einsum("ni,ni->n", quaternions, quaternions)) - 1.0) <= _ROTATION_TOLERANCE
+        return (
+            np.abs(np.sqrt(np.einsum("ni,ni->n", quaternions, quaternions)) - 1.0)
+            <= _ROTATION_TOLERANCE
+        )
 
 
 def _check(is_good: Bool[np.ndarray, " n"], fault: str, path: Path, rows: _Rows) -> None:

@@ -1,8 +1,8 @@
 """A video file (MP4, AVI, ...) as a recording of single pictures, by OpenCV's reader.
 
-Calibration is the ``camera.json`` beside it, truth is ``NAME.tum`` for ``NAME.mp4``. Times are the container's, so
-that a camera of varying rate keeps its own. A turn that the file asks players for is not applied: a calibration is of the pixels as
-they are stored.
+Calibration is the ``camera.json`` beside it, truth is ``NAME.tum`` for ``NAME.mp4``. Times are the
+container's, so that a camera of varying rate keeps its own. A turn that the file asks players for
+is not applied: a calibration is of the pixels as they are stored.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from topoloc.sequences.camera_json import FILE_NAME, read_camera_json
 from topoloc.sequences.frame import Image, StereoFrame
 from topoloc.sequences.trajectory import read_truth
 
-# FFmpeg prints its own lines about broken files on stderr, beside the error that says it; read once a process, at its first use.
+# FFmpeg prints its own lines about broken files on stderr, beside the error that says it; read once
+# a process, at its first use.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm"})
@@ -47,7 +48,8 @@ class _Reader:
 
 @dataclass(eq=False)
 class Video:
-    """A StereoSequence in one file. Frames are decoded in their order; to ask for an earlier one begins anew."""
+    """A StereoSequence in one file. Frames are decoded in their order; to ask for an earlier one
+    begins anew."""
 
     name: str
     path: Path
@@ -72,7 +74,13 @@ class Video:
             index += len(self)
         if not 0 <= index < len(self):
             raise IndexError(f"frame {index} of a video of {len(self)}")
-        return StereoFrame(self.names[index], self.t_ns[index], self._decode(index), self.camera, world_from_cam=self.poses[index])
+        return StereoFrame(
+            self.names[index],
+            self.t_ns[index],
+            self._decode(index),
+            self.camera,
+            world_from_cam=self.poses[index],
+        )
 
     def _decode(self, index: int) -> Image:
         reader = self._reader
@@ -90,13 +98,15 @@ class Video:
         height, width = picture.shape[:2]
         if (width, height) != self.size:
             raise UnreadableImageError(
-                f"{self.path}, frame {index}: {width}x{height} pixels, but the first frame is of {self.size[0]}x{self.size[1]}"
+                f"{self.path}, frame {index}: {width}x{height} pixels, but the first frame is of"
+                f" {self.size[0]}x{self.size[1]}"
             )
         return picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
 
 
 def open_video(path: Path) -> Video:
-    """Open a video file. It is gone through once for its times; a file that was cut off ends with its last whole frame.
+    """Open a video file. It is gone through once for its times; a file that was cut off ends with
+    its last whole frame.
 
     Raises:
         RecordingError: no video, no frame in it that can be decoded, or its clock goes backwards.
@@ -108,7 +118,10 @@ def open_video(path: Path) -> Video:
         return video
     camera, (width, height) = read_camera_json(path.parent / FILE_NAME).camera, video.size
     if (camera.width, camera.height) != video.size:
-        raise CalibrationError(f"{path.parent / FILE_NAME}: of {camera.width}x{camera.height}, but {path.name} is {width}x{height}")
+        raise CalibrationError(
+            f"{path.parent / FILE_NAME}: of {camera.width}x{camera.height}, but {path.name} is"
+            f" {width}x{height}"
+        )
     return replace(video, camera=camera)
 
 
@@ -117,11 +130,14 @@ def uncalibrated_video(path: Path) -> Video:
     size, rate = frame_size(path)
     t_ns = _times(path, rate)
     poses = read_truth(path.with_suffix(".tum"), [], t_ns)
-    return Video(path.name, path, [f"{index:06d}" for index in range(len(t_ns))], t_ns, poses, None, size)
+    return Video(
+        path.name, path, [f"{index:06d}" for index in range(len(t_ns))], t_ns, poses, None, size
+    )
 
 
 def frame_size(path: Path) -> tuple[tuple[int, int], float]:
-    """Width and height of the first frame, in pixels, and the rate that the container names. Raises RecordingError."""
+    """Width and height of the first frame, in pixels, and the rate that the container names. Raises
+    RecordingError."""
     capture = _open(path)
     decoded, first = capture.read()
     if not decoded or first is None:
@@ -151,7 +167,8 @@ def _times(path: Path, rate: float) -> list[int]:
     for index in range(1, len(t_ns)):
         if t_ns[index] <= t_ns[index - 1]:
             raise RecordingError(
-                f"{path}, frame {index}: at {t_ns[index] / 1e9:.3f} s, but the frame before is at {t_ns[index - 1] / 1e9:.3f} s"
+                f"{path}, frame {index}: at {t_ns[index] / 1e9:.3f} s, but the frame before is at"
+                f" {t_ns[index - 1] / 1e9:.3f} s"
             )
     return t_ns
 
@@ -159,7 +176,9 @@ def _times(path: Path, rate: float) -> list[int]:
 @contextmanager
 def opencv_silent() -> Iterator[None]:
     """No OpenCV messages on stderr beside the error that says it."""
-    logging: Any = getattr(cv2.utils, "logging", cv2)  # OpenCV 4 has these functions in its own name space
+    logging: Any = getattr(
+        cv2.utils, "logging", cv2
+    )  # OpenCV 4 has these functions in its own name space
     with _LOG_LEVEL_LOCK:
         level = logging.getLogLevel()
         logging.setLogLevel(0)

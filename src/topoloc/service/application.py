@@ -32,7 +32,7 @@ from topoloc.tracking.tracker import TrackerConfig
 _ABOUT = """Where was this picture taken? Pictures become 6-DoF poses in maps that `topoloc build` made.
 
 A picture that cannot be localized is an answer (200, `"localized": false` and why); requests that make no sense are refused in one
-sentence."""
+sentence."""  # noqa: E501
 
 
 @dataclass(frozen=True)
@@ -44,14 +44,23 @@ class Access:
 
 
 def make_application(
-    maps: Maps, config: ServiceConfig, access: Access, tracking: TrackerConfig | None = None, asked: AtlasConfig | None = None
+    maps: Maps,
+    config: ServiceConfig,
+    access: Access,
+    tracking: TrackerConfig | None = None,
+    asked: AtlasConfig | None = None,
 ) -> App:
-    """The application; its maps are closed when it ends. `asked` says how the tiles of its atlases are asked."""
+    """The application; its maps are closed when it ends. `asked` says how the tiles of its atlases
+    are asked."""
     metrics = Metrics()
     atlases = ServedAtlases(maps, asked or AtlasConfig())
     answerer = Answerer(maps, config.max_pixels, 1e3 * config.answer_s, atlases)
-    streams = Streams(maps, answerer, tracking or TrackerConfig(), config.max_sessions, config.session_idle_s)
-    service = Service(maps, answerer, Workers(config.num_workers, config.max_queue), config, metrics, streams)
+    streams = Streams(
+        maps, answerer, tracking or TrackerConfig(), config.max_sessions, config.session_idle_s
+    )
+    service = Service(
+        maps, answerer, Workers(config.num_workers, config.max_queue), config, metrics, streams
+    )
     _watch(service)
 
     @asynccontextmanager
@@ -64,7 +73,14 @@ def make_application(
         await service.close()
         log("ended")
 
-    app = FastAPI(title="topoloc", version=topoloc.__version__, description=_ABOUT, lifespan=lifespan, docs_url=None, redoc_url=None)
+    app = FastAPI(
+        title="topoloc",
+        version=topoloc.__version__,
+        description=_ABOUT,
+        lifespan=lifespan,
+        docs_url=None,
+        redoc_url=None,
+    )
     app.state.service = service
     for routes in (map_routes, geopose_routes, stream_routes, page_routes):
         app.include_router(routes.router)
@@ -72,15 +88,27 @@ def make_application(
         app.add_exception_handler(kind, _refused)
     app.add_exception_handler(404, _refused)
     app.add_exception_handler(405, _refused)
-    return Guard(app, Door(access.token, access.loopback_only, config.max_upload_bytes, config.upload_s), metrics)
+    return Guard(
+        app,
+        Door(access.token, access.loopback_only, config.max_upload_bytes, config.upload_s),
+        metrics,
+    )
 
 
 def _watch(service: Service) -> None:
     gauge = service.metrics.gauge
-    gauge("topoloc_jobs", "Requests that are being answered or wait.", lambda: service.workers.num_jobs)
+    gauge(
+        "topoloc_jobs",
+        "Requests that are being answered or wait.",
+        lambda: service.workers.num_jobs,
+    )
     gauge("topoloc_streams", "Streams that are followed.", lambda: len(service.streams))
     gauge("topoloc_open_maps", "Maps that are open.", lambda: service.maps.num_open)
-    gauge("topoloc_open_map_bytes", "Bytes of the files of the maps that are open.", lambda: service.maps.num_bytes)
+    gauge(
+        "topoloc_open_map_bytes",
+        "Bytes of the files of the maps that are open.",
+        lambda: service.maps.num_bytes,
+    )
 
 
 async def _refused(request: Request, error: Exception) -> Response:
@@ -92,6 +120,14 @@ async def _refused(request: Request, error: Exception) -> Response:
         first: dict[str, Any] = dict(error.errors()[0])
         status, text = 422, f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
     elif isinstance(error, HTTPException) or hasattr(error, "status_code"):
-        status, text, headers = error.status_code, str(error.detail), dict(error.headers or {})  # pyright: ignore[reportAttributeAccessIssue]
+        status, text, headers = (
+            error.status_code,
+            str(error.detail),
+            dict(error.headers or {}),
+        )  # pyright: ignore[reportAttributeAccessIssue]
         text = f"nothing is at {request.url.path[:200]}" if status == 404 else text
-    return JSONResponse({"error": " ".join(text.split()), "request_id": request.scope["request_id"]}, status, headers)
+    return JSONResponse(
+        {"error": " ".join(text.split()), "request_id": request.scope["request_id"]},
+        status,
+        headers,
+    )

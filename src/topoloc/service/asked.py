@@ -1,4 +1,5 @@
-"""What a request asks: the picture's bytes and what goes with them, read out of a body that may be anything."""
+"""What a request asks: the picture's bytes and what goes with them, read out of a body that may be
+anything."""
 
 from __future__ import annotations
 
@@ -27,12 +28,27 @@ _MAX_MS = 600_000.0
 
 
 class Said(BaseModel):
-    """What may be said of a picture in the address instead of in the form, whose fields count first."""
+    """What may be said of a picture in the address instead of in the form, whose fields count
+    first."""
 
-    camera: str | None = Field(None, description="as the form's field `camera`", max_length=20_000, examples=CAMERA_EXAMPLES)
-    prior: str | None = Field(None, description="as the form's field `prior`", max_length=2_000, examples=[PRIOR_EXAMPLE])
-    near: str | None = Field(None, description="as the form's field `near`", max_length=200, examples=["50.8775,4.7043,200"])
-    max_ms: float | None = Field(None, description="milliseconds after which no further pose is tried", gt=0, le=600_000)
+    camera: str | None = Field(
+        None,
+        description="as the form's field `camera`",
+        max_length=20_000,
+        examples=CAMERA_EXAMPLES,
+    )
+    prior: str | None = Field(
+        None, description="as the form's field `prior`", max_length=2_000, examples=[PRIOR_EXAMPLE]
+    )
+    near: str | None = Field(
+        None,
+        description="as the form's field `near`",
+        max_length=200,
+        examples=["50.8775,4.7043,200"],
+    )
+    max_ms: float | None = Field(
+        None, description="milliseconds after which no further pose is tried", gt=0, le=600_000
+    )
     name: str | None = Field(None, description="what the answer calls the picture", max_length=200)
 
 
@@ -40,8 +56,9 @@ class Said(BaseModel):
 class Asked:
     """A picture and what is said of it.
 
-    `camera` is as `query_cameras.camera_named` reads it, None where nothing is said; `prior` is world_from_cam; `max_ms` is that of
-    `Localizer.localize`; tiles of atlases that are known to lie elsewhere than `near` are not asked.
+    `camera` is as `query_cameras.camera_named` reads it, None where nothing is said; `prior` is
+    world_from_cam; `max_ms` is that of `Localizer.localize`; tiles of atlases that are known to lie
+    elsewhere than `near` are not asked.
     """
 
     picture: PictureBytes
@@ -52,7 +69,8 @@ class Asked:
 
 
 async def read_asked(request: Request, said: Said) -> Asked:
-    """The body, which is a form with the field `image` or the picture itself; what goes with it is in the form, or in the address.
+    """The body, which is a form with the field `image` or the picture itself; what goes with it is
+    in the form, or in the address.
 
     Raises:
         Refusal: neither, or a field that makes no sense.
@@ -63,7 +81,11 @@ async def read_asked(request: Request, said: Said) -> Asked:
         data, name, more = await _read_form(request)
         fields |= more
     elif content_type == "application/x-www-form-urlencoded":
-        raise Refusal(415, "the body must be a picture (Content-Type: image/...), or a form with the file `image` (multipart/form-data)")
+        raise Refusal(
+            415,
+            "the body must be a picture (Content-Type: image/...), or a form with the file `image`"
+            " (multipart/form-data)",
+        )
     else:
         data, name = await read_body(request), f"image.{content_type.partition('/')[2]}"
     name = fields.get("name", name)[:200]
@@ -84,16 +106,28 @@ async def read_body(request: Request) -> bytes:
 async def _read_form(request: Request) -> tuple[bytes, str, dict[str, str]]:
     """The picture, its name and the other fields."""
     parser = MultiPartParser(
-        request.headers, request.stream(), max_files=1, max_fields=len(Said.model_fields) + 4, max_part_size=_MAX_FIELD_BYTES
+        request.headers,
+        request.stream(),
+        max_files=1,
+        max_fields=len(Said.model_fields) + 4,
+        max_part_size=_MAX_FIELD_BYTES,
     )
-    parser.spool_max_size = 2**40  # nothing is written to disk: the whole request is of bounded size
+    parser.spool_max_size = (
+        2**40
+    )  # nothing is written to disk: the whole request is of bounded size
     try:
         form = await parser.parse()
     except (MultiPartException, KeyError, UnicodeDecodeError) as error:
-        raise Refusal(400, f"the form cannot be read: {getattr(error, 'message', None) or 'it is malformed'}") from None
+        raise Refusal(
+            400, f"the form cannot be read: {getattr(error, 'message', None) or 'it is malformed'}"
+        ) from None
     except ClientDisconnect:
         raise Refusal(400, "the request ended early") from None
-    fields = {name: value for name, value in form.items() if name in Said.model_fields and isinstance(value, str)}
+    fields = {
+        name: value
+        for name, value in form.items()
+        if name in Said.model_fields and isinstance(value, str)
+    }
     picture = form.get("image")
     if isinstance(picture, UploadFile):
         return await picture.read(), picture.filename or "image", fields

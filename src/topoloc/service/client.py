@@ -40,7 +40,8 @@ class _Asking:
 class Client:
     """A service that `topoloc serve` runs. A context manager; `close` lets go of its connection.
 
-    Where the service says that too many wait, it is asked again after the time that it names, a few times.
+    Where the service says that too many wait, it is asked again after the time that it names, a few
+    times.
 
     Args:
         url: its address, as ``http://127.0.0.1:8571``.
@@ -68,11 +69,17 @@ class Client:
         return self._answer(_Asking("GET", "/v1/maps"))["maps"]
 
     def map(self, name: str) -> dict[str, Any]:
-        """What a map holds, as `topoloc info --json` says it, with its nodes. Raises ServiceError."""
+        """What a map holds, as `topoloc info --json` says it, with its nodes. Raises
+        ServiceError."""
         return self._answer(_Asking("GET", f"/v1/maps/{_quoted(name)}"))
 
     def localize(
-        self, map: str, image: Picture, camera: CameraName = None, prior: Rigid3 | None = None, max_ms: float | None = None
+        self,
+        map: str,
+        image: Picture,
+        camera: CameraName = None,
+        prior: Rigid3 | None = None,
+        max_ms: float | None = None,
     ) -> Localization | NotLocalized:
         """Where in this map was the picture taken?
 
@@ -85,15 +92,24 @@ class Client:
         Raises:
             ServiceError: the service does not answer, or refuses; its text says why.
         """
-        return result_from_json(self._answer(_localizing(f"/v1/maps/{_quoted(map)}/localize", image, camera, prior, max_ms)))
+        return result_from_json(
+            self._answer(
+                _localizing(f"/v1/maps/{_quoted(map)}/localize", image, camera, prior, max_ms)
+            )
+        )
 
-    def localize_everywhere(self, image: Picture, camera: CameraName = None, max_ms: float | None = None) -> dict[str, Any]:
-        """By all maps of the service: `{"map": ..., "answers": [{"map": ..., "result": ...}]}`. Raises ServiceError."""
+    def localize_everywhere(
+        self, image: Picture, camera: CameraName = None, max_ms: float | None = None
+    ) -> dict[str, Any]:
+        """By all maps of the service: `{"map": ..., "answers": [{"map": ..., "result": ...}]}`.
+        Raises ServiceError."""
         return self._answer(_localizing("/v1/localize", image, camera, None, max_ms))
 
     def explain(self, map: str, image: Picture, camera: CameraName = None) -> dict[str, Any]:
         """Why the picture gets its answer, as `topoloc explain --json`. Raises ServiceError."""
-        return self._answer(_localizing(f"/v1/maps/{_quoted(map)}/explain", image, camera, None, None))
+        return self._answer(
+            _localizing(f"/v1/maps/{_quoted(map)}/explain", image, camera, None, None)
+        )
 
     def _answer(self, asking: _Asking) -> Any:
         for tries_left in reversed(range(_MAX_TRIES)):
@@ -132,18 +148,31 @@ class AsyncClient:
         return await self._answer(_Asking("GET", f"/v1/maps/{_quoted(name)}"))
 
     async def localize(
-        self, map: str, image: Picture, camera: CameraName = None, prior: Rigid3 | None = None, max_ms: float | None = None
+        self,
+        map: str,
+        image: Picture,
+        camera: CameraName = None,
+        prior: Rigid3 | None = None,
+        max_ms: float | None = None,
     ) -> Localization | NotLocalized:
         """As `Client.localize`."""
-        return result_from_json(await self._answer(_localizing(f"/v1/maps/{_quoted(map)}/localize", image, camera, prior, max_ms)))
+        return result_from_json(
+            await self._answer(
+                _localizing(f"/v1/maps/{_quoted(map)}/localize", image, camera, prior, max_ms)
+            )
+        )
 
-    async def localize_everywhere(self, image: Picture, camera: CameraName = None, max_ms: float | None = None) -> dict[str, Any]:
+    async def localize_everywhere(
+        self, image: Picture, camera: CameraName = None, max_ms: float | None = None
+    ) -> dict[str, Any]:
         """As `Client.localize_everywhere`."""
         return await self._answer(_localizing("/v1/localize", image, camera, None, max_ms))
 
     async def explain(self, map: str, image: Picture, camera: CameraName = None) -> dict[str, Any]:
         """As `Client.explain`."""
-        return await self._answer(_localizing(f"/v1/maps/{_quoted(map)}/explain", image, camera, None, None))
+        return await self._answer(
+            _localizing(f"/v1/maps/{_quoted(map)}/explain", image, camera, None, None)
+        )
 
     async def _answer(self, asking: _Asking) -> Any:
         import asyncio
@@ -164,7 +193,9 @@ def _httpx() -> Any:
     try:
         import httpx
     except ModuleNotFoundError as error:
-        raise MissingExtraError("asking a service needs httpx: pip install 'topoloc[serve]'") from error
+        raise MissingExtraError(
+            "asking a service needs httpx: pip install 'topoloc[serve]'"
+        ) from error
     return httpx
 
 
@@ -173,13 +204,22 @@ def _options(url: str, token: str | None, timeout_s: float) -> dict[str, Any]:
     return {"base_url": url, "headers": headers, "timeout": timeout_s}
 
 
-def _localizing(path: str, image: Picture, camera: CameraName, prior: Rigid3 | None, max_ms: float | None) -> _Asking:
+def _localizing(
+    path: str, image: Picture, camera: CameraName, prior: Rigid3 | None, max_ms: float | None
+) -> _Asking:
     said = {"camera": json.dumps(camera.to_json()) if isinstance(camera, Camera) else camera}
     if prior is not None:
-        said["prior"] = json.dumps({"translation": prior.translation.tolist(), "quat_wxyz": prior.quat_wxyz().tolist()})
+        said["prior"] = json.dumps(
+            {"translation": prior.translation.tolist(), "quat_wxyz": prior.quat_wxyz().tolist()}
+        )
     if max_ms is not None:
         said["max_ms"] = str(max_ms)
-    return _Asking("POST", path, {name: value for name, value in said.items() if value is not None}, _encoded(image))
+    return _Asking(
+        "POST",
+        path,
+        {name: value for name, value in said.items() if value is not None},
+        _encoded(image),
+    )
 
 
 def _encoded(image: Picture) -> tuple[str, bytes]:
@@ -216,12 +256,18 @@ def _read(response: httpx.Response) -> Any:
         data = response.json()
     except ValueError:
         status = response.status_code
-        raise ServiceError(f"{response.url}: no answer of a topoloc service (status {status})", status) from None
+        raise ServiceError(
+            f"{response.url}: no answer of a topoloc service (status {status})", status
+        ) from None
     if response.status_code >= 400:
         text = data.get("error") if isinstance(data, dict) else None
-        raise ServiceError(f"{text or 'refused'} (status {response.status_code})", response.status_code)
+        raise ServiceError(
+            f"{text or 'refused'} (status {response.status_code})", response.status_code
+        )
     return data
 
 
 def _unanswered(http: httpx.Client | httpx.AsyncClient, error: Exception) -> ServiceError:
-    return ServiceError(f"{http.base_url}: no answer ({' '.join(str(error).split()) or type(error).__name__})")
+    return ServiceError(
+        f"{http.base_url}: no answer ({' '.join(str(error).split()) or type(error).__name__})"
+    )

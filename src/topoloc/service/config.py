@@ -18,20 +18,25 @@ class ServiceConfig:
     max_queue: Annotated[int, Between(0, 100_000)] = 32
     """Requests that may wait for a worker; one more is answered with 429."""
     memory_mb: Annotated[int, Between(32, 1_000_000)] = 512
-    """Megabytes of maps that are kept in memory, all maps together; the ones used longest ago are closed first."""
+    """Megabytes of maps that are kept in memory, all maps together; the ones used longest ago are
+    closed first."""
     max_upload_mb: Annotated[float, Above(0)] = 20.0
     """Megabytes of one request."""
     max_megapixels: Annotated[float, Between(0.01, 100)] = 50.0
     """Of one picture; known from its header before anything is decoded."""
     upload_s: Annotated[float, Above(0)] = 20.0
-    """Seconds in which a request must be there whole, and in which a client must take its answer."""
+    """Seconds in which a request must be there whole, and in which a client must take its
+    answer."""
     answer_s: Annotated[float, Above(0)] = 30.0
-    """Seconds in which a request is answered, waiting included; then it is told that it took too long."""
+    """Seconds in which a request is answered, waiting included; then it is told that it took too
+    long."""
     fetch_s: Annotated[float, Above(0)] = 10.0
-    """Seconds that a request waits for a tile to come from an object store; it goes on coming, for those who ask later."""
+    """Seconds that a request waits for a tile to come from an object store; it goes on coming, for
+    those who ask later."""
     geolocation_m: Annotated[float, Above(0)] = 100.0
-    """Where a request of the GeoPose Protocol says where the device is, tiles of atlases are not asked that lie further from there than
-    so many metres and three times the accuracy that the device claims."""
+    """Where a request of the GeoPose Protocol says where the device is, tiles of atlases are not
+    asked that lie further from there than so many metres and three times the accuracy that the
+    device claims."""
     max_sessions: Annotated[int, Between(0, 100_000)] = 64
     """Streams at a time."""
     session_idle_s: Annotated[float, Above(0)] = 60.0

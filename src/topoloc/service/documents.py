@@ -18,15 +18,28 @@ class Error(BaseModel):
 
 _CAMERA = {
     "type": "string",
-    "description": "`exif` (what the picture's file says, else any usual lens), `unknown`, `map`, `fx,fy,cx,cy` in pixels, "
-    'a JSON object as camera.json, or COLMAP\'s `{"model": "OPENCV", "params": [...]}` (centre of the top-left pixel at 0.5, 0.5)',
+    "description": (
+        "`exif` (what the picture's file says, else any usual lens), `unknown`, `map`,"
+        ' `fx,fy,cx,cy` in pixels, a JSON object as camera.json, or COLMAP\'s `{"model": "OPENCV",'
+        ' "params": [...]}` (centre of the top-left pixel at 0.5, 0.5)'
+    ),
 }
-_PRIOR = {"type": "string", "description": "about where the camera is, world_from_cam as results write it (JSON)"}
+_PRIOR = {
+    "type": "string",
+    "description": "about where the camera is, world_from_cam as results write it (JSON)",
+}
 _NEAR = {
     "type": "string",
-    "description": "`LAT,LON,METRES`: tiles of atlases that are known to lie further from this place on earth are not asked; maps are",
+    "description": (
+        "`LAT,LON,METRES`: tiles of atlases that are known to lie further from this place on earth"
+        " are not asked; maps are"
+    ),
 }
-CAMERA_EXAMPLES = ["unknown", "380,380,319.5,199.5", '{"model": "OPENCV", "params": [380, 380, 320, 200, 0.01, 0, 0, 0]}']
+CAMERA_EXAMPLES = [
+    "unknown",
+    "380,380,319.5,199.5",
+    '{"model": "OPENCV", "params": [380, 380, 320, 200, 0.01, 0, 0, 0]}',
+]
 PRIOR_EXAMPLE = '{"translation": [0.2, 0.0, 1.4], "quat_wxyz": [1, 0, 0, 0]}'
 _REFUSED = {
     "query": "view.jpg",
@@ -41,14 +54,26 @@ _REFUSED = {
     "map": "47f0700ed2db59ce",
     "version": 1,
     "t_ns": 1700000000000000000,
-    "camera": {"model": "PINHOLE", "width": 640, "height": 400, "fx": 380.0, "fy": 380.0, "cx": 319.5, "cy": 199.5},
+    "camera": {
+        "model": "PINHOLE",
+        "width": 640,
+        "height": 400,
+        "fx": 380.0,
+        "fy": 380.0,
+        "cx": 319.5,
+        "cy": 199.5,
+    },
     "features": "surf",
 }
 _FORM = {
     "type": "object",
     "required": ["image"],
     "properties": {
-        "image": {"type": "string", "format": "binary", "description": "PNG, JPEG, BMP, PNM, TIFF or WebP; HEIC with the extra heic"},
+        "image": {
+            "type": "string",
+            "format": "binary",
+            "description": "PNG, JPEG, BMP, PNM, TIFF or WebP; HEIC with the extra heic",
+        },
         "camera": _CAMERA,
         "prior": _PRIOR,
         "near": _NEAR,
@@ -88,8 +113,16 @@ def errors(*statuses: int) -> dict[int | str, dict[str, Any]]:
 
 def result_schema() -> dict[str, Any]:
     """That of one result, with what it refers to written out."""
-    text = resources.files("topoloc.localization").joinpath("result.schema.json").read_text(encoding="utf-8")
-    return {name: value for name, value in resolved(json.loads(text)).items() if not name.startswith("$")} | {"examples": [_REFUSED]}
+    text = (
+        resources.files("topoloc.localization")
+        .joinpath("result.schema.json")
+        .read_text(encoding="utf-8")
+    )
+    return {
+        name: value
+        for name, value in resolved(json.loads(text)).items()
+        if not name.startswith("$")
+    } | {"examples": [_REFUSED]}
 
 
 def resolved(schema: dict[str, Any]) -> dict[str, Any]:

@@ -1,7 +1,9 @@
-"""Messages of the OSCP GeoPose Protocol, versions 1 and 2 (github.com/OpenArCloud/oscp-geopose-protocol).
+"""Messages of the OSCP GeoPose Protocol, versions 1 and 2
+(github.com/OpenArCloud/oscp-geopose-protocol).
 
-Clients leave out much of what the protocol asks for, so that here only what is used is wanted. Version 1 has one flat list of readings,
-and a camera's parameters in its sensor; version 2 lists by kind, and parameters in the reading.
+Clients leave out much of what the protocol asks for, so that here only what is used is wanted.
+Version 1 has one flat list of readings, and a camera's parameters in its sensor; version 2 lists by
+kind, and parameters in the reading.
 """
 
 from __future__ import annotations
@@ -74,7 +76,8 @@ class CameraReading(BaseModel):
 
 
 class GeolocationReading(BaseModel):
-    """Where the device takes itself to be: degrees, and metres of which two thirds of all readings are closer to the truth."""
+    """Where the device takes itself to be: degrees, and metres of which two thirds of all readings
+    are closer to the truth."""
 
     latitude: float | None = None
     longitude: float | None = None
@@ -114,22 +117,38 @@ class GeoPoseRequest(BaseModel):
         if isinstance(readings, SensorReadings):
             found = readings.cameraReadings or []
         else:
-            found = [_flat_reading(one, CameraReading) for one in readings if "imageBytes" in (one.reading or {})]
+            found = [
+                _flat_reading(one, CameraReading)
+                for one in readings
+                if "imageBytes" in (one.reading or {})
+            ]
         if not found:
             raise Refusal(400, "the request has no reading of a camera")
         params = {sensor.id: sensor.params for sensor in self.sensors}
-        return found[0].model_copy(update={"params": found[0].params or params.get(found[0].sensorId)})
+        return found[0].model_copy(
+            update={"params": found[0].params or params.get(found[0].sensorId)}
+        )
 
     def near(self, slack_m: float) -> NearPlace | None:
-        """Where the device takes itself to be, by the first reading that says how exactly, with three times that and `slack_m` metres
-        around it. None where no reading says so, or one makes no sense: then nothing is known."""
+        """Where the device takes itself to be, by the first reading that says how exactly, with
+        three times that and `slack_m` metres around it. None where no reading says so, or one makes
+        no sense: then nothing is known."""
         readings = self.sensorReadings
         if isinstance(readings, SensorReadings):
             found = readings.geolocationReadings or []
         else:
-            found = [_flat_reading(one, GeolocationReading) for one in readings if "latitude" in (one.reading or {})]
+            found = [
+                _flat_reading(one, GeolocationReading)
+                for one in readings
+                if "latitude" in (one.reading or {})
+            ]
         for one in found:
-            if one.latitude is None or one.longitude is None or not one.accuracy or one.accuracy < 0.0:  # some send 0 for "unknown"
+            if (
+                one.latitude is None
+                or one.longitude is None
+                or not one.accuracy
+                or one.accuracy < 0.0
+            ):  # some send 0 for "unknown"
                 continue
             with suppress(AtlasError):
                 return NearPlace(one.latitude, one.longitude, 3.0 * one.accuracy + slack_m)
@@ -180,10 +199,14 @@ class GeoPoseError(BaseModel):
 
 
 def check_version(accept: str) -> None:
-    """Raises Refusal where an Accept header names a version of the protocol that is neither 1.0 nor 2.0."""
+    """Raises Refusal where an Accept header names a version of the protocol that is neither 1.0 nor
+    2.0."""
     named = _VERSION.search(accept)
     if named and named.group(1) not in _KNOWN_VERSIONS:
-        raise Refusal(400, f"version {named.group(1)} of the GeoPose Protocol is not spoken here; 1.0 and 2.0 are")
+        raise Refusal(
+            400,
+            f"version {named.group(1)} of the GeoPose Protocol is not spoken here; 1.0 and 2.0 are",
+        )
 
 
 def read_request(body: bytes) -> GeoPoseRequest:
@@ -192,11 +215,14 @@ def read_request(body: bytes) -> GeoPoseRequest:
         return GeoPoseRequest.model_validate_json(body)
     except ValidationError as error:
         first = error.errors(include_input=False, include_url=False)[0]
-        raise Refusal(400, f"no GeoPose request: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        raise Refusal(
+            400, f"no GeoPose request: {'.'.join(map(str, first['loc']))}: {first['msg']}"
+        ) from None
 
 
 def picture_of(reading: CameraReading) -> PictureBytes | Image:
-    """The picture: a file's bytes, whatever the format is called (clients call JPEG files RGBA32), else bare pixels.
+    """The picture: a file's bytes, whatever the format is called (clients call JPEG files RGBA32),
+    else bare pixels.
 
     Raises:
         Refusal: neither.
@@ -206,7 +232,9 @@ def picture_of(reading: CameraReading) -> PictureBytes | Image:
     if reading.imageFormat.upper() == "DEPTH":
         raise Refusal(400, "a picture of depth cannot be localized")
     try:
-        data = base64.b64decode(reading.imageBytes.rpartition(",")[2], validate=True)  # some send a data: address
+        data = base64.b64decode(
+            reading.imageBytes.rpartition(",")[2], validate=True
+        )  # some send a data: address
     except (binascii.Error, ValueError):
         raise Refusal(400, "imageBytes: not base64") from None
     if not data:
@@ -230,12 +258,18 @@ def size_of(reading: CameraReading) -> tuple[int, int] | None:
 def camera_json(reading: CameraReading) -> dict[str, Any] | None:
     """The camera as `query_cameras.camera_of_json` takes it; None where the reading tells none."""
     params = reading.params
-    if params is None or not params.modelParams or (params.model or "UNKNOWN").upper().startswith("UNKNOWN"):
+    if (
+        params is None
+        or not params.modelParams
+        or (params.model or "UNKNOWN").upper().startswith("UNKNOWN")
+    ):
         return None
     return {"model": (params.model or "").upper(), "params": params.modelParams}
 
 
-def reply_to(request: GeoPoseRequest, result: Localization, georeference: Georeference, now_ms: float) -> GeoPoseReply:
+def reply_to(
+    request: GeoPoseRequest, result: Localization, georeference: Georeference, now_ms: float
+) -> GeoPoseReply:
     """The reply; where the map's place on earth was fitted, what that fit left over counts, too."""
     assert result.geopose is not None, "a map that knows its place"
     position_sigma = math.hypot(result.position_sigma_m, georeference.rms_m or 0.0)
@@ -243,7 +277,9 @@ def reply_to(request: GeoPoseRequest, result: Localization, georeference: Georef
     return GeoPoseReply(
         id=request.id,
         timestamp=request.timestamp if isinstance(request.timestamp, float) else now_ms,
-        accuracy=Accuracy(position=mean * position_sigma, orientation=mean * result.rotation_sigma_deg),
+        accuracy=Accuracy(
+            position=mean * position_sigma, orientation=mean * result.rotation_sigma_deg
+        ),
         geopose=GeoPoseOgc.model_validate(result.geopose.to_json()),
     )
 
@@ -253,4 +289,6 @@ def _flat_reading(one: SensorReading, kind: type[R]) -> R:
         return kind.model_validate({**(one.reading or {}), "sensorId": one.sensorId})
     except ValidationError as error:
         first = error.errors(include_input=False, include_url=False)[0]
-        raise Refusal(400, f"no reading of this kind: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        raise Refusal(
+            400, f"no reading of this kind: {'.'.join(map(str, first['loc']))}: {first['msg']}"
+        ) from None

@@ -1,6 +1,8 @@
-"""What is done every few seconds: streams that nobody uses are forgotten, and memory that is free goes back to the system.
+"""What is done every few seconds: streams that nobody uses are forgotten, and memory that is free
+goes back to the system.
 
-The C library keeps what threads freed, in pieces: without this a service grows by tens of megabytes over a thousand pictures.
+The C library keeps what threads freed, in pieces: without this a service grows by tens of megabytes
+over a thousand pictures.
 """
 
 from __future__ import annotations

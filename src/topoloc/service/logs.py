@@ -1,4 +1,5 @@
-"""One JSON line an event on standard error. Of requests it says who, what and how long, never what the picture showed."""
+"""One JSON line an event on standard error. Of requests it says who, what and how long, never what
+the picture showed."""
 
 from __future__ import annotations
 
@@ -25,15 +26,22 @@ class _JsonLines(logging.Formatter):
 
 
 def log_json() -> None:
-    """Everything that is logged from now on becomes JSON lines on standard error, uvicorn's words included."""
+    """Everything that is logged from now on becomes JSON lines on standard error, uvicorn's words
+    included."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(_JsonLines())
-    for name, level in (("topoloc.service", logging.INFO), ("uvicorn", logging.WARNING), ("asyncio", logging.WARNING)):
+    for name, level in (
+        ("topoloc.service", logging.INFO),
+        ("uvicorn", logging.WARNING),
+        ("asyncio", logging.WARNING),
+    ):
         logger = logging.getLogger(name)
         logger.handlers, logger.propagate = [handler], False
         logger.setLevel(level)
 
 
-def log(event: str, level: int = logging.INFO, failure: BaseException | None = None, **facts: Any) -> None:
+def log(
+    event: str, level: int = logging.INFO, failure: BaseException | None = None, **facts: Any
+) -> None:
     """One line; of a failure with its trace."""
     LOGGER.log(level, event, exc_info=failure, extra={"facts": facts})

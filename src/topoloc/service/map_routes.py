@@ -17,7 +17,9 @@ from topoloc.service.documents import PICTURE_BODY, answers, errors, result_sche
 from topoloc.service.state import service_of
 
 router = APIRouter()
-MapName = Annotated[str, Path(description="a map's name: its file's, without .topo", max_length=200)]
+MapName = Annotated[
+    str, Path(description="a map's name: its file's, without .topo", max_length=200)
+]
 
 
 SaidInAddress = Annotated[Said, Query()]
@@ -31,7 +33,11 @@ async def health(request: Request) -> dict[str, Any]:
     return {"status": "ok", "jobs": service.workers.num_jobs, "open_maps": service.maps.num_open}
 
 
-@router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}} | errors(401))
+@router.get(
+    "/metrics",
+    response_class=Response,
+    responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}} | errors(401),
+)
 async def metrics(request: Request) -> Response:
     """Counters and times, as Prometheus reads them."""
     return Response(service_of(request).metrics.text(), media_type="text/plain; version=0.0.4")
@@ -49,7 +55,11 @@ async def capabilities(request: Request) -> dict[str, Any]:
         "maps": service.maps.names(),
         "camera_models": list(MODELS),
         "geopose_protocol": ["1.0", "2.0"],
-        "limits": {"megabytes": config.max_upload_mb, "megapixels": config.max_megapixels, "sessions": config.max_sessions},
+        "limits": {
+            "megabytes": config.max_upload_mb,
+            "megapixels": config.max_megapixels,
+            "sessions": config.max_sessions,
+        },
     }
 
 
@@ -75,7 +85,10 @@ async def one_map(request: Request, map: MapName) -> JSONResponse:
 
 @router.post(
     "/v1/maps/{map}/localize",
-    responses=answers(result_schema(), "a pose, or why there is none: the JSON line of `topoloc localize --json`") | _ASKING,
+    responses=answers(
+        result_schema(), "a pose, or why there is none: the JSON line of `topoloc localize --json`"
+    )
+    | _ASKING,
     openapi_extra=PICTURE_BODY,
 )
 async def localize(request: Request, map: MapName, said: SaidInAddress) -> Response:
@@ -88,7 +101,8 @@ async def localize(request: Request, map: MapName, said: SaidInAddress) -> Respo
 
 @router.post("/v1/localize", responses=_ASKING, openapi_extra=PICTURE_BODY)
 async def localize_everywhere(request: Request, said: SaidInAddress) -> JSONResponse:
-    """Where, and in which of the maps? `map` is the only one that vouches for a pose; null where none does, or several."""
+    """Where, and in which of the maps? `map` is the only one that vouches for a pose; null where
+    none does, or several."""
     service, asked = service_of(request), await read_asked(request, said)
     results = await service.work(request, partial(service.answerer.localize_everywhere, asked))
     for map_name, result in results.items():
@@ -99,12 +113,20 @@ async def localize_everywhere(request: Request, said: SaidInAddress) -> JSONResp
 @router.post(
     "/v1/maps/{map}/explain",
     response_class=Response,
-    responses={200: {"content": {"application/json": {"schema": {"type": "object"}}, "text/html": {"schema": {"type": "string"}}}}}
+    responses={
+        200: {
+            "content": {
+                "application/json": {"schema": {"type": "object"}},
+                "text/html": {"schema": {"type": "string"}},
+            }
+        }
+    }
     | _ASKING,
     openapi_extra=PICTURE_BODY,
 )
 async def explain(request: Request, map: MapName, said: SaidInAddress) -> Response:
-    """Why this answer, or none: JSON, or the page of `topoloc explain` for those who accept text/html."""
+    """Why this answer, or none: JSON, or the page of `topoloc explain` for those who accept
+    text/html."""
     service, asked = service_of(request), await read_asked(request, said)
     as_page = "text/html" in request.headers.get("accept", "")
     text = await service.work(request, partial(service.answerer.explain, map, asked, as_page))
@@ -116,6 +138,9 @@ def _node_facts(summary: Any) -> dict[str, Any]:
     return {
         "node": summary.node_id,
         "session": summary.session_id,
-        "world_from_cam": {"translation": pose.translation.tolist(), "quat_wxyz": pose.quat_wxyz().tolist()},
+        "world_from_cam": {
+            "translation": pose.translation.tolist(),
+            "quat_wxyz": pose.quat_wxyz().tolist(),
+        },
         "num_points": summary.num_points,
     }

@@ -1,4 +1,5 @@
-"""The service as a deployment of Ray Serve: replicas of the one application, on as many machines, behind Serve's own proxies."""
+"""The service as a deployment of Ray Serve: replicas of the one application, on as many machines,
+behind Serve's own proxies."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ class AppMaker(Protocol):
 
 @dataclass(frozen=True)
 class Front:
-    """Where Serve's proxies listen, and how many requests a replica takes at once: those that it answers, and those that wait in it."""
+    """Where Serve's proxies listen, and how many requests a replica takes at once: those that it
+    answers, and those that wait in it."""
 
     host: str
     port: int
@@ -49,9 +51,11 @@ class Replica:
         return self._maker.application()
 
 
-def serve_on_ray(maker: AppMaker, address: str, front: Front, replicas: ReplicasConfig, wait: Callable[[], None]) -> None:
-    """Serve on the cluster at `address` (as `connected` takes it) until `wait`, which is called then, returns; requests in progress are
-    answered.
+def serve_on_ray(
+    maker: AppMaker, address: str, front: Front, replicas: ReplicasConfig, wait: Callable[[], None]
+) -> None:
+    """Serve on the cluster at `address` (as `connected` takes it) until `wait`, which is called
+    then, returns; requests in progress are answered.
 
     Raises:
         MissingExtraError: Ray Serve is not installed.
@@ -61,22 +65,38 @@ def serve_on_ray(maker: AppMaker, address: str, front: Front, replicas: Replicas
         try:
             from ray import serve
         except ImportError as error:
-            raise MissingExtraError(f"replicas need Ray Serve ({error}): pip install 'topoloc[cluster,serve]'") from error
+            raise MissingExtraError(
+                f"replicas need Ray Serve ({error}): pip install 'topoloc[cluster,serve]'"
+            ) from error
         logging.getLogger("ray.serve").setLevel(logging.ERROR)
         was_there = bool(serve.status().proxies)
-        options = {"host": front.host, "port": front.port, "ssl_certfile": front.tls_cert, "ssl_keyfile": front.tls_key}
+        options = {
+            "host": front.host,
+            "port": front.port,
+            "ssl_certfile": front.tls_cert,
+            "ssl_keyfile": front.tls_key,
+        }
         try:
             try:
                 if not was_there:
                     serve.start(
-                        proxy_location="EveryNode", http_options={key: value for key, value in options.items() if value is not None}
+                        proxy_location="EveryNode",
+                        http_options={
+                            key: value for key, value in options.items() if value is not None
+                        },
                     )
-                serve.run(_deployment(serve, front, replicas).bind(maker), name=NAME, route_prefix="/")
-            except Exception as error:  # of many classes; what a replica raised is a text in the deployment's state
-                raise ClusterError(f"no replica of the service began: {_reason(serve, error)}") from error
+                serve.run(
+                    _deployment(serve, front, replicas).bind(maker), name=NAME, route_prefix="/"
+                )
+            # of many classes; what a replica raised is a text in the deployment's state
+            except Exception as error:
+                raise ClusterError(
+                    f"no replica of the service began: {_reason(serve, error)}"
+                ) from error
             where = f"{'https' if front.tls_cert else 'http'}://{front.host}:{front.port}"
             print(
-                f"topoloc serves on {'the proxies of Ray Serve that run already' if was_there else where} by Ray",
+                "topoloc serves on"
+                f" {'the proxies of Ray Serve that run already' if was_there else where} by Ray",
                 file=sys.stderr,
                 flush=True,
             )
@@ -116,11 +136,15 @@ def _end(serve: Any, is_ours: bool) -> None:
 
 
 def _reason(serve: Any, error: Exception) -> str:
-    """What Serve says of our deployment: of a traceback the line that names a known failure, else the last one."""
+    """What Serve says of our deployment: of a traceback the line that names a known failure, else
+    the last one."""
     text = str(error)
     with suppress(Exception):  # the error itself says enough then
         deployments = serve.status().applications[NAME].deployments.values()
-        text = "\n".join(deployment.message for deployment in deployments if deployment.message) or text
+        text = (
+            "\n".join(deployment.message for deployment in deployments if deployment.message)
+            or text
+        )
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     known = [line.partition(": ")[2] for line in lines if line.startswith("topoloc.errors.")]
     return (known or lines[-1:] or [type(error).__name__])[-1][:400]

@@ -19,8 +19,16 @@ from topoloc.viewer.document import SceneBudget, document_of
 from topoloc.viewer.page import MODULES, import_map, static_text
 
 router = APIRouter()
-_PAGE_MODULES = MODULES | {f"topoloc/page/{name}": f"page/{name}.js" for name in ("page", "asking", "live", "matches")}
-_TYPES = {".js": "text/javascript", ".css": "text/css", ".html": "text/html", ".LICENSE": "text/plain", ".md": "text/plain"}
+_PAGE_MODULES = MODULES | {
+    f"topoloc/page/{name}": f"page/{name}.js" for name in ("page", "asking", "live", "matches")
+}
+_TYPES = {
+    ".js": "text/javascript",
+    ".css": "text/css",
+    ".html": "text/html",
+    ".LICENSE": "text/plain",
+    ".md": "text/plain",
+}
 _BUDGET = SceneBudget()
 _NUM_KEPT = 4
 
@@ -29,7 +37,9 @@ _NUM_KEPT = 4
 async def page() -> Response:
     """The page, which asks this service alone."""
     text, policy = _page()
-    return HTMLResponse(text, headers={"content-security-policy": policy, "referrer-policy": "no-referrer"})
+    return HTMLResponse(
+        text, headers={"content-security-policy": policy, "referrer-policy": "no-referrer"}
+    )
 
 
 @router.get("/static/{name:path}", include_in_schema=False)
@@ -38,12 +48,17 @@ async def static(name: str) -> Response:
     if name not in _static_files():
         raise Refusal(404, f"nothing is at /static/{name[:80]}")
     media_type = _TYPES[name[name.rindex(".") :]]
-    return Response(static_text(name), media_type=media_type, headers={"cache-control": "no-cache", "x-content-type-options": "nosniff"})
+    return Response(
+        static_text(name),
+        media_type=media_type,
+        headers={"cache-control": "no-cache", "x-content-type-options": "nosniff"},
+    )
 
 
 @router.get("/v1/maps/{map}/scene", responses=errors(401, 404, 422, 429, 503))
 async def scene(request: Request, map: Annotated[str, Path(max_length=200)]) -> Response:
-    """What a map looks like: points, nodes with their pictures, paths; as docs/viewer.md says. `topoloc view` makes pages of the same."""
+    """What a map looks like: points, nodes with their pictures, paths; as docs/viewer.md says.
+    `topoloc view` makes pages of the same."""
     service = service_of(request)
     body = await service.work(request, lambda: _scene_bytes(service, map))
     return Response(body, media_type="application/json")
@@ -55,7 +70,9 @@ def _scene_bytes(service: Service, name: str) -> bytes:
     with service.maps.lent(name) as opened:
         if name in kept and kept[name][0] == opened.stamp:
             return kept[name][1]
-        body = json.dumps(document_of(opened.localizer.topomap, name, budget=_BUDGET), separators=(",", ":")).encode()
+        body = json.dumps(
+            document_of(opened.localizer.topomap, name, budget=_BUDGET), separators=(",", ":")
+        ).encode()
         kept.pop(name, None)
         while len(kept) >= _NUM_KEPT:
             kept.pop(next(iter(kept)), None)
@@ -70,8 +87,9 @@ def _page() -> tuple[str, str]:
     inside = element[element.index(">") + 1 : element.rindex("<")]
     digest = base64.b64encode(sha256(inside.encode()).digest()).decode("ascii")
     policy = (
-        f"default-src 'none'; script-src 'self' 'sha256-{digest}'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
-        "media-src 'self' blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+        f"default-src 'none'; script-src 'self' 'sha256-{digest}'; style-src 'self'"
+        " 'unsafe-inline'; img-src 'self' data: blob:; media-src 'self' blob:; connect-src 'self';"
+        " base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
     )
     return static_text("page/page.html").replace("<!--import map-->", element), policy
 
@@ -80,4 +98,9 @@ def _page() -> tuple[str, str]:
 def _static_files() -> frozenset[str]:
     root: Any = resources.files("topoloc.viewer").joinpath("static")
     folders = [("", root), ("page/", root.joinpath("page"))]
-    return frozenset(prefix + file.name for prefix, folder in folders for file in folder.iterdir() if file.is_file())
+    return frozenset(
+        prefix + file.name
+        for prefix, folder in folders
+        for file in folder.iterdir()
+        if file.is_file()
+    )

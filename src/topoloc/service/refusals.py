@@ -45,5 +45,11 @@ def refusal_of(error: Exception) -> Refusal:
     if isinstance(error, TopolocError):
         return Refusal(422, str(error))
     if isinstance(error, MemoryError):
-        return Refusal(503, "out of memory; a smaller picture, or this one later, may do", retry_after_s=5)
-    return Refusal(503, "the worker failed while it answered this request; the log of the service says more", retry_after_s=1)
+        return Refusal(
+            503, "out of memory; a smaller picture, or this one later, may do", retry_after_s=5
+        )
+    return Refusal(
+        503,
+        "the worker failed while it answered this request; the log of the service says more",
+        retry_after_s=1,
+    )

@@ -1,7 +1,7 @@
 """The atlases among what is served: each opened anew when its manifest was written again.
 
-Stores are looked at by threads of their own, every few seconds: a silent one keeps nobody waiting, and what was opened of it goes on
-answering.
+Stores are looked at by threads of their own, every few seconds: a silent one keeps nobody waiting,
+and what was opened of it goes on answering.
 """
 
 from __future__ import annotations
@@ -18,11 +18,13 @@ from topoloc.errors import TopolocError
 from topoloc.service.logs import log
 
 LOOK_S = 5.0
-"""Seconds between two looks at an object store: one listing each, a reading where a manifest was written."""
+"""Seconds between two looks at an object store: one listing each, a reading where a manifest was
+written."""
 
 
 class ServedAtlases:
-    """Localizers of the atlases of these maps, which open their tiles as the maps of the service."""
+    """Localizers of the atlases of these maps, which open their tiles as the maps of the
+    service."""
 
     def __init__(self, maps: Maps, config: AtlasConfig) -> None:
         self._maps, self._config = maps, config
@@ -38,7 +40,9 @@ class ServedAtlases:
         """Look at those in object stores from now on, until `close`."""
         for watched in self._maps.atlases:
             if watched.is_remote:
-                threading.Thread(target=self._look_at, args=(watched,), name="atlas", daemon=True).start()
+                threading.Thread(
+                    target=self._look_at, args=(watched,), name="atlas", daemon=True
+                ).start()
 
     def close(self) -> None:
         """No more looks; one that waits for its store is not waited for."""
@@ -47,7 +51,10 @@ class ServedAtlases:
     def _localizer(self, watched: WatchedAtlas) -> AtlasLocalizer:
         atlas, known = watched.now(), self._opened.get(watched.where)
         if known is None or known[0] is not atlas:
-            self._opened[watched.where] = known = atlas, AtlasLocalizer(atlas, self._maps, self._config, _warn)
+            self._opened[watched.where] = known = (
+                atlas,
+                AtlasLocalizer(atlas, self._maps, self._config, _warn),
+            )
         return known[1]
 
     def _look_at(self, watched: WatchedAtlas) -> None:
@@ -57,7 +64,9 @@ class ServedAtlases:
                 if watched.look():
                     log("atlas", where=watched.where, serial=watched.now().manifest.serial)
                 told = ""
-            except Exception as error:  # whatever it is, the next look may succeed; what was opened before answers
+            except (
+                Exception
+            ) as error:  # whatever it is, the next look may succeed; what was opened before answers
                 if str(error) != told:
                     unknown = None if isinstance(error, TopolocError) else error
                     log("atlas", logging.WARNING, unknown, where=watched.where, detail=str(error))

@@ -22,7 +22,8 @@ from topoloc.service.logs import log_json
 
 _MAX_CONNECTIONS = 1000
 _KEEP_ALIVE_S = 75
-"""Longer than clients and load balancers keep a connection (5 to 60 s): else a request now and then meets one that is being closed."""
+"""Longer than clients and load balancers keep a connection (5 to 60 s): else a request now and then
+meets one that is being closed."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,11 @@ def serve(app: App, address: Address, limits: ServiceConfig) -> None:
     log_json()
     scheme = "https" if address.tls_cert else "http"
     host, port = listener.getsockname()[:2]
-    print(f"topoloc serves on {scheme}://{f'[{host}]' if ':' in host else host}:{port}", file=sys.stderr, flush=True)
+    print(
+        f"topoloc serves on {scheme}://{f'[{host}]' if ':' in host else host}:{port}",
+        file=sys.stderr,
+        flush=True,
+    )
     asyncio.run(_Server(config).serve([listener]))
 
 
@@ -71,7 +76,9 @@ def _listener(address: Address) -> socket.socket:
         family = socket.AF_INET6 if ":" in address.host else socket.AF_INET
         return socket.create_server((address.host, address.port), family=family, backlog=256)
     except OSError as error:
-        raise TopolocError(f"cannot listen on {address.host}, port {address.port}: {error.strerror or error}") from None
+        raise TopolocError(
+            f"cannot listen on {address.host}, port {address.port}: {error.strerror or error}"
+        ) from None
 
 
 class _Server(uvicorn.Server):
@@ -115,5 +122,9 @@ class _Patient(H11Protocol):
         self._timer = self.loop.call_later(seconds, self._give_up, self.cycle)
 
     def _give_up(self, before: Any) -> None:
-        if self.cycle is before and self.transport.get_protocol() is self and not self.transport.is_closing():
+        if (
+            self.cycle is before
+            and self.transport.get_protocol() is self
+            and not self.transport.is_closing()
+        ):
             self.transport.close()

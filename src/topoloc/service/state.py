@@ -28,7 +28,8 @@ R = TypeVar("R")
 
 @dataclass(eq=False)
 class Service:
-    """Maps, those who answer from them, and what is counted; `scenes` are the documents of some maps with the stamps of their files."""
+    """Maps, those who answer from them, and what is counted; `scenes` are the documents of some
+    maps with the stamps of their files."""
 
     maps: Maps
     answerer: Answerer
@@ -40,13 +41,16 @@ class Service:
     num_awaiting: int = 0
 
     async def work(self, request: HTTPConnection, job: Callable[[], R]) -> R:
-        """What a worker makes of the job, which may be done again from its beginning: where it needs a tile that is not here, the worker is
-        free for others until that has come. Raises Refusal, whatever it raised."""
+        """What a worker makes of the job, which may be done again from its beginning: where it
+        needs a tile that is not here, the worker is free for others until that has come. Raises
+        Refusal, whatever it raised."""
         start = time.monotonic()
         try:
             while True:
                 try:
-                    return await self.workers.run(job, self.config.answer_s, time.monotonic() - start)
+                    return await self.workers.run(
+                        job, self.config.answer_s, time.monotonic() - start
+                    )
                 except TileAwaited as awaited:
                     await self._ended(awaited.fetch)
         except Exception as error:
@@ -56,16 +60,25 @@ class Service:
             raise refusal from error
 
     async def _ended(self, fetch: Fetch) -> None:
-        """When the tile is here, will not come, or has been waited for long enough. Raises Refusal where too many wait already."""
+        """When the tile is here, will not come, or has been waited for long enough. Raises Refusal
+        where too many wait already."""
         if self.num_awaiting >= self.workers.number + self.workers.max_queue:
-            raise Refusal(429, f"{self.num_awaiting} requests wait already for tiles that are being fetched", retry_after_s=5)
+            raise Refusal(
+                429,
+                f"{self.num_awaiting} requests wait already for tiles that are being fetched",
+                retry_after_s=5,
+            )
         self.num_awaiting += 1
         try:
-            await asyncio.wait([asyncio.wrap_future(fetch.ended)], timeout=max(0.0, fetch.until - time.monotonic()))
+            await asyncio.wait(
+                [asyncio.wrap_future(fetch.ended)], timeout=max(0.0, fetch.until - time.monotonic())
+            )
         finally:
             self.num_awaiting -= 1
 
-    def count(self, request: HTTPConnection, name: str, result: Localization | NotLocalized) -> None:
+    def count(
+        self, request: HTTPConnection, name: str, result: Localization | NotLocalized
+    ) -> None:
         """The outcome, for the metrics and the log."""
         outcome = "localized" if isinstance(result, Localization) else result.reason
         self.metrics.answers.labels(name, outcome).inc()

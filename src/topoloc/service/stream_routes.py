@@ -23,8 +23,14 @@ from topoloc.service.streams import Stream
 router = APIRouter()
 PROTOCOL = "topoloc"
 """The subprotocol that a browser asks for beside the one with its token."""
-TimeNs = Annotated[int | None, Query(description="when it was taken, nanoseconds; now where nothing is said", ge=0, lt=2**63)]
-StreamCamera = Annotated[str | None, Query(description="of all its pictures, as the form's field `camera`", max_length=20_000)]
+TimeNs = Annotated[
+    int | None,
+    Query(description="when it was taken, nanoseconds; now where nothing is said", ge=0, lt=2**63),
+]
+StreamCamera = Annotated[
+    str | None,
+    Query(description="of all its pictures, as the form's field `camera`", max_length=20_000),
+]
 
 
 class StreamFacts(BaseModel):
@@ -35,7 +41,9 @@ class StreamFacts(BaseModel):
     idle_s: float
 
 
-@router.post("/v1/maps/{map}/sessions", status_code=201, responses=errors(401, 403, 404, 422, 429, 503))
+@router.post(
+    "/v1/maps/{map}/sessions", status_code=201, responses=errors(401, 403, 404, 422, 429, 503)
+)
 async def begin(request: Request, map: MapName, camera: StreamCamera = None) -> StreamFacts:
     """Begin a stream: pictures that follow each other, so that each helps with the next."""
     service = service_of(request)
@@ -49,16 +57,23 @@ async def begin(request: Request, map: MapName, camera: StreamCamera = None) -> 
     | errors(400, 401, 403, 404, 408, 409, 413, 415, 422, 429, 503),
     openapi_extra=PICTURE_BODY,
 )
-async def next_picture(request: Request, map: MapName, session: str, said: SaidInAddress, t_ns: TimeNs = None) -> Response:
+async def next_picture(
+    request: Request, map: MapName, session: str, said: SaidInAddress, t_ns: TimeNs = None
+) -> Response:
     """The next picture of a stream."""
     service = service_of(request)
     stream, asked = service.streams.find(map, session), await read_asked(request, said)
-    answer = await service.work(request, lambda: service.streams.next(stream, asked, time.time_ns() if t_ns is None else t_ns))
+    answer = await service.work(
+        request,
+        lambda: service.streams.next(stream, asked, time.time_ns() if t_ns is None else t_ns),
+    )
     request.scope["facts"].update({"map": map, "outcome": answer["state"]})
     return Response(json.dumps(answer), media_type="application/json")
 
 
-@router.delete("/v1/maps/{map}/sessions/{session}", status_code=204, responses=errors(401, 403, 404, 422, 503))
+@router.delete(
+    "/v1/maps/{map}/sessions/{session}", status_code=204, responses=errors(401, 403, 404, 422, 503)
+)
 async def end(request: Request, map: MapName, session: str) -> Response:
     """End a stream."""
     service = service_of(request)
@@ -69,11 +84,14 @@ async def end(request: Request, map: MapName, session: str) -> Response:
 
 @router.websocket("/v1/maps/{map}/sessions")
 async def stream_over_websocket(socket: WebSocket, map: str) -> None:
-    """A stream as long as the connection: a binary message is a picture, its answer a text. A text message says what holds for the
-    pictures after it: `{"camera": ..., "t_ns": ...}` (the time for the next one alone)."""
+    """A stream as long as the connection: a binary message is a picture, its answer a text. A text
+    message says what holds for the pictures after it: `{"camera": ..., "t_ns": ...}` (the time for
+    the next one alone)."""
     service = service_of(socket)
     try:
-        stream = await service.work(socket, lambda: service.streams.begin(map, socket.query_params.get("camera")))
+        stream = await service.work(
+            socket, lambda: service.streams.begin(map, socket.query_params.get("camera"))
+        )
     except Refusal as refusal:
         await socket.send_denial_response(_denied(socket, refusal))
         return
@@ -106,13 +124,19 @@ async def _talk(socket: WebSocket, service: Service, stream: Stream) -> None:
         t_ns = said.pop("t_ns", None) or time.time_ns()
         asked = Asked(PictureBytes(str(number), message["bytes"]), said.get("camera"))
         number += 1
-        await _send(socket, await _answered(socket, service, stream, asked, t_ns), service.config.upload_s)
+        await _send(
+            socket, await _answered(socket, service, stream, asked, t_ns), service.config.upload_s
+        )
 
 
-async def _answered(socket: WebSocket, service: Service, stream: Stream, asked: Asked, t_ns: int) -> str:
+async def _answered(
+    socket: WebSocket, service: Service, stream: Stream, asked: Asked, t_ns: int
+) -> str:
     """The answer, or why this picture has none; the stream goes on."""
     try:
-        return json.dumps(await service.work(socket, lambda: service.streams.next(stream, asked, t_ns)))
+        return json.dumps(
+            await service.work(socket, lambda: service.streams.next(stream, asked, t_ns))
+        )
     except Refusal as refusal:
         return json.dumps({"query": asked.picture.name, "error": refusal.text})
 
@@ -130,7 +154,9 @@ def _said(text: str) -> dict[str, Any]:
     if not isinstance(data, dict) or not set(data) <= {"camera", "t_ns"}:
         raise Refusal(422, 'a text message is an object of "camera" and "t_ns"')
     t_ns, camera = data.get("t_ns"), data.get("camera")
-    if t_ns is not None and (isinstance(t_ns, bool) or not isinstance(t_ns, int) or not 0 <= t_ns < 2**63):
+    if t_ns is not None and (
+        isinstance(t_ns, bool) or not isinstance(t_ns, int) or not 0 <= t_ns < 2**63
+    ):
         raise Refusal(422, "t_ns is an integer of nanoseconds")
     return data if isinstance(camera, str | None) else data | {"camera": json.dumps(camera)}
 

@@ -38,7 +38,9 @@ class Streams:
         idle_s: a stream without a picture for so long is forgotten.
     """
 
-    def __init__(self, maps: Maps, answerer: Answerer, config: TrackerConfig, max_streams: int, idle_s: float) -> None:
+    def __init__(
+        self, maps: Maps, answerer: Answerer, config: TrackerConfig, max_streams: int, idle_s: float
+    ) -> None:
         self._maps, self._answerer, self._config = maps, answerer, config
         self._max_streams, self._idle_s = max_streams, idle_s
         self._lock = threading.Lock()
@@ -48,7 +50,8 @@ class Streams:
         return len(self._streams)
 
     def begin(self, map_name: str, camera: str | None) -> Stream:
-        """A stream in this map; `camera` is what its pictures' camera is called where they do not say it themselves.
+        """A stream in this map; `camera` is what its pictures' camera is called where they do not
+        say it themselves.
 
         Raises:
             Refusal: there are too many, or there is no such map.
@@ -63,14 +66,18 @@ class Streams:
                 self._streams[stream.id] = stream
         if is_full:
             self._maps.give_back(opened)
-            raise Refusal(429, f"{self._max_streams} streams are followed already", retry_after_s=10)
+            raise Refusal(
+                429, f"{self._max_streams} streams are followed already", retry_after_s=10
+            )
         return stream
 
     def find(self, map_name: str, stream_id: str) -> Stream:
         """Raises Refusal."""
         stream = self._streams.get(stream_id)
         if stream is None or stream.map_name != map_name:
-            raise Refusal(404, "there is no such stream here; one without a picture for a while is forgotten")
+            raise Refusal(
+                404, "there is no such stream here; one without a picture for a while is forgotten"
+            )
         return stream
 
     def next(self, stream: Stream, asked: Asked, t_ns: int) -> dict[str, Any]:
@@ -81,7 +88,11 @@ class Streams:
             TopolocError: the picture, its camera or its time is none.
         """
         if not stream.lock.acquire(blocking=False):
-            raise Refusal(409, "the picture before is looked at still; the next one may come when that is answered")
+            raise Refusal(
+                409,
+                "the picture before is looked at still; the next one may come when that is"
+                " answered",
+            )
         try:
             if stream.is_ended:
                 raise Refusal(404, "the stream has ended")
@@ -89,7 +100,9 @@ class Streams:
             named = Asked(asked.picture, asked.camera or stream.camera)
             image, camera = self._answerer.decoded(named, stream.opened.localizer.topomap)
             if isinstance(camera, RoughCamera):
-                raise CalibrationError("a stream needs a calibrated camera: `map`, fx,fy,cx,cy or a JSON object")
+                raise CalibrationError(
+                    "a stream needs a calibrated camera: `map`, fx,fy,cx,cy or a JSON object"
+                )
             return stream.tracker.process(image, camera, t_ns).to_json(asked.picture.name)
         finally:
             stream.last_used = time.monotonic()
@@ -107,7 +120,11 @@ class Streams:
     def forget_idle(self) -> None:
         """End those that nobody has used for long."""
         oldest = time.monotonic() - self._idle_s
-        for stream in [one for one in list(self._streams.values()) if one.last_used < oldest and not one.lock.locked()]:
+        for stream in [
+            one
+            for one in list(self._streams.values())
+            if one.last_used < oldest and not one.lock.locked()
+        ]:
             self.end(stream)
 
     def close(self) -> None:

@@ -1,4 +1,5 @@
-"""Threads that answer, beside the loop that listens; and the line of those who wait for them, which has an end."""
+"""Threads that answer, beside the loop that listens; and the line of those who wait for them, which
+has an end."""
 
 from __future__ import annotations
 
@@ -14,7 +15,8 @@ R = TypeVar("R")
 
 
 class Workers:
-    """So many threads, and at most `max_queue` jobs that wait for them. Called from the loop alone."""
+    """So many threads, and at most `max_queue` jobs that wait for them. Called from the loop
+    alone."""
 
     def __init__(self, number: int, max_queue: int) -> None:
         self.number, self.max_queue = number, max_queue
@@ -30,11 +32,16 @@ class Workers:
         """What the job returns or raises; of the seconds until it takes too long some may be spent.
 
         Raises:
-            Refusal: too many wait already; or it took too long, in which case a job that had begun is finished for nobody.
+            Refusal: too many wait already; or it took too long, in which case a job that had begun
+                is finished for nobody.
         """
         if self._num_jobs >= self.number + self.max_queue:
             wait_s = max(1, round(self._num_jobs * self._seconds_a_job / self.number))
-            raise Refusal(429, f"{self._num_jobs} requests are being answered or wait already", retry_after_s=wait_s)
+            raise Refusal(
+                429,
+                f"{self._num_jobs} requests are being answered or wait already",
+                retry_after_s=wait_s,
+            )
         self._num_jobs += 1
         loop = asyncio.get_running_loop()
         future: Future[R] = self._pool.submit(self._timed, job)

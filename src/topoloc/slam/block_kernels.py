@@ -1,4 +1,5 @@
-"""Numba kernels of `block_system`: Cholesky's factor of a matrix of 6x6 blocks, column by column, and what it solves."""
+"""Numba kernels of `block_system`: Cholesky's factor of a matrix of 6x6 blocks, column by column,
+and what it solves."""
 
 from __future__ import annotations
 
@@ -63,7 +64,8 @@ def _subtract_product(block, a, b):
 
 @kernel(**_OPTIONS)
 def factor_blocks(starts, rows, blocks):
-    """In place: `blocks` (b, 6, 6), of which the upper triangles on the diagonal are left as they are."""
+    """In place: `blocks` (b, 6, 6), of which the upper triangles on the diagonal are left as they
+    are."""
     for p in range(len(starts) - 1):
         first, last = starts[p], starts[p + 1]
         _cholesky(blocks[first])

@@ -1,8 +1,10 @@
-"""Symmetric positive definite systems of 6x6 blocks, most of which are zero: what poses that are tied together are solved by.
+"""Symmetric positive definite systems of 6x6 blocks, most of which are zero: what poses that are
+tied together are solved by.
 
-Cholesky's factor has more blocks than the matrix: whoever is eliminated ties all of its neighbours to each other. Where the one with the
-fewest neighbours goes first (George & Liu, *The evolution of the minimum degree ordering algorithm*, 1989), a walk costs time and memory
-by its length, loops and laps included.
+Cholesky's factor has more blocks than the matrix: whoever is eliminated ties all of its neighbours
+to each other. Where the one with the fewest neighbours goes first (George & Liu, *The evolution of
+the minimum degree ordering algorithm*, 1989), a walk costs time and memory by its length, loops and
+laps included.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ from topoloc.slam.block_kernels import factor_blocks, place_of_block, solve_fact
 
 @dataclass(frozen=True, eq=False)
 class BlockPattern:
-    """Which blocks of the factor are other than zero: of its column p the rows `rows[starts[p]]`, which is p, to `rows[starts[p + 1] - 1]`.
+    """Which blocks of the factor are other than zero: of its column p the rows `rows[starts[p]]`,
+    which is p, to `rows[starts[p + 1] - 1]`.
 
     Rows and columns are in the order of elimination; `ranks[i]` is the place of unknown i in it.
     """
@@ -51,8 +54,16 @@ class BlockPattern:
                 tied[other] -= {i, other}
                 heappush(waiting, (len(tied[other]), other))
         starts = np.cumsum([0, *(1 + len(column) for column in columns)])
-        rows = [np.sort(ranks[[*column]]) if column else np.zeros(0, np.int64) for column in columns]
-        return BlockPattern(ranks, starts, np.concatenate([np.r_[p, r] for p, r in enumerate(rows)]) if rows else np.zeros(0, np.int64))
+        rows = [
+            np.sort(ranks[[*column]]) if column else np.zeros(0, np.int64) for column in columns
+        ]
+        return BlockPattern(
+            ranks,
+            starts,
+            np.concatenate([np.r_[p, r] for p, r in enumerate(rows)])
+            if rows
+            else np.zeros(0, np.int64),
+        )
 
     def empty(self) -> Float[np.ndarray, "b 6 6"]:
         """The blocks of a matrix of this pattern, all zero."""
@@ -64,7 +75,8 @@ class BlockPattern:
         return self.starts[:-1]
 
     def place(self, i: int, j: int) -> tuple[int, bool]:
-        """Where the block of unknowns i and j lies, which must be tied, and whether i is its column (its row in the upper half)."""
+        """Where the block of unknowns i and j lies, which must be tied, and whether i is its column
+        (its row in the upper half)."""
         low, high = sorted((int(self.ranks[i]), int(self.ranks[j])))
         return int(place_of_block(self.starts, self.rows, high, low)), bool(low == self.ranks[i])
 
@@ -72,7 +84,8 @@ class BlockPattern:
 def solve_blocks(
     pattern: BlockPattern, blocks: Float[np.ndarray, "b 6 6"], rights: Float[np.ndarray, "k n 6"]
 ) -> Float[np.ndarray, "k n 6"]:
-    """x with ``H x = right`` for each right-hand side, all in the order of elimination; `blocks`, H's lower half, become its factor."""
+    """x with ``H x = right`` for each right-hand side, all in the order of elimination; `blocks`,
+    H's lower half, become its factor."""
     factor_blocks(pattern.starts, pattern.rows, blocks)
     solved = np.array(rights)
     for right in solved:

@@ -1,8 +1,10 @@
-"""Bundle adjustment: key frames and the landmarks they see, moved to where they explain pixels and disparities best.
+"""Bundle adjustment: key frames and the landmarks they see, moved to where they explain pixels and
+disparities best.
 
-Levenberg-Marquardt with the points eliminated (Triggs et al., *Bundle adjustment: a modern synthesis*, 2000, section 6) and Cauchy's
-loss. What is left of the poses is sparse (`block_system`), and observations are gone through part by part (`bundle_parts`): the window
-of the odometry and a walk of kilometres are one problem, whose time and memory grow with its length.
+Levenberg-Marquardt with the points eliminated (Triggs et al., *Bundle adjustment: a modern
+synthesis*, 2000, section 6) and Cauchy's loss. What is left of the poses is sparse
+(`block_system`), and observations are gone through part by part (`bundle_parts`): the window of the
+odometry and a walk of kilometres are one problem, whose time and memory grow with its length.
 """
 
 from __future__ import annotations
@@ -17,14 +19,22 @@ from jaxtyping import Float, Int
 from topoloc.bounds import Above, AtLeast, Between
 from topoloc.geometry.rigid import Rigid3
 from topoloc.slam.block_system import BlockPattern, solve_blocks
-from topoloc.slam.bundle_kernels import count_ties, eliminate_points, move_points, robust_cost, squared_residuals, tied_frames
+from topoloc.slam.bundle_kernels import (
+    count_ties,
+    eliminate_points,
+    move_points,
+    robust_cost,
+    squared_residuals,
+    tied_frames,
+)
 from topoloc.slam.bundle_parts import BundleParts, Part
 from topoloc.slam.keyframes import DisparityBias, KeyFrame, Landmarks
 
 
 @dataclass(frozen=True)
 class BundleConfig:
-    """How long and how robustly to optimise; residuals are in standard deviations of the measurements."""
+    """How long and how robustly to optimise; residuals are in standard deviations of the
+    measurements."""
 
     max_steps: Annotated[int, Between(0, 1000)] = 6
     """Steps of Levenberg and Marquardt, at most."""
@@ -33,14 +43,17 @@ class BundleConfig:
     min_decrease: Annotated[float, Between(0, 1)] = 1e-3
     """A step that lowers the cost by less than this share of it is the last one."""
     outlier_square: Annotated[float, Above(0)] = 25.0
-    """Squared residual, summed over x, y and disparity, from which on an observation is wrong and used no more."""
+    """Squared residual, summed over x, y and disparity, from which on an observation is wrong and
+    used no more."""
     part_observations: Annotated[int, AtLeast(1)] = 100_000
-    """Observations that are laid side by side at once, about; of longer walks one part after the other."""
+    """Observations that are laid side by side at once, about; of longer walks one part after the
+    other."""
 
 
 @dataclass(frozen=True, eq=False)
 class Anchor:
-    """What is known of a key frame's pose from elsewhere; `information` (6, 6) is that of its left perturbation (metres, radians)."""
+    """What is known of a key frame's pose from elsewhere; `information` (6, 6) is that of its left
+    perturbation (metres, radians)."""
 
     keyframe: KeyFrame
     cam_from_world: Rigid3
@@ -61,14 +74,15 @@ class _State:
         squares = np.empty(len(part.frames))
         points = self.points[part.first : part.last]
         squared_residuals(
-            self.rotations, self.translations, self.cameras, points, part.frames, part.rows, part.measured, part.weights, squares
+            self.rotations, self.translations, self.cameras, points, part.frames, part.rows, part.measured, part.weights, squares  # noqa: E501
         )  # fmt: skip
         return squares
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """What does not move: the observations, which poses are free (`slots`, by the order of elimination; -1: held), and whose bias is."""
+    """What does not move: the observations, which poses are free (`slots`, by the order of
+    elimination; -1: held), and whose bias is."""
 
     parts: BundleParts
     pattern: BlockPattern
@@ -79,13 +93,24 @@ class _Problem:
 
     def prior_cost(self, state: _State, scale_squared: float) -> float:
         """Of biases other than expected, and of poses other than the anchors say."""
-        of_biases = sum(bias.information * (state.cameras[k, 5] - bias.value_px) ** 2 for bias, k in self.first_of_biases())
-        return float(of_biases + sum(scale_squared * np.log1p(square / scale_squared) for *_, square in self.pulls(state)))
+        of_biases = sum(
+            bias.information * (state.cameras[k, 5] - bias.value_px) ** 2
+            for bias, k in self.first_of_biases()
+        )
+        return float(
+            of_biases
+            + sum(
+                scale_squared * np.log1p(square / scale_squared) for *_, square in self.pulls(state)
+            )
+        )
 
     def pulls(self, state: _State) -> Iterator[tuple[int, Anchor, Float[np.ndarray, "6"], float]]:
-        """Of each anchor: its key frame, how far that one is off, and the square of that in sigma."""
+        """Of each anchor: its key frame, how far that one is off, and the square of that in
+        sigma."""
         for k, anchor in self.anchors:
-            off = (Rigid3(state.rotations[k], state.translations[k]) @ anchor.cam_from_world.inverse()).log()
+            off = (
+                Rigid3(state.rotations[k], state.translations[k]) @ anchor.cam_from_world.inverse()
+            ).log()
             yield k, anchor, off, float(off @ anchor.information @ off)
 
     def first_of_biases(self) -> list[tuple[DisparityBias, int]]:
@@ -99,10 +124,11 @@ def adjust_bundle(
     config: BundleConfig,
     anchors: Sequence[Anchor] = (),
 ) -> None:
-    """Move the poses of `free` and the landmarks that they see; `held` key frames see some of these too, and stay.
+    """Move the poses of `free` and the landmarks that they see; `held` key frames see some of these
+    too, and stay.
 
-    With nothing held, and no anchors of key frames of `free`, the first of `free` stays. Observations found to be wrong become inactive in
-    all of these key frames.
+    With nothing held, and no anchors of key frames of `free`, the first of `free` stays.
+    Observations found to be wrong become inactive in all of these key frames.
     """
     if not held and not anchors:
         free, held = free[1:], free[:1]
@@ -114,7 +140,12 @@ def adjust_bundle(
     if parts.num_observations == 0:
         return
     number_of = {id(keyframe): k for k, keyframe in enumerate(keyframes)}
-    problem = _problem(parts, keyframes, len(free), [(number_of[id(anchor.keyframe)], anchor) for anchor in anchors])
+    problem = _problem(
+        parts,
+        keyframes,
+        len(free),
+        [(number_of[id(anchor.keyframe)], anchor) for anchor in anchors],
+    )
     state = _State(
         rotations=np.array([k.cam_from_world.rotation for k in keyframes]),
         translations=np.array([k.cam_from_world.translation for k in keyframes]),
@@ -137,7 +168,9 @@ def _landmarks_of(keyframes: Sequence[KeyFrame]) -> Int[np.ndarray, " n"]:
     """Ascending. All of a long walk's observations are never side by side."""
     of_each = [k.observations.landmark_ids[k.observations.active] for k in keyframes]
     first = min((int(ids.min()) for ids in of_each if len(ids)), default=0)
-    is_seen = np.zeros(max((int(ids.max()) + 1 - first for ids in of_each if len(ids)), default=0), np.bool_)
+    is_seen = np.zeros(
+        max((int(ids.max()) + 1 - first for ids in of_each if len(ids)), default=0), np.bool_
+    )
     for ids in of_each:
         is_seen[ids - first] = True
     return np.flatnonzero(is_seen) + first
@@ -148,7 +181,12 @@ def _camera_row(keyframe: KeyFrame) -> list[float]:
     return [camera.fx, camera.fy, camera.cx, camera.cy, keyframe.stereo.bf, keyframe.bias.value_px]
 
 
-def _problem(parts: BundleParts, keyframes: Sequence[KeyFrame], num_free: int, anchors: list[tuple[int, Anchor]]) -> _Problem:
+def _problem(
+    parts: BundleParts,
+    keyframes: Sequence[KeyFrame],
+    num_free: int,
+    anchors: list[tuple[int, Anchor]],
+) -> _Problem:
     slots = np.arange(len(keyframes))
     slots[num_free:] = -1
     ties = np.zeros(0, np.int64)
@@ -156,7 +194,9 @@ def _problem(parts: BundleParts, keyframes: Sequence[KeyFrame], num_free: int, a
         keys = np.empty(count_ties(part.starts, part.frames, slots), np.int64)
         tied_frames(part.starts, part.frames, slots, num_free, keys)
         ties = np.union1d(ties, keys)
-    pattern = BlockPattern.of(num_free, zip((ties // num_free).tolist(), (ties % num_free).tolist(), strict=True))
+    pattern = BlockPattern.of(
+        num_free, zip((ties // num_free).tolist(), (ties % num_free).tolist(), strict=True)
+    )
     slots[:num_free] = pattern.ranks
     biases = list(dict.fromkeys(k.bias for k in keyframes if np.isfinite(k.bias.information)))
     columns = np.array([biases.index(k.bias) if k.bias in biases else -1 for k in keyframes])
@@ -165,7 +205,9 @@ def _problem(parts: BundleParts, keyframes: Sequence[KeyFrame], num_free: int, a
 
 def _optimised(problem: _Problem, state: _State, config: BundleConfig) -> _State:
     scale = config.cauchy_scale**2
-    cost = problem.prior_cost(state, scale) + sum(float(robust_cost(state.squares(part), scale)) for part in problem.parts)
+    cost = problem.prior_cost(state, scale) + sum(
+        float(robust_cost(state.squares(part), scale)) for part in problem.parts
+    )
     damping = 1e-4
     for _ in range(config.max_steps):
         steps, bias_steps = _steps(problem, state, scale, damping)
@@ -180,14 +222,17 @@ def _optimised(problem: _Problem, state: _State, config: BundleConfig) -> _State
     return state
 
 
-def _steps(problem: _Problem, state: _State, scale: float, damping: float) -> tuple[Float[np.ndarray, "f 6"], Float[np.ndarray, " c"]]:
-    """Of the free poses in the order of elimination, and of the biases: the reduced system made and solved."""
+def _steps(
+    problem: _Problem, state: _State, scale: float, damping: float
+) -> tuple[Float[np.ndarray, "f 6"], Float[np.ndarray, " c"]]:
+    """Of the free poses in the order of elimination, and of the biases: the reduced system made and
+    solved."""
     p, pattern = problem, problem.pattern
     blocks, vector = pattern.empty(), np.zeros((len(pattern.ranks), 6))
     border, corner = np.zeros((len(p.biases), *vector.shape)), np.zeros((len(p.biases), 2))
     for part in p.parts:
         eliminate_points(
-            state.rotations, state.translations, state.cameras, p.slots, p.columns, state.points[part.first : part.last],
+            state.rotations, state.translations, state.cameras, p.slots, p.columns, state.points[part.first : part.last],  # noqa: E501
             part.starts, part.frames, part.measured, part.weights, scale, damping,
             pattern.starts, pattern.rows, blocks, vector, border, corner,
         )  # fmt: skip
@@ -202,17 +247,28 @@ def _steps(problem: _Problem, state: _State, scale: float, damping: float) -> tu
     blocks[pattern.diagonal[:, None], along, along] += 1e-9
     own = np.diag((1.0 + damping) * corner[:, 0] + 1e-9)
     solved = solve_blocks(pattern, blocks, np.concatenate([vector[None], border]))
-    flat, of_border = border.reshape(len(border), vector.size), solved[1:].reshape(len(border), vector.size)
+    flat, of_border = (
+        border.reshape(len(border), vector.size),
+        solved[1:].reshape(len(border), vector.size),
+    )
     bias_steps = np.linalg.solve(own - flat @ of_border.T, corner[:, 1] - flat @ solved[0].ravel())
     return solved[0] - np.tensordot(bias_steps, solved[1:], 1), bias_steps
 
 
 def _moved(
-    problem: _Problem, state: _State, steps: tuple[Float[np.ndarray, "f 6"], Float[np.ndarray, " c"]], scale: float, damping: float
+    problem: _Problem,
+    state: _State,
+    steps: tuple[Float[np.ndarray, "f 6"], Float[np.ndarray, " c"]],
+    scale: float,
+    damping: float,
 ) -> tuple[_State, float]:
     """All after these steps, and what it costs."""
     p, (of_poses, of_biases) = problem, steps
-    rotations, translations, cameras = state.rotations.copy(), state.translations.copy(), state.cameras.copy()
+    rotations, translations, cameras = (
+        state.rotations.copy(),
+        state.translations.copy(),
+        state.cameras.copy(),
+    )
     for k in np.flatnonzero(p.slots >= 0).tolist():
         new = Rigid3.exp(of_poses[p.slots[k]]) @ Rigid3(rotations[k], translations[k])
         rotations[k], translations[k] = new.rotation, new.translation
@@ -223,7 +279,7 @@ def _moved(
     for part in p.parts:
         rows = slice(part.first, part.last)
         move_points(
-            state.rotations, state.translations, state.cameras, p.slots, p.columns, state.points[rows],
+            state.rotations, state.translations, state.cameras, p.slots, p.columns, state.points[rows],  # noqa: E501
             part.starts, part.frames, part.measured, part.weights, scale, damping,
             p.pattern.starts, *nothing, of_poses, of_biases, moved.points[rows],
         )  # fmt: skip

@@ -1,7 +1,9 @@
-"""Numba kernels of bundle adjustment: normal equations with the points eliminated, and what a step changes.
+"""Numba kernels of bundle adjustment: normal equations with the points eliminated, and what a step
+changes.
 
-A key frame sees a point at (x, y, d): pixel and disparity, d = bf / depth + bias. Poses move by left perturbations
-``exp(xi) @ cam_from_world``, xi = (translation, rotation). Cameras are rows (fx, fy, cx, cy, bf, bias).
+A key frame sees a point at (x, y, d): pixel and disparity, d = bf / depth + bias. Poses move by
+left perturbations ``exp(xi) @ cam_from_world``, xi = (translation, rotation). Cameras are rows (fx,
+fy, cx, cy, bf, bias).
 """
 
 from __future__ import annotations
@@ -13,15 +15,22 @@ from topoloc.slam.block_kernels import place_of_block
 
 _OPTIONS = {"error_model": "numpy"}
 _MIN_DEPTH = 0.02
-# What an observation costs whose point is behind the camera: as much as one that is off by a hundred sigma.
+# What an observation costs whose point is behind the camera: as much as one that is off by a
+# hundred sigma.
 _BEHIND = 1e4
 
 
 @kernel(**_OPTIONS)
 def _residual(rotation, translation, camera, point, measured, weights, residual, seen):
-    """Whitened (measured - predicted), and the point in the camera's frame; returns its square, negative behind the camera."""
+    """Whitened (measured - predicted), and the point in the camera's frame; returns its square,
+    negative behind the camera."""
     for axis in range(3):
-        seen[axis] = rotation[axis, 0] * point[0] + rotation[axis, 1] * point[1] + rotation[axis, 2] * point[2] + translation[axis]
+        seen[axis] = (
+            rotation[axis, 0] * point[0]
+            + rotation[axis, 1] * point[1]
+            + rotation[axis, 2] * point[2]
+            + translation[axis]
+        )
     if seen[2] < _MIN_DEPTH:
         return -1.0
     inverse = 1.0 / seen[2]
@@ -32,12 +41,24 @@ def _residual(rotation, translation, camera, point, measured, weights, residual,
 
 
 @kernel(**_OPTIONS)
-def squared_residuals(rotations, translations, cameras, points, frames, rows, measured, weights, squares):
-    """Fill the squared whitened residual of each observation (frame and point rows given); infinite behind the camera."""
+def squared_residuals(
+    rotations, translations, cameras, points, frames, rows, measured, weights, squares
+):
+    """Fill the squared whitened residual of each observation (frame and point rows given); infinite
+    behind the camera."""
     residual, seen = np.empty(3), np.empty(3)
     for k in range(len(frames)):
         f = frames[k]
-        square = _residual(rotations[f], translations[f], cameras[f], points[rows[k]], measured[k], weights[k], residual, seen)
+        square = _residual(
+            rotations[f],
+            translations[f],
+            cameras[f],
+            points[rows[k]],
+            measured[k],
+            weights[k],
+            residual,
+            seen,
+        )
         squares[k] = square if square >= 0.0 else np.inf
 
 
@@ -68,7 +89,9 @@ def _jacobians(rotation, camera, seen, weights, by_pose, by_point):
         by_pose[r, 4] = a * seen[2] - c * seen[0]
         by_pose[r, 5] = -a * seen[1] + b * seen[0]
         for axis in range(3):
-            by_point[r, axis] = a * rotation[0, axis] + b * rotation[1, axis] + c * rotation[2, axis]
+            by_point[r, axis] = (
+                a * rotation[0, axis] + b * rotation[1, axis] + c * rotation[2, axis]
+            )
 
 
 @kernel(**_OPTIONS)
@@ -101,7 +124,8 @@ def count_ties(starts, frames, slots):
 
 @kernel(**_OPTIONS)
 def tied_frames(starts, frames, slots, num_free, keys):
-    """Into `keys`, i * num_free + j for all slots i and j that see a point in common, as often as they do."""
+    """Into `keys`, i * num_free + j for all slots i and j that see a point in common, as often as
+    they do."""
     at = 0
     for n in range(len(starts) - 1):
         for k in range(starts[n], starts[n + 1]):
@@ -114,12 +138,14 @@ def tied_frames(starts, frames, slots, num_free, keys):
 
 @kernel(**_OPTIONS)
 def _look_at_point(
-    point, rotations, translations, cameras, slots, column, frames, measured, weights, scale_squared, damping, is_adding,
+    point, rotations, translations, cameras, slots, column, frames, measured, weights, scale_squared, damping, is_adding,  # noqa: E501
     pattern_starts, blocks, vector, border, corner, couplings, inverse, gradient, bias_coupling,
 ):  # fmt: skip
-    """What the observations of one point say of it, and where `is_adding` what they say of the poses and the bias that see it.
+    """What the observations of one point say of it, and where `is_adding` what they say of the
+    poses and the bias that see it.
 
-    Filled: `couplings` (k, 6, 3) with the poses, the `inverse` (3, 3) of the point's own block, its `gradient` and `bias_coupling` (3,).
+    Filled: `couplings` (k, 6, 3) with the poses, the `inverse` (3, 3) of the point's own block, its
+    `gradient` and `bias_coupling` (3,).
     """
     residual, seen = np.empty(3), np.empty(3)
     by_pose, by_point, block = np.empty((3, 6)), np.empty((3, 3)), np.zeros((3, 3))
@@ -128,7 +154,16 @@ def _look_at_point(
     for k in range(len(frames)):
         f = frames[k]
         couplings[k] = 0.0
-        square = _residual(rotations[f], translations[f], cameras[f], point, measured[k], weights[k], residual, seen)
+        square = _residual(
+            rotations[f],
+            translations[f],
+            cameras[f],
+            point,
+            measured[k],
+            weights[k],
+            residual,
+            seen,
+        )
         if square < 0.0:
             continue
         robust = 1.0 / (1.0 + square / scale_squared)
@@ -149,7 +184,7 @@ def _look_at_point(
                         couplings[k, r, s] += robust * by_pose[q, r] * by_point[q, s]
         if is_adding:
             _add_observation(
-                slot, column, robust, weights[k, 2], residual, by_pose, pattern_starts, blocks, vector, border, corner
+                slot, column, robust, weights[k, 2], residual, by_pose, pattern_starts, blocks, vector, border, corner  # noqa: E501
             )  # fmt: skip
     for r in range(3):
         block[r, r] += damping * block[r, r] + 1e-9
@@ -157,8 +192,21 @@ def _look_at_point(
 
 
 @kernel(**_OPTIONS)
-def _add_observation(slot, column, robust, disparity_weight, residual, by_pose, pattern_starts, blocks, vector, border, corner):
-    """What one observation says of the pose in `slot` and of the bias in `column`, -1 where these are held."""
+def _add_observation(
+    slot,
+    column,
+    robust,
+    disparity_weight,
+    residual,
+    by_pose,
+    pattern_starts,
+    blocks,
+    vector,
+    border,
+    corner,
+):
+    """What one observation says of the pose in `slot` and of the bias in `column`, -1 where these
+    are held."""
     if column >= 0:
         corner[column, 0] += robust * disparity_weight**2
         corner[column, 1] += robust * disparity_weight * residual[2]
@@ -176,9 +224,10 @@ def _add_observation(slot, column, robust, disparity_weight, residual, by_pose, 
 
 @kernel(**_OPTIONS)
 def _subtract_point(
-    slots, column, frames, couplings, inverse, gradient, bias_coupling, pattern_starts, pattern_rows, blocks, vector, border, corner
+    slots, column, frames, couplings, inverse, gradient, bias_coupling, pattern_starts, pattern_rows, blocks, vector, border, corner  # noqa: E501
 ):  # fmt: skip
-    """Take a point out of the system: what the poses and the bias that it ties together still know without it."""
+    """Take a point out of the system: what the poses and the bias that it ties together still know
+    without it."""
     step, product = inverse @ gradient, np.empty((6, 3))
     if column >= 0:
         corner[column, 0] -= bias_coupling @ (inverse @ bias_coupling)
@@ -190,34 +239,51 @@ def _subtract_point(
         coupling = couplings[k]
         for r in range(6):
             for s in range(3):
-                product[r, s] = coupling[r, 0] * inverse[0, s] + coupling[r, 1] * inverse[1, s] + coupling[r, 2] * inverse[2, s]
-            vector[i, r] -= coupling[r, 0] * step[0] + coupling[r, 1] * step[1] + coupling[r, 2] * step[2]
+                product[r, s] = (
+                    coupling[r, 0] * inverse[0, s]
+                    + coupling[r, 1] * inverse[1, s]
+                    + coupling[r, 2] * inverse[2, s]
+                )
+            vector[i, r] -= (
+                coupling[r, 0] * step[0] + coupling[r, 1] * step[1] + coupling[r, 2] * step[2]
+            )
             if column >= 0:
                 border[column, i, r] -= (
-                    product[r, 0] * bias_coupling[0] + product[r, 1] * bias_coupling[1] + product[r, 2] * bias_coupling[2]
+                    product[r, 0] * bias_coupling[0]
+                    + product[r, 1] * bias_coupling[1]
+                    + product[r, 2] * bias_coupling[2]
                 )
         for other in range(len(frames)):
             j = slots[frames[other]]
             if j < 0 or j > i:
                 continue
-            block, coupled = blocks[place_of_block(pattern_starts, pattern_rows, i, j)], couplings[other]
+            block, coupled = (
+                blocks[place_of_block(pattern_starts, pattern_rows, i, j)],
+                couplings[other],
+            )
             for r in range(6):
                 for s in range(6):
-                    block[r, s] -= product[r, 0] * coupled[s, 0] + product[r, 1] * coupled[s, 1] + product[r, 2] * coupled[s, 2]
+                    block[r, s] -= (
+                        product[r, 0] * coupled[s, 0]
+                        + product[r, 1] * coupled[s, 1]
+                        + product[r, 2] * coupled[s, 2]
+                    )
 
 
 @kernel(**_OPTIONS)
 def eliminate_points(
-    rotations, translations, cameras, slots, columns, points, starts, frames, measured, weights, scale_squared, damping,
+    rotations, translations, cameras, slots, columns, points, starts, frames, measured, weights, scale_squared, damping,  # noqa: E501
     pattern_starts, pattern_rows, blocks, vector, border, corner,
 ):  # fmt: skip
-    """Add to the reduced system of the free poses and biases what the observations of some points say, these points eliminated.
+    """Add to the reduced system of the free poses and biases what the observations of some points
+    say, these points eliminated.
 
-    `slots[f]` is the place of key frame f among the free ones in the order of elimination, -1 where it is held; `columns[f]` that of its
-    disparity's bias among the biases, -1 where that is held; the key frames that see a point share it. Observations are sorted by
-    point: those of point n are starts[n] .. starts[n + 1] - 1. The system: the `blocks` (b, 6, 6) of the pattern and the right-hand side
-    `vector` (k, 6) of the poses, their `border` (c, k, 6) with the biases, and of each bias its own information and right-hand
-    side, `corner` (c, 2).
+    `slots[f]` is the place of key frame f among the free ones in the order of elimination, -1 where
+    it is held; `columns[f]` that of its disparity's bias among the biases, -1 where that is held;
+    the key frames that see a point share it. Observations are sorted by point: those of point n are
+    starts[n] .. starts[n + 1] - 1. The system: the `blocks` (b, 6, 6) of the pattern and the
+    right-hand side `vector` (k, 6) of the poses, their `border` (c, k, 6) with the biases, and of
+    each bias its own information and right-hand side, `corner` (c, 2).
     """
     longest = 0
     for n in range(len(points)):
@@ -228,21 +294,22 @@ def eliminate_points(
         first, last = starts[n], starts[n + 1]
         column = columns[frames[first]] if last > first else -1
         _look_at_point(
-            points[n], rotations, translations, cameras, slots, column, frames[first:last], measured[first:last], weights[first:last],
-            scale_squared, damping, True, pattern_starts, blocks, vector, border, corner, couplings, inverse, gradient, bias_coupling,
+            points[n], rotations, translations, cameras, slots, column, frames[first:last], measured[first:last], weights[first:last],  # noqa: E501
+            scale_squared, damping, True, pattern_starts, blocks, vector, border, corner, couplings, inverse, gradient, bias_coupling,  # noqa: E501
         )  # fmt: skip
         _subtract_point(
-            slots, column, frames[first:last], couplings, inverse, gradient, bias_coupling, pattern_starts, pattern_rows,
+            slots, column, frames[first:last], couplings, inverse, gradient, bias_coupling, pattern_starts, pattern_rows,  # noqa: E501
             blocks, vector, border, corner,
         )  # fmt: skip
 
 
 @kernel(**_OPTIONS)
 def move_points(
-    rotations, translations, cameras, slots, columns, points, starts, frames, measured, weights, scale_squared, damping,
+    rotations, translations, cameras, slots, columns, points, starts, frames, measured, weights, scale_squared, damping,  # noqa: E501
     pattern_starts, blocks, border, corner, steps, bias_steps, moved,
 ):  # fmt: skip
-    """The points after the `steps` (k, 6) of poses and those of biases, into `moved`; all else as in `eliminate_points`."""
+    """The points after the `steps` (k, 6) of poses and those of biases, into `moved`; all else as
+    in `eliminate_points`."""
     longest = 0
     for n in range(len(points)):
         longest = max(longest, starts[n + 1] - starts[n])
@@ -252,8 +319,8 @@ def move_points(
         first, last = starts[n], starts[n + 1]
         column = columns[frames[first]] if last > first else -1
         _look_at_point(
-            points[n], rotations, translations, cameras, slots, column, frames[first:last], measured[first:last], weights[first:last],
-            scale_squared, damping, False, pattern_starts, blocks, steps, border, corner, couplings, inverse, rest, bias_coupling,
+            points[n], rotations, translations, cameras, slots, column, frames[first:last], measured[first:last], weights[first:last],  # noqa: E501
+            scale_squared, damping, False, pattern_starts, blocks, steps, border, corner, couplings, inverse, rest, bias_coupling,  # noqa: E501
         )  # fmt: skip
         if column >= 0:
             for s in range(3):
@@ -266,4 +333,9 @@ def move_points(
                 for r in range(6):
                     rest[s] -= couplings[k - first, r, s] * steps[slot, r]
         for r in range(3):
-            moved[n, r] = points[n, r] + inverse[r, 0] * rest[0] + inverse[r, 1] * rest[1] + inverse[r, 2] * rest[2]
+            moved[n, r] = (
+                points[n, r]
+                + inverse[r, 0] * rest[0]
+                + inverse[r, 1] * rest[1]
+                + inverse[r, 2] * rest[2]
+            )

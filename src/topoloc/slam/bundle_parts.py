@@ -1,4 +1,5 @@
-"""The observations of a bundle adjustment, some landmarks after the other: what is in memory at once has an end, however long the walk."""
+"""The observations of a bundle adjustment, some landmarks after the other: what is in memory at
+once has an end, however long the walk."""
 
 from __future__ import annotations
 
@@ -16,8 +17,8 @@ from topoloc.slam.keyframes import KeyFrame
 class Part:
     """The observations of the landmarks `first` to `last` of a bundle, sorted by landmark.
 
-    Those of landmark n are `starts[n - first]` to `starts[n - first + 1] - 1`: by which key frame (`frames`), in which row of that one's
-    observations (`sources`), and what was measured.
+    Those of landmark n are `starts[n - first]` to `starts[n - first + 1] - 1`: by which key frame
+    (`frames`), in which row of that one's observations (`sources`), and what was measured.
     """
 
     first: int
@@ -35,21 +36,29 @@ class Part:
 
 
 class BundleParts:
-    """The active observations of landmarks by key frames, part by part; gone through as often as one likes, and made anew each time.
+    """The active observations of landmarks by key frames, part by part; gone through as often as
+    one likes, and made anew each time.
 
     Args:
         ids: the landmarks, ascending.
         max_observations: of a part, about.
     """
 
-    def __init__(self, keyframes: Sequence[KeyFrame], ids: Int[np.ndarray, " n"], max_observations: int) -> None:
+    def __init__(
+        self, keyframes: Sequence[KeyFrame], ids: Int[np.ndarray, " n"], max_observations: int
+    ) -> None:
         self._keyframes, self._ids = keyframes, ids
         self._orders = [_order(keyframe, ids) for keyframe in keyframes]
         num_parts = -(-self.num_observations // max_observations)
         self._borders = np.linspace(0, len(ids), num_parts + 1).astype(np.int64)
         ends = ids[self._borders[1:] - 1] + 1 if num_parts else ids[:0]
-        seen = [k.observations.landmark_ids[order] for k, order in zip(keyframes, self._orders, strict=True)]
-        self._cuts: Int[np.ndarray, "k p1"] = np.array([np.searchsorted(one, np.r_[0, ends]) for one in seen])
+        seen = [
+            k.observations.landmark_ids[order]
+            for k, order in zip(keyframes, self._orders, strict=True)
+        ]
+        self._cuts: Int[np.ndarray, "k p1"] = np.array(
+            [np.searchsorted(one, np.r_[0, ends]) for one in seen]
+        )
 
     @property
     def num_observations(self) -> int:
@@ -69,13 +78,21 @@ class BundleParts:
     def _part(self, number: int) -> Part:
         first, last = self._borders[number : number + 2].tolist()
         seeing = np.flatnonzero(self._cuts[:, number + 1] > self._cuts[:, number]).tolist()
-        sources = [self._orders[k][self._cuts[k, number] : self._cuts[k, number + 1]] for k in seeing]
+        sources = [
+            self._orders[k][self._cuts[k, number] : self._cuts[k, number + 1]] for k in seeing
+        ]
         seen = [self._keyframes[k].observations for k in seeing]
-        ids = np.concatenate([one.landmark_ids[rows] for one, rows in zip(seen, sources, strict=True)])
+        ids = np.concatenate(
+            [one.landmark_ids[rows] for one, rows in zip(seen, sources, strict=True)]
+        )
         rows = np.searchsorted(self._ids[first:last], ids)
         order = np.argsort(rows, kind="stable")
-        weights = np.concatenate([one.weights[rows] for one, rows in zip(seen, sources, strict=True)])[order]
-        measured = np.concatenate([one.measured[rows] for one, rows in zip(seen, sources, strict=True)])[order]
+        weights = np.concatenate(
+            [one.weights[rows] for one, rows in zip(seen, sources, strict=True)]
+        )[order]
+        measured = np.concatenate(
+            [one.measured[rows] for one, rows in zip(seen, sources, strict=True)]
+        )[order]
         return Part(
             first,
             last,

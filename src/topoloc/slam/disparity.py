@@ -1,7 +1,8 @@
-"""How far left and right see a point apart, to a fraction of a pixel; depth images answer as a stereo pair would.
+"""How far left and right see a point apart, to a fraction of a pixel; depth images answer as a
+stereo pair would.
 
-SLAM speaks of disparity only: its noise hardly depends on depth, and points far away stay harmless. A depth image becomes the
-disparity that a second camera 8 cm to the right would measure.
+SLAM speaks of disparity only: its noise hardly depends on depth, and points far away stay harmless.
+A depth image becomes the disparity that a second camera 8 cm to the right would measure.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ class DisparityConfig:
     min_correlation: Annotated[float, Between(-1, 1)] = 0.8
     """Least normalised correlation of the two pictures."""
     max_second_correlation: Annotated[float, Between(0, 1)] = 0.95
-    """A second place on the row that correlates with this share of the best makes the point ambiguous."""
+    """A second place on the row that correlates with this share of the best makes the point
+    ambiguous."""
     search_px: Annotated[int, Between(0, 1000)] = 4
     """A disparity that is known already is sought again this far on either side."""
     min_sigma_px: Annotated[float, Above(0)] = 0.15
@@ -44,12 +46,14 @@ class DisparityConfig:
     max_share_of_width: Annotated[float, Between(0, 1)] = 0.2
     """Largest disparity, as a share of the picture's width."""
     max_depth_step: Annotated[float, Between(0, 1)] = 0.05
-    """RGB-D: largest spread of depth around a point, as a share of depth; more is the edge of something."""
+    """RGB-D: largest spread of depth around a point, as a share of depth; more is the edge of
+    something."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredView:
-    """A view of a frame with what measuring in it needs: `left` and `right` are its pictures as floats."""
+    """A view of a frame with what measuring in it needs: `left` and `right` are its pictures as
+    floats."""
 
     view: FrameView
     stereo: StereoCamera
@@ -62,8 +66,15 @@ def measured_view(frame: StereoFrame) -> MeasuredView:
     view = frame_view(frame)
     left = view.grey.astype(np.float32)
     if view.right_grey is not None and view.rig is not None:
-        return MeasuredView(view, StereoCamera(view.camera, view.camera.fx * view.rig.baseline), left, view.right_grey.astype(np.float32))
-    return MeasuredView(view, StereoCamera(view.camera, view.camera.fx * _BASELINE_OF_DEPTH), left, None)
+        return MeasuredView(
+            view,
+            StereoCamera(view.camera, view.camera.fx * view.rig.baseline),
+            left,
+            view.right_grey.astype(np.float32),
+        )
+    return MeasuredView(
+        view, StereoCamera(view.camera, view.camera.fx * _BASELINE_OF_DEPTH), left, None
+    )
 
 
 def measure_disparities(
@@ -72,9 +83,11 @@ def measure_disparities(
     guesses_px: Float[np.ndarray, " n"],
     config: DisparityConfig,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Disparity of points of the left picture, that of an infinitely far one being 0, and its standard deviation, pixels.
+    """Disparity of points of the left picture, that of an infinitely far one being 0, and its
+    standard deviation, pixels.
 
-    A point with a guess (not NaN) is sought around it, others on the whole row. NaN where it is not found.
+    A point with a guess (not NaN) is sought around it, others on the whole row. NaN where it is not
+    found.
     """
     if measured.right is None:
         return _from_depth(measured, points_img, config)
@@ -83,9 +96,16 @@ def measure_disparities(
     at_infinity = rig.left.cx - rig.right.cx
     largest = int(measured.view.camera.width * config.max_share_of_width)
     known = np.isfinite(guesses_px)
-    lows = np.where(known, np.floor(np.nan_to_num(guesses_px) + at_infinity) - config.search_px, 0.0).clip(0, largest).astype(np.int64)
+    lows = (
+        np.where(known, np.floor(np.nan_to_num(guesses_px) + at_infinity) - config.search_px, 0.0)
+        .clip(0, largest)
+        .astype(np.int64)
+    )
     nums = np.where(known, 2 * config.search_px + 2, largest + 1)
-    disparities, sigmas = np.empty(len(points_img), np.float32), np.empty(len(points_img), np.float32)
+    disparities, sigmas = (
+        np.empty(len(points_img), np.float32),
+        np.empty(len(points_img), np.float32),
+    )
     # The long searches are shared out evenly.
     order = np.argsort(nums, kind="stable")
     order = np.concatenate([order[0::2], order[1::2]])

@@ -1,7 +1,9 @@
-"""Numba kernels: the disparity of single points of a rectified pair, by correlation along the row and refinement.
+"""Numba kernels: the disparity of single points of a rectified pair, by correlation along the row
+and refinement.
 
-Dense stereo would spend its time on pixels that no key point needs; matching descriptors of the right picture would lose
-the points that the detector did not find twice. A thousand points cost a few milliseconds this way.
+Dense stereo would spend its time on pixels that no key point needs; matching descriptors of the
+right picture would lose the points that the detector did not find twice. A thousand points cost a
+few milliseconds this way.
 """
 
 from __future__ import annotations
@@ -15,17 +17,24 @@ _OPTIONS = {"error_model": "numpy", "fastmath": {"reassoc", "contract", "arcp"}}
 
 @kernel(**_OPTIONS)
 def _sample_row(image, x, y, row):
-    """Bilinear samples at x, x + 1, ... of one height, all at the same fraction of a pixel: a loop that vectorises."""
+    """Bilinear samples at x, x + 1, ... of one height, all at the same fraction of a pixel: a loop
+    that vectorises."""
     left, top = int(np.floor(x)), int(np.floor(y))
     fx, fy = np.float32(x - left), np.float32(y - top)
-    upper, lower = image[top, left : left + len(row) + 1], image[top + 1, left : left + len(row) + 1]
+    upper, lower = (
+        image[top, left : left + len(row) + 1],
+        image[top + 1, left : left + len(row) + 1],
+    )
     for k in range(len(row)):
-        row[k] = (1 - fy) * (upper[k] * (1 - fx) + upper[k + 1] * fx) + fy * (lower[k] * (1 - fx) + lower[k + 1] * fx)
+        row[k] = (1 - fy) * (upper[k] * (1 - fx) + upper[k + 1] * fx) + fy * (
+            lower[k] * (1 - fx) + lower[k + 1] * fx
+        )
 
 
 @kernel(**_OPTIONS)
 def _normalized_patch(image, x, y, half, patch):
-    """Fill `patch` with the zero-mean, unit-norm patch around (x, y); return its norm before (0: no texture)."""
+    """Fill `patch` with the zero-mean, unit-norm patch around (x, y); return its norm before (0: no
+    texture)."""
     side = 2 * half + 1
     mean = np.float32(0)
     for j in range(side):
@@ -49,13 +58,14 @@ def _normalized_patch(image, x, y, half, patch):
 
 @kernel(**_OPTIONS)
 def _correlations(patch, half, image, x, y, shift_sign, num_disparities, strip, sums, scores):
-    """NCC of `patch` (centre (x, y) in its own picture) with `image` at x + shift_sign * d for d = 0 .. num_disparities - 1."""
+    """NCC of `patch` (centre (x, y) in its own picture) with `image` at x + shift_sign * d for d =
+    0 .. num_disparities - 1."""
     side = 2 * half + 1
     width = image.shape[1]
     length = num_disparities + side - 1
     start = x - half if shift_sign > 0 else x - half - (num_disparities - 1)
-    # All samples of a strip lie at the same fraction of a pixel. Slices that are walked through from 0 on: only of these
-    # does the compiler make vectors.
+    # All samples of a strip lie at the same fraction of a pixel. Slices that are walked through
+    # from 0 on: only of these does the compiler make vectors.
     first, top = int(np.floor(start)), int(np.floor(y)) - half
     fx, fy = np.float32(start - np.floor(start)), np.float32(y - np.floor(y))
     begin, end = max(0, -first), min(length, width - 1 - first)
@@ -65,10 +75,15 @@ def _correlations(patch, half, image, x, y, shift_sign, num_disparities, strip, 
     columns, squares = sums[0, begin:end], sums[1, begin:end]
     columns[:], squares[:] = 0.0, 0.0
     for j in range(side):
-        upper, lower = image[top + j, first + begin : first + end + 1], image[top + j + 1, first + begin : first + end + 1]
+        upper, lower = (
+            image[top + j, first + begin : first + end + 1],
+            image[top + j + 1, first + begin : first + end + 1],
+        )
         row = strip[j, begin:end]
         for k in range(len(row)):
-            value = (1 - fy) * (upper[k] * (1 - fx) + upper[k + 1] * fx) + fy * (lower[k] * (1 - fx) + lower[k + 1] * fx)
+            value = (1 - fy) * (upper[k] * (1 - fx) + upper[k + 1] * fx) + fy * (
+                lower[k] * (1 - fx) + lower[k + 1] * fx
+            )
             row[k] = value
             columns[k] += value
             squares[k] += value * value
@@ -93,7 +108,8 @@ def _correlations(patch, half, image, x, y, shift_sign, num_disparities, strip, 
 
 @kernel(**_OPTIONS)
 def _refine_disparity(patch, half, right, x, y, disparity, num_iterations):
-    """Gauss-Newton on the disparity with gain and offset eliminated; returns (disparity, standard deviation in pixels)."""
+    """Gauss-Newton on the disparity with gain and offset eliminated; returns (disparity, standard
+    deviation in pixels)."""
     side = 2 * half + 1
     width = right.shape[1]
     sigma = np.float32(np.inf)
@@ -109,7 +125,10 @@ def _refine_disparity(patch, half, right, x, y, disparity, num_iterations):
             _sample_row(right, xr - half - 1, y + j - half, samples)
             values, slopes = window[j], slope[j]
             for i in range(side):
-                values[i], slopes[i] = samples[i + 1], np.float32(0.5) * (samples[i + 2] - samples[i])
+                values[i], slopes[i] = (
+                    samples[i + 1],
+                    np.float32(0.5) * (samples[i + 2] - samples[i]),
+                )
                 mean += values[i]
                 slope_mean += slopes[i]
         mean /= side * side
@@ -141,14 +160,32 @@ def _refine_disparity(patch, half, right, x, y, disparity, num_iterations):
 
 
 @kernel(**_OPTIONS)
-def _match_point(left, right, x, y, half, low, num_disparities, min_score, max_ratio, patch, back, strip, sums, scores):
-    """(disparity, sigma) of one point, sought among low .. low + num_disparities - 1; NaN as `match_in_ranges` says."""
+def _match_point(
+    left,
+    right,
+    x,
+    y,
+    half,
+    low,
+    num_disparities,
+    min_score,
+    max_ratio,
+    patch,
+    back,
+    strip,
+    sums,
+    scores,
+):
+    """(disparity, sigma) of one point, sought among low .. low + num_disparities - 1; NaN as
+    `match_in_ranges` says."""
     height, width = left.shape
     side = 2 * half + 1
     nothing = np.float32(np.nan), np.float32(np.nan)
     if x < half or y < half or x >= width - half - 1 or y >= height - half - 1:
         return nothing
-    if _normalized_patch(left, x, y, half, patch) < 2.0 * side:  # standard deviation of less than two grey levels
+    if (
+        _normalized_patch(left, x, y, half, patch) < 2.0 * side
+    ):  # standard deviation of less than two grey levels
         return nothing
     _correlations(patch, half, right, x - low, y, -1, num_disparities, strip, sums, scores)
     best = int(np.argmax(scores[:num_disparities]))
@@ -162,7 +199,12 @@ def _match_point(left, right, x, y, half, low, num_disparities, min_score, max_r
         return nothing
     disparity, sigma = _refine_disparity(patch, half, right, x, y, np.float32(low + best), 8)
     xr = x - disparity
-    if not np.isfinite(sigma) or abs(disparity - low - best) > 1.5 or xr < half or xr >= width - half - 1:
+    if (
+        not np.isfinite(sigma)
+        or abs(disparity - low - best) > 1.5
+        or xr < half
+        or xr >= width - half - 1
+    ):
         return nothing
     # found back within a pixel? a point seen by one camera only is not
     _normalized_patch(right, xr, y, half, back)
@@ -173,20 +215,41 @@ def _match_point(left, right, x, y, half, low, num_disparities, min_score, max_r
 
 
 @kernel(**_OPTIONS)
-def match_in_ranges(left, right, points, lows, nums, half, min_score, max_ratio, disparities, sigmas):
-    """Disparity of each point (x, y) of `left` in `right` (float32 pictures of one size) with its standard deviation; fills the last two.
+def match_in_ranges(
+    left, right, points, lows, nums, half, min_score, max_ratio, disparities, sigmas
+):
+    """Disparity of each point (x, y) of `left` in `right` (float32 pictures of one size) with its
+    standard deviation; fills the last two.
 
-    That of point n is sought among lows[n] .. lows[n] + nums[n] - 1. NaN where the point is too near the border, without texture, not
-    distinct along the row (the best score elsewhere reaches `max_ratio` of the best), below `min_score`, or not found back from the right
-    picture within a pixel.
+    That of point n is sought among lows[n] .. lows[n] + nums[n] - 1. NaN where the point is too
+    near the border, without texture, not distinct along the row (the best score elsewhere reaches
+    `max_ratio` of the best), below `min_score`, or not found back from the right picture within a
+    pixel.
     """
     side = 2 * half + 1
     most = 1
     for n in range(len(points)):
         most = max(most, nums[n])
     patch, back = np.empty((side, side), np.float32), np.empty((side, side), np.float32)
-    strip, sums, scores = np.empty((side, most + side), np.float32), np.empty((5, most + side), np.float32), np.empty(most, np.float32)
+    strip, sums, scores = (
+        np.empty((side, most + side), np.float32),
+        np.empty((5, most + side), np.float32),
+        np.empty(most, np.float32),
+    )
     for n in range(len(points)):
         disparities[n], sigmas[n] = _match_point(
-            left, right, points[n, 0], points[n, 1], half, lows[n], nums[n], min_score, max_ratio, patch, back, strip, sums, scores
+            left,
+            right,
+            points[n, 0],
+            points[n, 1],
+            half,
+            lows[n],
+            nums[n],
+            min_score,
+            max_ratio,
+            patch,
+            back,
+            strip,
+            sums,
+            scores,
         )

@@ -1,4 +1,5 @@
-"""Recordings that SLAM would quietly make nonsense of: left and right swapped, a baseline in millimetres, pairs that are none."""
+"""Recordings that SLAM would quietly make nonsense of: left and right swapped, a baseline in
+millimetres, pairs that are none."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ class InputCheckConfig:
     min_start_points: Annotated[int, AtLeast(4)] = 40
     """Points with disparity that tracking can begin with."""
     max_vertical_px: Annotated[float, Above(0)] = 0.9
-    """Vertical distance of left and right (median over a key frame's points, then over key frames): beyond it they are no pair."""
+    """Vertical distance of left and right (median over a key frame's points, then over key frames):
+    beyond it they are no pair."""
     min_keyframes: Annotated[int, AtLeast(1)] = 3
     """Key frames seen before such a verdict."""
     tracking: TrackingConfig = field(default_factory=lambda: TrackingConfig(max_shift_px=5.0))
@@ -41,14 +43,23 @@ class InputChecks:
         self._vertical_px: list[float] = []
         self._has_begun = False
         self.right_residuals_px: list[Float[np.ndarray, " n"]] = []
-        """Per key frame: distance between where landmarks are in the right picture and where they should be."""
+        """Per key frame: distance between where landmarks are in the right picture and where they
+        should be."""
 
     def check_rig(self, frame: StereoFrame) -> None:
         """Raises CalibrationError for a baseline that cannot be in metres."""
         if frame.rig is not None and frame.rig.baseline > self._config.max_baseline:
-            raise CalibrationError(f"{self._recording}: a baseline of {frame.rig.baseline:g} m; is it in millimetres?")
+            raise CalibrationError(
+                f"{self._recording}: a baseline of {frame.rig.baseline:g} m; is it in millimetres?"
+            )
 
-    def can_start(self, frame: StereoFrame, measured: MeasuredView, corners: Float32[np.ndarray, "n 2"], config: DisparityConfig) -> bool:
+    def can_start(
+        self,
+        frame: StereoFrame,
+        measured: MeasuredView,
+        corners: Float32[np.ndarray, "n 2"],
+        config: DisparityConfig,
+    ) -> bool:
         """Whether enough of the corners have a disparity for tracking to begin.
 
         Raises:
@@ -57,22 +68,37 @@ class InputChecks:
         num_found = _num_with_disparity(measured, corners, config)
         if measured.right is None or self._has_begun:
             return num_found >= self._config.min_start_points
-        # What the right camera sees to the right of the left one moves to the left where both pictures are mirrored.
+        # What the right camera sees to the right of the left one moves to the left where both
+        # pictures are mirrored.
         mirrored = replace(measured, left=_mirrored(measured.left), right=_mirrored(measured.right))
-        mirrored_corners = (np.array([measured.left.shape[1] - 1, 0]) + corners * [-1, 1]).astype(np.float32)
-        if _num_with_disparity(mirrored, mirrored_corners, config) > max(self._config.min_start_points, 2 * num_found):
+        mirrored_corners = (np.array([measured.left.shape[1] - 1, 0]) + corners * [-1, 1]).astype(
+            np.float32
+        )
+        if _num_with_disparity(mirrored, mirrored_corners, config) > max(
+            self._config.min_start_points, 2 * num_found
+        ):
             raise RecordingError(
-                f"{self._recording}: left and right pictures are swapped: {frame.name} shows points further right in right"
+                f"{self._recording}: left and right pictures are swapped: {frame.name} shows points"
+                " further right in right"
             )
         if num_found < self._config.min_start_points:
             assert measured.view.right_grey is not None
-            coarse, _ = follow(measured.view.grey, measured.view.right_grey, corners, corners, self._config.tracking)
+            coarse, _ = follow(
+                measured.view.grey,
+                measured.view.right_grey,
+                corners,
+                corners,
+                self._config.tracking,
+            )
             self._seek_in_right(measured, corners, coarse)
         self._has_begun = num_found >= self._config.min_start_points
         return self._has_begun
 
-    def look_at_keyframe(self, keyframe: KeyFrame, landmarks: Landmarks, measured: MeasuredView) -> None:
-        """Seek landmarks of a new key frame in the right picture, and compare with where they should be there."""
+    def look_at_keyframe(
+        self, keyframe: KeyFrame, landmarks: Landmarks, measured: MeasuredView
+    ) -> None:
+        """Seek landmarks of a new key frame in the right picture, and compare with where they
+        should be there."""
         if measured.right is None or measured.view.rig is None:
             return
         seen = keyframe.observations
@@ -83,29 +109,46 @@ class InputChecks:
         at_infinity = measured.view.rig.left.cx - measured.view.rig.right.cx
         to_right = np.column_stack([-seen.measured[rows, 2] - at_infinity, np.zeros(len(rows))])
         points = seen.measured[rows, :2]
-        found = self._seek_in_right(measured, points.astype(np.float32), (points + to_right).astype(np.float32))
-        expected = keyframe.stereo.project(keyframe.cam_from_world.apply(landmarks.positions[seen.landmark_ids[rows]]))
-        expected_right = expected[:, :2] - np.column_stack([expected[:, 2] + keyframe.bias.value_px + at_infinity, np.zeros(len(rows))])
+        found = self._seek_in_right(
+            measured, points.astype(np.float32), (points + to_right).astype(np.float32)
+        )
+        expected = keyframe.stereo.project(
+            keyframe.cam_from_world.apply(landmarks.positions[seen.landmark_ids[rows]])
+        )
+        expected_right = expected[:, :2] - np.column_stack(
+            [expected[:, 2] + keyframe.bias.value_px + at_infinity, np.zeros(len(rows))]
+        )
         self.right_residuals_px.append(np.linalg.norm(found - expected_right, axis=1))
 
     def verdict(self) -> None:
-        """Raises RecordingError where left and right pictures were no pairs: at other moments, or not rectified as calibrated."""
+        """Raises RecordingError where left and right pictures were no pairs: at other moments, or
+        not rectified as calibrated."""
         if len(self._vertical_px) < self._config.min_keyframes:
             return
         vertical = float(np.median(self._vertical_px))
         if vertical > self._config.max_vertical_px:
             raise RecordingError(
-                f"{self._recording}: left and right pictures are no pairs: the same points are {vertical:.1f} px apart vertically (median);"
-                " taken at different moments, or calibrated wrongly?"
+                f"{self._recording}: left and right pictures are no pairs: the same points are"
+                f" {vertical:.1f} px apart vertically (median); taken at different moments, or"
+                " calibrated wrongly?"
             )
 
     def _seek_in_right(
-        self, measured: MeasuredView, points: Float32[np.ndarray, "n 2"], guesses: Float32[np.ndarray, "n 2"]
+        self,
+        measured: MeasuredView,
+        points: Float32[np.ndarray, "n 2"],
+        guesses: Float32[np.ndarray, "n 2"],
     ) -> Float[np.ndarray, "n 2"]:
-        """Where points of the left picture are in the right one, up and down as well; NaN where not found. Keeps the median height."""
+        """Where points of the left picture are in the right one, up and down as well; NaN where not
+        found. Keeps the median height."""
         assert measured.right is not None
         found = align_with_reference(
-            measured.left, measured.right, points, guesses, np.ones(len(points), np.float32), self._config.tracking
+            measured.left,
+            measured.right,
+            points,
+            guesses,
+            np.ones(len(points), np.float32),
+            self._config.tracking,
         )
         places = np.where(found.is_alike[:, None], found.points_img, np.nan).astype(np.float64)
         if np.count_nonzero(found.is_alike) >= max(10, len(points) // 3):
@@ -117,5 +160,11 @@ def _mirrored(picture: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]
     return np.ascontiguousarray(picture[:, ::-1])
 
 
-def _num_with_disparity(measured: MeasuredView, corners: Float32[np.ndarray, "n 2"], config: DisparityConfig) -> int:
-    return int(np.isfinite(measure_disparities(measured, corners, np.full(len(corners), np.nan), config)[0]).sum())
+def _num_with_disparity(
+    measured: MeasuredView, corners: Float32[np.ndarray, "n 2"], config: DisparityConfig
+) -> int:
+    return int(
+        np.isfinite(
+            measure_disparities(measured, corners, np.full(len(corners), np.nan), config)[0]
+        ).sum()
+    )

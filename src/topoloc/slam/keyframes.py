@@ -1,4 +1,5 @@
-"""Key frames and the landmarks that they see: what SLAM remembers. Data, and the few questions asked of it."""
+"""Key frames and the landmarks that they see: what SLAM remembers. Data, and the few questions
+asked of it."""
 
 from __future__ import annotations
 
@@ -17,13 +18,15 @@ from topoloc.slam.metric_points import MetricPoints
 
 @dataclass(frozen=True)
 class StereoCamera:
-    """A pinhole that measures disparity, too: ``disparity = bf / depth``, bf in pixels times metres."""
+    """A pinhole that measures disparity, too: ``disparity = bf / depth``, bf in pixels times
+    metres."""
 
     camera: Camera
     bf: float
 
     def points_cam(self, measured: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Points (metres) of pixels and disparities (x, y, d); rows of NaN where d is unknown or not positive."""
+        """Points (metres) of pixels and disparities (x, y, d); rows of NaN where d is unknown or
+        not positive."""
         z = self.bf / np.where(measured[:, 2] > 0.0, measured[:, 2], np.nan)
         return np.column_stack([self.camera.normalized_from_img(measured[:, :2]) * z[:, None], z])
 
@@ -35,10 +38,12 @@ class StereoCamera:
 
 @dataclass(eq=False)
 class DisparityBias:
-    """What a recording's measured disparities are too large by, pixels, and how well that is known (1 / px^2).
+    """What a recording's measured disparities are too large by, pixels, and how well that is known
+    (1 / px^2).
 
-    Rectification is never perfect: an angle of one milliradian between the two cameras shifts all disparities by f / 1000, most of
-    a pixel in a street camera, and makes all that is far too far or too near. Motion tells: see `bundle`.
+    Rectification is never perfect: an angle of one milliradian between the two cameras shifts all
+    disparities by f / 1000, most of a pixel in a street camera, and makes all that is far too far
+    or too near. Motion tells: see `bundle`.
     """
 
     value_px: float = 0.0
@@ -49,7 +54,9 @@ class DisparityBias:
 class Landmarks:
     """Positions of all landmarks by their id, each in the world of its sub-map (metres)."""
 
-    positions: Float[np.ndarray, "capacity 3"] = field(default_factory=lambda: np.full((1024, 3), np.nan))
+    positions: Float[np.ndarray, "capacity 3"] = field(
+        default_factory=lambda: np.full((1024, 3), np.nan)
+    )
     num: int = 0
 
     def add(self, points_world: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
@@ -66,10 +73,12 @@ class Landmarks:
 
 @dataclass(eq=False)
 class Observations:
-    """What one key frame sees of landmarks: pixel and disparity (x, y, d) and the inverse of their standard deviations.
+    """What one key frame sees of landmarks: pixel and disparity (x, y, d) and the inverse of their
+    standard deviations.
 
-    An unknown disparity has weight 0. `active` is False for what has been found to be wrong. All of it is kept in single precision, which
-    is that of the pictures' measurements: of a long walk nothing else takes as much memory.
+    An unknown disparity has weight 0. `active` is False for what has been found to be wrong. All of
+    it is kept in single precision, which is that of the pictures' measurements: of a long walk
+    nothing else takes as much memory.
     """
 
     landmark_ids: Int[np.ndarray, " n"]
@@ -79,7 +88,10 @@ class Observations:
 
     def __post_init__(self) -> None:
         self.landmark_ids = np.asarray(self.landmark_ids, np.int32)
-        self.measured, self.weights = np.asarray(self.measured, np.float32), np.asarray(self.weights, np.float32)
+        self.measured, self.weights = (
+            np.asarray(self.measured, np.float32),
+            np.asarray(self.weights, np.float32),
+        )
 
     def append(self, other: Observations) -> None:
         self.landmark_ids = np.concatenate([self.landmark_ids, other.landmark_ids])
@@ -98,7 +110,8 @@ class PlaceView:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """How a key frame follows from an earlier one, `source`: covariance of the left perturbation of cam_from_source (m, rad)."""
+    """How a key frame follows from an earlier one, `source`: covariance of the left perturbation of
+    cam_from_source (m, rad)."""
 
     source: KeyFrame
     covariance: Float[np.ndarray, "6 6"]
@@ -106,9 +119,11 @@ class Motion:
 
 @dataclass(eq=False)
 class KeyFrame:
-    """A frame that SLAM keeps. `cam_from_world` is that of the rectified view and changes as the map is optimised.
+    """A frame that SLAM keeps. `cam_from_world` is that of the rectified view and changes as the
+    map is optimised.
 
-    `motion` is None for the first of a sub-map. How it looks lies on a shelf that it shares with others (`places`), at `place_row`.
+    `motion` is None for the first of a sub-map. How it looks lies on a shelf that it shares with
+    others (`places`), at `place_row`.
     """
 
     recording: int
@@ -131,7 +146,8 @@ class KeyFrame:
 
     @property
     def place(self) -> PlaceView | None:
-        """How it looks, where that is known; waits for what a thread still looks at (`coming_place`)."""
+        """How it looks, where that is known; waits for what a thread still looks at
+        (`coming_place`)."""
         if self.coming_place is not None:
             self.place, self.coming_place = self.coming_place.result(), None
         return None if self.place_row is None else self.places[self.place_row]
@@ -153,4 +169,6 @@ class FramePose:
 
     def world_from_cam(self) -> Rigid3:
         """The pose of the frame's own camera, which rectification may have turned."""
-        return (self.cam_from_keyframe @ self.keyframe.cam_from_world).inverse() @ self.view_from_cam
+        return (
+            self.cam_from_keyframe @ self.keyframe.cam_from_world
+        ).inverse() @ self.view_from_cam

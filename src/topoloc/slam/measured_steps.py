@@ -1,4 +1,5 @@
-"""How the camera moved between pictures of a recording, measured from the pictures alone: what a trajectory can be held against."""
+"""How the camera moved between pictures of a recording, measured from the pictures alone: what a
+trajectory can be held against."""
 
 from __future__ import annotations
 
@@ -30,7 +31,8 @@ class MeasuredStepsConfig:
     num_steps: Annotated[int, Between(1, 1000)] = 16
     """Pictures that a step begins at, spread over the recording."""
     gaps: tuple[int, ...] = (12, 5, 2, 1)
-    """Frames from a step's first picture to its last; the first gap over which enough is recognised is taken."""
+    """Frames from a step's first picture to its last; the first gap over which enough is recognised
+    is taken."""
     min_inliers: Annotated[int, AtLeast(6)] = 40
     """Points of the first picture that must be recognised in the last."""
     pose: AbsolutePoseConfig = field(default_factory=AbsolutePoseConfig)
@@ -40,8 +42,9 @@ class MeasuredStepsConfig:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredStep:
-    """`first_from_last` is the motion between the cameras of two frames; `median_depth` (metres) that of the points it stands on. Of a
-    single camera (`has_scale` is False) the way has the length 1, and the depth is unknown (0)."""
+    """`first_from_last` is the motion between the cameras of two frames; `median_depth` (metres)
+    that of the points it stands on. Of a single camera (`has_scale` is False) the way has the
+    length 1, and the depth is unknown (0)."""
 
     first: int
     last: int
@@ -50,12 +53,14 @@ class MeasuredStep:
     has_scale: bool = True
 
 
-def measure_steps(sequence: StereoSequence, usable: list[int], config: MeasuredStepsConfig) -> list[MeasuredStep]:
-    """Steps spread over the frames `usable` (their rows, increasing), by the left pictures and the depth of each step's first frame; of
-    a single camera by its pictures alone.
+def measure_steps(
+    sequence: StereoSequence, usable: list[int], config: MeasuredStepsConfig
+) -> list[MeasuredStep]:
+    """Steps spread over the frames `usable` (their rows, increasing), by the left pictures and the
+    depth of each step's first frame; of a single camera by its pictures alone.
 
-    A step that cannot be measured, as too little is recognised, is left out. All steps over one gap are sought before those over the next,
-    so that the recording is read in its order.
+    A step that cannot be measured, as too little is recognised, is left out. All steps over one gap
+    are sought before those over the next, so that the recording is read in its order.
 
     Raises:
         RecordingError, CalibrationError, UnreadableImageError: from reading the recording.
@@ -64,19 +69,38 @@ def measure_steps(sequence: StereoSequence, usable: list[int], config: MeasuredS
     firsts: dict[int, _Seen] = {}
     steps: dict[int, MeasuredStep] = {}
 
-    def measure(pair: tuple[int, int, StereoFrame | None, StereoFrame]) -> tuple[int, _Seen, MeasuredStep | None]:
+    def measure(
+        pair: tuple[int, int, StereoFrame | None, StereoFrame],
+    ) -> tuple[int, _Seen, MeasuredStep | None]:
         start, other, frame, other_frame = pair
         first = firsts[start] if frame is None else _seen(frame, config, is_first=True)
         motion = _motion(first, last := _seen(other_frame, config, is_first=False), config)
         if motion is None:
             return start, first, None
         first_from_last = first.view_from_cam.inverse() @ motion[0].inverse() @ last.view_from_cam
-        return start, first, MeasuredStep(usable[start], usable[other], first_from_last, motion[1], has_scale=first.points is not None)
+        return (
+            start,
+            first,
+            MeasuredStep(
+                usable[start],
+                usable[other],
+                first_from_last,
+                motion[1],
+                has_scale=first.points is not None,
+            ),
+        )
 
     for gap in config.gaps:  # backwards where the recording ends
-        pairs = ((start, start + gap if start + gap < len(usable) else start - gap) for start in starts if start not in steps)
+        pairs = (
+            (start, start + gap if start + gap < len(usable) else start - gap)
+            for start in starts
+            if start not in steps
+        )
         pairs = [pair for pair in pairs if pair[1] >= 0]
-        read = ((a, b, None if a in firsts else sequence[usable[a]], left_frame(sequence, usable[b])) for a, b in pairs)
+        read = (
+            (a, b, None if a in firsts else sequence[usable[a]], left_frame(sequence, usable[b]))
+            for a, b in pairs
+        )
         for start, first, step in in_order(measure, read):
             firsts[start] = first
             if step is not None:
@@ -105,8 +129,11 @@ def _seen(frame: StereoFrame, config: MeasuredStepsConfig, is_first: bool) -> _S
 
 
 def _motion(first: _Seen, last: _Seen, config: MeasuredStepsConfig) -> tuple[Rigid3, float] | None:
-    """last_from_first of the views, and the median depth of what it stands on; of a single camera 0, and the way has the length 1."""
-    matches = match_features(last.features.descriptors, first.features.descriptors, MatchingConfig())
+    """last_from_first of the views, and the median depth of what it stands on; of a single camera
+    0, and the way has the length 1."""
+    matches = match_features(
+        last.features.descriptors, first.features.descriptors, MatchingConfig()
+    )
     if len(matches) < config.min_inliers:
         return None
     points_img = last.features.points_img[matches.query_idx].astype(np.float64)
@@ -115,8 +142,13 @@ def _motion(first: _Seen, last: _Seen, config: MeasuredStepsConfig) -> tuple[Rig
         moved = estimate_relative_pose(first_img, first.camera, points_img, last.camera)
         is_seen = moved is not None and np.count_nonzero(moved.inliers) >= config.min_inliers
         return (moved.second_from_first, 0.0) if is_seen and moved is not None else None
-    points, covariances = first.points.points_cam[matches.train_idx], first.points.covariances[matches.train_idx]
-    pose = estimate_absolute_pose(points_img, points, last.camera, config.pose, point_covariances=covariances)
+    points, covariances = (
+        first.points.points_cam[matches.train_idx],
+        first.points.covariances[matches.train_idx],
+    )
+    pose = estimate_absolute_pose(
+        points_img, points, last.camera, config.pose, point_covariances=covariances
+    )
     if pose is None or np.count_nonzero(pose.inliers) < config.min_inliers:
         return None
     return pose.cam_from_world, float(np.median(points[pose.inliers, 2]))

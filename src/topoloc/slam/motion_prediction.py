@@ -1,8 +1,8 @@
 """Where the camera will be if it goes on as it went, and how far from there it may be.
 
-Constant velocity; how wrong that is has been seen at every frame so far, as an acceleration. A camera without a picture for a time T
-is off by the acceleration times T^2 / 2, so that four frames lost are bridged where somebody walks steadily, and are not where he
-starts and stops.
+Constant velocity; how wrong that is has been seen at every frame so far, as an acceleration. A
+camera without a picture for a time T is off by the acceleration times T^2 / 2, so that four frames
+lost are bridged where somebody walks steadily, and are not where he starts and stops.
 """
 
 from __future__ import annotations
@@ -33,16 +33,20 @@ class PredictionConfig:
     way_share: Annotated[float, AtLeast(0)] = 0.1
     """Sigma of a prediction is at least this share of its way, and of its turn."""
     stop_share: Annotated[float, AtLeast(0)] = 0.7
-    """From a frame to the very next a camera may stop or turn back: sigma is this share of its way and turn there."""
+    """From a frame to the very next a camera may stop or turn back: sigma is this share of its way
+    and turn there."""
     max_sigmas: Annotated[float, Above(0)] = 3.0
-    """A step that is further from the prediction than this is not what the motion lets expect, ..."""
+    """A step that is further from the prediction than this is not what the motion lets expect,
+    ..."""
     clear_sigmas: Annotated[float, Above(0)] = 3.5
-    """... and where another step is as expected, it must be this much less so: root of the difference of their squares."""
+    """... and where another step is as expected, it must be this much less so: root of the
+    difference of their squares."""
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """cam_from_world, one sigma of its position (metres) and of its direction (radians), infinite where no motion is known."""
+    """cam_from_world, one sigma of its position (metres) and of its direction (radians), infinite
+    where no motion is known."""
 
     cam_from_world: Rigid3
     step: Rigid3
@@ -53,18 +57,25 @@ class Prediction:
     def distance(self, cam_from_world: Rigid3) -> float:
         """How far from the prediction a pose is, in sigma."""
         away = cam_from_world @ self.cam_from_world.inverse()
-        return float(max(np.linalg.norm(away.translation) / self.sigma, away.angle() / self.sigma_rad))
+        return float(
+            max(np.linalg.norm(away.translation) / self.sigma, away.angle() / self.sigma_rad)
+        )
 
 
-def expected_one(prediction: Prediction | None, poses: Sequence[Rigid3], config: PredictionConfig) -> Rigid3 | None:
-    """Which of several cam_from_world the motion singles out: near the prediction, and all others far; None where it cannot tell."""
+def expected_one(
+    prediction: Prediction | None, poses: Sequence[Rigid3], config: PredictionConfig
+) -> Rigid3 | None:
+    """Which of several cam_from_world the motion singles out: near the prediction, and all others
+    far; None where it cannot tell."""
     if len(poses) == 1:
         return poses[0]
     if prediction is None or not poses:
         return None
     distances = np.array([prediction.distance(pose) for pose in poses])
     nearest, next_one = np.argsort(distances, kind="stable")[:2]
-    clear = distances[nearest] < config.max_sigmas and distances[next_one] > np.hypot(distances[nearest], config.clear_sigmas)
+    clear = distances[nearest] < config.max_sigmas and distances[next_one] > np.hypot(
+        distances[nearest], config.clear_sigmas
+    )
     return poses[int(nearest)] if clear else None
 
 
@@ -80,7 +91,8 @@ class MotionHistory:
         self._cam_from_world: Rigid3 | None = None
 
     def remember(self, t_ns: int, cam_from_world: Rigid3, moved: Rigid3 | None = None) -> None:
-        """A frame was at `cam_from_world`; `moved` is its motion since the frame before, None where that is not known."""
+        """A frame was at `cam_from_world`; `moved` is its motion since the frame before, None where
+        that is not known."""
         if moved is not None and self._t_ns is not None and t_ns > self._t_ns:
             interval = 1e-9 * (t_ns - self._t_ns)
             velocity = moved.log() / interval
@@ -88,7 +100,12 @@ class MotionHistory:
                 change = (velocity - self._velocity) * interval
                 between = 0.5 * (interval + self._intervals[-1])
                 rates = np.linalg.norm(change[:3]), np.linalg.norm(change[3:])
-                self._squares.append((float(rates[0] / (interval * between)) ** 2, float(rates[1] / (interval * between)) ** 2))
+                self._squares.append(
+                    (
+                        float(rates[0] / (interval * between)) ** 2,
+                        float(rates[1] / (interval * between)) ** 2,
+                    )
+                )
             self._velocity = velocity
             self._intervals.append(interval)
         self._t_ns, self._cam_from_world = t_ns, cam_from_world

@@ -1,10 +1,11 @@
 """Visual odometry: where the camera went, frame after frame, and the key frames that remember it.
 
-Read from `Odometry.process`. A frame's points are followed from the frame before, their landmarks give its pose (robust PnP), and where
-too few of them are left, or the view has changed, it becomes a key frame: disparities are measured, new corners become
-landmarks, and the last key frames are adjusted together. A camera that is lost is sought in the last places; after a while
-it starts a sub-map of its own, with the frames that were sought in vain. So it does at once where a repeating wall admits several
-steps and the motion does not tell which.
+Read from `Odometry.process`. A frame's points are followed from the frame before, their landmarks
+give its pose (robust PnP), and where too few of them are left, or the view has changed, it becomes
+a key frame: disparities are measured, new corners become landmarks, and the last key frames are
+adjusted together. A camera that is lost is sought in the last places; after a while it starts a
+sub-map of its own, with the frames that were sought in vain. So it does at once where a repeating
+wall admits several steps and the motion does not tell which.
 """
 
 from __future__ import annotations
@@ -21,19 +22,37 @@ from topoloc.shelf import Shelf
 from topoloc.slam.bundle import adjust_bundle
 from topoloc.slam.disparity import MeasuredView, measure_disparities, measured_view
 from topoloc.slam.input_checks import InputChecks
-from topoloc.slam.keyframes import DisparityBias, FramePose, KeyFrame, Landmarks, Motion, Observations, PlaceView
+from topoloc.slam.keyframes import (
+    DisparityBias,
+    FramePose,
+    KeyFrame,
+    Landmarks,
+    Motion,
+    Observations,
+    PlaceView,
+)
 from topoloc.slam.motion_prediction import MotionHistory, expected_one
 from topoloc.slam.place_matching import match_places, place_view
 from topoloc.slam.steps import LastFrame, OdometryConfig, Step, StepSeeker, Tracks
 from topoloc.slam.tracking import find_corners
 
-_PLACE_BYTES = 16_000_000  # of places in memory, about 80: the last few are asked, and comparing two takes ten times as long as reading
+# of places in memory, about 80: the last few are asked, and comparing two takes ten times as long
+# as reading
+_PLACE_BYTES = 16_000_000
 
 
 class Odometry:
-    """The state of one recording's odometry. `keyframes` and `landmarks` are those of all recordings, and are added to."""
+    """The state of one recording's odometry. `keyframes` and `landmarks` are those of all
+    recordings, and are added to."""
 
-    def __init__(self, recording: int, keyframes: list[KeyFrame], landmarks: Landmarks, checks: InputChecks, config: OdometryConfig):
+    def __init__(
+        self,
+        recording: int,
+        keyframes: list[KeyFrame],
+        landmarks: Landmarks,
+        checks: InputChecks,
+        config: OdometryConfig,
+    ):
         self._recording, self._keyframes, self._landmarks = recording, keyframes, landmarks
         self._checks, self._config = checks, config
         self._last: LastFrame | None = None
@@ -42,7 +61,9 @@ class Odometry:
         self._tracks = Tracks.of(np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
         self._chain: list[KeyFrame] = []  # the key frames since tracking began or began again
         self._num_lost = 0
-        self._missed: list[tuple[int, StereoFrame]] = []  # the frames since the camera was lost that may begin a sub-map
+        self._missed: list[
+            tuple[int, StereoFrame]
+        ] = []  # the frames since the camera was lost that may begin a sub-map
         self._history = MotionHistory(config.prediction)
         self._repeats: list[Rigid3] = []  # of the last frame before the camera was lost
         self._bias = DisparityBias()
@@ -50,9 +71,11 @@ class Odometry:
         self._looking = ThreadPoolExecutor(1, initializer=be_one_of_several)
         self._looked_at: KeyFrame | None = None
 
-    def process(self, frame_idx: int, frame: StereoFrame, measured: MeasuredView) -> list[FramePose]:
-        """Where this frame is, and those before it whose place is known only now; nothing where that is not known. `measured` is
-        `measured_view(frame)`."""
+    def process(
+        self, frame_idx: int, frame: StereoFrame, measured: MeasuredView
+    ) -> list[FramePose]:
+        """Where this frame is, and those before it whose place is known only now; nothing where
+        that is not known. `measured` is `measured_view(frame)`."""
         self._expect_bias(measured)
         pose = self._follow(frame_idx, frame, measured)
         return [pose] if pose is not None else self._lost(frame_idx, frame, measured)
@@ -67,7 +90,9 @@ class Odometry:
         if measured.right is not None:
             self._bias.information = 1.0 / self._config.sigma_bias_px**2
 
-    def _follow(self, frame_idx: int, frame: StereoFrame, measured: MeasuredView) -> FramePose | None:
+    def _follow(
+        self, frame_idx: int, frame: StereoFrame, measured: MeasuredView
+    ) -> FramePose | None:
         """Where the frame is, by its step from the last one."""
         step = self._track(frame, measured)
         if step is None:
@@ -78,24 +103,43 @@ class Odometry:
         assert self._reference is not None
         cam_from_keyframe = step.cam_from_world @ self._reference.cam_from_world.inverse()
         if self._is_keyframe_due(measured):
-            self._add_keyframe(frame, frame_idx, step.cam_from_world, measured, Motion(self._reference, step.covariance))
+            self._add_keyframe(
+                frame,
+                frame_idx,
+                step.cam_from_world,
+                measured,
+                Motion(self._reference, step.covariance),
+            )
             cam_from_keyframe = Rigid3.identity()
         return FramePose(frame_idx, self._reference, cam_from_keyframe, measured.view.view_from_cam)
 
     def _track(self, frame: StereoFrame, measured: MeasuredView) -> Step | None:
-        """The step from the last frame to this one; None where there is none, or the motion does not tell which."""
+        """The step from the last frame to this one; None where there is none, or the motion does
+        not tell which."""
         prediction = self._history.predict(frame.t_ns)
         if self._last is None or self._reference is None or prediction is None:
             return None
-        seeker = StepSeeker(self._last, self._reference, self._reference_picture, self._tracks, self._landmarks, measured, self._config)
+        seeker = StepSeeker(
+            self._last,
+            self._reference,
+            self._reference_picture,
+            self._tracks,
+            self._landmarks,
+            measured,
+            self._config,
+        )
         step = seeker.seek(prediction.cam_from_world) or seeker.seek(self._last.cam_from_world)
         trusted = self._config.prediction
-        is_expected = step is not None and prediction.distance(step.cam_from_world) < trusted.max_sigmas
+        is_expected = (
+            step is not None and prediction.distance(step.cam_from_world) < trusted.max_sigmas
+        )
         if is_expected and not prediction.is_gap:
             return step
         if self._num_lost == 0:
             self._repeats = seeker.repeats(prediction)
-        if step is None or (prediction.is_gap and not is_expected and step.share < self._config.min_gap_share):
+        if step is None or (
+            prediction.is_gap and not is_expected and step.share < self._config.min_gap_share
+        ):
             return None
         expected = expected_one(prediction, self._with_repeats(step.cam_from_world), trusted)
         if expected is not None and not seeker.is_same(expected, step.cam_from_world):
@@ -110,32 +154,48 @@ class Odometry:
         return [cam_from_world, *(repeat @ cam_from_world for repeat in self._repeats)]
 
     def _remember(self, frame: StereoFrame, measured: MeasuredView, cam_from_world: Rigid3) -> None:
-        moved = cam_from_world @ self._last.cam_from_world.inverse() if self._last is not None else None
+        moved = (
+            cam_from_world @ self._last.cam_from_world.inverse() if self._last is not None else None
+        )
         self._history.remember(frame.t_ns, cam_from_world, moved)
         self._last = LastFrame(measured, cam_from_world)
 
     def _is_keyframe_due(self, measured: MeasuredView) -> bool:
         assert self._reference is not None
         tracks, config = self._tracks, self._config
-        if len(tracks.landmark_ids) < config.keyframe_share * np.count_nonzero(self._reference.observations.active):
+        if len(tracks.landmark_ids) < config.keyframe_share * np.count_nonzero(
+            self._reference.observations.active
+        ):
             return True
         motion = np.median(np.linalg.norm(tracks.points_img - tracks.points_ref, axis=1))
         return bool(motion > config.keyframe_motion * measured.view.camera.width)
 
     def _add_keyframe(
-        self, frame: StereoFrame, frame_idx: int, cam_from_world: Rigid3, measured: MeasuredView, motion: Motion | None
+        self,
+        frame: StereoFrame,
+        frame_idx: int,
+        cam_from_world: Rigid3,
+        measured: MeasuredView,
+        motion: Motion | None,
     ) -> None:
-        """Make the frame a key frame: measure, add landmarks, adjust the window, and follow its points from here on."""
+        """Make the frame a key frame: measure, add landmarks, adjust the window, and follow its
+        points from here on."""
         config = self._config
         points, landmark_ids = self._tracks.points_img, self._tracks.landmark_ids
         corners = find_corners(measured.view.grey, points, self._config.tracking)
-        guesses = measured.stereo.project(cam_from_world.apply(self._landmarks.positions[landmark_ids]))[:, 2]
+        guesses = measured.stereo.project(
+            cam_from_world.apply(self._landmarks.positions[landmark_ids])
+        )[:, 2]
         all_points = np.concatenate([points, corners])
         bias = self._bias.value_px
         guesses = np.concatenate([guesses, np.full(len(corners), np.nan)]) + bias
-        disparities, sigmas = measure_disparities(measured, all_points, guesses, self._config.disparity)
+        disparities, sigmas = measure_disparities(
+            measured, all_points, guesses, self._config.disparity
+        )
         values = np.column_stack([all_points.astype(np.float64), disparities])
-        fresh = np.flatnonzero((disparities - bias)[len(points) :] > config.min_disparity_px) + len(points)
+        fresh = np.flatnonzero((disparities - bias)[len(points) :] > config.min_disparity_px) + len(
+            points
+        )
         unbiased = values[fresh] - [0.0, 0.0, bias]
         new_points = cam_from_world.inverse().apply(measured.stereo.points_cam(unbiased))
         rows = np.concatenate([np.arange(len(points)), fresh])
@@ -161,7 +221,9 @@ class Odometry:
         if self._is_new_place(keyframe):
             self._look(keyframe, measured)
 
-    def _observations(self, ids: np.ndarray, values: np.ndarray, sigmas: np.ndarray) -> Observations:
+    def _observations(
+        self, ids: np.ndarray, values: np.ndarray, sigmas: np.ndarray
+    ) -> Observations:
         weights = np.full((len(ids), 3), 1.0 / self._config.sigma_px)
         weights[:, 2] = np.where(np.isfinite(sigmas), 1.0 / sigmas, 0.0)
         return Observations(ids, values, weights, np.ones(len(ids), np.bool_))
@@ -191,12 +253,15 @@ class Odometry:
             return True
         motion = keyframe.cam_from_world @ last[0].cam_from_world.inverse()
         seen = keyframe.observations
-        depth = keyframe.cam_from_world.apply(self._landmarks.positions[seen.landmark_ids[seen.active]])[:, 2]
+        depth = keyframe.cam_from_world.apply(
+            self._landmarks.positions[seen.landmark_ids[seen.active]]
+        )[:, 2]
         far = np.linalg.norm(motion.translation) > self._config.place_distance * np.median(depth)
         return bool(far or motion.angle() > np.deg2rad(self._config.place_angle_deg))
 
     def _look(self, keyframe: KeyFrame, measured: MeasuredView) -> None:
-        """How a key frame looks is found while the next frames are followed; of one at a time, so that few pictures are held."""
+        """How a key frame looks is found while the next frames are followed; of one at a time, so
+        that few pictures are held."""
         if self._looked_at is not None:
             assert self._looked_at.place is not None  # waits
         keyframe.coming_place = self._looking.submit(place_view, measured.view, self._config.places)
@@ -206,7 +271,11 @@ class Odometry:
         """The last key frames of this sub-map whose looks are known, newest first."""
         if self._reference is None:
             return []
-        candidates = (k for k in reversed(self._keyframes) if k.recording == self._recording and k.submap == self._reference.submap)
+        candidates = (
+            k
+            for k in reversed(self._keyframes)
+            if k.recording == self._recording and k.submap == self._reference.submap
+        )
         return list(islice((keyframe for keyframe in candidates if keyframe.has_place), num))
 
     def _lost(self, frame_idx: int, frame: StereoFrame, measured: MeasuredView) -> list[FramePose]:
@@ -224,9 +293,14 @@ class Odometry:
         return self._begin_again()
 
     def _begin_again(self) -> list[FramePose]:
-        """A sub-map of the frames that were sought in vain, from the first on which all others follow."""
+        """A sub-map of the frames that were sought in vain, from the first on which all others
+        follow."""
         missed, self._missed, self._reference = self._missed, [], None
-        num_keyframes, num_landmarks, num_lost = len(self._keyframes), self._landmarks.num, self._num_lost
+        num_keyframes, num_landmarks, num_lost = (
+            len(self._keyframes),
+            self._landmarks.num,
+            self._num_lost,
+        )
         poses: list[FramePose] = []
         for frame_idx, frame in missed:
             measured = measured_view(frame)
@@ -244,7 +318,12 @@ class Odometry:
         return poses
 
     def _start(
-        self, frame_idx: int, frame: StereoFrame, measured: MeasuredView, cam_from_world: Rigid3, motion: Motion | None
+        self,
+        frame_idx: int,
+        frame: StereoFrame,
+        measured: MeasuredView,
+        cam_from_world: Rigid3,
+        motion: Motion | None,
     ) -> FramePose:
         """Tracking begins with this frame, as a key frame."""
         self._last, self._chain = None, []
@@ -256,8 +335,11 @@ class Odometry:
         assert self._reference is not None
         return FramePose(frame_idx, self._reference, Rigid3.identity(), measured.view.view_from_cam)
 
-    def _relocalize(self, frame: StereoFrame, measured: MeasuredView) -> tuple[Rigid3, Motion] | None:
-        """Where the camera is by one of the last places; where the wall repeats itself and the motion does not tell, the search ends."""
+    def _relocalize(
+        self, frame: StereoFrame, measured: MeasuredView
+    ) -> tuple[Rigid3, Motion] | None:
+        """Where the camera is by one of the last places; where the wall repeats itself and the
+        motion does not tell, the search ends."""
         here = place_view(measured.view, self._config.places)
         prediction = self._history.predict(frame.t_ns)
         for keyframe in self._last_places(self._config.places_asked):
@@ -267,7 +349,9 @@ class Odometry:
             if match is None:
                 continue
             cam_from_world = match.target_from_source @ keyframe.cam_from_world
-            expected = expected_one(prediction, self._with_repeats(cam_from_world), self._config.prediction)
+            expected = expected_one(
+                prediction, self._with_repeats(cam_from_world), self._config.prediction
+            )
             if expected is cam_from_world:
                 return cam_from_world, Motion(keyframe, match.covariance)
             self._reference = None

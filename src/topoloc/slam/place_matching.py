@@ -1,4 +1,5 @@
-"""Do two key frames see the same place, and from where? Local features matched, then robust PnP on metric points."""
+"""Do two key frames see the same place, and from where? Local features matched, then robust PnP on
+metric points."""
 
 from __future__ import annotations
 
@@ -29,7 +30,9 @@ class PlaceMatchingConfig:
     points: MetricPointsConfig = field(default_factory=MetricPointsConfig)
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     pose: AbsolutePoseConfig = field(
-        default_factory=lambda: AbsolutePoseConfig(max_reprojection_error_px=2.5, sigma_px=0.8, max_iterations=1000)
+        default_factory=lambda: AbsolutePoseConfig(
+            max_reprojection_error_px=2.5, sigma_px=0.8, max_iterations=1000
+        )
     )
     min_inliers: Annotated[int, AtLeast(4)] = 25
     """Matches that agree on the relative pose, at least."""
@@ -41,7 +44,8 @@ class PlaceMatchingConfig:
 
 @dataclass(frozen=True, eq=False)
 class PlaceMatch:
-    """target_from_source with the covariance of its left perturbation, and the rows of the features that agree."""
+    """target_from_source with the covariance of its left perturbation, and the rows of the features
+    that agree."""
 
     target_from_source: Rigid3
     covariance: Float[np.ndarray, "6 6"]
@@ -55,10 +59,18 @@ def place_view(view: FrameView, config: PlaceMatchingConfig) -> PlaceView:
     return PlaceView(features, locate_points(features, view, config.points))
 
 
-def match_places(source: PlaceView, target: PlaceView, stereo: StereoCamera, config: PlaceMatchingConfig) -> PlaceMatch | None:
-    """Where `source` was taken, seen from `target` (whose camera is `stereo`), or None where they do not agree on it."""
-    rows, matching = np.flatnonzero(source.points.valid), config.matching.resolved(find_kind(config.features.kind).ratio)
-    matches = match_features(target.features.descriptors, source.features.descriptors[rows], matching)
+def match_places(
+    source: PlaceView, target: PlaceView, stereo: StereoCamera, config: PlaceMatchingConfig
+) -> PlaceMatch | None:
+    """Where `source` was taken, seen from `target` (whose camera is `stereo`), or None where they
+    do not agree on it."""
+    rows, matching = (
+        np.flatnonzero(source.points.valid),
+        config.matching.resolved(find_kind(config.features.kind).ratio),
+    )
+    matches = match_features(
+        target.features.descriptors, source.features.descriptors[rows], matching
+    )
     if len(matches) < config.min_inliers:
         return None
     source_rows, target_rows = rows[matches.train_idx], matches.query_idx.astype(np.int64)
@@ -77,21 +89,31 @@ def match_places(source: PlaceView, target: PlaceView, stereo: StereoCamera, con
         return None
     if np.sqrt(np.trace(pose.covariance[:3, :3])) > config.max_sigma:
         return None
-    return PlaceMatch(pose.cam_from_world, pose.covariance, source_rows[pose.inliers], target_rows[pose.inliers])
+    return PlaceMatch(
+        pose.cam_from_world, pose.covariance, source_rows[pose.inliers], target_rows[pose.inliers]
+    )
 
 
 def num_repeated(view: PlaceView, stereo: StereoCamera, config: PlaceMatchingConfig) -> int:
-    """How many of a view's features look like others of the same picture, all as from one other place: a wall of equal panels.
+    """How many of a view's features look like others of the same picture, all as from one other
+    place: a wall of equal panels.
 
-    Each is matched with the one most like it elsewhere in the picture, and the other way round; so many agree on a pose.
+    Each is matched with the one most like it elsewhere in the picture, and the other way round; so
+    many agree on a pose.
     """
     points_img, descriptors = view.features.points_img.astype(np.float64), view.features.descriptors
     apart = np.linalg.norm(points_img[:, None] - points_img, axis=2)
-    likeness = np.where(apart < _ELSEWHERE * stereo.camera.width, -np.inf, descriptors @ descriptors.T)
+    likeness = np.where(
+        apart < _ELSEWHERE * stereo.camera.width, -np.inf, descriptors @ descriptors.T
+    )
     if len(descriptors) < config.min_inliers:
         return 0
     rows, nearest = np.arange(len(descriptors)), np.argmax(likeness, axis=1)
-    mutual = (np.argmax(likeness, axis=0)[nearest] == rows) & view.points.valid[nearest] & np.isfinite(likeness[rows, nearest])
+    mutual = (
+        (np.argmax(likeness, axis=0)[nearest] == rows)
+        & view.points.valid[nearest]
+        & np.isfinite(likeness[rows, nearest])
+    )
     if np.count_nonzero(mutual) < config.min_inliers:
         return 0
     sources = nearest[mutual]

@@ -1,9 +1,11 @@
 """Do the poses of a trajectory fit the pictures? If not, which known convention makes them fit?
 
-Steps between pictures are measured from these alone (`measured_steps.py`), of a single camera but for their length; a trajectory of the
-right convention has nearly the same ones. Where it has not, the conventions of `geometry/pose_conventions.py` are tried, then a clock that
-is shifted, then a camera that is mounted on the body whose poses these are: hand-eye calibration, body_step @ body_from_cam =
-body_from_cam @ camera_step (Park and Martin, *Robot sensor calibration: solving AX = XB on the Euclidean group*, 1994).
+Steps between pictures are measured from these alone (`measured_steps.py`), of a single camera but
+for their length; a trajectory of the right convention has nearly the same ones. Where it has not,
+the conventions of `geometry/pose_conventions.py` are tried, then a clock that is shifted, then a
+camera that is mounted on the body whose poses these are: hand-eye calibration, body_step @
+body_from_cam = body_from_cam @ camera_step (Park and Martin, *Robot sensor calibration: solving AX
+= XB on the Euclidean group*, 1994).
 """
 
 from __future__ import annotations
@@ -18,21 +20,42 @@ from jaxtyping import Float
 
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.alignment import nearest_rotation
-from topoloc.geometry.pose_conventions import AXES, DIRECTIONS, ROTATIONS, UNITS, Mend, meaning, mended
+from topoloc.geometry.pose_conventions import (
+    AXES,
+    DIRECTIONS,
+    ROTATIONS,
+    UNITS,
+    Mend,
+    meaning,
+    mended,
+)
 from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.trajectory import Trajectory, poses_at
 from topoloc.slam.measured_steps import MeasuredStep, MeasuredStepsConfig, measure_steps
 
 _MIN_TELLING = 5
-_MIN_BELIEVED, _MIN_NAMED = 0.5, 0.7  # of the telling steps, that agree with poses that are believed, with a convention that is named
-_MIN_TURN, _TURN, _WAY, _SHARE = math.radians(5.0), math.radians(1.5), 0.02, 0.15  # rad, rad, m, share of the step
+_MIN_BELIEVED, _MIN_NAMED = (
+    0.5,
+    0.7,
+)  # of the telling steps, that agree with poses that are believed, with a convention that is named
+_MIN_TURN, _TURN, _WAY, _SHARE = (
+    math.radians(5.0),
+    math.radians(1.5),
+    0.02,
+    0.15,
+)  # rad, rad, m, share of the step
 _DEPTH_SHARE = 0.01  # of the depth of what is seen, by which a measured way may be wrong
 _MIN_WAY = 3.0  # times the tolerance
 _UNIT_TOLERANCE = 0.15
 _DIRECTION = math.radians(12.0)  # of a way whose length is unknown
 _FARTHEST = 1e12  # no place in any unit; squares of much more are no numbers
-_MIN_SHIFT_S, _MAX_SHIFT_S, _NUM_SHIFTS, _MAX_GAP_S = 0.02, 3.0, 60, 1.0  # shifts tried to each side
+_MIN_SHIFT_S, _MAX_SHIFT_S, _NUM_SHIFTS, _MAX_GAP_S = (
+    0.02,
+    3.0,
+    60,
+    1.0,
+)  # shifts tried to each side
 _NOTED_MISS, _FAR_BETTER = 0.3, 0.4
 _MOUNTING_ROUNDS, _LEAST_TURN = 5, 0.05
 _BODY_COUNTS = 4.0  # conventions: a mounting has six numbers to fit by
@@ -42,8 +65,9 @@ _Poses = Sequence[Rigid3 | None]
 
 @dataclass(frozen=True)
 class PoseVerdict:
-    """`num_telling` steps are long enough to tell, `num_agreeing` of them agree with the poses as they are. `conventions`, as `--poses`
-    takes them, make most of them agree; empty where the poses are believed, or nothing known makes them fit."""
+    """`num_telling` steps are long enough to tell, `num_agreeing` of them agree with the poses as
+    they are. `conventions`, as `--poses` takes them, make most of them agree; empty where the poses
+    are believed, or nothing known makes them fit."""
 
     num_telling: int
     num_agreeing: int
@@ -51,7 +75,9 @@ class PoseVerdict:
 
     @property
     def is_believed(self) -> bool:
-        return not self.conventions and (self.num_telling < _MIN_TELLING or self.num_agreeing >= _MIN_BELIEVED * self.num_telling)
+        return not self.conventions and (
+            self.num_telling < _MIN_TELLING or self.num_agreeing >= _MIN_BELIEVED * self.num_telling
+        )
 
 
 @dataclass(frozen=True)
@@ -68,7 +94,9 @@ class _Reading:
     @property
     def rank(self) -> tuple[float, float]:
         """The plainer one is taken where two fit about as well."""
-        complexity = sum(_BODY_COUNTS if name.startswith("body") else 1.0 for name in self.conventions)
+        complexity = sum(
+            _BODY_COUNTS if name.startswith("body") else 1.0 for name in self.conventions
+        )
         return self.num_agreeing - 0.5 * complexity, -float(np.median(self.misses))
 
 
@@ -77,15 +105,18 @@ def check_gaps(sequence: StereoSequence) -> None:
     num_posed = sum(pose is not None for pose in sequence.poses)
     if 0 < 2 * num_posed < len(sequence):
         raise TrajectoryError(
-            f"{sequence.name}: only {num_posed} of {len(sequence)} frames have a pose; --allow-gaps maps these, without the others"
+            f"{sequence.name}: only {num_posed} of {len(sequence)} frames have a pose; --allow-gaps"
+            " maps these, without the others"
         )
 
 
 def check_poses(sequence: StereoSequence, config: MeasuredStepsConfig | None = None) -> None:
-    """Hold that the poses of a recording fit its pictures; those of a single camera but for their unit.
+    """Hold that the poses of a recording fit its pictures; those of a single camera but for their
+    unit.
 
     Raises:
-        TrajectoryError: they do not; names the convention that makes them fit, as `--poses` takes it, where one does.
+        TrajectoryError: they do not; names the convention that makes them fit, as `--poses` takes
+            it, where one does.
         RecordingError, CalibrationError, UnreadableImageError: from reading the recording.
     """
     posed = [k for k, pose in enumerate(sequence.poses) if pose is not None]
@@ -93,23 +124,35 @@ def check_poses(sequence: StereoSequence, config: MeasuredStepsConfig | None = N
         return
     if sequence[posed[0]].camera is None:
         return
-    verdict = judge_poses(measure_steps(sequence, posed, config or MeasuredStepsConfig()), sequence.poses, sequence.t_ns)
+    verdict = judge_poses(
+        measure_steps(sequence, posed, config or MeasuredStepsConfig()),
+        sequence.poses,
+        sequence.t_ns,
+    )
     if verdict.is_believed:
         return
-    differ = f"{verdict.num_telling - verdict.num_agreeing} of {verdict.num_telling} steps from picture to picture are not the poses'"
+    differ = (
+        f"{verdict.num_telling - verdict.num_agreeing} of {verdict.num_telling} steps from picture"
+        " to picture are not the poses'"
+    )
     if verdict.conventions:
         names = ",".join(verdict.conventions)
-        raise TrajectoryError(f"{sequence.name}: {differ}; they look like poses {meaning(verdict.conventions)}: --poses {names}")
+        raise TrajectoryError(
+            f"{sequence.name}: {differ}; they look like poses {meaning(verdict.conventions)}:"
+            f" --poses {names}"
+        )
     raise TrajectoryError(
-        f"{sequence.name}: {differ}, and no known convention explains it: of another recording, or wrongly calibrated?"
-        " --poses unchecked maps it all the same"
+        f"{sequence.name}: {differ}, and no known convention explains it: of another recording, or"
+        " wrongly calibrated? --poses unchecked maps it all the same"
     )
 
 
 def judge_poses(steps: Sequence[MeasuredStep], poses: _Poses, t_ns: Sequence[int]) -> PoseVerdict:
     """Hold the poses (world_from_cam in metres, one a frame) against the measured steps."""
     telling = [step for step in steps if _is_telling(step)]
-    telling = [step for step in telling if poses[step.first] is not None and poses[step.last] is not None]
+    telling = [
+        step for step in telling if poses[step.first] is not None and poses[step.last] is not None
+    ]
     if len(telling) < _MIN_TELLING:
         return PoseVerdict(len(telling), len(telling))
     if any(pose is not None and np.abs(pose.translation).max() > _FARTHEST for pose in poses):
@@ -119,9 +162,18 @@ def judge_poses(steps: Sequence[MeasuredStep], poses: _Poses, t_ns: Sequence[int
     if verdict.is_believed and not _is_noted(as_is):
         return verdict
     readings = [*_by_convention(telling, poses), *_best_shift(telling, poses, t_ns)]
-    if verdict.is_believed:  # of a way that is nearly straight and level, wrong poses may be nearly right
-        better = [one for one in readings if _is_far_better(one, as_is) and not any("scale" in name for name in one.conventions)]
-        return replace(verdict, conventions=max(better, key=lambda reading: reading.rank).conventions if better else ())
+    if (
+        verdict.is_believed
+    ):  # of a way that is nearly straight and level, wrong poses may be nearly right
+        better = [
+            one
+            for one in readings
+            if _is_far_better(one, as_is) and not any("scale" in name for name in one.conventions)
+        ]
+        return replace(
+            verdict,
+            conventions=max(better, key=lambda reading: reading.rank).conventions if better else (),
+        )
     best = max([*readings, *_as_body(telling, poses)], key=lambda reading: reading.rank)
     is_named = best.num_agreeing >= max(_MIN_NAMED * len(telling), as_is.num_agreeing + 1)
     return replace(verdict, conventions=best.conventions if is_named else ())
@@ -129,30 +181,44 @@ def judge_poses(steps: Sequence[MeasuredStep], poses: _Poses, t_ns: Sequence[int
 
 def _is_telling(step: MeasuredStep) -> bool:
     way = float(np.linalg.norm(step.first_from_last.translation))
-    return not step.has_scale or way > _MIN_WAY * (_WAY + _DEPTH_SHARE * step.median_depth) or step.first_from_last.angle() > _MIN_TURN
+    return (
+        not step.has_scale
+        or way > _MIN_WAY * (_WAY + _DEPTH_SHARE * step.median_depth)
+        or step.first_from_last.angle() > _MIN_TURN
+    )
 
 
 def _steps_of(telling: Sequence[MeasuredStep], poses: _Poses) -> list[Rigid3]:
     """first_from_last as the poses have it."""
     pairs = ((poses[step.first], poses[step.last]) for step in telling)
-    return [first.inverse() @ last for first, last in pairs if first is not None and last is not None]
+    return [
+        first.inverse() @ last for first, last in pairs if first is not None and last is not None
+    ]
 
 
 def _misses(telling: Sequence[MeasuredStep], steps: Sequence[Rigid3]) -> Float[np.ndarray, " n"]:
     """By how much each step is not the measured one: 1 is what is tolerated."""
     misses = []
     for measured, step in zip(telling, steps, strict=True):
-        apart, tolerated_turn = step.inverse() @ measured.first_from_last, _TURN + _SHARE * measured.first_from_last.angle()
+        apart, tolerated_turn = (
+            step.inverse() @ measured.first_from_last,
+            _TURN + _SHARE * measured.first_from_last.angle(),
+        )
         misses.append(max(_miss_of_way(measured, step), apart.angle() / tolerated_turn))
     return np.array(misses)
 
 
 def _miss_of_way(measured: MeasuredStep, step: Rigid3) -> float:
-    """By how much the way is another one, in units of what is tolerated; of a single camera by its direction alone."""
+    """By how much the way is another one, in units of what is tolerated; of a single camera by its
+    direction alone."""
     ours, theirs = measured.first_from_last.translation, step.translation
     if not measured.has_scale:
         length = float(np.linalg.norm(theirs))
-        return 2.0 if length == 0.0 else float(np.arccos(np.clip(ours @ theirs / length, -1.0, 1.0))) / _DIRECTION
+        return (
+            2.0
+            if length == 0.0
+            else float(np.arccos(np.clip(ours @ theirs / length, -1.0, 1.0))) / _DIRECTION
+        )
     tolerated = _WAY + _DEPTH_SHARE * measured.median_depth + _SHARE * float(np.linalg.norm(ours))
     # seen in the first camera; in the last one the difference is as long
     return float(np.linalg.norm(ours - theirs)) / tolerated
@@ -172,13 +238,20 @@ def _combined(*tables: dict[str, Mend]) -> list[tuple[str, ...]]:
     return [tuple(itertools.chain(*parts)) for parts in itertools.product(*choices)]
 
 
-def _read(telling: Sequence[MeasuredStep], poses: _Poses, conventions: tuple[str, ...]) -> list[Rigid3 | None]:
+def _read(
+    telling: Sequence[MeasuredStep], poses: _Poses, conventions: tuple[str, ...]
+) -> list[Rigid3 | None]:
     """The poses that the steps need, with these conventions undone."""
     needed = {step.first for step in telling} | {step.last for step in telling}
-    return [mended(pose, conventions) if pose is not None and k in needed else None for k, pose in enumerate(poses)]
+    return [
+        mended(pose, conventions) if pose is not None and k in needed else None
+        for k, pose in enumerate(poses)
+    ]
 
 
-def _unit_of(telling: Sequence[MeasuredStep], steps: Sequence[Rigid3]) -> tuple[tuple[str, ...], float]:
+def _unit_of(
+    telling: Sequence[MeasuredStep], steps: Sequence[Rigid3]
+) -> tuple[tuple[str, ...], float]:
     """The unit that gives the steps their measured lengths, as a convention, and its metres."""
     if not all(step.has_scale for step in telling):
         return (), 1.0
@@ -194,17 +267,28 @@ def _unit_of(telling: Sequence[MeasuredStep], steps: Sequence[Rigid3]) -> tuple[
     return (f"scale={factor:.4g}",), factor
 
 
-def _best_shift(telling: Sequence[MeasuredStep], poses: _Poses, t_ns: Sequence[int]) -> list[_Reading]:
-    """The poses at other times than those of the pictures, by the shift that fits best; none where the recording is too short for any."""
+def _best_shift(
+    telling: Sequence[MeasuredStep], poses: _Poses, t_ns: Sequence[int]
+) -> list[_Reading]:
+    """The poses at other times than those of the pictures, by the shift that fits best; none where
+    the recording is too short for any."""
     posed = [k for k, pose in enumerate(poses) if pose is not None]
     trajectory = Trajectory([pose for pose in poses if pose is not None], [t_ns[k] for k in posed])
     largest = min(_MAX_SHIFT_S, 0.4e-9 * (t_ns[posed[-1]] - t_ns[posed[0]]))
     shifts = np.linspace(-largest, largest, 2 * _NUM_SHIFTS + 1)
-    readings = (_shifted(telling, trajectory, t_ns, float(seconds)) for seconds in shifts if abs(seconds) > _MIN_SHIFT_S)
-    return sorted((one for one in readings if one is not None), key=lambda one: float(np.median(one.misses)))[:1]
+    readings = (
+        _shifted(telling, trajectory, t_ns, float(seconds))
+        for seconds in shifts
+        if abs(seconds) > _MIN_SHIFT_S
+    )
+    return sorted(
+        (one for one in readings if one is not None), key=lambda one: float(np.median(one.misses))
+    )[:1]
 
 
-def _shifted(telling: Sequence[MeasuredStep], trajectory: Trajectory, t_ns: Sequence[int], seconds: float) -> _Reading | None:
+def _shifted(
+    telling: Sequence[MeasuredStep], trajectory: Trajectory, t_ns: Sequence[int], seconds: float
+) -> _Reading | None:
     """None where too few steps have poses then."""
     misses = []
     for step in telling:
@@ -214,13 +298,17 @@ def _shifted(telling: Sequence[MeasuredStep], trajectory: Trajectory, t_ns: Sequ
             misses.append(float(_misses([step], [first.inverse() @ last])[0]))
     if len(misses) < max(_MIN_TELLING, len(telling) // 2):
         return None
-    misses += [float(np.median(misses))] * (len(telling) - len(misses))  # those beyond an end are taken to be as the others
+    misses += [float(np.median(misses))] * (
+        len(telling) - len(misses)
+    )  # those beyond an end are taken to be as the others
     return _Reading((f"shift={seconds:.3g}",), np.array(misses))
 
 
 def _is_far_better(other: _Reading, as_is: _Reading) -> bool:
     """Does another reading explain most of what the steps miss by?"""
-    return _is_noted(as_is) and float(np.median(other.misses)) < _FAR_BETTER * float(np.median(as_is.misses))
+    return _is_noted(as_is) and float(np.median(other.misses)) < _FAR_BETTER * float(
+        np.median(as_is.misses)
+    )
 
 
 def _is_noted(as_is: _Reading) -> bool:
@@ -229,38 +317,56 @@ def _is_noted(as_is: _Reading) -> bool:
 
 
 def _as_body(telling: Sequence[MeasuredStep], poses: _Poses) -> Iterator[_Reading]:
-    """The poses as those of a body, by the mounting of the camera that fits best; none by steps that know no metre."""
+    """The poses as those of a body, by the mounting of the camera that fits best; none by steps
+    that know no metre."""
     if not all(step.has_scale for step in telling):
         return
     for conventions in _combined(ROTATIONS, DIRECTIONS):
         steps = _steps_of(telling, _read(telling, poses, conventions))
         pairs = kept = list(zip(telling, steps, strict=True))
         mounting, misses = Rigid3.identity(), np.zeros(len(pairs))
-        for _ in range(_MOUNTING_ROUNDS):  # what the first mountings leave far off may be measured wrongly
+        for _ in range(
+            _MOUNTING_ROUNDS
+        ):  # what the first mountings leave far off may be measured wrongly
             mounting = _mounting(kept)
             misses = _misses(telling, [mounting.inverse() @ step @ mounting for step in steps])
-            kept = [pair for pair, miss in zip(pairs, misses, strict=True) if miss <= 1.5 * np.median(misses)]
+            kept = [
+                pair
+                for pair, miss in zip(pairs, misses, strict=True)
+                if miss <= 1.5 * np.median(misses)
+            ]
         w, x, y, z = mounting.quat_wxyz()
         numbers = ",".join(f"{number:.4g}" for number in (*mounting.translation, x, y, z, w))
         yield _Reading((*conventions, f"body={numbers}"), misses)
 
 
 def _mounting(pairs: Sequence[tuple[MeasuredStep, Rigid3]]) -> Rigid3:
-    """body_from_cam of least squares, by turns: its rotation by the steps' axes and ways, its translation by what is left of the ways.
+    """body_from_cam of least squares, by turns: its rotation by the steps' axes and ways, its
+    translation by what is left of the ways.
 
     Along an axis that all steps turn about, the translation cannot be seen, and is left at 0.
     """
     rotation, translation = np.eye(3), np.zeros(3)
-    of_axes = sum((np.outer(step.log()[3:], measured.first_from_last.log()[3:]) for measured, step in pairs), np.zeros((3, 3)))
+    of_axes = sum(
+        (np.outer(step.log()[3:], measured.first_from_last.log()[3:]) for measured, step in pairs),
+        np.zeros((3, 3)),
+    )
     for _ in range(_MOUNTING_ROUNDS):
         correlation = of_axes / _TURN**2
         for measured, step in pairs:
             way = step.translation - (translation - step.rotation @ translation)
             correlation = (
-                correlation + np.outer(way, measured.first_from_last.translation) / (_WAY + _DEPTH_SHARE * measured.median_depth) ** 2
+                correlation
+                + np.outer(way, measured.first_from_last.translation)
+                / (_WAY + _DEPTH_SHARE * measured.median_depth) ** 2
             )
         rotation = nearest_rotation(correlation)
         lefts = np.concatenate([step.rotation - np.eye(3) for _, step in pairs])
-        rights = np.concatenate([rotation @ measured.first_from_last.translation - step.translation for measured, step in pairs])
+        rights = np.concatenate(
+            [
+                rotation @ measured.first_from_last.translation - step.translation
+                for measured, step in pairs
+            ]
+        )
         translation = np.linalg.lstsq(lefts, rights, rcond=_LEAST_TURN)[0]
     return Rigid3(rotation, translation)

@@ -1,6 +1,8 @@
-"""The pose graph: key frames as nodes, motions and loops as edges, brought to agree (Gauss-Newton, Cauchy's loss on the loops).
+"""The pose graph: key frames as nodes, motions and loops as edges, brought to agree (Gauss-Newton,
+Cauchy's loss on the loops).
 
-An edge (i, j) measures Z = j_from_i. Its residual is ``log(X_j X_i^-1 Z^-1)`` with X = cam_from_world, moved by left perturbations.
+An edge (i, j) measures Z = j_from_i. Its residual is ``log(X_j X_i^-1 Z^-1)`` with X =
+cam_from_world, moved by left perturbations.
 """
 
 from __future__ import annotations
@@ -33,7 +35,8 @@ class PoseGraphConfig:
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """second_from_first with the covariance of its left perturbation; a loop may be wrong, a motion may not."""
+    """second_from_first with the covariance of its left perturbation; a loop may be wrong, a motion
+    may not."""
 
     first: int
     second: int
@@ -42,7 +45,9 @@ class Edge:
     is_loop: bool
 
 
-def optimise_graph(cam_from_worlds: Sequence[Rigid3], edges: Sequence[Edge], config: PoseGraphConfig) -> list[Rigid3]:
+def optimise_graph(
+    cam_from_worlds: Sequence[Rigid3], edges: Sequence[Edge], config: PoseGraphConfig
+) -> list[Rigid3]:
     """The poses, the first one unmoved."""
     poses = list(cam_from_worlds)
     informations = [np.linalg.inv(edge.covariance) for edge in edges]
@@ -53,11 +58,15 @@ def optimise_graph(cam_from_worlds: Sequence[Rigid3], edges: Sequence[Edge], con
         blocks, right = pattern.empty(), np.zeros((len(poses), 6))
         blocks[pattern.diagonal] = 1e-6 * np.eye(6)
         blocks[pattern.diagonal[ranks[0]]] += 1e12 * np.eye(6)
-        for edge, information, (place, is_first_above) in zip(edges, informations, places, strict=True):
+        for edge, information, (place, is_first_above) in zip(
+            edges, informations, places, strict=True
+        ):
             predicted = poses[edge.second] @ poses[edge.first].inverse()
             residual = (predicted @ edge.second_from_first.inverse()).log()
             if edge.is_loop:
-                information = information / (1.0 + residual @ information @ residual / config.cauchy_scale**2)
+                information = information / (
+                    1.0 + residual @ information @ residual / config.cauchy_scale**2
+                )
             adjoint = predicted.adjoint()
             weighted = adjoint.T @ information
             blocks[pattern.diagonal[ranks[edge.second]]] += information
@@ -76,6 +85,8 @@ def residuals_in_sigma(poses: Sequence[Rigid3], edges: Sequence[Edge]) -> Float[
     """Length of each edge's residual, in standard deviations."""
     lengths = np.empty(len(edges))
     for k, edge in enumerate(edges):
-        residual = (poses[edge.second] @ poses[edge.first].inverse() @ edge.second_from_first.inverse()).log()
+        residual = (
+            poses[edge.second] @ poses[edge.first].inverse() @ edge.second_from_first.inverse()
+        ).log()
         lengths[k] = np.sqrt(residual @ np.linalg.solve(edge.covariance, residual))
     return lengths

@@ -1,10 +1,11 @@
 """Odometry of a single camera: its motion in a unit of its own, stretch by stretch.
 
-Read from `SingleCameraOdometry.process`. Two pictures with enough parallax begin a stretch (five-point method), and their distance is its
-unit. From there on points are followed and give each frame's pose as in the odometry of stereo (`steps.py`); what has not shown its depth
-yet is followed beside them, and becomes a landmark as soon as its rays meet at an angle. The last key frames are adjusted together.
-Where too few points are left a stretch ends, and another one begins with a unit of its own: nothing is guessed in between. What a unit is
-in metres is not known here.
+Read from `SingleCameraOdometry.process`. Two pictures with enough parallax begin a stretch
+(five-point method), and their distance is its unit. From there on points are followed and give each
+frame's pose as in the odometry of stereo (`steps.py`); what has not shown its depth yet is followed
+beside them, and becomes a landmark as soon as its rays meet at an angle. The last key frames are
+adjusted together. Where too few points are left a stretch ends, and another one begins with a unit
+of its own: nothing is guessed in between. What a unit is in metres is not known here.
 """
 
 from __future__ import annotations
@@ -20,7 +21,15 @@ from topoloc.sequences.frame import StereoFrame
 from topoloc.sequences.frame_view import single_view
 from topoloc.slam.bundle import adjust_bundle
 from topoloc.slam.disparity import MeasuredView
-from topoloc.slam.keyframes import DisparityBias, FramePose, KeyFrame, Landmarks, Motion, Observations, StereoCamera
+from topoloc.slam.keyframes import (
+    DisparityBias,
+    FramePose,
+    KeyFrame,
+    Landmarks,
+    Motion,
+    Observations,
+    StereoCamera,
+)
 from topoloc.slam.motion_prediction import MotionHistory
 from topoloc.slam.single_camera_config import SingleCameraConfig
 from topoloc.slam.steps import LastFrame, Step, StepSeeker, Tracks
@@ -32,7 +41,8 @@ _CLEAREST_AND_LEAST_CLEAR = 0.5, 10.0
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """A motion without a break, in a world and a unit of its own: where its frames are, relative to key frames, and what these see."""
+    """A motion without a break, in a world and a unit of its own: where its frames are, relative to
+    key frames, and what these see."""
 
     landmarks: Landmarks
     frames: list[FramePose] = field(default_factory=list)
@@ -45,7 +55,8 @@ class Stretch:
 
 @dataclass(eq=False)
 class _Beginning:
-    """The first picture of a stretch that has not begun yet, the points still followed from it, and the frames since, with their points."""
+    """The first picture of a stretch that has not begun yet, the points still followed from it, and
+    the frames since, with their points."""
 
     frames: list[tuple[int, StereoFrame, MeasuredView, Tracks]]
     tracks: Tracks
@@ -87,8 +98,15 @@ class SingleCameraOdometry:
             tracks = self._followed_back(self._beginning, measured)
             left = len(tracks.landmark_ids) / max(len(self._beginning.tracks.landmark_ids), 1)
             self._beginning.frames.append((frame_idx, frame, measured, tracks))
-            if left >= self._config.start_share and len(self._beginning.frames) <= self._config.max_beginning:
-                moved = np.median(np.linalg.norm(tracks.points_img - tracks.points_ref, axis=1)) if len(tracks.landmark_ids) else 0.0
+            if (
+                left >= self._config.start_share
+                and len(self._beginning.frames) <= self._config.max_beginning
+            ):
+                moved = (
+                    np.median(np.linalg.norm(tracks.points_img - tracks.points_ref, axis=1))
+                    if len(tracks.landmark_ids)
+                    else 0.0
+                )
                 if moved > self._config.start_motion * measured.view.camera.width:
                     self._start(self._beginning)
                 return
@@ -100,16 +118,25 @@ class SingleCameraOdometry:
         """The points that are found in the next picture, and from there again where they were."""
         _, _, before, tracks = beginning.frames[-1]
         config = self._config.odometry.tracking
-        found, there = follow(before.view.grey, measured.view.grey, tracks.points_img, tracks.points_img, config)
+        found, there = follow(
+            before.view.grey, measured.view.grey, tracks.points_img, tracks.points_img, config
+        )
         back, again = follow(measured.view.grey, before.view.grey, found, tracks.points_img, config)
         returned = np.linalg.norm(back - tracks.points_img, axis=1) < self._config.max_return_px
         return replace(tracks, points_img=found).select(np.flatnonzero(there & again & returned))
 
     def _start(self, beginning: _Beginning) -> None:
         """A stretch begins if the first picture and the last one show a motion."""
-        config, (_, _, first, all_tracks), (_, _, last, tracks) = self._config, beginning.frames[0], beginning.frames[-1]
+        config, (_, _, first, all_tracks), (_, _, last, tracks) = (
+            self._config,
+            beginning.frames[0],
+            beginning.frames[-1],
+        )
         motion = estimate_relative_pose(
-            tracks.points_ref.astype(np.float64), first.view.camera, tracks.points_img.astype(np.float64), last.view.camera
+            tracks.points_ref.astype(np.float64),
+            first.view.camera,
+            tracks.points_img.astype(np.float64),
+            last.view.camera,
         )
         if motion is None or np.count_nonzero(motion.inliers) < config.start_points:
             return
@@ -117,10 +144,15 @@ class SingleCameraOdometry:
         self._landmarks.add(np.full((len(all_tracks.landmark_ids), 3), np.nan))
         agreeing = tracks.select(motion.inliers)
         poses = (Rigid3.identity(), motion.second_from_first)
-        for row, cam_from_world, points_img in ((0, poses[0], agreeing.points_ref), (-1, poses[1], agreeing.points_img)):
+        for row, cam_from_world, points_img in (
+            (0, poses[0], agreeing.points_ref),
+            (-1, poses[1], agreeing.points_img),
+        ):
             frame_idx, frame, measured, _ = beginning.frames[row]
             seen = self._observations(Tracks.of(agreeing.landmark_ids, points_img), 0)
-            self._chain.append(self._keyframe(frame_idx, frame.t_ns, measured, cam_from_world, seen))
+            self._chain.append(
+                self._keyframe(frame_idx, frame.t_ns, measured, cam_from_world, seen)
+            )
         known = self._settle(agreeing.landmark_ids, 2)
         if len(known) < config.start_points:
             self._chain = []
@@ -132,12 +164,21 @@ class SingleCameraOdometry:
         for frame_idx, frame, measured, of_frame in beginning.frames[:-1]:
             self._place_again(frame_idx, frame, measured, of_frame, known)
         frame_idx, frame, measured, _ = beginning.frames[-1]
-        self._follow_from(self._chain[-1], measured, agreeing.select(~np.isin(agreeing.landmark_ids, known)))
+        self._follow_from(
+            self._chain[-1], measured, agreeing.select(~np.isin(agreeing.landmark_ids, known))
+        )
         self._remember(frame.t_ns, measured, self._chain[-1].cam_from_world)
-        self.stretches[-1].frames.append(FramePose(frame_idx, self._chain[-1], Rigid3.identity(), measured.view.view_from_cam))
+        self.stretches[-1].frames.append(
+            FramePose(frame_idx, self._chain[-1], Rigid3.identity(), measured.view.view_from_cam)
+        )
 
     def _place_again(
-        self, frame_idx: int, frame: StereoFrame, measured: MeasuredView, tracks: Tracks, known: Int[np.ndarray, " n"]
+        self,
+        frame_idx: int,
+        frame: StereoFrame,
+        measured: MeasuredView,
+        tracks: Tracks,
+        known: Int[np.ndarray, " n"],
     ) -> None:
         """Where a frame of the beginning was, now that its points are known."""
         first = self._chain[0]
@@ -145,25 +186,35 @@ class SingleCameraOdometry:
             pose = Rigid3.identity()
         else:
             of_it = tracks.select(np.isin(tracks.landmark_ids, known))
-            found = self._seeker(LastFrame(measured, first.cam_from_world), first, of_it, measured).estimate(of_it)
+            found = self._seeker(
+                LastFrame(measured, first.cam_from_world), first, of_it, measured
+            ).estimate(of_it)
             if found is None:
                 return
             pose = found.cam_from_world
         self._remember(frame.t_ns, measured, pose)
-        self.stretches[-1].frames.append(FramePose(frame_idx, first, pose @ first.cam_from_world.inverse(), measured.view.view_from_cam))
+        self.stretches[-1].frames.append(
+            FramePose(
+                frame_idx, first, pose @ first.cam_from_world.inverse(), measured.view.view_from_cam
+            )
+        )
 
     def _follow(self, frame_idx: int, frame: StereoFrame, measured: MeasuredView) -> bool:
         """Where the frame is, by its step from the last one."""
         step = self._step(frame, measured)
         if step is None or self._last is None or self._reference is None:
             return False
-        waiting = self._seeker(self._last, self._reference, self._waiting, measured).follow(step.cam_from_world)
+        waiting = self._seeker(self._last, self._reference, self._waiting, measured).follow(
+            step.cam_from_world
+        )
         self._tracks, self._waiting = step.tracks, waiting
         self._remember(frame.t_ns, measured, step.cam_from_world)
         if self._is_keyframe_due(measured):
             self._add_keyframe(frame_idx, frame, measured, step)
         relative = self._last.cam_from_world @ self._reference.cam_from_world.inverse()
-        self.stretches[-1].frames.append(FramePose(frame_idx, self._reference, relative, measured.view.view_from_cam))
+        self.stretches[-1].frames.append(
+            FramePose(frame_idx, self._reference, relative, measured.view.view_from_cam)
+        )
         return True
 
     def _step(self, frame: StereoFrame, measured: MeasuredView) -> Step | None:
@@ -171,34 +222,57 @@ class SingleCameraOdometry:
         assert self._last is not None
         assert self._reference is not None
         seeker = self._seeker(self._last, self._reference, self._tracks, measured)
-        predicted = prediction.cam_from_world if prediction is not None else self._last.cam_from_world
+        predicted = (
+            prediction.cam_from_world if prediction is not None else self._last.cam_from_world
+        )
         return seeker.seek(predicted) or seeker.seek(self._last.cam_from_world)
 
-    def _seeker(self, last: LastFrame, reference: KeyFrame, tracks: Tracks, measured: MeasuredView) -> StepSeeker:
-        return StepSeeker(last, reference, self._reference_picture, tracks, self._landmarks, measured, self._config.odometry)
+    def _seeker(
+        self, last: LastFrame, reference: KeyFrame, tracks: Tracks, measured: MeasuredView
+    ) -> StepSeeker:
+        return StepSeeker(
+            last,
+            reference,
+            self._reference_picture,
+            tracks,
+            self._landmarks,
+            measured,
+            self._config.odometry,
+        )
 
     def _remember(self, t_ns: int, measured: MeasuredView, cam_from_world: Rigid3) -> None:
-        moved = cam_from_world @ self._last.cam_from_world.inverse() if self._last is not None else None
+        moved = (
+            cam_from_world @ self._last.cam_from_world.inverse() if self._last is not None else None
+        )
         self._history.remember(t_ns, cam_from_world, moved)
         self._last = LastFrame(measured, cam_from_world)
 
     def _is_keyframe_due(self, measured: MeasuredView) -> bool:
         assert self._reference is not None
         tracks, config = self._tracks, self._config.odometry
-        if len(tracks.landmark_ids) < config.keyframe_share * np.count_nonzero(self._reference.observations.active):
+        if len(tracks.landmark_ids) < config.keyframe_share * np.count_nonzero(
+            self._reference.observations.active
+        ):
             return True
         motion = np.median(np.linalg.norm(tracks.points_img - tracks.points_ref, axis=1))
         return bool(motion > config.keyframe_motion * measured.view.camera.width)
 
-    def _add_keyframe(self, frame_idx: int, frame: StereoFrame, measured: MeasuredView, step: Step) -> None:
-        """Make the frame a key frame: what has shown its depth becomes a landmark, new corners wait for theirs, the window is adjusted."""
+    def _add_keyframe(
+        self, frame_idx: int, frame: StereoFrame, measured: MeasuredView, step: Step
+    ) -> None:
+        """Make the frame a key frame: what has shown its depth becomes a landmark, new corners wait
+        for theirs, the window is adjusted."""
         config, tracks, waiting = self._config.odometry, self._tracks, self._waiting
         occupied = np.concatenate([tracks.points_img, waiting.points_img])
         corners = find_corners(measured.view.grey, occupied, config.tracking)
-        fresh = Tracks.of(self._landmarks.add(self._guessed(corners, measured, step.cam_from_world)), corners)
+        fresh = Tracks.of(
+            self._landmarks.add(self._guessed(corners, measured, step.cam_from_world)), corners
+        )
         seen = self._observations(_together(tracks, waiting, fresh), len(tracks.landmark_ids))
         motion = Motion(self._reference, step.covariance) if self._reference is not None else None
-        keyframe = self._keyframe(frame_idx, frame.t_ns, measured, step.cam_from_world, seen, motion)
+        keyframe = self._keyframe(
+            frame_idx, frame.t_ns, measured, step.cam_from_world, seen, motion
+        )
         self._chain.append(keyframe)
         self.stretches[-1].keyframes.append(keyframe)
         known = self._settle(np.sort(waiting.landmark_ids), self._config.min_rays)
@@ -206,27 +280,38 @@ class SingleCameraOdometry:
         adjust_bundle(free, held, self._landmarks, config.bundle)
         del self._chain[: -(config.window + config.held)]
         still = waiting.select(~np.isin(waiting.landmark_ids, known))
-        still = still.select(np.flatnonzero(np.isfinite(self._landmarks.positions[still.landmark_ids]).all(axis=1)))
+        still = still.select(
+            np.flatnonzero(np.isfinite(self._landmarks.positions[still.landmark_ids]).all(axis=1))
+        )
         self._follow_from(keyframe, measured, _together(still, fresh))
 
     def _settle(self, ids: Int[np.ndarray, " n"], min_rays: int) -> Int[np.ndarray, " k"]:
-        """Those of the points with these ids (ascending) that have shown their depth, and are landmarks now. One whose rays do not meet is
-        no point: it has no place any more."""
+        """Those of the points with these ids (ascending) that have shown their depth, and are
+        landmarks now. One whose rays do not meet is no point: it has no place any more."""
         if len(ids) == 0:
             return ids
         config, found = self._config, triangulate(self._chain, ids)
-        clear = is_clear(found, min_rays, np.deg2rad(config.min_parallax_deg), config.max_triangulation_px)
+        clear = is_clear(
+            found, min_rays, np.deg2rad(config.min_parallax_deg), config.max_triangulation_px
+        )
         self._landmarks.positions[ids[clear]] = found.points[clear]
         with np.errstate(invalid="ignore"):
-            wrong = (found.num_rays >= min_rays) & (found.parallax >= np.deg2rad(config.min_parallax_deg)) & ~clear
+            wrong = (
+                (found.num_rays >= min_rays)
+                & (found.parallax >= np.deg2rad(config.min_parallax_deg))
+                & ~clear
+            )
         self._landmarks.positions[ids[wrong]] = np.nan
         for keyframe in self._chain:
             seen = keyframe.observations
             seen.active[np.isin(seen.landmark_ids, ids[clear])] = True
         return ids[clear]
 
-    def _guessed(self, corners: Float32[np.ndarray, "n 2"], measured: MeasuredView, cam_from_world: Rigid3) -> Float[np.ndarray, "n 3"]:
-        """Where corners may be, as far away as the landmarks next to them in the picture: good enough to follow them."""
+    def _guessed(
+        self, corners: Float32[np.ndarray, "n 2"], measured: MeasuredView, cam_from_world: Rigid3
+    ) -> Float[np.ndarray, "n 3"]:
+        """Where corners may be, as far away as the landmarks next to them in the picture: good
+        enough to follow them."""
         nearest = 5
         depths = cam_from_world.apply(self._landmarks.positions[self._tracks.landmark_ids])[:, 2]
         apart = np.linalg.norm(corners[:, None] - self._tracks.points_img[None], axis=2)
@@ -245,13 +330,32 @@ class SingleCameraOdometry:
 
     def _sigmas(self, tracks: Tracks) -> Float[np.ndarray, " n"]:
         """Pixels; a point that is followed from here on counts as any other."""
-        unclear = np.clip((tracks.sigmas_px.astype(np.float64) / self._config.clear_px) ** 2, *_CLEAREST_AND_LEAST_CLEAR)
+        unclear = np.clip(
+            (tracks.sigmas_px.astype(np.float64) / self._config.clear_px) ** 2,
+            *_CLEAREST_AND_LEAST_CLEAR,
+        )
         return self._config.odometry.sigma_px * np.where(tracks.sigmas_px > 0.0, unclear, 1.0)
 
     def _keyframe(
-        self, frame_idx: int, t_ns: int, measured: MeasuredView, cam_from_world: Rigid3, seen: Observations, motion: Motion | None = None
+        self,
+        frame_idx: int,
+        t_ns: int,
+        measured: MeasuredView,
+        cam_from_world: Rigid3,
+        seen: Observations,
+        motion: Motion | None = None,
     ) -> KeyFrame:
-        return KeyFrame(0, frame_idx, t_ns, len(self.stretches), measured.stereo, cam_from_world, seen, self._bias, motion)
+        return KeyFrame(
+            0,
+            frame_idx,
+            t_ns,
+            len(self.stretches),
+            measured.stereo,
+            cam_from_world,
+            seen,
+            self._bias,
+            motion,
+        )
 
     def _follow_from(self, keyframe: KeyFrame, measured: MeasuredView, waiting: Tracks) -> None:
         seen = keyframe.observations
@@ -265,13 +369,21 @@ class SingleCameraOdometry:
 
 
 def _measured(frame: StereoFrame, max_side_px: int) -> MeasuredView:
-    """A single picture as odometry of stereo would look at it. Its unit takes the place of the baseline."""
+    """A single picture as odometry of stereo would look at it. Its unit takes the place of the
+    baseline."""
     view = single_view(frame, max_side_px)
-    return MeasuredView(view, StereoCamera(view.camera, view.camera.fx), view.grey.astype(np.float32), None)
+    return MeasuredView(
+        view, StereoCamera(view.camera, view.camera.fx), view.grey.astype(np.float32), None
+    )
 
 
 def _together(*tracks: Tracks) -> Tracks:
-    return Tracks(*(np.concatenate(columns) for columns in zip(*(vars(each).values() for each in tracks), strict=True)))
+    return Tracks(
+        *(
+            np.concatenate(columns)
+            for columns in zip(*(vars(each).values() for each in tracks), strict=True)
+        )
+    )
 
 
 def _no_tracks() -> Tracks:

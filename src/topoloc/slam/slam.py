@@ -1,8 +1,10 @@
-"""Stereo visual SLAM, read from the top: recordings in, the pose of each of their frames out, in one world.
+"""Stereo visual SLAM, read from the top: recordings in, the pose of each of their frames out, in
+one world.
 
-Odometry turns each recording into chains of key frames (sub-maps); loops join them where the same place is seen again, within a
-recording or between two, and what many weaker pairs say together where no loop does; a pose graph and a bundle adjustment of the whole
-make them agree. Of sub-maps that stay apart, those that hold most frames are kept. The world is the camera of their first frame.
+Odometry turns each recording into chains of key frames (sub-maps); loops join them where the same
+place is seen again, within a recording or between two, and what many weaker pairs say together
+where no loop does; a pose graph and a bundle adjustment of the whole make them agree. Of sub-maps
+that stay apart, those that hold most frames are kept. The world is the camera of their first frame.
 """
 
 from __future__ import annotations
@@ -50,10 +52,11 @@ class SlamConfig:
 class SlamResult:
     """`poses[r][i]` is world_from_cam of frame i of recording r, None where it is not known.
 
-    `num_submaps` counts the stretches in which tracking was never lost for good; of these `num_joined` share one world, the largest
-    by frames of the first recording, and the frames of the others have no pose. Theirs are `apart[r]`, one list as `poses[r]` for each
-    sub-map, in its own world, as odometry left them. `right_residuals_px` are distances between where
-    landmarks are found in the right pictures and where they should be.
+    `num_submaps` counts the stretches in which tracking was never lost for good; of these
+    `num_joined` share one world, the largest by frames of the first recording, and the frames of
+    the others have no pose. Theirs are `apart[r]`, one list as `poses[r]` for each sub-map, in its
+    own world, as odometry left them. `right_residuals_px` are distances between where landmarks are
+    found in the right pictures and where they should be.
     """
 
     poses: list[list[Rigid3 | None]]
@@ -68,15 +71,19 @@ class SlamResult:
 
 
 def run_slam(
-    sequences: StereoSequence | Sequence[StereoSequence], config: SlamConfig | None = None, progress: Progress | None = None
+    sequences: StereoSequence | Sequence[StereoSequence],
+    config: SlamConfig | None = None,
+    progress: Progress | None = None,
 ) -> SlamResult:
-    """Track one or several recordings of one place; those after the first are joined to it where they see the same.
+    """Track one or several recordings of one place; those after the first are joined to it where
+    they see the same.
 
     The same recordings give the same poses, byte for byte.
 
     Raises:
         ConfigError: a value of `config` is out of its bounds.
-        RecordingError: no frame could be tracked; left and right are swapped, or are no pairs; single pictures only.
+        RecordingError: no frame could be tracked; left and right are swapped, or are no pairs;
+            single pictures only.
         CalibrationError: no calibration, or a baseline that cannot be in metres.
         UnreadableImageError: from reading the recordings.
     """
@@ -94,7 +101,13 @@ def run_slam(
         tracked.append(_track(sequence, odometry, checks, progress))
         residuals += checks.right_residuals_px
     links = find_links(keyframes, config.loops, progress)
-    links += find_joins(keyframes, links, lambda keyframe: _looked_at(keyframe, sequences, config), config.joins, config.loops)
+    links += find_joins(
+        keyframes,
+        links,
+        lambda keyframe: _looked_at(keyframe, sequences, config),
+        config.joins,
+        config.loops,
+    )
     joined = join_submaps(keyframes, links, landmarks, _largest(keyframes, links, tracked[0]))
     links = _optimise(keyframes, links, joined, landmarks, config, progress)
     return SlamResult(
@@ -111,7 +124,9 @@ def run_slam(
 
 
 def posed_by_slam(
-    sequences: Sequence[StereoSequence], config: SlamConfig | None = None, progress: Progress | None = None
+    sequences: Sequence[StereoSequence],
+    config: SlamConfig | None = None,
+    progress: Progress | None = None,
 ) -> list[StereoSequence]:
     """The recordings with the poses that `run_slam` finds.
 
@@ -121,22 +136,30 @@ def posed_by_slam(
     return with_slam_poses(sequences, run_slam(sequences, config, progress))
 
 
-def with_slam_poses(sequences: Sequence[StereoSequence], result: SlamResult) -> list[StereoSequence]:
-    """The recordings with the poses that `run_slam` has found in them, and those of stretches that stayed apart.
+def with_slam_poses(
+    sequences: Sequence[StereoSequence], result: SlamResult
+) -> list[StereoSequence]:
+    """The recordings with the poses that `run_slam` has found in them, and those of stretches that
+    stayed apart.
 
     Raises:
         RecordingError: one of them shares no place with the others.
     """
     for sequence, poses in zip(sequences, result.poses, strict=True):
         if not any(poses):
-            raise RecordingError(f"{sequence.name}: no place of it was recognised in {sequences[0].name}; map it alone")
+            raise RecordingError(
+                f"{sequence.name}: no place of it was recognised in {sequences[0].name}; map it"
+                " alone"
+            )
     return [
         SequenceView(sequence, list(range(len(sequence))), poses, tuple(apart))
         for sequence, poses, apart in zip(sequences, result.poses, result.apart, strict=True)
     ]
 
 
-def _track(sequence: StereoSequence, odometry: Odometry, checks: InputChecks, progress: Progress) -> list[FramePose | None]:
+def _track(
+    sequence: StereoSequence, odometry: Odometry, checks: InputChecks, progress: Progress
+) -> list[FramePose | None]:
     poses: list[FramePose | None] = [None] * len(sequence)
     for i, (frame, measured) in enumerate(_read_ahead(sequence, checks)):
         for pose in odometry.process(i, frame, measured):
@@ -146,12 +169,18 @@ def _track(sequence: StereoSequence, odometry: Odometry, checks: InputChecks, pr
         poses[pose.frame_idx] = pose
     checks.verdict()
     if all(pose is None for pose in poses):
-        raise RecordingError(f"{sequence.name}: none of the {len(poses)} frames could be tracked: too dark, without texture, or no stereo")
+        raise RecordingError(
+            f"{sequence.name}: none of the {len(poses)} frames could be tracked: too dark, without"
+            " texture, or no stereo"
+        )
     return poses
 
 
-def _read_ahead(sequence: StereoSequence, checks: InputChecks) -> Iterator[tuple[StereoFrame, MeasuredView]]:
-    """The frames, each read and made ready for measuring while the one before is being worked on."""
+def _read_ahead(
+    sequence: StereoSequence, checks: InputChecks
+) -> Iterator[tuple[StereoFrame, MeasuredView]]:
+    """The frames, each read and made ready for measuring while the one before is being worked
+    on."""
 
     def read(index: int) -> tuple[StereoFrame, MeasuredView]:
         frame = sequence[index]
@@ -170,21 +199,36 @@ def _read_ahead(sequence: StereoSequence, checks: InputChecks) -> Iterator[tuple
 def _largest(keyframes: list[KeyFrame], links: list[Link], tracked: list[FramePose | None]) -> int:
     """The first of the sub-maps that, joined, hold most frames of the first recording."""
     groups = group_submaps(keyframes, links)
-    return Counter(groups[pose.keyframe.submap] for pose in tracked if pose is not None).most_common(1)[0][0]
+    return Counter(
+        groups[pose.keyframe.submap] for pose in tracked if pose is not None
+    ).most_common(1)[0][0]
 
 
-def _looked_at(keyframe: KeyFrame, sequences: Sequence[StereoSequence], config: SlamConfig) -> PlaceView:
+def _looked_at(
+    keyframe: KeyFrame, sequences: Sequence[StereoSequence], config: SlamConfig
+) -> PlaceView:
     """What a key frame looks like that was no place of its own: its picture is read once more."""
-    return place_view(frame_view(sequences[keyframe.recording][keyframe.frame_idx]), config.odometry.places)
+    return place_view(
+        frame_view(sequences[keyframe.recording][keyframe.frame_idx]), config.odometry.places
+    )
 
 
 def _optimise(
-    keyframes: list[KeyFrame], links: list, joined: list[int], landmarks: Landmarks, config: SlamConfig, progress: Progress
+    keyframes: list[KeyFrame],
+    links: list,
+    joined: list[int],
+    landmarks: Landmarks,
+    config: SlamConfig,
+    progress: Progress,
 ) -> list:
     """Make the joined key frames agree; the links that do."""
     chosen = [i for i, keyframe in enumerate(keyframes) if keyframe.submap in joined]
     row = {i: k for k, i in enumerate(chosen)}
-    of_joined = [type(link)(row[link.source], row[link.target], link.match) for link in links if link.source in row and link.target in row]
+    of_joined = [
+        type(link)(row[link.source], row[link.target], link.match)
+        for link in links
+        if link.source in row and link.target in row
+    ]
     ours = [keyframes[i] for i in chosen]
     progress("optimising", 0, 2)
     kept = close_loops(ours, of_joined, landmarks, config.globally)
@@ -194,14 +238,26 @@ def _optimise(
     return kept
 
 
-def _world_poses(tracked: list[list[FramePose | None]], joined: list[int]) -> list[list[Rigid3 | None]]:
+def _world_poses(
+    tracked: list[list[FramePose | None]], joined: list[int]
+) -> list[list[Rigid3 | None]]:
     """World_from_cam of every frame, the world being the camera of the first of them."""
-    poses = [[p.world_from_cam() if p is not None and p.keyframe.submap in joined else None for p in one] for one in tracked]
+    poses = [
+        [p.world_from_cam() if p is not None and p.keyframe.submap in joined else None for p in one]
+        for one in tracked
+    ]
     world_from_any = next(pose for one in poses for pose in one if pose is not None).inverse()
     return [[world_from_any @ pose if pose is not None else None for pose in one] for one in poses]
 
 
 def _poses_apart(tracked: list[FramePose | None], joined: list[int]) -> list[list[Rigid3 | None]]:
-    """Of each sub-map that is not among the joined ones, world_from_cam of its frames in its own world."""
+    """Of each sub-map that is not among the joined ones, world_from_cam of its frames in its own
+    world."""
     submaps = sorted({pose.keyframe.submap for pose in tracked if pose is not None} - set(joined))
-    return [[p.world_from_cam() if p is not None and p.keyframe.submap == submap else None for p in tracked] for submap in submaps]
+    return [
+        [
+            p.world_from_cam() if p is not None and p.keyframe.submap == submap else None
+            for p in tracked
+        ]
+        for submap in submaps
+    ]

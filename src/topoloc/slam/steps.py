@@ -1,7 +1,8 @@
-"""One step of the camera, from the last frame to the next: points followed, robust PnP. And which other steps would do as well.
+"""One step of the camera, from the last frame to the next: points followed, robust PnP. And which
+other steps would do as well.
 
-Where a wall repeats itself, the points of one panel are found on the next one just as well. That is not seen in the step that was
-found: it is seen by seeking from other places too.
+Where a wall repeats itself, the points of one panel are found on the next one just as well. That is
+not seen in the step that was found: it is seen by seeking from other places too.
 """
 
 from __future__ import annotations
@@ -33,7 +34,9 @@ class OdometryConfig:
     prediction: PredictionConfig = field(default_factory=PredictionConfig)
     disparity: DisparityConfig = field(default_factory=DisparityConfig)
     pose: AbsolutePoseConfig = field(
-        default_factory=lambda: AbsolutePoseConfig(max_reprojection_error_px=2.0, sigma_px=0.5, max_iterations=300, min_iterations=20)
+        default_factory=lambda: AbsolutePoseConfig(
+            max_reprojection_error_px=2.0, sigma_px=0.5, max_iterations=300, min_iterations=20
+        )
     )
     bundle: BundleConfig = field(default_factory=BundleConfig)
     places: PlaceMatchingConfig = field(default_factory=PlaceMatchingConfig)
@@ -58,13 +61,16 @@ class OdometryConfig:
     keyframe_motion: Annotated[float, Above(0)] = 0.03
     """... or when they have moved in the picture by this share of its width (median)."""
     min_gap_share: Annotated[float, Between(0, 1)] = 0.5
-    """After a gap, a step that the motion does not let expect is believed where this share of the points is found again."""
+    """After a gap, a step that the motion does not let expect is believed where this share of the
+    points is found again."""
     start_spacing_px: Annotated[float, Above(0)] = 25.0
-    """Whether the last picture looks alike from elsewhere is tried from places this far apart (median over the points) ..."""
+    """Whether the last picture looks alike from elsewhere is tried from places this far apart
+    (median over the points) ..."""
     max_starts: Annotated[int, Between(0, 1000)] = 16
     """... so many to either side along the motion at most, ..."""
     repeat_depth: Annotated[float, AtLeast(0)] = 1.0
-    """... and as far as this share of the median depth, as the way since the last frame, or as the prediction is uncertain."""
+    """... and as far as this share of the median depth, as the way since the last frame, or as the
+    prediction is uncertain."""
     repeat_share: Annotated[float, Between(0, 1)] = 0.3
     """It does where this share of the points that should be in the picture agree."""
     max_repeats: Annotated[int, Between(0, 1000)] = 8
@@ -74,19 +80,22 @@ class OdometryConfig:
     max_lost_tracked: Annotated[int, AtLeast(0)] = 3
     """The points of the last frame that was tracked are sought in so many more."""
     max_lost_frames: Annotated[int, AtLeast(0)] = 10
-    """A camera that is lost for longer starts a new sub-map, from the first of these frames on that the others follow."""
+    """A camera that is lost for longer starts a new sub-map, from the first of these frames on that
+    the others follow."""
     places_asked: Annotated[int, Between(0, 1000)] = 6
     """The last places in which a camera that is lost is sought."""
     place_distance: Annotated[float, AtLeast(0)] = 0.1
-    """A key frame keeps what it looks like (for loops) when it is this share of the median depth from the last that did ..."""
+    """A key frame keeps what it looks like (for loops) when it is this share of the median depth
+    from the last that did ..."""
     place_angle_deg: Annotated[float, AtLeast(0)] = 8.0
     """... or turned by this angle."""
 
 
 @dataclass(eq=False)
 class Tracks:
-    """The points being followed: where they are in the last frame, where in the last key frame, their landmarks, and by how much
-    the first are uncertain, by what does not look alike (pixels)."""
+    """The points being followed: where they are in the last frame, where in the last key frame,
+    their landmarks, and by how much the first are uncertain, by what does not look alike
+    (pixels)."""
 
     landmark_ids: Int[np.ndarray, " n"]
     points_img: Float32[np.ndarray, "n 2"]
@@ -94,12 +103,19 @@ class Tracks:
     sigmas_px: Float32[np.ndarray, " n"]
 
     @classmethod
-    def of(cls, landmark_ids: Int[np.ndarray, " n"], points_img: Float32[np.ndarray, "n 2"]) -> Tracks:
+    def of(
+        cls, landmark_ids: Int[np.ndarray, " n"], points_img: Float32[np.ndarray, "n 2"]
+    ) -> Tracks:
         """Points that are followed from here on."""
         return cls(landmark_ids, points_img, points_img, np.zeros(len(points_img), np.float32))
 
     def select(self, rows: np.ndarray) -> Tracks:
-        return Tracks(self.landmark_ids[rows], self.points_img[rows], self.points_ref[rows], self.sigmas_px[rows])
+        return Tracks(
+            self.landmark_ids[rows],
+            self.points_img[rows],
+            self.points_ref[rows],
+            self.sigmas_px[rows],
+        )
 
 
 @dataclass(eq=False)
@@ -112,7 +128,8 @@ class LastFrame:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A pose that enough points agree on. `share` is that of the points that should be in the picture."""
+    """A pose that enough points agree on. `share` is that of the points that should be in the
+    picture."""
 
     cam_from_world: Rigid3
     covariance: Float[np.ndarray, "6 6"]
@@ -143,15 +160,24 @@ class StepSeeker:
         return Step(pose.cam_from_world, pose.covariance, tracks.select(pose.inliers), share)
 
     def repeats(self, prediction: Prediction) -> list[Rigid3]:
-        """What moves a camera to where the last picture would look the same; nothing where nothing repeats itself."""
+        """What moves a camera to where the last picture would look the same; nothing where nothing
+        repeats itself."""
         itself, last = replace(self, measured=self.last.measured), self.last.cam_from_world
         steps = in_order(itself.seek, self._starts(last, prediction))
-        shifts = [step.cam_from_world @ last.inverse() for step in steps if step is not None and step.share > self.config.repeat_share]
+        shifts = [
+            step.cam_from_world @ last.inverse()
+            for step in steps
+            if step is not None and step.share > self.config.repeat_share
+        ]
         shifts = [shift for shift in shifts if not self.is_same(shift, Rigid3.identity())]
         if not shifts:
             return []
         least = min(shifts, key=lambda shift: float(np.linalg.norm(shift.translation))).log()
-        return [Rigid3.exp(k * least) for k in range(-self.config.max_repeats, self.config.max_repeats + 1) if k]
+        return [
+            Rigid3.exp(k * least)
+            for k in range(-self.config.max_repeats, self.config.max_repeats + 1)
+            if k
+        ]
 
     def _starts(self, centre: Rigid3, prediction: Prediction) -> list[Rigid3]:
         """Places around one along the predicted motion, as far apart as points are found again."""
@@ -164,7 +190,9 @@ class StepSeeker:
         apart = self._metres_apart(centre, direction)
         sigma = prediction.sigma if np.isfinite(prediction.sigma) else 0.0
         moved = float(np.linalg.norm(prediction.step.translation))
-        reach = max(config.prediction.max_sigmas * sigma, moved, config.repeat_depth * self._depth())
+        reach = max(
+            config.prediction.max_sigmas * sigma, moved, config.repeat_depth * self._depth()
+        )
         num = min(int(np.ceil(reach / apart)), config.max_starts)
         return [Rigid3.exp(k * apart * direction) @ centre for k in range(-num, num + 1) if k]
 
@@ -187,31 +215,61 @@ class StepSeeker:
     def is_same(self, a: Rigid3, b: Rigid3) -> bool:
         """Whether two cam_from_world are one place."""
         away = a @ b.inverse()
-        return bool(np.linalg.norm(away.translation) < self.config.same_step * self._depth() and away.angle() < self.config.same_step)
+        return bool(
+            np.linalg.norm(away.translation) < self.config.same_step * self._depth()
+            and away.angle() < self.config.same_step
+        )
 
     def _in_picture(self, cam_from_world: Rigid3) -> np.ndarray:
         camera = self.measured.stereo.camera
-        points = self.measured.stereo.project(cam_from_world.apply(self.landmarks.positions[self.tracks.landmark_ids]))
+        points = self.measured.stereo.project(
+            cam_from_world.apply(self.landmarks.positions[self.tracks.landmark_ids])
+        )
         with np.errstate(invalid="ignore"):
-            return np.all((points[:, :2] > 8.0) & (points[:, :2] < [camera.width - 9.0, camera.height - 9.0]), axis=1)
+            return np.all(
+                (points[:, :2] > 8.0) & (points[:, :2] < [camera.width - 9.0, camera.height - 9.0]),
+                axis=1,
+            )
 
     def follow(self, predicted: Rigid3) -> Tracks:
-        """The points found again from a predicted cam_from_world, where they look as in the last key frame."""
+        """The points found again from a predicted cam_from_world, where they look as in the last
+        key frame."""
         config, tracks, measured = self.config.tracking, self.tracks, self.measured
         points_world = self.landmarks.positions[tracks.landmark_ids]
-        before, after = (measured.stereo.project(pose.apply(points_world))[:, :2] for pose in (self.last.cam_from_world, predicted))
+        before, after = (
+            measured.stereo.project(pose.apply(points_world))[:, :2]
+            for pose in (self.last.cam_from_world, predicted)
+        )
         limit = np.array([measured.view.camera.width, measured.view.camera.height]) / 2.0
-        guesses = (tracks.points_img + np.clip(np.nan_to_num(after - before), -limit, limit)).astype(np.float32)
-        found, is_found = follow(self.last.measured.view.grey, measured.view.grey, tracks.points_img, guesses, config)
+        guesses = (
+            tracks.points_img + np.clip(np.nan_to_num(after - before), -limit, limit)
+        ).astype(np.float32)
+        found, is_found = follow(
+            self.last.measured.view.grey, measured.view.grey, tracks.points_img, guesses, config
+        )
         tracks = replace(tracks, points_img=found).select(is_found)
         scales = self._patch_scales(tracks.landmark_ids, predicted)
-        found = align_with_reference(self.reference_picture, measured.left, tracks.points_ref, tracks.points_img, scales, config)
-        return replace(tracks, points_img=found.points_img, sigmas_px=found.sigmas_px).select(found.is_alike)
+        found = align_with_reference(
+            self.reference_picture,
+            measured.left,
+            tracks.points_ref,
+            tracks.points_img,
+            scales,
+            config,
+        )
+        return replace(tracks, points_img=found.points_img, sigmas_px=found.sigmas_px).select(
+            found.is_alike
+        )
 
-    def _patch_scales(self, landmark_ids: Int[np.ndarray, " n"], predicted: Rigid3) -> Float32[np.ndarray, " n"]:
-        """How much larger each landmark's surroundings look than in the last key frame: what is approached grows."""
+    def _patch_scales(
+        self, landmark_ids: Int[np.ndarray, " n"], predicted: Rigid3
+    ) -> Float32[np.ndarray, " n"]:
+        """How much larger each landmark's surroundings look than in the last key frame: what is
+        approached grows."""
         points_world = self.landmarks.positions[landmark_ids]
-        before, now = (pose.apply(points_world)[:, 2] for pose in (self.reference.cam_from_world, predicted))
+        before, now = (
+            pose.apply(points_world)[:, 2] for pose in (self.reference.cam_from_world, predicted)
+        )
         return np.clip(before / np.maximum(now, 1e-3), 0.5, 2.0).astype(np.float32)
 
     def estimate(self, tracks: Tracks) -> AbsolutePose | None:
@@ -233,10 +291,14 @@ class StepSeeker:
         enough = max(config.min_tracked, config.min_tracked_share * len(tracks.landmark_ids))
         return pose if num_inliers >= enough else None
 
-    def _landmark_covariances(self, points_world: Float[np.ndarray, "n 3"], stereo: StereoCamera) -> Float[np.ndarray, "n 3 3"]:
+    def _landmark_covariances(
+        self, points_world: Float[np.ndarray, "n 3"], stereo: StereoCamera
+    ) -> Float[np.ndarray, "n 3 3"]:
         """In the world's axes, as the last key frame measured them."""
         rotation = self.reference.cam_from_world.rotation
         points_cam = self.reference.cam_from_world.apply(points_world)
         sigma_z = self.config.sigma_landmark_px * points_cam[:, 2] ** 2 / stereo.bf
-        covariances = ray_covariances(points_cam, sigma_z, stereo.camera, np.full(len(points_cam), 0.1))
+        covariances = ray_covariances(
+            points_cam, sigma_z, stereo.camera, np.full(len(points_cam), 0.1)
+        )
         return rotation.T @ covariances @ rotation

@@ -1,10 +1,12 @@
 """Sub-maps that no loop has joined, joined by what many of their pictures say together.
 
-Across a gap two sub-maps share little: a few pictures at their ends, seen from elsewhere, with too few matches for any of them to be
-believed alone. So pairs that match weakly are gathered, both ways, with those of the key frames around them; each says where one sub-map
-lies in the other, and what enough of them agree on, from pictures of which none counts twice, joins the two (`transform_consensus`).
-Two floors of one building agree, too, on what they share. So key frames that then are nearest to each other are looked at: what both must
-see alike has to be found again, and of another place hardly any of it is. Pictures of a wall of equal panels say nothing here.
+Across a gap two sub-maps share little: a few pictures at their ends, seen from elsewhere, with too
+few matches for any of them to be believed alone. So pairs that match weakly are gathered, both
+ways, with those of the key frames around them; each says where one sub-map lies in the other, and
+what enough of them agree on, from pictures of which none counts twice, joins the two
+(`transform_consensus`). Two floors of one building agree, too, on what they share. So key frames
+that then are nearest to each other are looked at: what both must see alike has to be found again,
+and of another place hardly any of it is. Pictures of a wall of equal panels say nothing here.
 """
 
 from __future__ import annotations
@@ -33,7 +35,9 @@ from topoloc.slam.place_matching import PlaceMatchingConfig, match_places, num_r
 
 _MIN_LOOSE = 6  # matches that agree on a pose which is known already
 _MIN_TRACE = 1.0  # of a turn by 90 degrees: beyond it hardly anything is in both pictures
-_LOOKED_AT = 10  # times as many pairs as are checked, the nearest, are asked how much they must see alike
+_LOOKED_AT = (
+    10  # times as many pairs as are checked, the nearest, are asked how much they must see alike
+)
 
 Look = Callable[[KeyFrame], PlaceView]
 """What a key frame looks like, from its recording."""
@@ -43,7 +47,9 @@ Look = Callable[[KeyFrame], PlaceView]
 class JoinConfig:
     """Which pictures of two sub-maps are compared, and what joins them."""
 
-    matching: PlaceMatchingConfig = field(default_factory=lambda: PlaceMatchingConfig(min_inliers=12, min_inlier_share=0.3))
+    matching: PlaceMatchingConfig = field(
+        default_factory=lambda: PlaceMatchingConfig(min_inliers=12, min_inlier_share=0.3)
+    )
     consensus: ConsensusConfig = field(default_factory=lambda: ConsensusConfig(min_independent=3))
     num_candidates: Annotated[int, Between(0, 1000)] = 4
     """Places of the other sub-maps that look most alike, which each one is compared with."""
@@ -56,9 +62,11 @@ class JoinConfig:
     sigma_deg: Annotated[float, Above(0)] = 1.0
     """... and degrees."""
     covariance_scale: Annotated[float, Above(0)] = 4.0
-    """Matched features of one view share their errors: more than independent ones would be wrong by."""
+    """Matched features of one view share their errors: more than independent ones would be wrong
+    by."""
     drift: Annotated[float, AtLeast(0)] = 0.02
-    """Share of the way between two pictures of a sub-map by which they may be wrong (one sigma) ..."""
+    """Share of the way between two pictures of a sub-map by which they may be wrong (one sigma)
+    ..."""
     drift_deg: Annotated[float, AtLeast(0)] = 0.3
     """... and degrees a metre."""
     num_checked: Annotated[int, Between(0, 1000)] = 20
@@ -72,21 +80,30 @@ class JoinConfig:
     min_seen_again: Annotated[float, Between(0, 1)] = 0.08
     """... the share of them that must be matched as the join has it, ..."""
     min_covered: Annotated[float, Between(0, 1)] = 0.55
-    """... and the share of them that lie in parts of a picture where any is: a board may hang in two rooms."""
+    """... and the share of them that lie in parts of a picture where any is: a board may hang in
+    two rooms."""
     cells: Annotated[int, Between(1, 100)] = 4
     """Such parts, across a picture and down."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Ends:
-    """The two key frames that match best, of the earlier and of the later sub-map: what is said of the two is said at these."""
+    """The two key frames that match best, of the earlier and of the later sub-map: what is said of
+    the two is said at these."""
 
     first: KeyFrame
     second: KeyFrame
 
 
-def find_joins(keyframes: Sequence[KeyFrame], links: Sequence[Link], look: Look, config: JoinConfig, loops: LoopConfig) -> list[Link]:
-    """Links that join sub-maps which `links` leave apart; key frames that are compared get their place."""
+def find_joins(
+    keyframes: Sequence[KeyFrame],
+    links: Sequence[Link],
+    look: Look,
+    config: JoinConfig,
+    loops: LoopConfig,
+) -> list[Link]:
+    """Links that join sub-maps which `links` leave apart; key frames that are compared get their
+    place."""
     groups = group_submaps(keyframes, links)
     places = [i for i, keyframe in enumerate(keyframes) if keyframe.has_place]
     if len(set(groups.values())) < 2 or len(places) < 2:
@@ -101,22 +118,34 @@ def find_joins(keyframes: Sequence[KeyFrame], links: Sequence[Link], look: Look,
             if not keyframes[i].has_place:
                 keyframes[i].place = look(keyframes[i])
         found += _matched(sorted(around), keyframes, config, loops)
-        joins += _agreeing([link for link in found if _is_distinct(link, keyframes, repeated, config)], keyframes, config)
+        joins += _agreeing(
+            [link for link in found if _is_distinct(link, keyframes, repeated, config)],
+            keyframes,
+            config,
+        )
     return joins
 
 
-def _is_distinct(link: Link, keyframes: Sequence[KeyFrame], repeated: dict[int, int], config: JoinConfig) -> bool:
-    """Whether neither picture looks nearly as much like itself, from elsewhere, as like the other; `repeated` remembers what did."""
+def _is_distinct(
+    link: Link, keyframes: Sequence[KeyFrame], repeated: dict[int, int], config: JoinConfig
+) -> bool:
+    """Whether neither picture looks nearly as much like itself, from elsewhere, as like the other;
+    `repeated` remembers what did."""
     for end in (link.source, link.target):
         place = keyframes[end].place
         if end not in repeated and place is not None:
             repeated[end] = num_repeated(place, keyframes[end].stereo, config.matching)
     rivals = max(repeated[link.source], repeated[link.target])
-    return rivals < max(config.consensus.rival_share * len(link.match.source_rows), config.matching.min_inliers)
+    return rivals < max(
+        config.consensus.rival_share * len(link.match.source_rows), config.matching.min_inliers
+    )
 
 
-def _agreeing(links: Sequence[Link], keyframes: Sequence[KeyFrame], config: JoinConfig) -> list[Link]:
-    """Those of the links between two sub-maps that say the same, where enough do and what they say is true of other pictures."""
+def _agreeing(
+    links: Sequence[Link], keyframes: Sequence[KeyFrame], config: JoinConfig
+) -> list[Link]:
+    """Those of the links between two sub-maps that say the same, where enough do and what they say
+    is true of other pictures."""
     if not links:
         return []
     best = max(links, key=lambda link: len(link.match.source_rows))
@@ -134,14 +163,22 @@ def group_submaps(keyframes: Sequence[KeyFrame], links: Sequence[Link]) -> dict[
     groups = {keyframe.submap: keyframe.submap for keyframe in keyframes}
     for link in links:
         one, other = (groups[keyframes[end].submap] for end in (link.source, link.target))
-        groups = {submap: min(one, other) if group in (one, other) else group for submap, group in groups.items()}
+        groups = {
+            submap: min(one, other) if group in (one, other) else group
+            for submap, group in groups.items()
+        }
     return groups
 
 
 def _look_alikes(
-    keyframes: Sequence[KeyFrame], places: list[int], groups: dict[int, int], config: JoinConfig, loops: LoopConfig
+    keyframes: Sequence[KeyFrame],
+    places: list[int],
+    groups: dict[int, int],
+    config: JoinConfig,
+    loops: LoopConfig,
 ) -> dict[tuple[int, int], list[tuple[int, int]]]:
-    """For each two sub-maps that are apart, the pairs (of the earlier, of the later) that look alike."""
+    """For each two sub-maps that are apart, the pairs (of the earlier, of the later) that look
+    alike."""
     pairs: dict[tuple[int, int], set[tuple[int, int]]] = {}
     for number, ranked in enumerate(rank_places([keyframes[i] for i in places], loops.vlad)):
         own = keyframes[places[number]].submap
@@ -150,16 +187,24 @@ def _look_alikes(
             submap = keyframes[places[other]].submap
             num_of[submap] = num_of.get(submap, 0) + 1
             if groups[submap] != groups[own] and num_of[submap] <= config.num_candidates:
-                ends = (places[number], places[other]) if own < submap else (places[other], places[number])
+                ends = (
+                    (places[number], places[other])
+                    if own < submap
+                    else (places[other], places[number])
+                )
                 pairs.setdefault((min(own, submap), max(own, submap)), set()).add(ends)
     return {submaps: sorted(pairs[submaps]) for submaps in sorted(pairs)}
 
 
-def _around(links: Sequence[Link], keyframes: Sequence[KeyFrame], config: JoinConfig) -> set[tuple[int, int]]:
+def _around(
+    links: Sequence[Link], keyframes: Sequence[KeyFrame], config: JoinConfig
+) -> set[tuple[int, int]]:
     """Pairs of key frames around those of the links: of the earlier sub-map, of the later."""
     pairs: set[tuple[int, int]] = set()
     for link in links:
-        one, other = (_neighbours(end, keyframes, config.neighbours) for end in _in_order(link, keyframes))
+        one, other = (
+            _neighbours(end, keyframes, config.neighbours) for end in _in_order(link, keyframes)
+        )
         pairs |= set(product(one, other))
     return pairs
 
@@ -171,15 +216,26 @@ def _neighbours(row: int, keyframes: Sequence[KeyFrame], num: int) -> list[int]:
     return own[max(at - num, 0) : at + num + 1]
 
 
-def _matched(pairs: Sequence[tuple[int, int]], keyframes: Sequence[KeyFrame], config: JoinConfig, loops: LoopConfig) -> list[Link]:
+def _matched(
+    pairs: Sequence[tuple[int, int]],
+    keyframes: Sequence[KeyFrame],
+    config: JoinConfig,
+    loops: LoopConfig,
+) -> list[Link]:
     """Both ways of each pair, where it matches and the camera can have gone so."""
     links = []
     for source, target in (ends for pair in pairs for ends in (pair, pair[::-1])):
         a, b = keyframes[source].place, keyframes[target].place
-        match = match_places(a, b, keyframes[target].stereo, config.matching) if a is not None and b is not None else None
+        match = (
+            match_places(a, b, keyframes[target].stereo, config.matching)
+            if a is not None and b is not None
+            else None
+        )
         if match is not None:
             link = Link(source, target, match)
-            if keyframes[source].recording != keyframes[target].recording or is_within_reach(link, keyframes, loops):
+            if keyframes[source].recording != keyframes[target].recording or is_within_reach(
+                link, keyframes, loops
+            ):
                 links.append(link)
     return links
 
@@ -192,24 +248,32 @@ def _in_order(link: Link, keyframes: Sequence[KeyFrame]) -> list[int]:
 def _estimates(
     links: Sequence[Link], keyframes: Sequence[KeyFrame], ends: _Ends, config: JoinConfig
 ) -> tuple[list[Rigid3], Float[np.ndarray, "n 6 6"]]:
-    """first_from_second as each link says, and the covariances; the further along the sub-maps it is, the less exactly."""
+    """first_from_second as each link says, and the covariances; the further along the sub-maps it
+    is, the less exactly."""
     estimates, covariances, along = [], [], DriftConfig(config.drift, config.drift_deg)
     for link in links:
         a, b = _in_order(link, keyframes)
         first_from_a = ends.first.cam_from_world @ keyframes[a].cam_from_world.inverse()
         b_from_second = keyframes[b].cam_from_world @ ends.second.cam_from_world.inverse()
         a_from_b = link.match.target_from_source
-        covariance = config.covariance_scale * link.match.covariance + diagonal_covariance(config.sigma, config.sigma_deg)
+        covariance = config.covariance_scale * link.match.covariance + diagonal_covariance(
+            config.sigma, config.sigma_deg
+        )
         if link.source == a:
             a_from_b, covariance = a_from_b.inverse(), covariance_of_inverse(a_from_b, covariance)
-        estimate, carried_covariance = carried(first_from_a, a_from_b, covariance, b_from_second, along)
+        estimate, carried_covariance = carried(
+            first_from_a, a_from_b, covariance, b_from_second, along
+        )
         estimates.append(estimate)
         covariances.append(carried_covariance)
     return estimates, np.stack(covariances)
 
 
-def _is_seen_again(consensus: TransformConsensus, keyframes: Sequence[KeyFrame], ends: _Ends, config: JoinConfig) -> bool:
-    """Whether enough of what key frames of both sub-maps must see alike is matched, and not on one thing alone."""
+def _is_seen_again(
+    consensus: TransformConsensus, keyframes: Sequence[KeyFrame], ends: _Ends, config: JoinConfig
+) -> bool:
+    """Whether enough of what key frames of both sub-maps must see alike is matched, and not on one
+    thing alone."""
     loosely = replace(config.matching, min_inliers=_MIN_LOOSE, min_inlier_share=0.0)
     num_seen, num_found, num_covered = 0, 0, 0
     for source, target, rows in _near_views(consensus.a_from_b, keyframes, ends, config):
@@ -217,23 +281,43 @@ def _is_seen_again(consensus: TransformConsensus, keyframes: Sequence[KeyFrame],
         assert a is not None
         assert b is not None
         cells = _cells(a, keyframes[source], config)
-        seen, found = np.bincount(cells[rows], minlength=config.cells**2), np.zeros(config.cells**2, np.int64)
+        seen, found = (
+            np.bincount(cells[rows], minlength=config.cells**2),
+            np.zeros(config.cells**2, np.int64),
+        )
         match = match_places(a, b, keyframes[target].stereo, loosely)
-        if match is not None and _is_as_joined(Link(source, target, match), consensus, keyframes, ends, config):
+        if match is not None and _is_as_joined(
+            Link(source, target, match), consensus, keyframes, ends, config
+        ):
             found = np.bincount(cells[np.intersect1d(match.source_rows, rows)], minlength=len(seen))
-        num_seen, num_found, num_covered = num_seen + seen.sum(), num_found + found.sum(), num_covered + seen[found > 0].sum()
-    enough = num_found >= config.min_seen_again * num_seen and num_covered >= config.min_covered * num_seen
+        num_seen, num_found, num_covered = (
+            num_seen + seen.sum(),
+            num_found + found.sum(),
+            num_covered + seen[found > 0].sum(),
+        )
+    enough = (
+        num_found >= config.min_seen_again * num_seen
+        and num_covered >= config.min_covered * num_seen
+    )
     return bool(num_seen >= config.min_seen_points and enough)
 
 
 def _cells(place: PlaceView, keyframe: KeyFrame, config: JoinConfig) -> Int[np.ndarray, " n"]:
     """In which cell of a grid over its picture each feature lies."""
     camera = keyframe.stereo.camera
-    columns_rows = np.floor(config.cells * place.features.points_img / [camera.width, camera.height]).astype(np.int64)
+    columns_rows = np.floor(
+        config.cells * place.features.points_img / [camera.width, camera.height]
+    ).astype(np.int64)
     return np.clip(columns_rows, 0, config.cells - 1) @ [1, config.cells]
 
 
-def _is_as_joined(link: Link, consensus: TransformConsensus, keyframes: Sequence[KeyFrame], ends: _Ends, config: JoinConfig) -> bool:
+def _is_as_joined(
+    link: Link,
+    consensus: TransformConsensus,
+    keyframes: Sequence[KeyFrame],
+    ends: _Ends,
+    config: JoinConfig,
+) -> bool:
     estimates, covariances = _estimates([link], keyframes, ends, config)
     residual = (estimates[0] @ consensus.a_from_b.inverse()).log()
     square = residual @ np.linalg.solve(covariances[0] + consensus.covariance, residual)
@@ -243,14 +327,34 @@ def _is_as_joined(link: Link, consensus: TransformConsensus, keyframes: Sequence
 def _near_views(
     first_from_second: Rigid3, keyframes: Sequence[KeyFrame], ends: _Ends, config: JoinConfig
 ) -> list[tuple[int, int, Int[np.ndarray, " n"]]]:
-    """Source, target and the source's features that are seen alike, of the pairs of places that have most of these; both ways."""
-    ones, others = ([i for i, k in enumerate(keyframes) if k.submap == end.submap and k.has_place] for end in (ends.first, ends.second))
-    first_from_ones = [ends.first.cam_from_world @ keyframes[a].cam_from_world.inverse() for a in ones]
-    first_from_others = [first_from_second @ ends.second.cam_from_world @ keyframes[b].cam_from_world.inverse() for b in others]
-    places, other_places = (np.array([pose.translation for pose in poses]) for poses in (first_from_ones, first_from_others))
-    turned = np.einsum("aij,bij->ab", *(np.stack([pose.rotation for pose in poses]) for poses in (first_from_ones, first_from_others)))
+    """Source, target and the source's features that are seen alike, of the pairs of places that
+    have most of these; both ways."""
+    ones, others = (
+        [i for i, k in enumerate(keyframes) if k.submap == end.submap and k.has_place]
+        for end in (ends.first, ends.second)
+    )
+    first_from_ones = [
+        ends.first.cam_from_world @ keyframes[a].cam_from_world.inverse() for a in ones
+    ]
+    first_from_others = [
+        first_from_second @ ends.second.cam_from_world @ keyframes[b].cam_from_world.inverse()
+        for b in others
+    ]
+    places, other_places = (
+        np.array([pose.translation for pose in poses])
+        for poses in (first_from_ones, first_from_others)
+    )
+    turned = np.einsum(
+        "aij,bij->ab",
+        *(
+            np.stack([pose.rotation for pose in poses])
+            for poses in (first_from_ones, first_from_others)
+        ),
+    )
     apart = np.linalg.norm(places[:, None] - other_places, axis=2)
-    nearest = np.argsort(np.where(turned > _MIN_TRACE, apart, np.inf), axis=None, kind="stable")[: _LOOKED_AT * config.num_checked]
+    nearest = np.argsort(np.where(turned > _MIN_TRACE, apart, np.inf), axis=None, kind="stable")[
+        : _LOOKED_AT * config.num_checked
+    ]
     views = []
     for a, b in np.column_stack(np.unravel_index(nearest, apart.shape)).tolist():
         b_from_a = first_from_others[b].inverse() @ first_from_ones[a]
@@ -260,17 +364,24 @@ def _near_views(
     return sorted(views, key=lambda view: -len(view[2]))[: config.num_checked]
 
 
-def _alike(source: KeyFrame, target: KeyFrame, target_from_source: Rigid3, config: JoinConfig) -> Int[np.ndarray, " n"]:
-    """Which features of `source` lie within the picture of `target`, and are seen from about the same side and as far away."""
+def _alike(
+    source: KeyFrame, target: KeyFrame, target_from_source: Rigid3, config: JoinConfig
+) -> Int[np.ndarray, " n"]:
+    """Which features of `source` lie within the picture of `target`, and are seen from about the
+    same side and as far away."""
     place = source.place
     assert place is not None
     valid = np.flatnonzero(place.points.valid)
     points = target_from_source.apply(place.points.points_cam[valid])
     pixels, camera = target.stereo.project(points)[:, :2], target.stereo.camera
     with np.errstate(invalid="ignore"):
-        is_inside = np.all((pixels > 0.0) & (pixels < [camera.width - 1.0, camera.height - 1.0]), axis=1)
+        is_inside = np.all(
+            (pixels > 0.0) & (pixels < [camera.width - 1.0, camera.height - 1.0]), axis=1
+        )
     rays = points - target_from_source.translation
     lengths, others = np.linalg.norm(points, axis=1), np.linalg.norm(rays, axis=1)
-    is_from_side = np.sum(points * rays, axis=1) > np.cos(np.deg2rad(config.alike_deg)) * lengths * others
+    is_from_side = (
+        np.sum(points * rays, axis=1) > np.cos(np.deg2rad(config.alike_deg)) * lengths * others
+    )
     is_as_far = (lengths < config.alike_ratio * others) & (others < config.alike_ratio * lengths)
     return valid[is_inside & is_from_side & is_as_far]

@@ -1,8 +1,9 @@
-"""Points followed from picture to picture: corners spread over a grid, pyramidal Lucas-Kanade, then the key frame's own patch.
+"""Points followed from picture to picture: corners spread over a grid, pyramidal Lucas-Kanade, then
+the key frame's own patch.
 
-Bouguet, *Pyramidal implementation of the Lucas Kanade feature tracker*, 2000, as in OpenCV, finds a point again across a step of
-motion; alignment with the patch of the last key frame takes the drift of many such steps away and says whether it is still
-the same point.
+Bouguet, *Pyramidal implementation of the Lucas Kanade feature tracker*, 2000, as in OpenCV, finds a
+point again across a step of motion; alignment with the patch of the last key frame takes the drift
+of many such steps away and says whether it is still the same point.
 """
 
 from __future__ import annotations
@@ -48,14 +49,15 @@ def follow(
     guesses_img: Float32[np.ndarray, "n 2"],
     config: TrackingConfig,
 ) -> tuple[Float32[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
-    """Where the points of the previous picture are in the current one, sought from `guesses_img`; and which were found."""
+    """Where the points of the previous picture are in the current one, sought from `guesses_img`;
+    and which were found."""
     if len(points_img) == 0:
         return guesses_img.copy(), np.zeros(0, np.bool_)
     window = (config.window_px, config.window_px)
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.03)
     found, status, _ = cv2.calcOpticalFlowPyrLK(
         previous, current, points_img[:, None], guesses_img[:, None].copy(),
-        winSize=window, maxLevel=config.levels, criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        winSize=window, maxLevel=config.levels, criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,  # noqa: E501
     )  # pyright: ignore[reportCallIssue, reportArgumentType]  # fmt: skip
     found = np.ascontiguousarray(found[:, 0], np.float32)
     return found, (status[:, 0] > 0) & np.isfinite(found).all(axis=1)
@@ -63,7 +65,8 @@ def follow(
 
 @dataclass(frozen=True, eq=False)
 class Aligned:
-    """Where points are found, which look like the reference there, and how uncertain their places are by what does not fit (pixels)."""
+    """Where points are found, which look like the reference there, and how uncertain their places
+    are by what does not fit (pixels)."""
 
     points_img: Float32[np.ndarray, "n 2"]
     is_alike: Bool[np.ndarray, " n"]
@@ -78,12 +81,16 @@ def align_with_reference(
     scales: Float32[np.ndarray, " n"],
     config: TrackingConfig,
 ) -> Aligned:
-    """Points of `picture` moved to where they look most like `points_ref` of the reference enlarged by `scales`."""
-    refined, (scores, sigmas) = np.empty_like(points_img), np.empty((2, len(points_img)), np.float32)
+    """Points of `picture` moved to where they look most like `points_ref` of the reference enlarged
+    by `scales`."""
+    refined, (scores, sigmas) = (
+        np.empty_like(points_img),
+        np.empty((2, len(points_img)), np.float32),
+    )
 
     def run(first: int, last: int) -> None:
         refine_tracks(
-            reference, picture, points_ref, points_img, scales, config.patch_half_px, 8, config.max_shift_px, first, last,
+            reference, picture, points_ref, points_img, scales, config.patch_half_px, 8, config.max_shift_px, first, last,  # noqa: E501
             refined, scores, sigmas,
         )  # fmt: skip
 
@@ -92,9 +99,12 @@ def align_with_reference(
 
 
 def find_corners(
-    grey: UInt8[np.ndarray, "h w"], occupied_img: Float[np.ndarray, "n 2"] | Float32[np.ndarray, "n 2"], config: TrackingConfig
+    grey: UInt8[np.ndarray, "h w"],
+    occupied_img: Float[np.ndarray, "n 2"] | Float32[np.ndarray, "n 2"],
+    config: TrackingConfig,
 ) -> Float32[np.ndarray, "m 2"]:
-    """The strongest corner of each cell of a grid that holds no point yet (Shi and Tomasi, 1994), row by row."""
+    """The strongest corner of each cell of a grid that holds no point yet (Shi and Tomasi, 1994),
+    row by row."""
     height, width = grey.shape
     side = max(8, round(np.sqrt(height * width / config.num_corners)))
     rows, columns = height // side, width // side
@@ -107,4 +117,6 @@ def find_corners(
     is_free[cell_of[inside, 1], cell_of[inside, 0]] = False
     corners = np.empty((rows * columns, 2), np.float32)
     border = config.patch_half_px + 3
-    return corners[: best_of_cells(strength, is_free, side, top, left, border, np.float32(threshold), corners)]
+    return corners[
+        : best_of_cells(strength, is_free, side, top, left, border, np.float32(threshold), corners)
+    ]

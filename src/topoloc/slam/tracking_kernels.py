@@ -1,6 +1,8 @@
-"""Numba kernels: a tracked point brought to where it looks most like the picture it was first seen in; corners to begin with.
+"""Numba kernels: a tracked point brought to where it looks most like the picture it was first seen
+in; corners to begin with.
 
-Point trackers step from frame to frame and drift a little at each; the patch of the last key frame does not.
+Point trackers step from frame to frame and drift a little at each; the patch of the last key frame
+does not.
 """
 
 from __future__ import annotations
@@ -24,15 +26,20 @@ def sample_bilinear(image, x, y):
 
 @kernel(**_OPTIONS)
 def _prepare(image, x, y, half, patch, slope_x, slope_y):
-    """The zero-mean patch around (x, y) and its zero-mean slopes; returns its norm and the inverse of the 2x2 normal matrix."""
+    """The zero-mean patch around (x, y) and its zero-mean slopes; returns its norm and the inverse
+    of the 2x2 normal matrix."""
     side = 2 * half + 1
     mean, mean_x, mean_y = np.float32(0), np.float32(0), np.float32(0)
     for j in range(side):
         for i in range(side):
             xx, yy = x + i - half, y + j - half
             patch[j, i] = sample_bilinear(image, xx, yy)
-            slope_x[j, i] = np.float32(0.5) * (sample_bilinear(image, xx + 1, yy) - sample_bilinear(image, xx - 1, yy))
-            slope_y[j, i] = np.float32(0.5) * (sample_bilinear(image, xx, yy + 1) - sample_bilinear(image, xx, yy - 1))
+            slope_x[j, i] = np.float32(0.5) * (
+                sample_bilinear(image, xx + 1, yy) - sample_bilinear(image, xx - 1, yy)
+            )
+            slope_y[j, i] = np.float32(0.5) * (
+                sample_bilinear(image, xx, yy + 1) - sample_bilinear(image, xx, yy - 1)
+            )
             mean += patch[j, i]
             mean_x += slope_x[j, i]
             mean_y += slope_y[j, i]
@@ -52,7 +59,8 @@ def _prepare(image, x, y, half, patch, slope_x, slope_y):
 
 @kernel(**_OPTIONS)
 def _compare(image, x, y, scale, half, patch, window):
-    """Fill `window` with the zero-mean patch around (x, y), `scale` times as large; returns its sum of squares and product with `patch`."""
+    """Fill `window` with the zero-mean patch around (x, y), `scale` times as large; returns its sum
+    of squares and product with `patch`."""
     side = 2 * half + 1
     mean = np.float32(0)
     for j in range(side):
@@ -70,14 +78,29 @@ def _compare(image, x, y, scale, half, patch, window):
 
 
 @kernel(**_OPTIONS)
-def refine_tracks(reference, image, points_ref, points, scales, half, num_iterations, max_shift, first, last, refined, scores, sigmas):
+def refine_tracks(
+    reference,
+    image,
+    points_ref,
+    points,
+    scales,
+    half,
+    num_iterations,
+    max_shift,
+    first,
+    last,
+    refined,
+    scores,
+    sigmas,
+):
     """Fill `refined`, `scores` and `sigmas` for the rows first .. last - 1.
 
-    The patch around a point of the image is `scales` times as large as that of the reference. Gauss-Newton on a shift, gain
-    and offset of the light eliminated, slopes taken from the reference (inverse compositional alignment, Baker and Matthews,
-    IJCV 2004). The score is the normalised correlation at the end; -1 where the point is near a border, has no texture, or
-    wanders further than `max_shift` pixels from where it was. What does not fit, taken for noise, leaves the shift uncertain by the sigma
-    (pixels, the mean of both directions).
+    The patch around a point of the image is `scales` times as large as that of the reference.
+    Gauss-Newton on a shift, gain and offset of the light eliminated, slopes taken from the
+    reference (inverse compositional alignment, Baker and Matthews, IJCV 2004). The score is the
+    normalised correlation at the end; -1 where the point is near a border, has no texture, or
+    wanders further than `max_shift` pixels from where it was. What does not fit, taken for noise,
+    leaves the shift uncertain by the sigma (pixels, the mean of both directions).
     """
     side = 2 * half + 1
     patch = np.empty((side, side), np.float32)
@@ -101,7 +124,9 @@ def refine_tracks(reference, image, points_ref, points, scales, half, num_iterat
         scale = scales[n]
         margin = int(half * scale) + 2
         for _ in range(num_iterations):
-            if not (x >= margin and y >= margin and x < width - margin - 1 and y < height - margin - 1):
+            if not (
+                x >= margin and y >= margin and x < width - margin - 1 and y < height - margin - 1
+            ):
                 scores[n] = np.float32(-1)
                 break
             squares, dot = _compare(image, x, y, scale, half, patch, window)
@@ -128,7 +153,12 @@ def refine_tracks(reference, image, points_ref, points, scales, half, num_iterat
             scores[n] = np.float32(-1)
         if scores[n] > 0:
             refined[n, 0], refined[n, 1] = x, y
-            noise = norm * norm * max(np.float32(1) - scores[n] * scores[n], np.float32(0)) / (side * side)
+            noise = (
+                norm
+                * norm
+                * max(np.float32(1) - scores[n] * scores[n], np.float32(0))
+                / (side * side)
+            )
             sigmas[n] = scale * np.sqrt(noise * (a + c) / (2 * determinant))
 
 
@@ -144,21 +174,29 @@ def _is_peak(strength, y, x):
 
 @kernel()
 def best_of_cells(strength, is_free, side, top, left, border, threshold, corners):
-    """Fill `corners` with x, y of the strongest peak of each free cell, row by row of the grid; returns their number.
+    """Fill `corners` with x, y of the strongest peak of each free cell, row by row of the grid;
+    returns their number.
 
-    `is_free` (rows, columns) are the cells, `side` pixels wide, the first of them at (left, top). Only what is stronger than `threshold`
-    and at least `border` (1 or more) pixels inside the picture counts; of equal ones the first.
+    `is_free` (rows, columns) are the cells, `side` pixels wide, the first of them at (left, top).
+    Only what is stronger than `threshold` and at least `border` (1 or more) pixels inside the
+    picture counts; of equal ones the first.
     """
     height, width = strength.shape
     count = 0
     for row in range(is_free.shape[0]):
-        first_y, last_y = max(top + row * side, border), min(top + (row + 1) * side, height - border)
+        first_y, last_y = (
+            max(top + row * side, border),
+            min(top + (row + 1) * side, height - border),
+        )
         for column in range(is_free.shape[1]):
             if not is_free[row, column]:
                 continue
             best, best_x, best_y = threshold, -1, -1
             for y in range(first_y, last_y):
-                for x in range(max(left + column * side, border), min(left + (column + 1) * side, width - border)):
+                for x in range(
+                    max(left + column * side, border),
+                    min(left + (column + 1) * side, width - border),
+                ):
                     if strength[y, x] > best and _is_peak(strength, y, x):
                         best, best_x, best_y = strength[y, x], x, y
             if best_x >= 0:

@@ -1,4 +1,5 @@
-"""Points seen by several key frames, put where their rays meet: what a single camera knows of depth."""
+"""Points seen by several key frames, put where their rays meet: what a single camera knows of
+depth."""
 
 from __future__ import annotations
 
@@ -13,8 +14,9 @@ from topoloc.slam.keyframes import KeyFrame
 
 @dataclass(frozen=True, eq=False)
 class Triangulated:
-    """Of each point: where its rays come nearest to each other (world), how many there are, the widest angle between the first of them and
-    another (radians), and the largest distance (pixels) from where a key frame sees it; infinite behind one. NaN where one ray is all."""
+    """Of each point: where its rays come nearest to each other (world), how many there are, the
+    widest angle between the first of them and another (radians), and the largest distance (pixels)
+    from where a key frame sees it; infinite behind one. NaN where one ray is all."""
 
     points: Float[np.ndarray, "n 3"]
     num_rays: Int[np.ndarray, " n"]
@@ -24,7 +26,8 @@ class Triangulated:
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """All observations of the points sought: row of the point, key frame, pixel, centre and unit direction of the ray in the world."""
+    """All observations of the points sought: row of the point, key frame, pixel, centre and unit
+    direction of the ray in the world."""
 
     rows: Int[np.ndarray, " m"]
     frames: Int[np.ndarray, " m"]
@@ -34,7 +37,8 @@ class _Seen:
 
 
 def triangulate(keyframes: Sequence[KeyFrame], ids: Int[np.ndarray, " n"]) -> Triangulated:
-    """The points with these ids (in ascending order) by all that the key frames observe of them, active or not."""
+    """The points with these ids (in ascending order) by all that the key frames observe of them,
+    active or not."""
     seen, num = _gather(keyframes, ids), len(ids)
     across = np.eye(3) - seen.directions[:, :, None] * seen.directions[:, None, :]
     normal, right = np.zeros((num, 3, 3)), np.zeros((num, 3))
@@ -67,16 +71,28 @@ def _gather(keyframes: Sequence[KeyFrame], ids: Int[np.ndarray, " n"]) -> _Seen:
     return _Seen(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def _distances_px(keyframes: Sequence[KeyFrame], seen: _Seen, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " m"]:
+def _distances_px(
+    keyframes: Sequence[KeyFrame], seen: _Seen, points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, " m"]:
     distances = np.full(len(seen.rows), np.inf)
     for number, keyframe in enumerate(keyframes):
         of_it = np.flatnonzero(seen.frames == number)
-        projected = keyframe.stereo.project(keyframe.cam_from_world.apply(points[seen.rows[of_it]]))[:, :2]
-        distances[of_it] = np.nan_to_num(np.linalg.norm(projected - seen.points_img[of_it], axis=1), nan=np.inf)
+        projected = keyframe.stereo.project(
+            keyframe.cam_from_world.apply(points[seen.rows[of_it]])
+        )[:, :2]
+        distances[of_it] = np.nan_to_num(
+            np.linalg.norm(projected - seen.points_img[of_it], axis=1), nan=np.inf
+        )
     return distances
 
 
-def is_clear(found: Triangulated, min_rays: int, min_parallax: float, max_px: float) -> Bool[np.ndarray, " n"]:
+def is_clear(
+    found: Triangulated, min_rays: int, min_parallax: float, max_px: float
+) -> Bool[np.ndarray, " n"]:
     """Which points are known well enough to be believed."""
     with np.errstate(invalid="ignore"):
-        return (found.num_rays >= min_rays) & (found.parallax >= min_parallax) & (found.worst_px <= max_px)
+        return (
+            (found.num_rays >= min_rays)
+            & (found.parallax >= min_parallax)
+            & (found.worst_px <= max_px)
+        )

@@ -1,9 +1,11 @@
-"""Points of the map followed from picture to picture, between two pictures that were localized in full.
+"""Points of the map followed from picture to picture, between two pictures that were localized in
+full.
 
-The points that a full localization stands on are sought again by Lucas and Kanade's method and aligned with their patch in that picture
-(`slam/tracking.py`). The pose is that of the localized picture, moved by what the points say of the motion since. For this the points
-are put where that picture, at its pose, shows them, at the depth that the map gives: what the map is wrong by is the same before and
-after the motion, and only wrong depths are left to disturb it.
+The points that a full localization stands on are sought again by Lucas and Kanade's method and
+aligned with their patch in that picture (`slam/tracking.py`). The pose is that of the localized
+picture, moved by what the points say of the motion since. For this the points are put where that
+picture, at its pose, shows them, at the depth that the map gives: what the map is wrong by is the
+same before and after the motion, and only wrong depths are left to disturb it.
 """
 
 from __future__ import annotations
@@ -22,7 +24,8 @@ from topoloc.geometry.stereo import ray_covariances
 from topoloc.localization.pose_fit import SeenPoints
 from topoloc.slam.tracking import TrackingConfig, align_with_reference, follow
 
-# Where a point lies beside its ray: the pixel defines the ray, so this only keeps the covariance regular.
+# Where a point lies beside its ray: the pixel defines the ray, so this only keeps the covariance
+# regular.
 _RAY_SIGMA_PX = 0.1
 
 
@@ -38,13 +41,16 @@ class FollowingConfig:
     """Share of the points found again that must agree."""
     tracking: TrackingConfig = field(default_factory=lambda: TrackingConfig(max_shift_px=4.0))
     pose: AbsolutePoseConfig = field(
-        default_factory=lambda: AbsolutePoseConfig(max_reprojection_error_px=2.0, sigma_px=0.5, max_iterations=300, min_iterations=20)
+        default_factory=lambda: AbsolutePoseConfig(
+            max_reprojection_error_px=2.0, sigma_px=0.5, max_iterations=300, min_iterations=20
+        )
     )
 
 
 @dataclass(frozen=True, eq=False)
 class Followed:
-    """Where a picture was taken, relative to the localized one; `covariance` is of the left perturbation of `cam_from_ref` (m, rad)."""
+    """Where a picture was taken, relative to the localized one; `covariance` is of the left
+    perturbation of `cam_from_ref` (m, rad)."""
 
     cam_from_ref: Rigid3
     covariance: Float[np.ndarray, "6 6"]
@@ -59,7 +65,14 @@ class Followed:
 class PointFollower:
     """Holds the localized picture, its points, and where they were last seen."""
 
-    def __init__(self, grey: UInt8[np.ndarray, "h w"], seen: SeenPoints, cam_from_world: Rigid3, camera: Camera, config: FollowingConfig):
+    def __init__(
+        self,
+        grey: UInt8[np.ndarray, "h w"],
+        seen: SeenPoints,
+        cam_from_world: Rigid3,
+        camera: Camera,
+        config: FollowingConfig,
+    ):
         self._config, self._camera, self._cam_from_world = config, camera, cam_from_world
         seen = _on_their_rays(_spread(seen, camera, config.max_points), cam_from_world, camera)
         self._seen = seen
@@ -72,7 +85,8 @@ class PointFollower:
         return self._camera
 
     def follow(self, grey: UInt8[np.ndarray, "h w"], expected: Rigid3) -> Followed | None:
-        """The motion up to this picture, taken at about `expected` (cam_from_world); None where the points are lost."""
+        """The motion up to this picture, taken at about `expected` (cam_from_world); None where the
+        points are lost."""
         for guess in (expected, self._last_from_world):
             rows, points_img = self._seek(grey, guess)
             pose = self._pose(points_img, rows)
@@ -89,25 +103,49 @@ class PointFollower:
             num_found=len(rows),
             num_agreeing=len(agreeing),
             share_left=len(agreeing) / len(self._seen),
-            shift_px=float(np.median(np.linalg.norm(self._last_img - self._seen.points_img[agreeing], axis=1))),
+            shift_px=float(
+                np.median(np.linalg.norm(self._last_img - self._seen.points_img[agreeing], axis=1))
+            ),
         )
 
-    def _seek(self, grey: UInt8[np.ndarray, "h w"], guess: Rigid3) -> tuple[np.ndarray, Float32[np.ndarray, "n 2"]]:
+    def _seek(
+        self, grey: UInt8[np.ndarray, "h w"], guess: Rigid3
+    ) -> tuple[np.ndarray, Float32[np.ndarray, "n 2"]]:
         """Rows of the points found again, and where."""
         points_world = self._seen.points_world[self._rows]
-        before, after = (self._camera.img_from_cam(pose.apply(points_world)) for pose in (self._last_from_world, guess))
+        before, after = (
+            self._camera.img_from_cam(pose.apply(points_world))
+            for pose in (self._last_from_world, guess)
+        )
         limit = np.array([self._camera.width, self._camera.height]) / 2.0
-        guesses = (self._last_img + np.clip(np.nan_to_num(after - before), -limit, limit)).astype(np.float32)
-        found, is_found = follow(self._last_grey, grey, self._last_img, guesses, self._config.tracking)
+        guesses = (self._last_img + np.clip(np.nan_to_num(after - before), -limit, limit)).astype(
+            np.float32
+        )
+        found, is_found = follow(
+            self._last_grey, grey, self._last_img, guesses, self._config.tracking
+        )
         rows, found = self._rows[is_found], found[is_found]
-        depths = [pose.apply(self._seen.points_world[rows])[:, 2] for pose in (self._cam_from_world, guess)]
+        depths = [
+            pose.apply(self._seen.points_world[rows])[:, 2]
+            for pose in (self._cam_from_world, guess)
+        ]
         scales = np.clip(depths[0] / np.maximum(depths[1], 1e-3), 0.5, 2.0).astype(np.float32)
         points_ref = self._seen.points_img[rows]
-        aligned = align_with_reference(self._reference, grey.astype(np.float32), points_ref, found, scales, self._config.tracking)
+        aligned = align_with_reference(
+            self._reference,
+            grey.astype(np.float32),
+            points_ref,
+            found,
+            scales,
+            self._config.tracking,
+        )
         return rows[aligned.is_alike], aligned.points_img[aligned.is_alike]
 
-    def _pose(self, points_img: Float32[np.ndarray, "n 2"], rows: np.ndarray) -> AbsolutePose | None:
-        """The pose that enough of the points agree on, found anew: from a prediction that is off the refinement may not get there."""
+    def _pose(
+        self, points_img: Float32[np.ndarray, "n 2"], rows: np.ndarray
+    ) -> AbsolutePose | None:
+        """The pose that enough of the points agree on, found anew: from a prediction that is off
+        the refinement may not get there."""
         config = self._config
         if len(rows) < config.min_points:
             return None
@@ -122,20 +160,28 @@ class PointFollower:
 def _on_their_rays(seen: SeenPoints, cam_from_world: Rigid3, camera: Camera) -> SeenPoints:
     """The points moved onto the rays of their pixels; their covariance is that of the depth."""
     depths = cam_from_world.apply(seen.points_world)[:, 2]
-    rays = np.column_stack([camera.normalized_from_img(seen.points_img.astype(np.float64)), np.ones(len(seen))])
+    rays = np.column_stack(
+        [camera.normalized_from_img(seen.points_img.astype(np.float64)), np.ones(len(seen))]
+    )
     points_cam = rays * depths[:, None]
     axis = cam_from_world.rotation[2]
     sigma_z = np.sqrt(np.maximum(np.einsum("i,nij,j->n", axis, seen.covariances, axis), 0.0))
     covariances = ray_covariances(points_cam, sigma_z, camera, np.full(len(seen), _RAY_SIGMA_PX))
     rotation = cam_from_world.rotation
-    return SeenPoints(seen.points_img, cam_from_world.inverse().apply(points_cam), rotation.T @ covariances @ rotation)
+    return SeenPoints(
+        seen.points_img,
+        cam_from_world.inverse().apply(points_cam),
+        rotation.T @ covariances @ rotation,
+    )
 
 
 def _spread(seen: SeenPoints, camera: Camera, max_points: int) -> SeenPoints:
     """At most so many of the points, taken in turn from the cells of a grid."""
     if len(seen) <= max_points:
         return seen
-    cells = np.floor(seen.points_img / [camera.width / 8.0, camera.height / 6.0]).astype(np.int64) @ [1, 8]
+    cells = np.floor(seen.points_img / [camera.width / 8.0, camera.height / 6.0]).astype(
+        np.int64
+    ) @ [1, 8]
     order = np.argsort(cells, kind="stable")
     starts = np.flatnonzero(np.diff(cells[order], prepend=-1))
     turns = np.arange(len(order)) - np.repeat(starts, np.diff(np.append(starts, len(order))))

@@ -1,12 +1,16 @@
-"""What is believed of where a stream's camera is: several hypotheses, each with its motion and its weight.
+"""What is believed of where a stream's camera is: several hypotheses, each with its motion and its
+weight.
 
-A picture of a place that repeats itself may have been taken at any of several poses, and now and then a picture is placed wrongly. So a
-stream believes not one pose but a set of them (a multi-hypothesis filter: Reid, *An algorithm for tracking multiple targets*, 1979). Each
-hypothesis predicts the next pose. Where the next picture's answer has a pose that follows, it gains by the probability of that pose
-and by how little this surprises; where it has none, the probability of an answer that misses the true pose is left. Poses that follow from
-nothing begin hypotheses at the weight of "elsewhere". Alternatives of two pictures taken close together err alike: what they say counts by
-the share of it that is new. So a camera that was carried, a stream that was placed wrongly to begin with, and walls of equal panels are
-decided alike. What followed points show of the motion is true of all hypotheses, and moves them together.
+A picture of a place that repeats itself may have been taken at any of several poses, and now and
+then a picture is placed wrongly. So a stream believes not one pose but a set of them (a
+multi-hypothesis filter: Reid, *An algorithm for tracking multiple targets*, 1979). Each hypothesis
+predicts the next pose. Where the next picture's answer has a pose that follows, it gains by the
+probability of that pose and by how little this surprises; where it has none, the probability of an
+answer that misses the true pose is left. Poses that follow from nothing begin hypotheses at the
+weight of "elsewhere". Alternatives of two pictures taken close together err alike: what they say
+counts by the share of it that is new. So a camera that was carried, a stream that was placed
+wrongly to begin with, and walls of equal panels are decided alike. What followed points show of the
+motion is true of all hypotheses, and moves them together.
 """
 
 from __future__ import annotations
@@ -23,7 +27,14 @@ from topoloc.bounds import Above, AtLeast, Between
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Alternative
-from topoloc.tracking.motion import MotionConfig, MotionState, predict_motion, start_motion, surprise, update_motion
+from topoloc.tracking.motion import (
+    MotionConfig,
+    MotionState,
+    predict_motion,
+    start_motion,
+    surprise,
+    update_motion,
+)
 
 
 @dataclass(frozen=True)
@@ -32,29 +43,36 @@ class HypothesesConfig:
 
     motion: MotionConfig = field(default_factory=MotionConfig)
     max_surprise: Annotated[float, Above(0)] = 33.0
-    """Squared Mahalanobis distance from the prediction (chi^2 with 6 degrees of freedom: 1 in 100,000), beyond which no pose follows."""
+    """Squared Mahalanobis distance from the prediction (chi^2 with 6 degrees of freedom: 1 in
+    100,000), beyond which no pose follows."""
     prediction_scale: Annotated[float, Above(0)] = 2.5
-    """By how much the prediction may be more wrong than its sigma says: hands jerk, wheels meet kerbs."""
+    """By how much the prediction may be more wrong than its sigma says: hands jerk, wheels meet
+    kerbs."""
     min_probability: Annotated[float, Between(0.5, 1)] = 0.9
-    """A hypothesis that has so much of all weight is the pose; while none has, the answer is `ambiguous`."""
+    """A hypothesis that has so much of all weight is the pose; while none has, the answer is
+    `ambiguous`."""
     miss: Annotated[float, Between(1e-6, 0.5)] = 0.01
     """Probability that a localization is wrong ..."""
     miss_ambiguous: Annotated[float, Between(1e-6, 0.5)] = 0.1
     """... and that the true pose is not among alternatives, at least."""
     renewal: Annotated[float, Above(0)] = 1.0
-    """Motion (way in depths of the points, plus radians) after which what alternatives say is new (but for 1/e) ..."""
+    """Motion (way in depths of the points, plus radians) after which what alternatives say is new
+    (but for 1/e) ..."""
     renewal_alone: Annotated[float, Above(0)] = 0.1
     """... and what a single pose says that is less sure than a localization can be."""
     refused: Annotated[float, Between(0.01, 1)] = 0.6
-    """Share of its weight that a hypothesis keeps, beside "elsewhere", with a picture that gets no pose: it should have had one there."""
+    """Share of its weight that a hypothesis keeps, beside "elsewhere", with a picture that gets no
+    pose: it should have had one there."""
     elsewhere: Annotated[float, Between(1e-9, 0.5)] = 0.0005
-    """Probability that the camera is at none of the hypotheses, at least: it was carried, or all of them are wrong."""
+    """Probability that the camera is at none of the hypotheses, at least: it was carried, or all of
+    them are wrong."""
     max_number: Annotated[int, Between(1, 1000)] = 24
     """The heaviest hypotheses are kept, so many ..."""
     min_weight: Annotated[float, Between(0, 0.1)] = 0.002
     """... of at least this share of all weight."""
     max_asked: Annotated[int, AtLeast(0)] = 8
-    """Around so many of them, the heaviest, a picture is sought where the answer leaves them out."""
+    """Around so many of them, the heaviest, a picture is sought where the answer leaves them
+    out."""
     max_predicted: Annotated[float, AtLeast(0)] = 1.0
     """Seconds without a measured pose after which a hypothesis is given up ..."""
     max_predicted_with_odometry: Annotated[float, AtLeast(0)] = 20.0
@@ -63,7 +81,8 @@ class HypothesesConfig:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A pose that the picture at hand may have. `covariance` is here, as everywhere below, of the right perturbation."""
+    """A pose that the picture at hand may have. `covariance` is here, as everywhere below, of the
+    right perturbation."""
 
     world_from_cam: Rigid3
     covariance: Float[np.ndarray, "6 6"]
@@ -73,10 +92,12 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class _Hypothesis:
-    """`state` is of the pose measured last, `odom_from_cam` of that moment, `now` the state at the picture at hand.
+    """`state` is of the pose measured last, `odom_from_cam` of that moment, `now` the state at the
+    picture at hand.
 
-    `from_best` takes poses of the best hypothesis into those of this one, whatever the motion since they were compared.
-    `taken` is the number of the candidate that it took of this picture's, None where none.
+    `from_best` takes poses of the best hypothesis into those of this one, whatever the motion since
+    they were compared. `taken` is the number of the candidate that it took of this picture's, None
+    where none.
     """
 
     state: MotionState
@@ -119,15 +140,21 @@ class PoseHypotheses:
         return not self._alive or self.alternatives()[0].probability >= self.config.min_probability
 
     def alternatives(self) -> tuple[Alternative, ...]:
-        """The poses at the picture at hand, the likeliest first; hypotheses of one pose that differ in their velocity are one."""
+        """The poses at the picture at hand, the likeliest first; hypotheses of one pose that differ
+        in their velocity are one."""
         found: list[Alternative] = []
         for one in self._alive:
             pose = one.now.world_from_cam
-            known = next((k for k, other in enumerate(found) if is_same_place(other.world_from_cam, pose)), None)
+            known = next(
+                (k for k, other in enumerate(found) if is_same_place(other.world_from_cam, pose)),
+                None,
+            )
             if known is None:
                 found.append(Alternative(pose, one.weight, one.node_id))
             else:
-                found[known] = replace(found[known], probability=found[known].probability + one.weight)
+                found[known] = replace(
+                    found[known], probability=found[known].probability + one.weight
+                )
         return tuple(sorted(found, key=lambda one: -one.probability))
 
     def seconds_since(self, t_ns: int) -> float:
@@ -135,13 +162,24 @@ class PoseHypotheses:
         return (t_ns - self._alive[0].state.t_ns) / 1e9 if self._alive else float("inf")
 
     def predict(self, t_ns: int, odom_from_cam: Rigid3 | None = None) -> MotionState | None:
-        """Where the best hypothesis has the camera at this time; those not measured for too long are given up."""
+        """Where the best hypothesis has the camera at this time; those not measured for too long
+        are given up."""
         config, before, alive = self.config, self._alive, list[_Hypothesis]()
         for one in before:
             before_from_cam = _since(one.odom_from_cam, odom_from_cam)
-            limit = config.max_predicted if before_from_cam is None else config.max_predicted_with_odometry
+            limit = (
+                config.max_predicted
+                if before_from_cam is None
+                else config.max_predicted_with_odometry
+            )
             if t_ns - one.state.t_ns <= limit * 1e9:
-                alive.append(replace(one, now=predict_motion(one.state, t_ns, config.motion, before_from_cam), taken=None))
+                alive.append(
+                    replace(
+                        one,
+                        now=predict_motion(one.state, t_ns, config.motion, before_from_cam),
+                        taken=None,
+                    )
+                )
         self.continues = bool(alive) and alive[0].state is before[0].state
         left = sum(one.weight for one in alive)
         self._keep(
@@ -149,59 +187,116 @@ class PoseHypotheses:
         )  # who was given up is elsewhere: what is left beside it is no belief
         return self.best
 
-    def follows(self, predicted: MotionState, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"]) -> bool:
+    def follows(
+        self, predicted: MotionState, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"]
+    ) -> bool:
         """Whether this pose can follow from a prediction."""
-        return self._slack_surprise(predicted, world_from_cam, covariance) <= self.config.max_surprise
+        return (
+            self._slack_surprise(predicted, world_from_cam, covariance) <= self.config.max_surprise
+        )
 
-    def _slack_surprise(self, predicted: MotionState, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"]) -> float:
+    def _slack_surprise(
+        self, predicted: MotionState, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"]
+    ) -> float:
         slack = (self.config.prediction_scale**2 - 1.0) * predicted.pose_covariance
         return surprise(predicted, world_from_cam, covariance + slack)
 
-    def move(self, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"], odom_from_cam: Rigid3 | None) -> None:
-        """Followed points show the best hypothesis at this pose, and so each other one where the same motion takes it."""
+    def move(
+        self,
+        world_from_cam: Rigid3,
+        covariance: Float[np.ndarray, "6 6"],
+        odom_from_cam: Rigid3 | None,
+    ) -> None:
+        """Followed points show the best hypothesis at this pose, and so each other one where the
+        same motion takes it."""
         for k, one in enumerate(self._alive):
             now = update_motion(one.now, one.from_best @ world_from_cam, covariance)
             self._alive[k] = replace(one, state=now, now=now, odom_from_cam=odom_from_cam)
 
-    def weigh(self, t_ns: int, candidates: Sequence[Candidate], odom_from_cam: Rigid3 | None = None, share_new: float = 1.0) -> None:
+    def weigh(
+        self,
+        t_ns: int,
+        candidates: Sequence[Candidate],
+        odom_from_cam: Rigid3 | None = None,
+        share_new: float = 1.0,
+    ) -> None:
         """What the picture's answer makes of the hypotheses, if this share of what it says is new.
 
-        The candidates exclude each other; where there are none, a place that is not in the map is a little likelier.
+        The candidates exclude each other; where there are none, a place that is not in the map is a
+        little likelier.
         """
         if not candidates:
-            self._keep([replace(one, weight=self.config.refused * one.weight) for one in self._alive], self._elsewhere)
+            self._keep(
+                [replace(one, weight=self.config.refused * one.weight) for one in self._alive],
+                self._elsewhere,
+            )
             return
-        before, miss = self.best, self.config.miss if len(candidates) == 1 else self.config.miss_ambiguous
+        before, miss = (
+            self.best,
+            self.config.miss if len(candidates) == 1 else self.config.miss_ambiguous,
+        )
         none = max(miss, 1.0 - sum(one.probability for one in candidates))
         new = self._agreed(candidates[0], odom_from_cam, share_new) if len(candidates) == 1 else []
         for one in self._alive:
-            if new and self.follows(one.now, candidates[0].world_from_cam, candidates[0].covariance):
+            if new and self.follows(
+                one.now, candidates[0].world_from_cam, candidates[0].covariance
+            ):
                 continue  # it is that one
-            taking = [self._taking(one, number, candidate, odom_from_cam) for number, candidate in enumerate(candidates)]
+            taking = [
+                self._taking(one, number, candidate, odom_from_cam)
+                for number, candidate in enumerate(candidates)
+            ]
             children = [child for child in taking if child is not None]
             children.append(replace(one, weight=one.weight * none))
             gain = sum(child.weight for child in children) / one.weight
-            new += [replace(child, weight=child.weight * gain ** (share_new - 1.0)) for child in children]
+            new += [
+                replace(child, weight=child.weight * gain ** (share_new - 1.0))
+                for child in children
+            ]
         for number, candidate in enumerate(candidates):
             weight = self._elsewhere * candidate.probability * share_new
-            heaviest = max((one for one in new if one.taken == number), key=lambda one: one.weight, default=None)
+            heaviest = max(
+                (one for one in new if one.taken == number),
+                key=lambda one: one.weight,
+                default=None,
+            )
             if heaviest is not None and heaviest.weight >= weight:
                 new[new.index(heaviest)] = replace(heaviest, weight=heaviest.weight + weight)
             else:
-                state = start_motion(t_ns, candidate.world_from_cam, candidate.covariance, self.config.motion)
-                new.append(_Hypothesis(state, odom_from_cam, state, weight, candidate.node_id, Rigid3.identity(), number))
+                state = start_motion(
+                    t_ns, candidate.world_from_cam, candidate.covariance, self.config.motion
+                )
+                new.append(
+                    _Hypothesis(
+                        state,
+                        odom_from_cam,
+                        state,
+                        weight,
+                        candidate.node_id,
+                        Rigid3.identity(),
+                        number,
+                    )
+                )
         self._keep(_merged(new), self._elsewhere * none**share_new)
         best = self._alive[0].now
-        self.continues = before is not None and self.follows(before, best.world_from_cam, best.pose_covariance)
+        self.continues = before is not None and self.follows(
+            before, best.world_from_cam, best.pose_covariance
+        )
         self._compare()
 
     def correct(self, state: MotionState, odom_from_cam: Rigid3 | None) -> None:
-        """The heaviest hypothesis is in this state: its pose is known better than from the candidate that it took."""
-        self._alive[0] = replace(self._alive[0], state=state, now=state, odom_from_cam=odom_from_cam)
+        """The heaviest hypothesis is in this state: its pose is known better than from the
+        candidate that it took."""
+        self._alive[0] = replace(
+            self._alive[0], state=state, now=state, odom_from_cam=odom_from_cam
+        )
         self._compare()
 
-    def _agreed(self, candidate: Candidate, odom_from_cam: Rigid3 | None, share_new: float) -> list[_Hypothesis]:
-        """The hypotheses that a sure pose follows from, as one: there they all are. The motion is that of the likeliest of them."""
+    def _agreed(
+        self, candidate: Candidate, odom_from_cam: Rigid3 | None, share_new: float
+    ) -> list[_Hypothesis]:
+        """The hypotheses that a sure pose follows from, as one: there they all are. The motion is
+        that of the likeliest of them."""
         pose, covariance = candidate.world_from_cam, candidate.covariance
         weight, likeliest = 0.0, (-math.inf, None)
         for one in self._alive:
@@ -209,19 +304,30 @@ class PoseHypotheses:
                 surprised = math.exp(-0.5 * self._slack_surprise(one.now, pose, covariance))
                 weight += one.weight * (candidate.probability * surprised) ** share_new
                 spread = float(np.linalg.slogdet(one.now.pose_covariance + covariance)[1])
-                density = math.log(one.weight) - 0.5 * (surprise(one.now, pose, covariance) + spread)
+                density = math.log(one.weight) - 0.5 * (
+                    surprise(one.now, pose, covariance) + spread
+                )
                 likeliest = max(likeliest, (density, taking), key=lambda pair: pair[0])
         return [] if likeliest[1] is None else [replace(likeliest[1], weight=weight)]
 
-    def _taking(self, one: _Hypothesis, number: int, candidate: Candidate, odom_from_cam: Rigid3 | None) -> _Hypothesis | None:
-        """The hypothesis that the picture was taken there, less likely the more that surprises; None where it does not follow."""
+    def _taking(
+        self, one: _Hypothesis, number: int, candidate: Candidate, odom_from_cam: Rigid3 | None
+    ) -> _Hypothesis | None:
+        """The hypothesis that the picture was taken there, less likely the more that surprises;
+        None where it does not follow."""
         pose, covariance = candidate.world_from_cam, candidate.covariance
         if not self.follows(one.now, pose, covariance):
             return None
         state = update_motion(one.now, pose, covariance)
         likelihood = max(math.exp(-0.5 * surprise(one.now, pose, covariance)), 1e-100)
         return _Hypothesis(
-            state, odom_from_cam, state, one.weight * candidate.probability * likelihood, candidate.node_id, one.from_best, number
+            state,
+            odom_from_cam,
+            state,
+            one.weight * candidate.probability * likelihood,
+            candidate.node_id,
+            one.from_best,
+            number,
         )
 
     def _keep(self, hypotheses: list[_Hypothesis], elsewhere: float) -> None:
@@ -237,15 +343,23 @@ class PoseHypotheses:
     def _compare(self) -> None:
         """From where the best hypothesis is to where each is."""
         best_from_world = self._alive[0].now.world_from_cam.inverse()
-        self._alive = [replace(one, from_best=one.now.world_from_cam @ best_from_world) for one in self._alive]
+        self._alive = [
+            replace(one, from_best=one.now.world_from_cam @ best_from_world) for one in self._alive
+        ]
 
 
 def _merged(hypotheses: list[_Hypothesis]) -> list[_Hypothesis]:
-    """Those that agree in pose and velocity become one, of what was measured now where there is a choice."""
+    """Those that agree in pose and velocity become one, of what was measured now where there is a
+    choice."""
     kept: list[_Hypothesis] = []
     least = 1e-4 * max(one.weight for one in hypotheses)
-    for one in sorted((one for one in hypotheses if one.weight > least), key=lambda one: (one.taken is None, -one.weight)):
-        same = next((k for k, other in enumerate(kept) if _is_same_motion(one.now, other.now)), None)
+    for one in sorted(
+        (one for one in hypotheses if one.weight > least),
+        key=lambda one: (one.taken is None, -one.weight),
+    ):
+        same = next(
+            (k for k, other in enumerate(kept) if _is_same_motion(one.now, other.now)), None
+        )
         if same is None:
             kept.append(one)
         else:
@@ -254,8 +368,11 @@ def _merged(hypotheses: list[_Hypothesis]) -> list[_Hypothesis]:
 
 
 def _is_same_motion(a: MotionState, b: MotionState) -> bool:
-    """Nearer in pose and velocity than what is left open of both would have them by chance every other time."""
-    error = np.concatenate([(a.world_from_cam.inverse() @ b.world_from_cam).log(), b.velocity - a.velocity])
+    """Nearer in pose and velocity than what is left open of both would have them by chance every
+    other time."""
+    error = np.concatenate(
+        [(a.world_from_cam.inverse() @ b.world_from_cam).log(), b.velocity - a.velocity]
+    )
     return float(error @ np.linalg.solve(a.covariance + b.covariance, error)) < 6.0
 
 

@@ -1,8 +1,9 @@
-"""The last localized pictures adjusted together: each knows where it is in the map, and how the camera moved from one to the next.
+"""The last localized pictures adjusted together: each knows where it is in the map, and how the
+camera moved from one to the next.
 
-Localizing has a centimetre of noise, following points a tenth of it. A pose graph over the last few localized pictures
-(`slam/pose_graph.py`; node 0 is the world) takes from each what it knows best, with a loss under which a wrong localization
-loses its say.
+Localizing has a centimetre of noise, following points a tenth of it. A pose graph over the last few
+localized pictures (`slam/pose_graph.py`; node 0 is the world) takes from each what it knows best,
+with a loss under which a wrong localization loses its say.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ class PoseWindowConfig:
 
     size: Annotated[int, Between(1, 1000)] = 10
     """Localized pictures that are adjusted together."""
-    graph: PoseGraphConfig = field(default_factory=lambda: PoseGraphConfig(max_steps=5, min_step=1e-4))
+    graph: PoseGraphConfig = field(
+        default_factory=lambda: PoseGraphConfig(max_steps=5, min_step=1e-4)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +61,8 @@ class PoseWindow:
         cam_from_before: Rigid3,
         motion_covariance: Float[np.ndarray, "6 6"],
     ) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
-        """The smoothed cam_from_world of a picture that was localized at `cam_from_world`, `cam_from_before` after the last one
-        added, and the covariance of its left perturbation.
+        """The smoothed cam_from_world of a picture that was localized at `cam_from_world`,
+        `cam_from_before` after the last one added, and the covariance of its left perturbation.
         """
         if self._smoothed:
             adjoint = cam_from_before.adjoint()
@@ -68,9 +71,14 @@ class PoseWindow:
             self._covariance = (both + both.T) / 2.0  # symmetric but for rounding
         else:
             self._covariance = covariance
-        self._smoothed.append(cam_from_before @ self._smoothed[-1] if self._smoothed else cam_from_world)
+        self._smoothed.append(
+            cam_from_before @ self._smoothed[-1] if self._smoothed else cam_from_world
+        )
         self._entries.append(_Entry(cam_from_world, covariance, cam_from_before, motion_covariance))
-        edges = [Edge(0, k, entry.cam_from_world, entry.covariance, is_loop=True) for k, entry in enumerate(self._entries, start=1)]
+        edges = [
+            Edge(0, k, entry.cam_from_world, entry.covariance, is_loop=True)
+            for k, entry in enumerate(self._entries, start=1)
+        ]
         edges += [
             Edge(k - 1, k, entry.cam_from_before, entry.motion_covariance, is_loop=True)
             for k, entry in enumerate(self._entries, start=1)

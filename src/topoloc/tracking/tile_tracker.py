@@ -1,7 +1,8 @@
 """A stream through the tiles of an atlas: read from `TileTracker.process`.
 
-The atlas is asked until it names the tile that a picture shows. From there the stream is followed in that tile's map, as in any map
-(`tracker.py`). Where that has known nothing for a while, the atlas is asked again: the camera may have gone on into another tile.
+The atlas is asked until it names the tile that a picture shows. From there the stream is followed
+in that tile's map, as in any map (`tracker.py`). Where that has known nothing for a while, the
+atlas is asked again: the camera may have gone on into another tile.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from topoloc.tracking.stream_result import StreamedPose
 from topoloc.tracking.tracker import Tracker, TrackerConfig
 
 _ASK_EVERY_NS = 1_000_000_000
-"""The atlas is asked again where nothing was known for so long: a refusal costs as much as a dozen tracked pictures or more."""
+"""The atlas is asked again where nothing was known for so long: a refusal costs as much as a dozen
+tracked pictures or more."""
 _KNOWN = ("localized", "tracked")
 
 
@@ -50,7 +52,9 @@ class TileTracker:
         """
         check_size(image, camera)
         self._advance(t_ns)
-        answer = None if self._tile is None else self._named(self._tile[2].process(image, camera, t_ns))
+        answer = (
+            None if self._tile is None else self._named(self._tile[2].process(image, camera, t_ns))
+        )
         if answer is not None and answer.state in _KNOWN:
             self._known_ns = t_ns
             return answer
@@ -59,12 +63,15 @@ class TileTracker:
         self._asked_ns = t_ns
         result = self.localizer.localize(image, camera, t_ns=t_ns)
         if not isinstance(result, Localization):
-            return answer or StreamedPose(t_ns, "ambiguous" if result.reason == "ambiguous" else "lost", result)
+            return answer or StreamedPose(
+                t_ns, "ambiguous" if result.reason == "ambiguous" else "lost", result
+            )
         assert result.provenance.tile is not None, "an atlas names the tile of its answer"
         return self._begun(result.provenance.tile, image, camera, t_ns)
 
     def miss(self, t_ns: int, result: NotLocalized) -> StreamedPose:
-        """The answer to a picture that could not be read. Raises QueryError as of `Tracker.miss`."""
+        """The answer to a picture that could not be read. Raises QueryError as of
+        `Tracker.miss`."""
         self._advance(t_ns)
         if self._tile is None:
             return StreamedPose(t_ns, "lost", self.localizer.completed(result, t_ns))
@@ -80,7 +87,10 @@ class TileTracker:
         if problem := time_problem(t_ns):
             raise QueryError(problem)
         if self._t_ns is not None and t_ns < self._t_ns:
-            raise QueryError(f"the clock of the stream goes backwards: {t_ns / 1e9:.6f} s comes after {self._t_ns / 1e9:.6f} s")
+            raise QueryError(
+                f"the clock of the stream goes backwards: {t_ns / 1e9:.6f} s comes after"
+                f" {self._t_ns / 1e9:.6f} s"
+            )
         self._t_ns = t_ns
 
     def _begun(self, tile_id: str, image: Image, camera: Camera, t_ns: int) -> StreamedPose:

@@ -1,15 +1,18 @@
 """Localizing a stream of pictures: read from `Tracker.process`.
 
-Where a picture was taken is predicted from the motion so far, or from external odometry. Points of the map that the last
-localized picture showed are followed into it; that alone gives its pose, in a few milliseconds. Every so often, and whenever too
-few points are left, it is localized in full, around the predicted pose instead of by the coarse search. What that answers is weighed
-against what is believed so far (`pose_hypotheses.py`): a pose that the motion does not allow for is refused (reason `jump`), until
-several agree that the camera is elsewhere indeed, and between the alternatives of ambiguous pictures the motion decides. While
-several are left, the answer is `ambiguous`. Localized pictures are adjusted together in a sliding window; what comes out of it is the
-smoothed pose.
+Where a picture was taken is predicted from the motion so far, or from external odometry. Points of
+the map that the last localized picture showed are followed into it; that alone gives its pose, in a
+few milliseconds. Every so often, and whenever too few points are left, it is localized in full,
+around the predicted pose instead of by the coarse search. What that answers is weighed against what
+is believed so far (`pose_hypotheses.py`): a pose that the motion does not allow for is refused
+(reason `jump`), until several agree that the camera is elsewhere indeed, and between the
+alternatives of ambiguous pictures the motion decides. While several are left, the answer is
+`ambiguous`. Localized pictures are adjusted together in a sliding window; what comes out of it is
+the smoothed pose.
 
-`mode="paper"` is the rule of section III-B instead: each picture is localized alone, and where its pose lies further than
-`max_jump` from the one before, that one is copied. Here the copy is said to be one.
+`mode="paper"` is the rule of section III-B instead: each picture is localized alone, and where its
+pose lies further than `max_jump` from the one before, that one is copied. Here the copy is said to
+be one.
 """
 
 from __future__ import annotations
@@ -37,7 +40,14 @@ from topoloc.tracking.pose_hypotheses import HypothesesConfig, PoseHypotheses
 from topoloc.tracking.pose_window import PoseWindow, PoseWindowConfig
 from topoloc.tracking.stream_result import StreamedPose
 from topoloc.tracking.stream_search import Expected, Found, StreamSearch, refused
-from topoloc.tracking.tracker_state import Reference, StreamPicture, doubt_of, followed_covariance, reduced, smoothed_covariance
+from topoloc.tracking.tracker_state import (
+    Reference,
+    StreamPicture,
+    doubt_of,
+    followed_covariance,
+    reduced,
+    smoothed_covariance,
+)
 
 
 @dataclass(frozen=True)
@@ -45,9 +55,11 @@ class TrackerConfig:
     """When a picture is localized in full, and what is believed."""
 
     mode: Literal["motion", "paper"] = "motion"
-    """`paper`: each picture is localized alone, and a pose too far from the one before is refused, which is copied."""
+    """`paper`: each picture is localized alone, and a pose too far from the one before is refused,
+    which is copied."""
     max_jump: Annotated[float, Above(0)] = 1.0
-    """mode "paper": metres from one pose to the next beyond which the new one is refused (the paper: 1 to 5, by the size of the place)."""
+    """mode "paper": metres from one pose to the next beyond which the new one is refused (the
+    paper: 1 to 5, by the size of the place)."""
     hypotheses: HypothesesConfig = field(default_factory=HypothesesConfig)
     following: FollowingConfig = field(default_factory=FollowingConfig)
     window: PoseWindowConfig = field(default_factory=PoseWindowConfig)
@@ -62,24 +74,32 @@ class TrackerConfig:
     retry_after: Annotated[float, AtLeast(0)] = 0.1
     """Seconds to the next attempt where that failed and the points are still there."""
     max_doubt: Annotated[float, Above(0)] = 0.3
-    """Where the prediction leaves open by more than this where points are seen (three sigma, radians), the coarse search is asked."""
+    """Where the prediction leaves open by more than this where points are seen (three sigma,
+    radians), the coarse search is asked."""
     floor_share: Annotated[float, AtLeast(0)] = 0.001
-    """Sigma of a localization's noise is at least this share of the points' depth, and so many radians."""
+    """Sigma of a localization's noise is at least this share of the points' depth, and so many
+    radians."""
     reach: Annotated[float, Above(0)] = 2.0
-    """How far (way in depths of the points, plus radians) what the map is wrong by lasts (to 1/e)."""
+    """How far (way in depths of the points, plus radians) what the map is wrong by lasts (to
+    1/e)."""
     blend_time: Annotated[float, Above(0)] = 0.2
-    """Seconds (to 1/e) in which what a new localization corrects is worked into the smoothed pose, so that it does not jump."""
+    """Seconds (to 1/e) in which what a new localization corrects is worked into the smoothed pose,
+    so that it does not jump."""
     followed_share: Annotated[float, AtLeast(0)] = 0.05
     """Sigma of a followed motion, as a share of its way and turn, beside what the points say."""
 
 
 class Tracker:
-    """The state of one stream; `reset` begins another. Raises ConfigError where a value of `config` is out of its bounds."""
+    """The state of one stream; `reset` begins another. Raises ConfigError where a value of `config`
+    is out of its bounds."""
 
     def __init__(self, localizer: Localizer, config: TrackerConfig | None = None) -> None:
         self.localizer, self.config = localizer, config or TrackerConfig()
         check_bounds(self.config)
-        self._hypotheses, self._window = PoseHypotheses(self.config.hypotheses), PoseWindow(self.config.window)
+        self._hypotheses, self._window = (
+            PoseHypotheses(self.config.hypotheses),
+            PoseWindow(self.config.window),
+        )
         self._search = StreamSearch(localizer, self._hypotheses, self.config.floor_share)
         self.reset()
 
@@ -93,22 +113,28 @@ class Tracker:
         self._hypotheses.forget()
         self._window.clear()
 
-    def process(self, image: Image, camera: Camera, t_ns: int, odom_from_cam: Rigid3 | None = None) -> StreamedPose:
+    def process(
+        self, image: Image, camera: Camera, t_ns: int, odom_from_cam: Rigid3 | None = None
+    ) -> StreamedPose:
         """Where was this picture, the next of the stream, taken?
 
         Args:
-            t_ns: its time, later than that of the picture before; equal only where it is the same picture again.
-            odom_from_cam: its pose by external odometry, in any frame that does not move; only its change from picture to picture counts.
+            t_ns: its time, later than that of the picture before; equal only where it is the same
+                picture again.
+            odom_from_cam: its pose by external odometry, in any frame that does not move; only its
+                change from picture to picture counts.
 
         Raises:
-            QueryError: the clock goes backwards, stands still or is not in integer nanoseconds; the image is no picture of 8 bits; the
-                camera is of another image size.
+            QueryError: the clock goes backwards, stands still or is not in integer nanoseconds; the
+                image is no picture of 8 bits; the camera is of another image size.
         """
         check_size(image, camera)
         is_same = self._image is not None and np.array_equal(self._image, image)
         self._advance(t_ns, may_stand_still=is_same)
         if is_same and self._answer is not None:
-            return replace(self._answer, t_ns=t_ns, result=at_time(self._answer.result, t_ns), is_repeated=True)
+            return replace(
+                self._answer, t_ns=t_ns, result=at_time(self._answer.result, t_ns), is_repeated=True
+            )
         self._image = image.copy()  # who reads a camera may read into the same memory again
         if self.config.mode == "paper":
             answer = self._by_paper(image, camera, t_ns)
@@ -118,7 +144,9 @@ class Tracker:
         self._answer = self._completed(answer, camera)
         return self._answer
 
-    def miss(self, t_ns: int, result: NotLocalized, odom_from_cam: Rigid3 | None = None) -> StreamedPose:
+    def miss(
+        self, t_ns: int, result: NotLocalized, odom_from_cam: Rigid3 | None = None
+    ) -> StreamedPose:
         """The answer to a picture that could not be read: predicted, where the motion is known.
 
         Raises:
@@ -138,18 +166,28 @@ class Tracker:
     def _advance(self, t_ns: int, may_stand_still: bool = False) -> None:
         if problem := time_problem(t_ns):
             raise QueryError(problem)
-        if self._t_ns is not None and (t_ns < self._t_ns or (t_ns == self._t_ns and not may_stand_still)):
+        if self._t_ns is not None and (
+            t_ns < self._t_ns or (t_ns == self._t_ns and not may_stand_still)
+        ):
             what = "stands still" if t_ns == self._t_ns else "goes backwards"
-            raise QueryError(f"the clock of the stream {what}: {t_ns / 1e9:.6f} s comes after {self._t_ns / 1e9:.6f} s")
+            raise QueryError(
+                f"the clock of the stream {what}: {t_ns / 1e9:.6f} s comes after"
+                f" {self._t_ns / 1e9:.6f} s"
+            )
         self._t_ns = t_ns
 
     def _by_paper(self, image: Image, camera: Camera, t_ns: int) -> StreamedPose:
-        """Section III-B: "when such a jump is found, we copy the previous pose from the trajectory"."""
+        """Section III-B: "when such a jump is found, we copy the previous pose from the
+        trajectory"."""
         result = self.localizer.localize(image, camera)
         if not isinstance(result, Localization):
             return self._copied(result, t_ns)
         previous = self._answer.smoothed if self._answer is not None else None
-        if previous is not None and np.linalg.norm(result.world_from_cam.translation - previous.translation) > self.config.max_jump:
+        if (
+            previous is not None
+            and np.linalg.norm(result.world_from_cam.translation - previous.translation)
+            > self.config.max_jump
+        ):
             return self._copied(refused(result), t_ns)
         return StreamedPose(t_ns, "localized", result, result.world_from_cam, result.covariance)
 
@@ -165,7 +203,11 @@ class Tracker:
         with clock.stage("tracking"):
             followed = self._follow(picture, predicted)
         if followed is not None:
-            self._hypotheses.move(self._blended(followed, picture.t_ns).inverse(), followed.covariance, picture.odom_from_cam)
+            self._hypotheses.move(
+                self._blended(followed, picture.t_ns).inverse(),
+                followed.covariance,
+                picture.odom_from_cam,
+            )
         if followed is None or self._is_due(followed, picture):
             self._attempt_ns = picture.t_ns
             found = self._search.find(picture, self._expected(predicted, followed))
@@ -187,21 +229,43 @@ class Tracker:
         if self._hypotheses.is_decided:
             return answer
         alternatives = self._hypotheses.alternatives()
-        detail = "the pictures so far leave open which of these" if len(alternatives) > 1 else "too little speaks for this pose so far"
-        result = NotLocalized("ambiguous", [], 0, 0, answer.result.times_ms, detail, alternatives, answer.result.provenance)
+        detail = (
+            "the pictures so far leave open which of these"
+            if len(alternatives) > 1
+            else "too little speaks for this pose so far"
+        )
+        result = NotLocalized(
+            "ambiguous",
+            [],
+            0,
+            0,
+            answer.result.times_ms,
+            detail,
+            alternatives,
+            answer.result.provenance,
+        )
         return StreamedPose(answer.t_ns, "ambiguous", result)
 
     def _follow(self, picture: StreamPicture, predicted: MotionState | None) -> Followed | None:
-        """The points followed into this picture; None where they are lost or lead where the camera cannot be."""
+        """The points followed into this picture; None where they are lost or lead where the camera
+        cannot be."""
         reference = self._reference
-        if reference is None or predicted is None or reference.follower.camera != picture.grey_camera:
+        if (
+            reference is None
+            or predicted is None
+            or reference.follower.camera != picture.grey_camera
+        ):
             return None
         followed = reference.follower.follow(picture.grey, predicted.world_from_cam.inverse())
         if followed is None:
             return None
         world_from_cam = self._blended(followed, picture.t_ns).inverse()
         floor = noise_floor(reference.errors.depth, self.config.floor_share)
-        return followed if self._hypotheses.follows(predicted, world_from_cam, followed.covariance + floor) else None
+        return (
+            followed
+            if self._hypotheses.follows(predicted, world_from_cam, followed.covariance + floor)
+            else None
+        )
 
     def _is_due(self, followed: Followed, picture: StreamPicture) -> bool:
         """Whether it is time to localize in full."""
@@ -212,10 +276,17 @@ class Tracker:
         if picture.t_ns - self._attempt_ns < config.retry_after * 1e9:
             return False
         is_old = picture.t_ns - reference.t_ns >= config.localize_every * 1e9
-        return is_old or followed.share_left < config.min_share_left or followed.shift_px > config.max_shift * picture.grey_camera.width
+        return (
+            is_old
+            or followed.share_left < config.min_share_left
+            or followed.shift_px > config.max_shift * picture.grey_camera.width
+        )
 
-    def _expected(self, predicted: MotionState | None, followed: Followed | None) -> Expected | None:
-        """About where the picture was taken; a followed pose is wrong by its reference's errors and by wrong depths, too."""
+    def _expected(
+        self, predicted: MotionState | None, followed: Followed | None
+    ) -> Expected | None:
+        """About where the picture was taken; a followed pose is wrong by its reference's errors and
+        by wrong depths, too."""
         reference, is_alone = self._reference, len(self._hypotheses.alternatives()) == 1
         if reference is None or predicted is None:
             return None
@@ -223,59 +294,108 @@ class Tracker:
             is_known = doubt_of(predicted, reference.errors.depth) <= self.config.max_doubt
             return Expected(predicted.world_from_cam, np.zeros((6, 6)), is_known and is_alone)
         motion, scale = followed.cam_from_ref.adjoint(), self.config.hypotheses.prediction_scale**2
-        doubt = motion @ reference.errors.whole @ motion.T + scale * followed_covariance(followed, self.config.followed_share)
+        doubt = motion @ reference.errors.whole @ motion.T + scale * followed_covariance(
+            followed, self.config.followed_share
+        )
         near = (followed.cam_from_ref @ reference.cam_from_world).inverse()
-        return Expected(near, doubt, is_alone, is_followed=True, is_from_walls=reference.found.is_from_walls)
+        return Expected(
+            near, doubt, is_alone, is_followed=True, is_from_walls=reference.found.is_from_walls
+        )
 
     def _believe(
-        self, picture: StreamPicture, found: Found, predicted: MotionState | None, followed: Followed | None, seconds: float
+        self,
+        picture: StreamPicture,
+        found: Found,
+        predicted: MotionState | None,
+        followed: Followed | None,
+        seconds: float,
     ) -> StreamedPose:
         """The answer that a full localization gives, `seconds` after the pose measured before."""
         cam_from_world, errors = found.result.world_from_cam.inverse(), found.errors
         t_ns, offset = picture.t_ns, Rigid3.identity()
         if predicted is None or self._reference is None:
-            smoothed, doubt = self._window.add(cam_from_world, errors.noise, Rigid3.identity(), errors.noise)
+            smoothed, doubt = self._window.add(
+                cam_from_world, errors.noise, Rigid3.identity(), errors.noise
+            )
         else:
             motion, motion_covariance = self._motion(predicted, followed)
-            motion_covariance = motion_covariance + lasting_change(errors, motion, self.config.reach)
+            motion_covariance = motion_covariance + lasting_change(
+                errors, motion, self.config.reach
+            )
             before = self._blended(followed, t_ns) if followed is not None else None
             if followed is None and np.trace(motion_covariance) >= np.trace(errors.noise):
                 self._window.clear()  # a guess from the poses before says nothing new of this one
-            smoothed, doubt = self._window.add(cam_from_world, errors.noise, motion, motion_covariance)
+            smoothed, doubt = self._window.add(
+                cam_from_world, errors.noise, motion, motion_covariance
+            )
             if before is not None:
                 offset = self._faded(before @ smoothed.inverse(), seconds)
             measured = errors.noise if followed is None else followed.covariance
-            self._hypotheses.correct(update_motion(predicted, (offset @ smoothed).inverse(), measured), picture.odom_from_cam)
+            self._hypotheses.correct(
+                update_motion(predicted, (offset @ smoothed).inverse(), measured),
+                picture.odom_from_cam,
+            )
         points = found.seen.in_image(picture.grey_camera.width / picture.camera.width)
-        follower = PointFollower(picture.grey, points, cam_from_world, picture.grey_camera, self.config.following)
-        self._reference = Reference(t_ns, found.result, cam_from_world, errors, smoothed, doubt + errors.lasting, offset, follower)
+        follower = PointFollower(
+            picture.grey, points, cam_from_world, picture.grey_camera, self.config.following
+        )
+        self._reference = Reference(
+            t_ns,
+            found.result,
+            cam_from_world,
+            errors,
+            smoothed,
+            doubt + errors.lasting,
+            offset,
+            follower,
+        )
         best = self._hypotheses.best
         assert best is not None
-        return StreamedPose(t_ns, "localized", found.result, best.world_from_cam, smoothed_covariance(self._reference))
+        return StreamedPose(
+            t_ns,
+            "localized",
+            found.result,
+            best.world_from_cam,
+            smoothed_covariance(self._reference),
+        )
 
     def _blended(self, followed: Followed, t_ns: int) -> Rigid3:
         """The smoothed cam_from_world of a followed picture."""
         reference = self._reference
         assert reference is not None
-        return self._faded(reference.offset, (t_ns - reference.t_ns) / 1e9) @ followed.cam_from_ref @ reference.smoothed
+        return (
+            self._faded(reference.offset, (t_ns - reference.t_ns) / 1e9)
+            @ followed.cam_from_ref
+            @ reference.smoothed
+        )
 
     def _faded(self, offset: Rigid3, seconds: float) -> Rigid3:
         return Rigid3.exp(np.exp(-seconds / self.config.blend_time) * offset.log())
 
-    def _motion(self, predicted: MotionState, followed: Followed | None) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
-        """cam_from_before, from the picture localized last, with the covariance of its left perturbation."""
+    def _motion(
+        self, predicted: MotionState, followed: Followed | None
+    ) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
+        """cam_from_before, from the picture localized last, with the covariance of its left
+        perturbation."""
         assert self._reference is not None
         if followed is not None:
             return followed.cam_from_ref, followed_covariance(followed, self.config.followed_share)
-        return predicted.world_from_cam.inverse() @ self._reference.smoothed.inverse(), predicted.pose_covariance
+        return (
+            predicted.world_from_cam.inverse() @ self._reference.smoothed.inverse(),
+            predicted.pose_covariance,
+        )
 
-    def _tracked(self, picture: StreamPicture, followed: Followed, clock: StageClock) -> StreamedPose:
+    def _tracked(
+        self, picture: StreamPicture, followed: Followed, clock: StageClock
+    ) -> StreamedPose:
         reference, state = self._reference, self._hypotheses.best
         assert reference is not None
         assert state is not None
         world_from_cam = (followed.cam_from_ref @ reference.cam_from_world).inverse()
         adjoint, motion = world_from_cam.adjoint(), followed.cam_from_ref.adjoint()
-        covariance = adjoint @ (motion @ reference.errors.whole @ motion.T + followed.covariance) @ adjoint.T
+        covariance = (
+            adjoint @ (motion @ reference.errors.whole @ motion.T + followed.covariance) @ adjoint.T
+        )
         found = reference.found
         result = Localization(
             world_from_cam=world_from_cam,
@@ -288,11 +408,23 @@ class Tracker:
             times_ms=clock.times_ms(),
             provenance=found.provenance,
         )
-        return StreamedPose(picture.t_ns, "tracked", result, state.world_from_cam, smoothed_covariance(reference, state))
+        return StreamedPose(
+            picture.t_ns,
+            "tracked",
+            result,
+            state.world_from_cam,
+            smoothed_covariance(reference, state),
+        )
 
     def _without_pose(self, result: NotLocalized, t_ns: int) -> StreamedPose:
         """Predicted for a while, then lost."""
         predicted = self._hypotheses.best
         if predicted is None:
             return StreamedPose(t_ns, "lost", result)
-        return StreamedPose(t_ns, "predicted", result, predicted.world_from_cam, smoothed_covariance(self._reference, predicted))
+        return StreamedPose(
+            t_ns,
+            "predicted",
+            result,
+            predicted.world_from_cam,
+            smoothed_covariance(self._reference, predicted),
+        )

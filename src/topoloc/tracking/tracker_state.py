@@ -19,7 +19,8 @@ from topoloc.tracking.pose_errors import PoseErrors
 
 @dataclass(frozen=True, eq=False)
 class StreamPicture:
-    """The picture at hand, its time and external odometry; in grey, and reduced, with the camera of that."""
+    """The picture at hand, its time and external odometry; in grey, and reduced, with the camera of
+    that."""
 
     image: Image
     camera: Camera
@@ -31,7 +32,8 @@ class StreamPicture:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """The picture that was localized last: its pose raw and smoothed, what these are wrong by, and its points.
+    """The picture that was localized last: its pose raw and smoothed, what these are wrong by, and
+    its points.
 
     `covariance` is of the left perturbation of `smoothed`, what the map is wrong by included.
     `offset` (left of `smoothed`) is what the smoothed poses before it were off by; it fades.
@@ -54,13 +56,20 @@ def doubt_of(predicted: MotionState, depth: float) -> float:
 
 
 def followed_covariance(followed: Followed, share: float) -> Float[np.ndarray, "6 6"]:
-    """Of a followed motion: what the points say, and what wrong depths make of it, this share of the motion."""
-    way, turn = float(np.linalg.norm(followed.cam_from_ref.translation)), followed.cam_from_ref.angle()
+    """Of a followed motion: what the points say, and what wrong depths make of it, this share of
+    the motion."""
+    way, turn = (
+        float(np.linalg.norm(followed.cam_from_ref.translation)),
+        followed.cam_from_ref.angle(),
+    )
     return followed.covariance + np.diag(np.repeat([way**2, turn**2], 3)) * share**2
 
 
-def smoothed_covariance(reference: Reference | None, since: MotionState | None = None) -> Float[np.ndarray, "6 6"]:
-    """Of the left perturbation of world_from_cam: what the picture localized last is wrong by, and the motion since."""
+def smoothed_covariance(
+    reference: Reference | None, since: MotionState | None = None
+) -> Float[np.ndarray, "6 6"]:
+    """Of the left perturbation of world_from_cam: what the picture localized last is wrong by, and
+    the motion since."""
     covariance = np.zeros((6, 6))
     if reference is not None:
         adjoint = reference.smoothed.inverse().adjoint()
@@ -71,10 +80,14 @@ def smoothed_covariance(reference: Reference | None, since: MotionState | None =
     return covariance + adjoint @ since.pose_covariance @ adjoint.T
 
 
-def reduced(grey: UInt8[np.ndarray, "h w"], camera: Camera, max_side_px: int) -> tuple[UInt8[np.ndarray, "a b"], Camera]:
+def reduced(
+    grey: UInt8[np.ndarray, "h w"], camera: Camera, max_side_px: int
+) -> tuple[UInt8[np.ndarray, "a b"], Camera]:
     """The picture with its camera, smaller where a side is longer than `max_side_px`."""
     scale = max_side_px / max(grey.shape)
     if scale >= 1.0:
         return grey, camera
     width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
-    return cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA), camera.rescaled(width, height)
+    return cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA), camera.rescaled(
+        width, height
+    )

@@ -1,6 +1,8 @@
-"""Everything that a query needs, compiled before the first one comes: a made-up place is mapped, asked about and walked through.
+"""Everything that a query needs, compiled before the first one comes: a made-up place is mapped,
+asked about and walked through.
 
-The machine code is kept (see `compiled.py`): with it this takes a second or two, without it half a minute.
+The machine code is kept (see `compiled.py`): with it this takes a second or two, without it half a
+minute.
 """
 
 from __future__ import annotations
@@ -37,14 +39,17 @@ _WALL_Z, _WALL_SLOPE = 2.0, 0.4  # the wall: z = 2 m + 0.4 x
 
 
 def is_warm() -> bool:
-    """Whether the machine code of what answers is kept: of kernels with which a search begins and ends, and of the last in streams."""
+    """Whether the machine code of what answers is kept: of kernels with which a search begins and
+    ends, and of the last in streams."""
     return all(map(is_kept, (integral_image, match_projections, solve_factored)))
 
 
 def warm_up(progress: Progress | None = None) -> None:
-    """Compile, or load, all that localizing an image or a stream calls, so that the first query takes no longer than the later ones.
+    """Compile, or load, all that localizing an image or a stream calls, so that the first query
+    takes no longer than the later ones.
 
-    Also fills the cache of machine code where there is none: in a container's image, while it is built.
+    Also fills the cache of machine code where there is none: in a container's image, while it is
+    built.
 
     Args:
         progress: called with ("compiling", steps done, steps in all).
@@ -97,7 +102,9 @@ class _Walk:
     def __init__(self, wall: Float32[np.ndarray, "h w"]) -> None:
         self._wall, self._places = wall, (0.0, 0.2)
         self.names, self.t_ns = ["first", "second"], [0, 100_000_000]
-        self.poses: list[Rigid3 | None] = [Rigid3(np.eye(3), np.array([place, 0.0, 0.0])) for place in self._places]
+        self.poses: list[Rigid3 | None] = [
+            Rigid3(np.eye(3), np.array([place, 0.0, 0.0])) for place in self._places
+        ]
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -105,7 +112,14 @@ class _Walk:
     def __getitem__(self, index: int) -> StereoFrame:
         image, depth = _seen(self._wall, self._places[index])
         registered = DepthImage(depth, _CAMERA, Rigid3.identity())
-        return StereoFrame(self.names[index], self.t_ns[index], image, _CAMERA, depth=registered, world_from_cam=self.poses[index])
+        return StereoFrame(
+            self.names[index],
+            self.t_ns[index],
+            image,
+            _CAMERA,
+            depth=registered,
+            world_from_cam=self.poses[index],
+        )
 
 
 def _texture(seed: int) -> Float32[np.ndarray, "h w"]:
@@ -118,12 +132,19 @@ def _texture(seed: int) -> Float32[np.ndarray, "h w"]:
     return np.clip(127.5 + 20.0 * total, 0.0, 255.0)
 
 
-def _seen(wall: Float32[np.ndarray, "h w"], place: float) -> tuple[UInt8[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+def _seen(
+    wall: Float32[np.ndarray, "h w"], place: float
+) -> tuple[UInt8[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
     """The wall's picture and depth (metres) from `place` metres along x."""
     camera = _CAMERA
-    wall_from_texel = np.array([[1.0, 0.0, -320.0], [0.0, 1.0, -240.0], [0.0, 0.0, _TEXELS_PER_METRE]]) / _TEXELS_PER_METRE
+    wall_from_texel = (
+        np.array([[1.0, 0.0, -320.0], [0.0, 1.0, -240.0], [0.0, 0.0, _TEXELS_PER_METRE]])
+        / _TEXELS_PER_METRE
+    )
     cam_from_wall = np.array([[1.0, 0.0, -place], [0.0, 1.0, 0.0], [_WALL_SLOPE, 0.0, _WALL_Z]])
-    image = cv2.warpPerspective(wall, camera.matrix() @ cam_from_wall @ wall_from_texel, (camera.width, camera.height))
+    image = cv2.warpPerspective(
+        wall, camera.matrix() @ cam_from_wall @ wall_from_texel, (camera.width, camera.height)
+    )
     rays_x = (np.arange(camera.width) - camera.cx) / camera.fx
     depth = (_WALL_Z + _WALL_SLOPE * place) / (1.0 - _WALL_SLOPE * rays_x)
     return np.rint(image).astype(np.uint8), np.tile(depth.astype(np.float32), (camera.height, 1))

@@ -1,7 +1,8 @@
-"""A scene as one JSON document: what `static/` shows in 3-D, in a page of its own, in a report, and from the service.
+"""A scene as one JSON document: what `static/` shows in 3-D, in a page of its own, in a report, and
+from the service.
 
-Results are in it as they are on the wire (`Localization.to_json`), so that a page shows those of a file and live ones by one code. Its keys
-are in docs/viewer.md.
+Results are in it as they are on the wire (`Localization.to_json`), so that a page shows those of a
+file and live ones by one code. Its keys are in docs/viewer.md.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ _PICTURE_QUALITY = 75
 
 @dataclass(frozen=True)
 class SceneBudget:
-    """How large a document may become: points at 20 bytes each, and bytes of all nodes' pictures as they stand in it."""
+    """How large a document may become: points at 20 bytes each, and bytes of all nodes' pictures as
+    they stand in it."""
 
     max_points: int = 150_000
     max_picture_bytes: int = 3_500_000
@@ -42,14 +44,20 @@ class SceneBudget:
 
 @dataclass(frozen=True)
 class ResultSet:
-    """Answers of one file or recording, as JSON (`to_json`), with `true_world_from_cam` where the truth is known; or only a path."""
+    """Answers of one file or recording, as JSON (`to_json`), with `true_world_from_cam` where the
+    truth is known; or only a path."""
 
     name: str
     answers: Sequence[Mapping[str, Any]] = ()
     path: Sequence[Rigid3] = ()
 
 
-def document_of(topomap: TopoMetricMap, name: str, results: Sequence[ResultSet] = (), budget: SceneBudget | None = None) -> dict[str, Any]:
+def document_of(
+    topomap: TopoMetricMap,
+    name: str,
+    results: Sequence[ResultSet] = (),
+    budget: SceneBudget | None = None,
+) -> dict[str, Any]:
     """The map and what was found in it.
 
     Raises:
@@ -63,11 +71,21 @@ def document_of(topomap: TopoMetricMap, name: str, results: Sequence[ResultSet] 
         "version": 1,
         "name": name,
         "up": _up(topomap, poses).round(6).tolist(),
-        "focus": [corner.round(3).tolist() for corner in _focus(np.array([pose.translation for pose in poses]), shown.points_world)],
+        "focus": [
+            corner.round(3).tolist()
+            for corner in _focus(np.array([pose.translation for pose in poses]), shown.points_world)
+        ],
         "map": _facts(topomap, len(shown.points_world)),
         "points": {"world": _base64(shown.points_world.astype("<f4")), "rgb": _base64(shown.rgb)},
         "nodes": _nodes(topomap, shown.cameras, _pictures(shown.jpegs, budget.max_picture_bytes)),
-        "paths": [*_mapped_paths(topomap), *(path_json(one.name, [p.translation for p in one.path]) for one in results if one.path)],
+        "paths": [
+            *_mapped_paths(topomap),
+            *(
+                path_json(one.name, [p.translation for p in one.path])
+                for one in results
+                if one.path
+            ),
+        ],
         "results": [results_json(one) for one in results if one.answers],
     }
 
@@ -79,15 +97,27 @@ def script_json(document: Mapping[str, Any]) -> str:
 
 
 def _facts(topomap: TopoMetricMap, num_shown: int) -> dict[str, Any]:
-    sessions = [{"id": s.session_id, "name": s.name, "date": s.start_date} for s in topomap.sessions]
+    sessions = [
+        {"id": s.session_id, "name": s.name, "date": s.start_date} for s in topomap.sessions
+    ]
     num_points = sum(summary.num_points for summary in topomap.summaries)
-    facts = {"id": map_id_of(topomap), "version": topomap.version, "num_nodes": len(topomap.summaries), "num_points": num_points}
-    return facts | {"num_points_shown": num_shown, "length_m": topomap.length_m, "sessions": sessions}
+    facts = {
+        "id": map_id_of(topomap),
+        "version": topomap.version,
+        "num_nodes": len(topomap.summaries),
+        "num_points": num_points,
+    }
+    return facts | {
+        "num_points_shown": num_shown,
+        "length_m": topomap.length_m,
+        "sessions": sessions,
+    }
 
 
 @dataclass(frozen=True, eq=False)
 class _Shown:
-    """What is read of the nodes: of each its camera and picture, of all together the points with their colours."""
+    """What is read of the nodes: of each its camera and picture, of all together the points with
+    their colours."""
 
     cameras: list[Camera]
     jpegs: list[bytes]
@@ -96,23 +126,34 @@ class _Shown:
 
 
 def _read(topomap: TopoMetricMap, max_points: int) -> _Shown:
-    """Of the points that a node knows well as many as there is room for, coloured by its picture."""
+    """Of the points that a node knows well as many as there is room for, coloured by its
+    picture."""
     share = min(1.0, max_points / max(1, sum(summary.num_points for summary in topomap.summaries)))
-    cameras, jpegs, points, colours = list[Camera](), list[bytes](), [np.zeros((0, 3))], [np.zeros((0, 3))]
+    cameras, jpegs, points, colours = (
+        list[Camera](),
+        list[bytes](),
+        [np.zeros((0, 3))],
+        [np.zeros((0, 3))],
+    )
     for node in topomap.nodes:
         sigmas = np.linalg.norm(node.point_sqrt_covs.astype(np.float64), axis=1)
         known = sigmas <= _LIKELY_SIGMA * np.linalg.norm(node.points_cam, axis=1)
         rows = np.flatnonzero(known & np.isfinite(node.points_cam).all(axis=1))
-        chosen = rows[np.linspace(0, len(rows), int(share * len(rows)), endpoint=False).astype(np.int64)]
+        chosen = rows[
+            np.linspace(0, len(rows), int(share * len(rows)), endpoint=False).astype(np.int64)
+        ]
         points.append(node.summary.world_from_cam.apply(node.points_cam[chosen].astype(np.float64)))
         colours.append(seen_colours(node, node.features.points_img[chosen].astype(np.float64)))
         cameras.append(node.camera)
         jpegs.append(node.template_jpeg)
-    return _Shown(cameras, jpegs, np.concatenate(points), np.concatenate(colours).round().astype(np.uint8))
+    return _Shown(
+        cameras, jpegs, np.concatenate(points), np.concatenate(colours).round().astype(np.uint8)
+    )
 
 
 def _up(topomap: TopoMetricMap, poses: Sequence[Rigid3]) -> Float[np.ndarray, "3"]:
-    """Up on earth where the map knows it; else what its cameras agree on, an axis of the world where that is one of them nearly."""
+    """Up on earth where the map knows it; else what its cameras agree on, an axis of the world
+    where that is one of them nearly."""
     if topomap.georeference is not None:
         return topomap.georeference.enu_from_world.rotation.T @ np.array([0.0, 0.0, 1.0])
     up = -np.mean([pose.rotation[:, 1] for pose in poses], axis=0)
@@ -125,15 +166,23 @@ def _up(topomap: TopoMetricMap, poses: Sequence[Rigid3]) -> Float[np.ndarray, "3
     return axis if axis @ up > np.cos(np.deg2rad(25.0)) else up
 
 
-def _focus(centres: Float[np.ndarray, "m 3"], points: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray]:
-    """(low, high) corners of the box that a first view shows: all nodes, and the points but for the outermost."""
+def _focus(
+    centres: Float[np.ndarray, "m 3"], points: Float[np.ndarray, "n 3"]
+) -> tuple[np.ndarray, np.ndarray]:
+    """(low, high) corners of the box that a first view shows: all nodes, and the points but for the
+    outermost."""
     low, high = centres.min(axis=0), centres.max(axis=0)
     if len(points):
-        low, high = np.minimum(low, np.quantile(points, 0.03, axis=0)), np.maximum(high, np.quantile(points, 0.97, axis=0))
+        low, high = (
+            np.minimum(low, np.quantile(points, 0.03, axis=0)),
+            np.maximum(high, np.quantile(points, 0.97, axis=0)),
+        )
     return low, high
 
 
-def _nodes(topomap: TopoMetricMap, cameras: Sequence[Camera], pictures: Sequence[str | None]) -> list[dict[str, Any]]:
+def _nodes(
+    topomap: TopoMetricMap, cameras: Sequence[Camera], pictures: Sequence[str | None]
+) -> list[dict[str, Any]]:
     return [
         {
             "id": summary.node_id,
@@ -144,17 +193,23 @@ def _nodes(topomap: TopoMetricMap, cameras: Sequence[Camera], pictures: Sequence
             "camera": camera.to_json(),
             "picture": picture,
         }
-        for summary, name, camera, picture in zip(topomap.summaries, names_of(topomap), cameras, pictures, strict=True)
+        for summary, name, camera, picture in zip(
+            topomap.summaries, names_of(topomap), cameras, pictures, strict=True
+        )
     ]
 
 
 def _pictures(jpegs: Sequence[bytes], max_bytes: int) -> list[str | None]:
-    """The nodes' pictures as base64, all of one width: the largest by which they fit; of very many only every k-th."""
+    """The nodes' pictures as base64, all of one width: the largest by which they fit; of very many
+    only every k-th."""
     room = max_bytes * 3 // 4
     if sum(map(len, jpegs)) <= room:
         return [_base64(np.frombuffer(jpeg, np.uint8)) if jpeg else None for jpeg in jpegs]
     tried = jpegs[:: max(1, len(jpegs) // 12)]
-    sizes = {width: len(jpegs) * float(np.mean([len(_shrunk(jpeg, width)) for jpeg in tried])) for width in _PICTURE_WIDTHS}
+    sizes = {
+        width: len(jpegs) * float(np.mean([len(_shrunk(jpeg, width)) for jpeg in tried]))
+        for width in _PICTURE_WIDTHS
+    }
     width = next((width for width, size in sizes.items() if size <= room), _PICTURE_WIDTHS[-1])
     step = max(1, int(np.ceil(sizes[width] / room)))
     shrunk = (_shrunk(jpeg, width) if row % step == 0 else b"" for row, jpeg in enumerate(jpegs))
@@ -167,24 +222,35 @@ def _shrunk(jpeg: bytes, width: int) -> bytes:
         return b""
     scale = min(1.0, width / picture.shape[1])
     size = (max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale)))
-    return jpeg_of(cv2.cvtColor(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2RGB), _PICTURE_QUALITY)
+    return jpeg_of(
+        cv2.cvtColor(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2RGB),
+        _PICTURE_QUALITY,
+    )
 
 
 def _mapped_paths(topomap: TopoMetricMap) -> Iterator[dict[str, Any]]:
-    """The way of each session: through all its mapping pictures, or its nodes where the map keeps no others."""
+    """The way of each session: through all its mapping pictures, or its nodes where the map keeps
+    no others."""
     images_of: dict[int, list[Rigid3]] = {}
     for image in topomap.place_images:
         images_of.setdefault(image.session_id, []).append(image.world_from_cam)
     for session in topomap.sessions:
         images = images_of.get(session.session_id, [])
-        nodes = [summary.world_from_cam for summary in topomap.summaries if summary.session_id == session.session_id]
+        nodes = [
+            summary.world_from_cam
+            for summary in topomap.summaries
+            if summary.session_id == session.session_id
+        ]
         poses = images if len(images) > len(nodes) else nodes
         if poses:
-            yield path_json(session.name, [pose.translation for pose in poses]) | {"session": session.session_id}
+            yield path_json(session.name, [pose.translation for pose in poses]) | {
+                "session": session.session_id
+            }
 
 
 def path_json(name: str, positions: Sequence[Float[np.ndarray, "3"]]) -> dict[str, Any]:
-    """A path as lines, a new one wherever the next position is far off; of a long one every k-th position."""
+    """A path as lines, a new one wherever the next position is far off; of a long one every k-th
+    position."""
     path = np.array(positions).reshape(-1, 3)[:: max(1, -(-len(positions) // MAX_PATH))]
     steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
     gaps = np.flatnonzero(steps > GAP_STEPS * np.median(steps)) + 1 if len(steps) else []
@@ -193,7 +259,11 @@ def path_json(name: str, positions: Sequence[Float[np.ndarray, "3"]]) -> dict[st
 
 def results_json(results: ResultSet) -> dict[str, Any]:
     step = max(1, -(-len(results.answers) // MAX_RESULTS))
-    return {"name": results.name, "num_answers": len(results.answers), "answers": [_rounded(dict(one)) for one in results.answers[::step]]}
+    return {
+        "name": results.name,
+        "num_answers": len(results.answers),
+        "answers": [_rounded(dict(one)) for one in results.answers[::step]],
+    }
 
 
 def _rounded(value: Any) -> Any:

@@ -23,14 +23,19 @@ def scene_of_map(
     with_points: bool = True,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Scene:
-    """The nodes of all sessions, or of one; their points, where they are wanted, by the map's first kind of features.
+    """The nodes of all sessions, or of one; their points, where they are wanted, by the map's first
+    kind of features.
 
     The trajectory is that of all mapping pictures.
 
     Raises:
         MapError: the map cannot be read, or has no such session.
     """
-    rows = [row for row, s in enumerate(topomap.summaries) if session_id is None or s.session_id == session_id]
+    rows = [
+        row
+        for row, s in enumerate(topomap.summaries)
+        if session_id is None or s.session_id == session_id
+    ]
     if not rows:
         known = ", ".join(f"{session.session_id} ({session.name})" for session in topomap.sessions)
         raise MapError(f"the map has no session {session_id} with nodes; its sessions: {known}")
@@ -43,25 +48,46 @@ def scene_of_map(
         if tracks is not None:
             pixels = node.features.points_img.astype(np.float64)
             point_rows = tracks.point_rows[start : start + len(pixels)]
-            view, start = replace(view, points_img=pixels, point_rows=point_rows), start + len(pixels)
+            view, start = (
+                replace(view, points_img=pixels, point_rows=point_rows),
+                start + len(pixels),
+            )
             seen_rgb.append(seen_colours(node, pixels))
         views.append(view)
-    posed = [image for image in topomap.place_images if session_id is None or image.session_id == session_id]
+    posed = [
+        image
+        for image in topomap.place_images
+        if session_id is None or image.session_id == session_id
+    ]
     points = Points.none() if tracks is None else _points(tracks, np.concatenate(seen_rgb))
-    return Scene(name, views, points, [image.world_from_cam for image in posed], topomap.georeference)
+    return Scene(
+        name, views, points, [image.world_from_cam for image in posed], topomap.georeference
+    )
 
 
 def _view(topomap: TopoMetricMap, node: TopoNode, name: str) -> View:
     s, georeference = node.summary, topomap.georeference
     geopose = None if georeference is None else georeference.geopose(s.world_from_cam)
     picture = _decoded(node.template_jpeg)
-    jpeg_camera = None if picture is None else node.camera.rescaled(picture.shape[1], picture.shape[0])
+    jpeg_camera = (
+        None if picture is None else node.camera.rescaled(picture.shape[1], picture.shape[0])
+    )
     jpeg = node.template_jpeg if picture is not None else b""
-    return View(name, s.world_from_cam, s.t_ns, node.camera, s.session_id, jpeg=jpeg, jpeg_camera=jpeg_camera, geopose=geopose)
+    return View(
+        name,
+        s.world_from_cam,
+        s.t_ns,
+        node.camera,
+        s.session_id,
+        jpeg=jpeg,
+        jpeg_camera=jpeg_camera,
+        geopose=geopose,
+    )
 
 
 def names_of(topomap: TopoMetricMap) -> list[str]:
-    """Each node's picture; where several sessions call pictures alike, with the session's number before it."""
+    """Each node's picture; where several sessions call pictures alike, with the session's number
+    before it."""
     names = [summary.name for summary in topomap.summaries]
     if len(set(names)) == len(names):
         return names
@@ -76,17 +102,26 @@ def _points(tracks: Tracks, seen_rgb: Float[np.ndarray, "m 3"]) -> Points:
     rgb, errors = np.zeros((num_points, 3)), np.zeros(num_points)
     np.add.at(rgb, rows, seen_rgb[shown])
     np.add.at(errors, rows, tracks.errors_px[shown])
-    return Points(tracks.points_world, np.rint(rgb / counts[:, None]).astype(np.uint8), errors / counts)
+    return Points(
+        tracks.points_world, np.rint(rgb / counts[:, None]).astype(np.uint8), errors / counts
+    )
 
 
 def seen_colours(node: TopoNode, pixels: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 3"]:
-    """What the node's picture shows at pixels of its camera, RGB, 0 to 255; black where it cannot be read."""
+    """What the node's picture shows at pixels of its camera, RGB, 0 to 255; black where it cannot
+    be read."""
     picture = _decoded(node.template_jpeg)
     if picture is None or len(pixels) == 0:
         return np.zeros((len(pixels), 3))
     scale = np.array([picture.shape[1] / node.camera.width, picture.shape[0] / node.camera.height])
     places = ((pixels + 0.5) * scale - 0.5).astype(np.float32)
-    return cv2.remap(picture, places[:, None, 0], places[:, None, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0].astype(float)
+    return cv2.remap(
+        picture,
+        places[:, None, 0],
+        places[:, None, 1],
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )[:, 0].astype(float)
 
 
 def _decoded(jpeg: bytes) -> UInt8[np.ndarray, "h w 3"] | None:

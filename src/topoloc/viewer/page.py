@@ -1,7 +1,9 @@
-"""A scene as a page of its own, or as a part of one: self-contained, so that it works from a file and asks nothing of anybody.
+"""A scene as a page of its own, or as a part of one: self-contained, so that it works from a file
+and asks nothing of anybody.
 
-The front end is plain modules of JavaScript (`static/`) that know each other by name: an import map leads from the names to `/static/`
-where the service gives them, and to copies within the page where it is a file.
+The front end is plain modules of JavaScript (`static/`) that know each other by name: an import map
+leads from the names to `/static/` where the service gives them, and to copies within the page where
+it is a file.
 """
 
 from __future__ import annotations
@@ -57,18 +59,26 @@ def embedded_scene(document: Mapping[str, Any], name: str = "scene") -> str:
 
 def scene_page(document: Mapping[str, Any]) -> str:
     """A page that is the scene."""
-    head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
+    head = (
+        '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
+    )
     title = f"<title>{escape(str(document['name']))}</title>"
     style = f"<style>\n{static_text('theme.css')}</style>"
     body = embedded_scene(document).replace("<div data-scene", '<div class="whole" data-scene', 1)
-    return f'<!DOCTYPE html>\n<html lang="en"><head>{head}\n{title}\n{style}\n{embedded_head()}</head><body>\n{body}\n</body></html>\n'
+    return (
+        "<!DOCTYPE html>\n<html"
+        f' lang="en"><head>{head}\n{title}\n{style}\n{embedded_head()}</head><body>\n{body}\n</body></html>\n'  # noqa: E501
+    )
 
 
 def write_scene_page(path: Path, document: Mapping[str, Any]) -> None:
-    """Write the page, at once or not at all. Raises TopolocError where the file cannot be written."""
+    """Write the page, at once or not at all. Raises TopolocError where the file cannot be
+    written."""
     write_text(path, scene_page(document))
 
 
 @cache
 def _data_address(file: str) -> str:
-    return "data:text/javascript;base64," + base64.b64encode(static_text(file).encode()).decode("ascii")
+    return "data:text/javascript;base64," + base64.b64encode(static_text(file).encode()).decode(
+        "ascii"
+    )

@@ -16,7 +16,8 @@ from topoloc.viewer.document import ResultSet
 
 
 def read_results(path: Path) -> list[ResultSet]:
-    """The JSON lines of `topoloc localize --json`, the answers of `topoloc evaluate --json` by recording, or a trajectory (TUM, KITTI).
+    """The JSON lines of `topoloc localize --json`, the answers of `topoloc evaluate --json` by
+    recording, or a trajectory (TUM, KITTI).
 
     Raises:
         ResultError: the file is missing, or holds something else; names the line.
@@ -29,7 +30,15 @@ def read_results(path: Path) -> list[ResultSet]:
     if whole is not None and "localized" not in whole:
         return _of_evaluation(path, whole)
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
-    return [ResultSet(path.stem, [_answer(f"{path}, line {number}", line) for number, line in ([(1, whole)] if whole else lines)])]
+    return [
+        ResultSet(
+            path.stem,
+            [
+                _answer(f"{path}, line {number}", line)
+                for number, line in ([(1, whole)] if whole else lines)
+            ],
+        )
+    ]
 
 
 def _whole(text: str) -> Mapping[str, Any] | None:
@@ -43,7 +52,10 @@ def _whole(text: str) -> Mapping[str, Any] | None:
 
 def _of_evaluation(path: Path, evaluation: Mapping[str, Any]) -> list[ResultSet]:
     if not isinstance(evaluation.get("answers"), list):
-        raise ResultError(f"{path}: neither results nor an evaluation with its answers, as `topoloc evaluate --json` writes them")
+        raise ResultError(
+            f"{path}: neither results nor an evaluation with its answers, as `topoloc evaluate"
+            " --json` writes them"
+        )
     sets: dict[str, list[Mapping[str, Any]]] = {}
     for number, one in enumerate(evaluation["answers"]):
         answer = _answer(f"{path}, answer {number}", one)
@@ -58,7 +70,9 @@ def _answer(where: str, line: Any) -> Mapping[str, Any]:
         answer = result_from_json(data).to_json(checked.text(data.get("query", ""), "query"))
         for key in ("smoothed", "true_world_from_cam"):
             if key in data:
-                answer[key] = None if data[key] is None else pose_json(checked.rigid(data[key], key))
+                answer[key] = (
+                    None if data[key] is None else pose_json(checked.rigid(data[key], key))
+                )
         for key in ("state", "recording"):
             if key in data:
                 answer[key] = checked.text(data[key], key)

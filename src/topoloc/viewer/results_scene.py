@@ -1,4 +1,5 @@
-"""A file of results (JSON lines of `topoloc localize --json`) as a scene: the pictures that were localized are the views."""
+"""A file of results (JSON lines of `topoloc localize --json`) as a scene: the pictures that were
+localized are the views."""
 
 from __future__ import annotations
 
@@ -18,7 +19,11 @@ def scene_of_results(path: Path) -> Scene:
         ResultError: the file is missing, a line is no result, or none has a pose; names the line.
     """
     views = list[View]()
-    lines = [(number, line) for number, line in enumerate(read_text(path, ResultError).splitlines(), 1) if line.strip()]
+    lines = [
+        (number, line)
+        for number, line in enumerate(read_text(path, ResultError).splitlines(), 1)
+        if line.strip()
+    ]
     for number, line in lines:
         try:
             data = checked.object_of(line)

@@ -1,4 +1,5 @@
-"""What is shown or exported, whatever the form: pictures with known poses, and the points that they show. Data only."""
+"""What is shown or exported, whatever the form: pictures with known poses, and the points that they
+show. Data only."""
 
 from __future__ import annotations
 
@@ -15,10 +16,12 @@ from topoloc.geometry.rigid import Rigid3
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A picture and where it was taken. `name` is that of its file; `t_ns` is None where it has no time.
+    """A picture and where it was taken. `name` is that of its file; `t_ns` is None where it has no
+    time.
 
-    Pixel `points_img[k]` of `camera` shows point `point_rows[k]` of the scene, -1 for none. `jpeg` is the picture, encoded, possibly
-    smaller than `camera`, and seen by `jpeg_camera`; empty where it is not at hand.
+    Pixel `points_img[k]` of `camera` shows point `point_rows[k]` of the scene, -1 for none. `jpeg`
+    is the picture, encoded, possibly smaller than `camera`, and seen by `jpeg_camera`; empty where
+    it is not at hand.
     """
 
     name: str
@@ -35,7 +38,8 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Points in the world (metres), their colours where pictures show them (else black), and the mean reprojection error (pixels)."""
+    """Points in the world (metres), their colours where pictures show them (else black), and the
+    mean reprojection error (pixels)."""
 
     world: Float[np.ndarray, "n 3"]
     rgb: UInt8[np.ndarray, "n 3"]
@@ -48,7 +52,8 @@ class Points:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """`views` in the order in which they were taken; `trajectory` are all poses that are known, with or without a picture or a time."""
+    """`views` in the order in which they were taken; `trajectory` are all poses that are known,
+    with or without a picture or a time."""
 
     name: str
     views: Sequence[View]

@@ -11,8 +11,18 @@ from pathlib import Path
 from topoloc.errors import TopolocError
 from topoloc.sequences.atomic import write_bytes
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "microsoft-edge")
-_SOFTWARE_3D = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")  # WebGL where there is no graphics card
+BROWSERS = (
+    "chromium",
+    "chromium-browser",
+    "google-chrome",
+    "google-chrome-stable",
+    "chrome",
+    "microsoft-edge",
+)
+_SOFTWARE_3D = (
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+)  # WebGL where there is no graphics card
 _TIMEOUT_S, _VIRTUAL_MS = 120.0, 3_000
 
 
@@ -20,7 +30,9 @@ def find_browser() -> str:
     """The program. Raises TopolocError where there is none."""
     found = next((path for name in BROWSERS if (path := shutil.which(name))), None)
     if found is None:
-        raise TopolocError(f"a picture of a page needs one of {', '.join(BROWSERS[:3])}, and none is installed")
+        raise TopolocError(
+            f"a picture of a page needs one of {', '.join(BROWSERS[:3])}, and none is installed"
+        )
     return found
 
 
@@ -33,14 +45,34 @@ def write_screenshot(page: Path, out: Path, width: int = 1300, height: int = 850
     browser = find_browser()
     with tempfile.TemporaryDirectory(prefix="topoloc-view-") as profile:
         picture = Path(profile) / "page.png"
-        arguments = ("--headless=new", "--no-first-run", "--hide-scrollbars", *_SOFTWARE_3D, f"--user-data-dir={profile}")
-        arguments += ("--no-sandbox",) if hasattr(os, "geteuid") and os.geteuid() == 0 else ()  # Chromium's refuses to be root's
-        arguments += (f"--virtual-time-budget={_VIRTUAL_MS}", f"--window-size={width},{height}", f"--screenshot={picture}")
+        arguments = (
+            "--headless=new",
+            "--no-first-run",
+            "--hide-scrollbars",
+            *_SOFTWARE_3D,
+            f"--user-data-dir={profile}",
+        )
+        arguments += (
+            ("--no-sandbox",) if hasattr(os, "geteuid") and os.geteuid() == 0 else ()
+        )  # Chromium's refuses to be root's
+        arguments += (
+            f"--virtual-time-budget={_VIRTUAL_MS}",
+            f"--window-size={width},{height}",
+            f"--screenshot={picture}",
+        )
         try:
-            done = subprocess.run([browser, *arguments, page.resolve().as_uri()], capture_output=True, timeout=_TIMEOUT_S, check=False)
+            done = subprocess.run(
+                [browser, *arguments, page.resolve().as_uri()],
+                capture_output=True,
+                timeout=_TIMEOUT_S,
+                check=False,
+            )
         except subprocess.TimeoutExpired:
             raise TopolocError(f"{browser} made no picture within {_TIMEOUT_S:g} s") from None
         if done.returncode or not picture.is_file():
             said = done.stderr.decode(errors="replace").strip().splitlines()
-            raise TopolocError(f"{browser} made no picture: {said[-1][:200] if said else f'exit status {done.returncode}'}")
+            raise TopolocError(
+                f"{browser} made no picture:"
+                f" {said[-1][:200] if said else f'exit status {done.returncode}'}"
+            )
         write_bytes(out, picture.read_bytes())

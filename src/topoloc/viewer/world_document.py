@@ -1,4 +1,5 @@
-"""Tiles of an atlas that share a world as one document of the viewer: each tile's own (`document.py`), moved to where it lies."""
+"""Tiles of an atlas that share a world as one document of the viewer: each tile's own
+(`document.py`), moved to where it lies."""
 
 from __future__ import annotations
 
@@ -28,8 +29,9 @@ def document_of_world(
     budget: SceneBudget | None = None,
     warn: Callable[[str], None] = lambda text: None,
 ) -> Document:
-    """As `document_of`, of all tiles of a world together. Nodes name their tile, sessions are numbered anew, points and pictures are shared
-    out by nodes. Answers stand where their tile lies; those of tiles of other worlds are left out.
+    """As `document_of`, of all tiles of a world together. Nodes name their tile, sessions are
+    numbered anew, points and pictures are shared out by nodes. Answers stand where their tile lies;
+    those of tiles of other worlds are left out.
 
     Raises:
         AtlasError: none of the tiles can be read.
@@ -38,18 +40,33 @@ def document_of_world(
     budget, parts, first_session = budget or SceneBudget(), list[Document](), 0
     for placed, topomap in opened_tiles(atlas, world.tiles, warn):
         share = placed.tile.num_nodes / max(1, world.num_nodes)
-        its_budget = SceneBudget(int(share * budget.max_points), int(share * budget.max_picture_bytes))
-        part = _moved(document_of(topomap, placed.tile.tile_id, budget=its_budget), placed.world_from_map, first_session)
-        first_session = max((session["id"] for session in part["map"]["sessions"]), default=first_session - 1) + 1
+        its_budget = SceneBudget(
+            int(share * budget.max_points), int(share * budget.max_picture_bytes)
+        )
+        part = _moved(
+            document_of(topomap, placed.tile.tile_id, budget=its_budget),
+            placed.world_from_map,
+            first_session,
+        )
+        first_session = (
+            max((session["id"] for session in part["map"]["sessions"]), default=first_session - 1)
+            + 1
+        )
         parts.append(part)
-    paths = [path_json(one.name, [pose.translation for pose in one.path]) for one in results if one.path]
+    paths = [
+        path_json(one.name, [pose.translation for pose in one.path]) for one in results if one.path
+    ]
     shown = [replace(one, answers=answers_in(world, one.answers)) for one in results if one.answers]
     joined = _joined(parts, name)
-    return joined | {"paths": joined["paths"] + paths, "results": [results_json(one) for one in shown]}
+    return joined | {
+        "paths": joined["paths"] + paths,
+        "results": [results_json(one) for one in shown],
+    }
 
 
 def answers_in(world: SharedWorld, answers: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Answers of an atlas, as JSON, in the coordinates of a world that tiles share; those of other tiles are left out."""
+    """Answers of an atlas, as JSON, in the coordinates of a world that tiles share; those of other
+    tiles are left out."""
     moved = list[dict[str, Any]]()
     for answer in answers:
         alternatives = list(answer.get("alternatives", []))
@@ -57,14 +74,20 @@ def answers_in(world: SharedWorld, answers: Sequence[Mapping[str, Any]]) -> list
         pose = world.world_from_map_of(named)
         if pose is None:
             continue
-        its = dict(answer) | {key: _moved_pose(pose, answer[key]) for key in _POSES if answer.get(key) is not None}
+        its = dict(answer) | {
+            key: _moved_pose(pose, answer[key]) for key in _POSES if answer.get(key) is not None
+        }
         if "covariance" in its:
             covariance = np.array(its["covariance"], np.float64)
             its["covariance"] = (pose.adjoint() @ covariance @ pose.adjoint().T).tolist()
         if alternatives:
-            placed = [(one, world.world_from_map_of(one.get("tile") or named)) for one in alternatives]
+            placed = [
+                (one, world.world_from_map_of(one.get("tile") or named)) for one in alternatives
+            ]
             its["alternatives"] = [
-                one | {"world_from_cam": _moved_pose(there, one["world_from_cam"])} for one, there in placed if there is not None
+                one | {"world_from_cam": _moved_pose(there, one["world_from_cam"])}
+                for one, there in placed
+                if there is not None
             ]
         moved.append(its)
     return moved
@@ -80,8 +103,13 @@ def _moved(document: Document, world_from_map: Rigid3, first_session: int) -> Do
     points = np.frombuffer(base64.b64decode(document["points"]["world"]), "<f4").reshape(-1, 3)
     moved = world_from_map.apply(points.astype(np.float64)).astype("<f4")
     corners = np.array(np.meshgrid(*np.array(document["focus"]).T)).reshape(3, -1).T
-    numbers = {session["id"]: first_session + k for k, session in enumerate(document["map"]["sessions"])}
-    sessions = [one | {"id": numbers[one["id"]], "name": f"{tile_id}: {one['name']}"} for one in document["map"]["sessions"]]
+    numbers = {
+        session["id"]: first_session + k for k, session in enumerate(document["map"]["sessions"])
+    }
+    sessions = [
+        one | {"id": numbers[one["id"]], "name": f"{tile_id}: {one['name']}"}
+        for one in document["map"]["sessions"]
+    ]
     nodes = [
         node
         | {"tile": tile_id, "session": numbers.get(node["session"], first_session)}
@@ -94,22 +122,38 @@ def _moved(document: Document, world_from_map: Rigid3, first_session: int) -> Do
         "map": document["map"] | {"sessions": sessions},
         "points": {"world": moved, "rgb": base64.b64decode(document["points"]["rgb"])},
         "nodes": nodes,
-        "paths": [_moved_path(path, world_from_map, tile_id, numbers) for path in document["paths"]],
+        "paths": [
+            _moved_path(path, world_from_map, tile_id, numbers) for path in document["paths"]
+        ],
     }
 
 
-def _moved_path(path: Document, world_from_map: Rigid3, tile_id: str, numbers: Mapping[int, int]) -> Document:
-    lines = [world_from_map.apply(np.array(line, np.float64).reshape(-1, 3)).round(4).tolist() for line in path["lines"]]
-    return {"name": f"{tile_id}: {path['name']}", "lines": lines, "session": numbers[path["session"]]}
+def _moved_path(
+    path: Document, world_from_map: Rigid3, tile_id: str, numbers: Mapping[int, int]
+) -> Document:
+    lines = [
+        world_from_map.apply(np.array(line, np.float64).reshape(-1, 3)).round(4).tolist()
+        for line in path["lines"]
+    ]
+    return {
+        "name": f"{tile_id}: {path['name']}",
+        "lines": lines,
+        "session": numbers[path["session"]],
+    }
 
 
 def _joined(parts: Sequence[Document], name: str) -> Document:
     """One document of several that lie in one world."""
     facts = [part["map"] for part in parts]
-    sums = {key: sum(one[key] for one in facts) for key in ("num_nodes", "num_points", "num_points_shown", "length_m")}
+    sums = {
+        key: sum(one[key] for one in facts)
+        for key in ("num_nodes", "num_points", "num_points_shown", "length_m")
+    }
     focus = np.concatenate([part["focus"] for part in parts])
     up = np.sum([part["map"]["num_nodes"] * part["up"] for part in parts], axis=0)
-    world, rgb = (b"".join(bytes(part["points"][key]) for part in parts) for key in ("world", "rgb"))
+    world, rgb = (
+        b"".join(bytes(part["points"][key]) for part in parts) for key in ("world", "rgb")
+    )
     return parts[0] | {
         "name": name,
         "up": (up / max(float(np.linalg.norm(up)), 1e-9)).round(6).tolist(),
@@ -121,7 +165,10 @@ def _joined(parts: Sequence[Document], name: str) -> Document:
             "tiles": [part["name"] for part in parts],
             "sessions": [one for f in facts for one in f["sessions"]],
         },
-        "points": {"world": base64.b64encode(world).decode("ascii"), "rgb": base64.b64encode(rgb).decode("ascii")},
+        "points": {
+            "world": base64.b64encode(world).decode("ascii"),
+            "rgb": base64.b64encode(rgb).decode("ascii"),
+        },
         "nodes": [node for part in parts for node in part["nodes"]],
         "paths": [path for part in parts for path in part["paths"]],
         "results": [],

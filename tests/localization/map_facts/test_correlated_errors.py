@@ -1,4 +1,5 @@
-"""rho, the share of error that map points have in common, on maps whose nodes are in their places and on one whose nodes are not."""
+"""rho, the share of error that map points have in common, on maps whose nodes are in their places
+and on one whose nodes are not."""
 
 from __future__ import annotations
 
@@ -29,7 +30,12 @@ def _disturbed(topomap: TopoMetricMap, metres: float, radians: float) -> TopoMet
     nodes = []
     for node in topomap.nodes:
         error = Rigid3(exp_so3(rng.normal(0.0, radians, 3)), rng.normal(0.0, metres, 3))
-        nodes.append(replace(node, summary=replace(node.summary, world_from_cam=node.summary.world_from_cam @ error)))
+        nodes.append(
+            replace(
+                node,
+                summary=replace(node.summary, world_from_cam=node.summary.world_from_cam @ error),
+            )
+        )
     return replace(topomap, nodes=nodes, summaries=[node.summary for node in nodes])
 
 
@@ -58,12 +64,16 @@ def measurings(monkeypatch: pytest.MonkeyPatch) -> list[TopoMetricMap]:
     return measured
 
 
-def test_a_map_knows_what_was_measured_when_it_was_built(room_map: Path, measurings: list[TopoMetricMap]):
+def test_a_map_knows_what_was_measured_when_it_was_built(
+    room_map: Path, measurings: list[TopoMetricMap]
+):
     loaded = TopoMetricMap.load(room_map)
     known = Localizer(loaded).correlated_errors
     assert not measurings
     unknown = replace(loaded, shared_errors=None)
-    assert Localizer(unknown).correlated_errors == pytest.approx(known, rel=0.3)  # the file's points are rounded
+    assert Localizer(unknown).correlated_errors == pytest.approx(
+        known, rel=0.3
+    )  # the file's points are rounded
     assert measurings == [unknown]
 
 
@@ -76,17 +86,24 @@ def test_a_map_knows_what_was_measured_when_it_was_built(room_map: Path, measuri
     ],
     ids=["correlated errors", "guided", "pose"],
 )
-def test_with_other_settings_it_is_measured_anew(config: LocalizerConfig, room_map: Path, measurings: list[TopoMetricMap]):
+def test_with_other_settings_it_is_measured_anew(
+    config: LocalizerConfig, room_map: Path, measurings: list[TopoMetricMap]
+):
     loaded = TopoMetricMap.load(room_map)
     rho = Localizer(loaded, config).correlated_errors
     assert measurings == [loaded]
     assert rho == Localizer(replace(loaded, shared_errors=None), config).correlated_errors
 
 
-def test_settings_that_it_does_not_depend_on_may_change(room_map: Path, measurings: list[TopoMetricMap]):
+def test_settings_that_it_does_not_depend_on_may_change(
+    room_map: Path, measurings: list[TopoMetricMap]
+):
     loaded = TopoMetricMap.load(room_map)
     assert loaded.shared_errors is not None
-    assert Localizer(loaded, LocalizerConfig(num_candidates=2)).correlated_errors == loaded.shared_errors.rho
+    assert (
+        Localizer(loaded, LocalizerConfig(num_candidates=2)).correlated_errors
+        == loaded.shared_errors.rho
+    )
     assert not measurings
 
 
@@ -108,10 +125,17 @@ def test_without_correlated_errors_the_covariance_stays_as_it_is():
     assert inflation(100, 0.1) == pytest.approx(11.0)
 
 
-def test_the_first_query_computes_nothing_of_the_map(room_map: Path, tiny_recording: Path, monkeypatch: pytest.MonkeyPatch):
-    localizer, frame = Localizer(TopoMetricMap.load(room_map)), topoloc.open_sequence(tiny_recording)[1]
+def test_the_first_query_computes_nothing_of_the_map(
+    room_map: Path, tiny_recording: Path, monkeypatch: pytest.MonkeyPatch
+):
+    localizer, frame = (
+        Localizer(TopoMetricMap.load(room_map)),
+        topoloc.open_sequence(tiny_recording)[1],
+    )
     assert localizer.map.focal == frame.camera.fx
-    Localizer(TopoMetricMap.load(room_map)).localize(frame.image, frame.camera)  # what Numba compiles is hashed, too
+    Localizer(TopoMetricMap.load(room_map)).localize(
+        frame.image, frame.camera
+    )  # what Numba compiles is hashed, too
 
     def never(*args: object) -> None:
         raise AssertionError("a digest of the nodes, or what the map knows, at a query")

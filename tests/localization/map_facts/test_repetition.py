@@ -38,12 +38,20 @@ def _wall(num_panels: int, noise: float = 0.0) -> LocalMap:
     """A wall of equal panels; each sees every point of the panel a little differently."""
     rng = np.random.default_rng(5)
     looks = rng.normal(size=(len(PANEL), 64))
-    descriptors = np.concatenate([looks + noise * rng.normal(size=looks.shape) for _ in range(num_panels)])
+    descriptors = np.concatenate(
+        [looks + noise * rng.normal(size=looks.shape) for _ in range(num_panels)]
+    )
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
     points_world = np.concatenate([PANEL + k * PERIOD for k in range(num_panels)])
     count, one = len(points_world), np.full(len(points_world), 0.02)
     return LocalMap(
-        descriptors.astype(np.float32), points_world, np.zeros((count, 3, 3)), one, np.zeros(count, int), one, np.zeros((count, 3))
+        descriptors.astype(np.float32),
+        points_world,
+        np.zeros((count, 3, 3)),
+        one,
+        np.zeros(count, int),
+        one,
+        np.zeros((count, 3)),
     )
 
 
@@ -65,14 +73,17 @@ def test_what_is_there_once_does_not_repeat_itself():
 
 
 def test_parts_of_a_panel_that_resemble_each_other_are_no_repetition_beside_the_panels():
-    """A handle above a handle: a third of the points find a copy there, where all find one a panel on."""
+    """A handle above a handle: a third of the points find a copy there, where all find one a panel
+    on."""
     wall = _wall(4)
     few = np.tile(np.arange(len(PANEL)) < 13, 4)
     above = LocalMap(
-        wall.descriptors[few], wall.points_world[few] + [0.0, 0.0, 0.5], wall.covariances[few], wall.radii[few],
+        wall.descriptors[few], wall.points_world[few] + [0.0, 0.0, 0.5], wall.covariances[few], wall.radii[few],  # noqa: E501
         wall.node_ids[few], wall.sizes[few], wall.directions[few],
     )  # fmt: skip
-    np.testing.assert_allclose(shifts_of(wall, LocalMap.pooled([wall, above]))[:, 2], 0.0, atol=0.01)
+    np.testing.assert_allclose(
+        shifts_of(wall, LocalMap.pooled([wall, above]))[:, 2], 0.0, atol=0.01
+    )
 
 
 def test_folded_points_of_all_panels_are_those_of_one():
@@ -82,14 +93,17 @@ def test_folded_points_of_all_panels_are_those_of_one():
 
 
 def test_copies_are_the_points_and_what_each_shift_makes_of_them():
-    np.testing.assert_allclose(copies(PANEL, PERIOD[None])[1] - PANEL, np.tile(PERIOD, (len(PANEL), 1)))
+    np.testing.assert_allclose(
+        copies(PANEL, PERIOD[None])[1] - PANEL, np.tile(PERIOD, (len(PANEL), 1))
+    )
 
 
 # moves across the whole map
 
 
 def _turned(opened: OpenMap, row: int) -> list[Rigid3]:
-    """The moves that are no shifts: all surfaces of this room are blobs, which resemble each other."""
+    """The moves that are no shifts: all surfaces of this room are blobs, which resemble each
+    other."""
     return [move for move in map(Rigid3.from_matrix, opened.moves(row)) if move.angle() > 0.1]
 
 
@@ -120,7 +134,9 @@ def test_what_the_build_found_is_kept_in_the_file_and_not_sought_again(
         opened = OpenMap(topomap)
         for row, node_id in enumerate(opened.node_ids):
             assert built.repetitions is not None
-            np.testing.assert_array_equal(opened.moves(row), built.repetitions.moves.get(node_id, np.zeros((0, 4, 4))))
+            np.testing.assert_array_equal(
+                opened.moves(row), built.repetitions.moves.get(node_id, np.zeros((0, 4, 4)))
+            )
         assert damages(tmp_path / "twice.topo") == []
     assert sought == []
 
@@ -139,19 +155,37 @@ class _OnlyTheFirstRoom:
         self._num_nodes = num_nodes
 
     def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
-        return [NodeScore(row, 1.0 / (1 + row)) for row in range(min(num_candidates, self._num_nodes))]
+        return [
+            NodeScore(row, 1.0 / (1 + row)) for row in range(min(num_candidates, self._num_nodes))
+        ]
 
 
 @pytest.mark.parametrize("max_repetitions", [LocalizerConfig().max_repetitions, 0])
-def test_a_copy_that_retrieval_does_not_name_is_found_by_the_map(room: TopoMetricMap, max_repetitions: int):
+def test_a_copy_that_retrieval_does_not_name_is_found_by_the_map(
+    room: TopoMetricMap, max_repetitions: int
+):
     """Without repetitions one of the two is believed, and half of the time wrongly."""
-    localizer = Localizer(twice(room), LocalizerConfig(max_repetitions=max_repetitions), coarse=_OnlyTheFirstRoom(len(room.nodes)))
+    localizer = Localizer(
+        twice(room),
+        LocalizerConfig(max_repetitions=max_repetitions),
+        coarse=_OnlyTheFirstRoom(len(room.nodes)),
+    )
     results = [(localizer.localize(picture, CAMERA), truth) for picture, truth in unseen_views()]
-    ambiguous = [(result, truth) for result, truth in results if isinstance(result, NotLocalized) and result.reason == "ambiguous"]
+    ambiguous = [
+        (result, truth)
+        for result, truth in results
+        if isinstance(result, NotLocalized) and result.reason == "ambiguous"
+    ]
     if max_repetitions == 0:
         assert any(isinstance(result, Localization) for result, _ in results)
         return
     assert len(ambiguous) >= 0.8 * len(results)
     assert not any(isinstance(result, Localization) for result, _ in results)
     for result, truth in ambiguous:
-        assert min(translation_error(one.world_from_cam, ELSEWHERE @ truth) for one in result.alternatives) < 0.05
+        assert (
+            min(
+                translation_error(one.world_from_cam, ELSEWHERE @ truth)
+                for one in result.alternatives
+            )
+            < 0.05
+        )

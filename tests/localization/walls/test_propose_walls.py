@@ -1,4 +1,5 @@
-"""Who comes back along a corridor that was mapped in one direction is localized by its walls, and nobody else is."""
+"""Who comes back along a corridor that was mapped in one direction is localized by its walls, and
+nobody else is."""
 
 from __future__ import annotations
 
@@ -11,7 +12,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from built_corridor import WIDE, WalkAhead, back, built_corridor, corridor, corridor_of_two_kinds, seen_ahead, seen_on_the_way_back
+from built_corridor import (
+    WIDE,
+    WalkAhead,
+    back,
+    built_corridor,
+    corridor,
+    corridor_of_two_kinds,
+    seen_ahead,
+    seen_on_the_way_back,
+)
 from tiny_world import path_pose, render, room
 from topoloc.errors import MapError
 from topoloc.features.kinds import KINDS, SURF, FeatureConfig, find_kind, learned_kind
@@ -53,18 +63,28 @@ def _is_right(result: Localization | NotLocalized, truth: Rigid3) -> bool:
 
 
 def _is_by_walls(result: Localization | NotLocalized) -> bool:
-    return isinstance(result, Localization) and result.evidence is not None and result.evidence.num_distinct is not None
+    return (
+        isinstance(result, Localization)
+        and result.evidence is not None
+        and result.evidence.num_distinct is not None
+    )
 
 
 def _is_pose(world_from_cam: Rigid3, truth: Rigid3) -> bool:
-    return translation_error(world_from_cam, truth) < 0.3 and rotation_error(world_from_cam, truth) < np.deg2rad(5.0)
+    return translation_error(world_from_cam, truth) < 0.3 and rotation_error(
+        world_from_cam, truth
+    ) < np.deg2rad(5.0)
 
 
 def test_the_way_back_is_localized_by_the_walls():
     assert all(_is_right(result, truth) for result, truth in _found_on_the_way_back())
     without = Localizer(built_corridor(), NO_WALLS)
-    answers = [(without.localize(picture, WIDE), truth) for picture, truth in seen_on_the_way_back()]
-    answered = [_is_right(result, truth) for result, truth in answers if isinstance(result, Localization)]
+    answers = [
+        (without.localize(picture, WIDE), truth) for picture, truth in seen_on_the_way_back()
+    ]
+    answered = [
+        _is_right(result, truth) for result, truth in answers if isinstance(result, Localization)
+    ]
     assert len(answered) < 0.5 * len(answers)  # where viewpoints suffice
     assert all(answered)
 
@@ -73,18 +93,25 @@ def test_an_answer_by_the_walls_says_what_it_stands_on(localizer: Localizer):
     topomap = localizer.topomap
     assert topomap.sides is not None
     with_sides = {summary.name for summary in topomap.sides.summaries}
-    by_walls = [(result, truth) for result, truth in _found_on_the_way_back() if _is_by_walls(result)]
+    by_walls = [
+        (result, truth) for result, truth in _found_on_the_way_back() if _is_by_walls(result)
+    ]
     assert len(by_walls) >= 3
     for result, truth in by_walls:
         assert isinstance(result, Localization)
         assert localizer.config.walls.min_found <= result.num_inliers <= result.num_matches
         assert 0.5 <= result.probability <= 1.0
-        node = topomap.summaries[result.node_id]  # an ordinary one, which saw the same wall from its other side
+        node = topomap.summaries[
+            result.node_id
+        ]  # an ordinary one, which saw the same wall from its other side
         assert node.name in with_sides
         assert 2.0 < truth.translation[1] - node.world_from_cam.translation[1] < 7.5
         assert len(result.candidates) == localizer.config.num_candidates
         assert result.times_ms["walls"] > 0.0
-        assert sum(ms for stage, ms in result.times_ms.items() if stage != "total") <= result.times_ms["total"]
+        assert (
+            sum(ms for stage, ms in result.times_ms.items() if stage != "total")
+            <= result.times_ms["total"]
+        )
         # the covariance covers the error, and would not cover a wrong corridor's length
         assert np.linalg.eigvalsh(result.covariance).min() > 0.0
         xi = (result.world_from_cam.inverse() @ truth).log()
@@ -99,15 +126,21 @@ def test_the_points_seen_are_handed_on(localizer: Localizer):
     assert isinstance(result, Localization)
     ((_, seen),) = named
     assert len(seen.points_img) == result.num_inliers
-    offsets = np.linalg.norm(WIDE.img_from_cam(truth.inverse().apply(seen.points_world)) - seen.points_img, axis=1)
+    offsets = np.linalg.norm(
+        WIDE.img_from_cam(truth.inverse().apply(seen.points_world)) - seen.points_img, axis=1
+    )
     assert np.median(offsets) < 3.0
 
 
-def test_the_walls_are_looked_at_once_for_all_maps(localizer: Localizer, monkeypatch: pytest.MonkeyPatch):
+def test_the_walls_are_looked_at_once_for_all_maps(
+    localizer: Localizer, monkeypatch: pytest.MonkeyPatch
+):
     extracted = list[tuple[int, ...]]()
     extract = propose_walls_module.extract_normalized
     monkeypatch.setattr(
-        propose_walls_module, "extract_normalized", lambda grey, config: extracted.append(grey.shape) or extract(grey, config)
+        propose_walls_module,
+        "extract_normalized",
+        lambda grey, config: extracted.append(grey.shape) or extract(grey, config),
     )
     image, _ = seen_on_the_way_back()[2]
     picture = Picture(image, WIDE)
@@ -140,26 +173,39 @@ def _elsewhere() -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
     pictures = {"noise": rng.integers(0, 256, (WIDE.height, WIDE.width), dtype=np.uint8)}
     pictures["blank"] = np.full((WIDE.height, WIDE.width), 120, np.uint8)
-    pictures["half blank"] = np.where(np.arange(WIDE.width) < 240, pictures["noise"], pictures["blank"])
+    pictures["half blank"] = np.where(
+        np.arange(WIDE.width) < 240, pictures["noise"], pictures["blank"]
+    )
     pictures |= {f"room {k}": render(room(), path_pose(k), WIDE)[0] for k in (1, 9)}
-    return pictures | {f"another corridor {k}": picture for k, (picture, _) in enumerate(seen_on_the_way_back(seed=5)[::2])}
+    return pictures | {
+        f"another corridor {k}": picture
+        for k, (picture, _) in enumerate(seen_on_the_way_back(seed=5)[::2])
+    }
 
 
 def test_pictures_from_elsewhere_are_refused(localizer: Localizer):
-    answered = [name for name, picture in _elsewhere().items() if isinstance(localizer.localize(picture, WIDE), Localization)]
+    answered = [
+        name
+        for name, picture in _elsewhere().items()
+        if isinstance(localizer.localize(picture, WIDE), Localization)
+    ]
     assert answered == []
 
 
 def test_a_wall_in_a_mirror_is_no_wall_of_the_map(localizer: Localizer):
     for picture, _ in seen_on_the_way_back()[::3]:
-        assert isinstance(localizer.localize(np.ascontiguousarray(picture[:, ::-1]), WIDE), NotLocalized)
+        assert isinstance(
+            localizer.localize(np.ascontiguousarray(picture[:, ::-1]), WIDE), NotLocalized
+        )
 
 
 def test_a_camera_that_is_not_known_or_sees_no_walls_gets_no_answer_by_them(localizer: Localizer):
     picture, truth = seen_on_the_way_back()[0]
     assert "walls" not in localizer.localize(picture, None).times_ms
     narrow = Camera.pinhole(480, 320, 900.0, 900.0, 239.5, 159.5)
-    assert isinstance(localizer.localize(render(corridor(), truth, narrow)[0], narrow), NotLocalized)
+    assert isinstance(
+        localizer.localize(render(corridor(), truth, narrow)[0], narrow), NotLocalized
+    )
 
 
 def _twice(topomap: TopoMetricMap, apart: float) -> TopoMetricMap:
@@ -169,40 +215,65 @@ def _twice(topomap: TopoMetricMap, apart: float) -> TopoMetricMap:
     moved = Rigid3(np.eye(3), np.array([0.0, apart, 0.0]))
     count, (model,) = len(sides.nodes), sides.coarse_models.values()
     copies = [
-        replace(node, summary=replace(node.summary, node_id=count + k, world_from_cam=moved @ node.summary.world_from_cam))
+        replace(
+            node,
+            summary=replace(
+                node.summary, node_id=count + k, world_from_cam=moved @ node.summary.world_from_cam
+            ),
+        )
         for k, node in enumerate(sides.nodes)
     ]
     nodes, ids = [*sides.nodes, *copies], model.arrays["node_ids"]
     arrays = dict(model.arrays) | {
         "vectors": np.concatenate([model.arrays["vectors"]] * 2),
         "node_ids": np.concatenate([ids, ids + count]).astype(ids.dtype),
-        "centres": np.concatenate([model.arrays["centres"], model.arrays["centres"] + moved.translation]),
+        "centres": np.concatenate(
+            [model.arrays["centres"], model.arrays["centres"] + moved.translation]
+        ),
     }
     models = {model.name: replace(model, arrays=arrays)}
-    return replace(topomap, sides=SideNodes([node.summary for node in nodes], nodes, models, sides.kind))
+    return replace(
+        topomap, sides=SideNodes([node.summary for node in nodes], nodes, models, sides.kind)
+    )
 
 
 def test_walls_that_stand_in_two_places_are_no_answer():
     localizer = Localizer(_twice(built_corridor(), apart=60.0))
-    results = [(localizer.localize(picture, WIDE), truth) for picture, truth in seen_on_the_way_back()[::2]]
+    results = [
+        (localizer.localize(picture, WIDE), truth) for picture, truth in seen_on_the_way_back()[::2]
+    ]
     assert not any(_is_by_walls(result) for result, _ in results)
-    assert all(_is_right(result, truth) for result, truth in results if isinstance(result, Localization))  # of viewpoints
+    assert all(
+        _is_right(result, truth) for result, truth in results if isinstance(result, Localization)
+    )  # of viewpoints
 
 
-def _by_the_walls(topomap: TopoMetricMap, picture: np.ndarray, config: WallsConfig | None = None) -> list[Hypothesis]:
+def _by_the_walls(
+    topomap: TopoMetricMap, picture: np.ndarray, config: WallsConfig | None = None
+) -> list[Hypothesis]:
     """What the walls let expect, whatever the nodes say; the likeliest first."""
     search = _search(topomap, picture, config)
     for proposal in propose_walls(search):
         hypothesis = hypothesis_of(search, proposal)
         if hypothesis is not None:
-            search.belief = search.belief.given(hypothesis, search.config.evidence, search.weights.rivals)
+            search.belief = search.belief.given(
+                hypothesis, search.config.evidence, search.weights.rivals
+            )
     return search.belief.ranked(search.weights.rivals)
 
 
-def _search(topomap: TopoMetricMap, picture: np.ndarray, config: WallsConfig | None = None) -> Search:
+def _search(
+    topomap: TopoMetricMap, picture: np.ndarray, config: WallsConfig | None = None
+) -> Search:
     open_map = OpenMap(topomap)
     resolved = LocalizerConfig(walls=config or WallsConfig()).for_kind(SURF)
-    return Search(Query(picture, WIDE, 1.0, open_map.feature_config), open_map, resolved, weights_of("surf"), rho=0.1)
+    return Search(
+        Query(picture, WIDE, 1.0, open_map.feature_config),
+        open_map,
+        resolved,
+        weights_of("surf"),
+        rho=0.1,
+    )
 
 
 def test_a_place_that_is_only_near_is_looked_at_again_from_the_pose_that_it_led_to():
@@ -223,7 +294,10 @@ def test_a_place_that_is_only_near_is_looked_at_again_from_the_pose_that_it_led_
 
 def test_poses_where_nodes_look_the_same_way_are_left_to_the_nodes():
     picture, truth = seen_ahead()[1]
-    assert not any(_is_pose(one.world_from_cam, truth) for one in _by_the_walls(built_corridor(), picture, WallsConfig(min_distance=0.0)))
+    assert not any(
+        _is_pose(one.world_from_cam, truth)
+        for one in _by_the_walls(built_corridor(), picture, WallsConfig(min_distance=0.0))
+    )
     picture, truth = seen_on_the_way_back()[2]
     assert _is_pose(_by_the_walls(built_corridor(), picture)[0].world_from_cam, truth)
     assert _by_the_walls(built_corridor(), picture, WallsConfig(min_distance=1e3)) == []
@@ -232,7 +306,9 @@ def test_poses_where_nodes_look_the_same_way_are_left_to_the_nodes():
 def test_walls_that_look_alike_elsewhere_have_less_for_them():
     """The points there are the same, and so tell nothing; and each place is named once."""
     picture, truth = seen_on_the_way_back()[2]
-    once, twice = (_by_the_walls(m, picture) for m in (built_corridor(), _twice(built_corridor(), apart=60.0)))
+    once, twice = (
+        _by_the_walls(m, picture) for m in (built_corridor(), _twice(built_corridor(), apart=60.0))
+    )
     assert _is_pose(once[0].world_from_cam, truth)
     assert len(twice) >= 2
     assert all(hypothesis.is_from_walls for hypothesis in (*once, *twice))
@@ -250,7 +326,10 @@ def test_learned_features_know_the_walls_where_the_map_has_them(tmp_path: Path):
     assert loaded.sides is not None
     assert loaded.sides.kind == find_kind(loaded.kinds[1]).kind_of_sides != loaded.kinds[1]
     assert loaded.by_kind(loaded.kinds[1]).sides is loaded.sides
-    localizer, learned = Localizer(loaded), Localizer(loaded, LocalizerConfig(kinds=(loaded.kinds[1],)))
+    localizer, learned = (
+        Localizer(loaded),
+        Localizer(loaded, LocalizerConfig(kinds=(loaded.kinds[1],))),
+    )
     for picture, truth in seen_on_the_way_back()[::2]:
         assert _is_right(localizer.localize(picture, WIDE), truth)
         result = learned.localize(picture, WIDE)
@@ -270,7 +349,9 @@ def test_walls_that_the_nodes_own_kind_describes_are_asked_still(monkeypatch: py
     network = learned_kind()
     with monkeypatch.context() as patch:  # as maps were, before walls had a network of their own
         patch.setitem(KINDS, network, replace(KINDS[network], sides=None))
-        topomap = build_map(WalkAhead(0), BuildConfig(features=FeatureConfig(kind=network), other_kinds=()))
+        topomap = build_map(
+            WalkAhead(0), BuildConfig(features=FeatureConfig(kind=network), other_kinds=())
+        )
     assert topomap.sides is not None
     assert topomap.sides.kind == network
     localizer = Localizer(topomap)
@@ -290,12 +371,16 @@ def test_from_a_file_the_same_is_answered(tmp_path: Path):
 
 SPOILT = {
     "no coarse model": "DELETE FROM side_coarse_models",
-    "the model of the nodes": "UPDATE side_coarse_models SET arrays = (SELECT arrays FROM coarse_models)",
+    "the model of the nodes": (
+        "UPDATE side_coarse_models SET arrays = (SELECT arrays FROM coarse_models)"
+    ),
 }
 
 
 @pytest.mark.parametrize("change", SPOILT.values(), ids=SPOILT.keys())
-def test_side_nodes_that_cannot_be_ranked_are_a_map_error_where_they_are_asked(tmp_path: Path, change: str):
+def test_side_nodes_that_cannot_be_ranked_are_a_map_error_where_they_are_asked(
+    tmp_path: Path, change: str
+):
     path = tmp_path / "corridor.topo"
     built_corridor().save(path)
     database = sqlite3.connect(path)

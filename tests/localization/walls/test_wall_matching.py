@@ -17,7 +17,14 @@ from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.local_map import LocalMap
-from topoloc.localization.walls.wall_matching import SeenSide, count_sides, estimate_pose, match_sides, nearest_sides, of_picture
+from topoloc.localization.walls.wall_matching import (
+    SeenSide,
+    count_sides,
+    estimate_pose,
+    match_sides,
+    nearest_sides,
+    of_picture,
+)
 from topoloc.map.topomap import SideNodes
 
 PICTURE, TRUTH = seen_on_the_way_back()[2]
@@ -32,7 +39,9 @@ def _sides() -> SideNodes:
 
 def _centres_and_axes() -> tuple[np.ndarray, np.ndarray]:
     (model,) = _sides().coarse_models.values()
-    return model.arrays["centres"], np.array([s.world_from_cam.rotation[:, 2] for s in _sides().summaries])
+    return model.arrays["centres"], np.array(
+        [s.world_from_cam.rotation[:, 2] for s in _sides().summaries]
+    )
 
 
 @cache
@@ -51,7 +60,9 @@ def _around() -> list[tuple[SeenSide, LocalMap]]:
     found = []
     for side in _seen():
         side_ids = nearest_sides(side.view, TRUTH.inverse(), centres, axes, 4)
-        found.append((side, LocalMap.pooled([LocalMap.of_node(_sides().nodes[k]) for k in side_ids])))
+        found.append(
+            (side, LocalMap.pooled([LocalMap.of_node(_sides().nodes[k]) for k in side_ids]))
+        )
     return found
 
 
@@ -63,7 +74,8 @@ def test_the_side_nodes_around_a_pose_show_the_wall_that_it_sees_whoever_stood_w
         assert 1 <= len(side_ids) <= 3
         to_the_right = (back(y) @ view.cam_from_side).rotation[0, 2]
         assert (centres[side_ids, 0] * to_the_right > 1.0).all()  # on the one wall
-        # who stands at y and looks back sees what is 1 to 3 wall distances behind y; its middle comes first
+        # who stands at y and looks back sees what is 1 to 3 wall distances behind y; its middle
+        # comes first
         off_middle = np.abs(centres[side_ids, 1] - (y - 2.2))
         assert off_middle[0] < 0.6
         assert off_middle.max() < 2.2
@@ -82,15 +94,24 @@ def test_matches_of_both_sides_lie_where_the_pose_puts_the_points():
     assert len(found.features) == sum(len(side.features) for side in _seen())
     assert len(found.local_map.radii) == sum(len(local_map.radii) for _, local_map in _around())
     points_world = found.local_map.points_world[found.matches.train_idx]
-    offsets = WIDE.img_from_cam(TRUTH.inverse().apply(points_world)) - found.features.points_img[found.matches.query_idx]
+    offsets = (
+        WIDE.img_from_cam(TRUTH.inverse().apply(points_world))
+        - found.features.points_img[found.matches.query_idx]
+    )
     assert np.median(np.linalg.norm(offsets, axis=1)) < 2.0
     for wall in (-1.1, 1.1):
         assert np.count_nonzero(np.abs(points_world[:, 0] - wall) < 0.1) > 50
     # the same feature once, at its own pixel
     assert len(set(found.matches.query_idx.tolist())) == len(found.matches)
     first = len(_seen()[0].features)
-    np.testing.assert_array_equal(found.features.points_img[first:], _seen()[1].in_picture.points_img)
-    cosines = np.sum(found.features.descriptors[found.matches.query_idx] * found.local_map.descriptors[found.matches.train_idx], axis=1)
+    np.testing.assert_array_equal(
+        found.features.points_img[first:], _seen()[1].in_picture.points_img
+    )
+    cosines = np.sum(
+        found.features.descriptors[found.matches.query_idx]
+        * found.local_map.descriptors[found.matches.train_idx],
+        axis=1,
+    )
     assert np.median(cosines) > 0.8
 
 
@@ -101,12 +122,18 @@ def test_at_a_wrong_pose_little_more_is_found_than_by_chance():
     assert at_truth is not None
     assert elsewhere is not None
     assert len(elsewhere.matches) < 0.5 * len(at_truth.matches)
-    assert count_sides(_around(), TRUTH.inverse(), GUIDED).num_by_chance < 0.4 * len(at_truth.matches)
+    assert count_sides(_around(), TRUTH.inverse(), GUIDED).num_by_chance < 0.4 * len(
+        at_truth.matches
+    )
 
 
 def test_visible_points_are_counted_by_what_they_cover_not_by_how_many_nodes_hold_them():
     once = count_sides(_around(), TRUTH.inverse(), GUIDED)
-    twice = count_sides([(side, LocalMap.pooled([points, points])) for side, points in _around()], TRUTH.inverse(), GUIDED)
+    twice = count_sides(
+        [(side, LocalMap.pooled([points, points])) for side, points in _around()],
+        TRUTH.inverse(),
+        GUIDED,
+    )
     assert 100 < once.num_visible == twice.num_visible
 
 
@@ -114,13 +141,18 @@ def test_what_must_be_seen_lies_in_the_picture_where_the_points_are():
     counts = count_sides(_around(), TRUTH.inverse(), GUIDED)
     assert counts.agreeing_img is None  # SURF says nothing of what is not found
     assert 100 < len(counts.visible_img) <= 2 * 512
-    points_img = np.concatenate([WIDE.img_from_cam(TRUTH.inverse().apply(points.points_world)) for _, points in _around()])
-    offsets = np.nanmin(np.linalg.norm(counts.visible_img[:, None] - points_img[None], axis=2), axis=1)
+    points_img = np.concatenate(
+        [WIDE.img_from_cam(TRUTH.inverse().apply(points.points_world)) for _, points in _around()]
+    )
+    offsets = np.nanmin(
+        np.linalg.norm(counts.visible_img[:, None] - points_img[None], axis=2), axis=1
+    )
     assert offsets.max() < 2.0  # pixels of the side view are rounded
 
 
 def test_the_pose_of_both_sides_is_refined_round_by_round_from_one_that_is_near():
-    """Matches around a pose that is not yet right draw it towards themselves, so once is not enough."""
+    """Matches around a pose that is not yet right draw it towards themselves, so once is not
+    enough."""
     world_from_cam = Rigid3(TRUTH.rotation, TRUTH.translation + np.array([0.03, -0.06, 0.02]))
     config = AbsolutePoseConfig(max_reprojection_error_px=6.0, sigma_px=2.0)
     for _ in range(3):

@@ -30,18 +30,28 @@ def _named(index: WallIndex, views: list[SideView]) -> list[NamedPlaces]:
     return [NamedPlaces.of(view, index, np.ones(len(index.axes), np.float32)) for view in views]
 
 
-def test_each_side_node_names_a_place_that_looks_back_at_its_wall(index: WallIndex, views: list[SideView]):
+def test_each_side_node_names_a_place_that_looks_back_at_its_wall(
+    index: WallIndex, views: list[SideView]
+):
     named = _named(index, views)
-    assert sum(len(of_view.likeness) for of_view in named) == len(index.axes)  # to the left who comes back sees what was to the right
+    assert sum(len(of_view.likeness) for of_view in named) == len(
+        index.axes
+    )  # to the left who comes back sees what was to the right
     for view, of_view in zip(views, named, strict=True):
         assert (of_view.rotations[:, :, 2] @ back(5.0).rotation[:, 2] > 0.9).all()
         for rotation, centre in zip(of_view.rotations, of_view.centres, strict=True):
             side_from_world = view.from_world(Rigid3(rotation, centre).inverse())
             pixels = view.camera.img_from_cam(side_from_world.apply(index.centres))
-            assert ((pixels > 0).all(axis=1) & (pixels[:, 0] < view.camera.width) & (pixels[:, 1] < view.camera.height)).any()
+            assert (
+                (pixels > 0).all(axis=1)
+                & (pixels[:, 0] < view.camera.width)
+                & (pixels[:, 1] < view.camera.height)
+            ).any()
 
 
-def test_a_place_that_both_views_name_comes_before_one_that_is_more_like_one_of_them(index: WallIndex, views: list[SideView]):
+def test_a_place_that_both_views_name_comes_before_one_that_is_more_like_one_of_them(
+    index: WallIndex, views: list[SideView]
+):
     """Along the corridor (y): both views a little like one place, one view more like another."""
     named = _named(index, views)
     ways = [of_view.centres[:, 1] for of_view in named]

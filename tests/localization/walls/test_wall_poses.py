@@ -15,19 +15,24 @@ NUM_POINTS, NODE_DEPTH = 60, 1.4
 
 @dataclass(frozen=True, eq=False)
 class Wall:
-    """A wall before an upright camera, and where another one sees its points; row k of both is a match, right where `is_right`."""
+    """A wall before an upright camera, and where another one sees its points; row k of both is a
+    match, right where `is_right`."""
 
     points: np.ndarray
     seen: np.ndarray
     is_right: np.ndarray
 
 
-def _wall(side_from_node: Rigid3, share_wrong: float = 0.0, seed: int = 0, thickness: float = 0.0) -> Wall:
-    """A wall 1.4 m before the node's side camera, seen from `side_from_node`; things on it stand out by up to `thickness`, and a share of
-    the matches is wrong."""
+def _wall(
+    side_from_node: Rigid3, share_wrong: float = 0.0, seed: int = 0, thickness: float = 0.0
+) -> Wall:
+    """A wall 1.4 m before the node's side camera, seen from `side_from_node`; things on it stand
+    out by up to `thickness`, and a share of the matches is wrong."""
     rng = np.random.default_rng(seed)
     across, up = rng.uniform(-1.25, 1.25, NUM_POINTS), rng.uniform(-1.0, 1.0, NUM_POINTS)
-    points_node = np.column_stack([across + 2.75, up, NODE_DEPTH - rng.uniform(0.0, thickness, NUM_POINTS)])
+    points_node = np.column_stack(
+        [across + 2.75, up, NODE_DEPTH - rng.uniform(0.0, thickness, NUM_POINTS)]
+    )
     wrong = rng.random(NUM_POINTS) < share_wrong
     rows = np.arange(NUM_POINTS)
     rows[wrong] = rng.integers(0, NUM_POINTS, np.count_nonzero(wrong))
@@ -45,16 +50,20 @@ def _side_from_node(found: tuple[int, Rigid3] | None) -> Rigid3:
 
 
 def _upright(turn: float, along: float, up: float, nearer: float) -> Rigid3:
-    """Turned about the vertical, then moved; about the middle of the wall, so that it stays in view."""
+    """Turned about the vertical, then moved; about the middle of the wall, so that it stays in
+    view."""
     rotation, middle = exp_so3(np.array([0.0, turn, 0.0])), np.array([2.75, 0.0, NODE_DEPTH])
     return Rigid3(rotation, middle - rotation @ middle + np.array([along, up, -nearer]))
 
 
 def test_the_pose_is_found_among_wrong_matches():
-    """Of many views nearly all: where half of the matches are wrong, some of them may agree on another pose as well as the right ones."""
+    """Of many views nearly all: where half of the matches are wrong, some of them may agree on
+    another pose as well as the right ones."""
     rng, near = np.random.default_rng(0), list[bool]()
     while len(near) < 400:
-        turn, along, up, nearer, share_wrong = rng.uniform([-0.35, -7.0, -0.5, -1.5, 0.0], [0.35, 1.0, 0.5, 0.5, 0.6])
+        turn, along, up, nearer, share_wrong = rng.uniform(
+            [-0.35, -7.0, -0.5, -1.5, 0.0], [0.35, 1.0, 0.5, 0.5, 0.6]
+        )
         truth = _upright(turn, along, up, nearer)
         wall = _wall(truth, share_wrong, seed=len(near))
         if not (truth.apply(wall.points)[:, 2] > 0.3).all():
@@ -62,9 +71,13 @@ def test_the_pose_is_found_among_wrong_matches():
         num_right = np.count_nonzero(wall.is_right)
         found = _asked(wall)
         assert found is not None
-        assert num_right - 1 <= found[0] < num_right + 0.25 * NUM_POINTS  # of many pairs not the very best may be drawn
+        assert (
+            num_right - 1 <= found[0] < num_right + 0.25 * NUM_POINTS
+        )  # of many pairs not the very best may be drawn
         angle = np.rad2deg((_side_from_node(found) @ truth.inverse()).angle())
-        metres = np.linalg.norm(_side_from_node(found).inverse().translation - truth.inverse().translation)
+        metres = np.linalg.norm(
+            _side_from_node(found).inverse().translation - truth.inverse().translation
+        )
         near.append(bool(angle < 6.0 and metres < 0.15 * (NODE_DEPTH - nearer) + 0.1))
     assert np.mean(near) > 0.98
 
@@ -81,11 +94,16 @@ def test_of_the_two_poses_of_a_plane_the_upright_one_is_found(turn: float):
 @pytest.mark.parametrize("not_level", [(0.03, 0.0), (0.0, 0.03), (-0.02, -0.02)])
 def test_a_camera_that_is_not_quite_level_is_found_all_the_same(not_level: tuple[float, float]):
     pitch, roll = not_level
-    truth = Rigid3(exp_so3(np.array([pitch, 0.0, roll])), np.zeros(3)) @ _upright(0.1, -4.0, 0.0, 0.2)
+    truth = Rigid3(exp_so3(np.array([pitch, 0.0, roll])), np.zeros(3)) @ _upright(
+        0.1, -4.0, 0.0, 0.2
+    )
     found = _asked(_wall(truth, share_wrong=0.3, thickness=0.1))
     assert found is not None
     assert found[0] > 0.4 * NUM_POINTS
-    assert np.linalg.norm(_side_from_node(found).inverse().translation - truth.inverse().translation) < 0.35
+    assert (
+        np.linalg.norm(_side_from_node(found).inverse().translation - truth.inverse().translation)
+        < 0.35
+    )
 
 
 def test_a_wall_and_its_mirror_image_have_no_pose_in_common():
@@ -120,7 +138,9 @@ def test_three_that_agree_are_enough_and_three_that_do_not_are_none():
 @pytest.mark.parametrize("turn", [0.9, -0.9])
 def test_cameras_turned_by_too_much_are_not_considered(turn: float):
     found = _asked(_wall(_upright(turn, 0.0, 0.0, -2.5)))
-    assert found is None or np.rad2deg(_side_from_node(found).angle()) < 35.1  # the other pose of a plane may be turned by less
+    assert (
+        found is None or np.rad2deg(_side_from_node(found).angle()) < 35.1
+    )  # the other pose of a plane may be turned by less
 
 
 def test_matches_of_one_point_alone_give_none():

@@ -1,4 +1,5 @@
-"""Weights are found again from poses drawn with known ones; what is right, wrong or lies between; the command's file is one that ships."""
+"""Weights are found again from poses drawn with known ones; what is right, wrong or lies between;
+the command's file is one that ships."""
 
 from __future__ import annotations
 
@@ -11,7 +12,14 @@ import numpy as np
 import pytest
 
 from topoloc.localization.evidence import Evidence, log_odds_of, node_log_odds
-from topoloc.localization.fitted_weights import EvidenceWeights, FittedWeights, RivalWeights, SharedErrorWeights, read_weights, weights_of
+from topoloc.localization.fitted_weights import (
+    EvidenceWeights,
+    FittedWeights,
+    RivalWeights,
+    SharedErrorWeights,
+    read_weights,
+    weights_of,
+)
 from topoloc_paper.fit import __main__ as command
 from topoloc_paper.fit.evidence import (
     Judged,
@@ -27,15 +35,38 @@ from topoloc_paper.fit.rivals import MIN_HARD_PAIRS, fit_rivals, num_mistaken, p
 from topoloc_paper.fit.tried_poses import TriedPose, load_poses, save_poses
 from topoloc_paper.fit.walls import MIN_POSES, fit_walls
 
-TRUE = EvidenceWeights(even_share=2.0, chance=1.0, inliers=0.3, inlier_share=1.5, spread=0.5, doubt=-0.5, bias=7.0, clear_log_odds=4.5)
+TRUE = EvidenceWeights(
+    even_share=2.0,
+    chance=1.0,
+    inliers=0.3,
+    inlier_share=1.5,
+    spread=0.5,
+    doubt=-0.5,
+    bias=7.0,
+    clear_log_odds=4.5,
+)
 PRIOR = replace(TRUE, even_share=1.0, inliers=1.0, bias=4.0)
 RIGHT, WRONG, BETWEEN = (0.01, 0.2), (3.0, 5.0), (0.3, 5.0)
 MAPS = ("corridor_map", "demo/map_lap1", "seven_scenes/kitchen@0-59/100")
 
 
-def _pose(error: tuple[float, float] | None, evidence: Evidence, index: int = 0, mapping: str = MAPS[0]) -> TriedPose:
+def _pose(
+    error: tuple[float, float] | None, evidence: Evidence, index: int = 0, mapping: str = MAPS[0]
+) -> TriedPose:
     metres, degrees = error or (None, None)
-    return TriedPose(mapping, mapping, index, "as it is", metres, degrees, 8.0, evidence, None, 6.0 if error else None, 0.02)
+    return TriedPose(
+        mapping,
+        mapping,
+        index,
+        "as it is",
+        metres,
+        degrees,
+        8.0,
+        evidence,
+        None,
+        6.0 if error else None,
+        0.02,
+    )
 
 
 def _evidence(rng: np.random.Generator) -> Evidence:
@@ -43,12 +74,26 @@ def _evidence(rng: np.random.Generator) -> Evidence:
     found = int(visible * rng.beta(1.0, 4.0)) + 12
     matches = int(rng.integers(10, 200))
     inliers = int(matches * rng.beta(1.0, 2.0))
-    spread, doubt, even = rng.uniform(0.05, 0.9), rng.lognormal(-1.0, 1.0), float(rng.beta(1.0, 8.0))
-    return Evidence(matches, inliers, found, visible, int(rng.integers(0, 60)), float(spread), float(doubt), even)
+    spread, doubt, even = (
+        rng.uniform(0.05, 0.9),
+        rng.lognormal(-1.0, 1.0),
+        float(rng.beta(1.0, 8.0)),
+    )
+    return Evidence(
+        matches,
+        inliers,
+        found,
+        visible,
+        int(rng.integers(0, 60)),
+        float(spread),
+        float(doubt),
+        even,
+    )
 
 
 def _drawn(num: int, seed: int = 0) -> list[TriedPose]:
-    """Poses that are right with the probability that `TRUE` gives them; the wrong ones are of the place itself."""
+    """Poses that are right with the probability that `TRUE` gives them; the wrong ones are of the
+    place itself."""
     rng, poses = np.random.default_rng(seed), []
     for k in range(num):
         evidence = _evidence(rng)
@@ -71,22 +116,33 @@ def test_weights_that_poses_were_drawn_with_are_found_again():
     assert np.corrcoef(there.log_odds, here.log_odds)[0, 1] > 0.99
     assert calibration_error(here.log_odds, here.is_right) < 0.06
     assert fitted.doubt == -0.5
-    clearest = max(odds for odds, pose in zip(judged("", poses, fitted).log_odds, poses, strict=True) if pose.is_wrong)
+    clearest = max(
+        odds
+        for odds, pose in zip(judged("", poses, fitted).log_odds, poses, strict=True)
+        if pose.is_wrong
+    )
     assert fitted.clear_log_odds > clearest
 
 
 def test_a_picture_from_elsewhere_lowers_the_bias_until_it_is_not_believed():
     poses = _drawn(1500)
-    strongest = max((pose.evidence for pose in poses), key=lambda evidence: node_log_odds(evidence, TRUE))
+    strongest = max(
+        (pose.evidence for pose in poses), key=lambda evidence: node_log_odds(evidence, TRUE)
+    )
     fitted = fit_evidence([*poses, _pose(None, strongest)], PRIOR, 0.1)
-    assert 1.0 / (1.0 + math.exp(-node_log_odds(strongest, fitted))) == pytest.approx(0.35, abs=1e-6)
+    assert 1.0 / (1.0 + math.exp(-node_log_odds(strongest, fitted))) == pytest.approx(
+        0.35, abs=1e-6
+    )
     assert fitted.bias < fit_evidence(poses, PRIOR, 0.1).bias - 1.0
 
 
 def test_every_family_is_judged_by_a_fit_without_it():
     poses = _drawn(3000)
     # in one family the evidence says the opposite: only a fit that has seen it could know
-    turned = [replace(pose, error_m=3.0 if pose.is_right else 0.01) if pose.mapping == MAPS[0] else pose for pose in poses]
+    turned = [
+        replace(pose, error_m=3.0 if pose.is_right else 0.01) if pose.mapping == MAPS[0] else pose
+        for pose in poses
+    ]
     held_out = {part.family: part for part in try_on_others(turned, PRIOR, 0.1)}
     assert set(held_out) == {"corridor", "lab", "kitchen"}
     assert calibration_error(held_out["corridor"].log_odds, held_out["corridor"].is_right) > 0.3
@@ -96,11 +152,15 @@ def test_every_family_is_judged_by_a_fit_without_it():
 def test_few_poses_stay_with_the_prior_and_the_strength_follows_what_was_not_fitted_to():
     poses = _drawn(90)
     assert fit_evidence(poses, TRUE, 1e4).in_order == pytest.approx(TRUE.in_order, abs=0.01)
-    assert best_strength(poses, TRUE) > best_strength(_drawn(3000), replace(PRIOR, even_share=0.2, bias=-2.0))
+    assert best_strength(poses, TRUE) > best_strength(
+        _drawn(3000), replace(PRIOR, even_share=0.2, bias=-2.0)
+    )
 
 
 def test_calibration_error_is_the_mean_gap_of_what_would_be_answered():
-    log_odds = np.array([math.log(9.0)] * 10 + [-3.0] * 50)  # ten answers of 0.9, of which six are right
+    log_odds = np.array(
+        [math.log(9.0)] * 10 + [-3.0] * 50
+    )  # ten answers of 0.9, of which six are right
     part = Judged("any", log_odds, np.array([True] * 6 + [False] * 4 + [True] * 50))
     assert calibration_error(part.log_odds, part.is_right) == pytest.approx(0.3)
 
@@ -111,7 +171,12 @@ def test_shared_errors_put_95_percent_inside():
 
     def poses(true_rho: float, said_rho: float) -> list[TriedPose]:
         inflation = 1.0 + evidence.num_found * true_rho
-        return [replace(_pose(RIGHT, evidence), square=float(inflation * rng.chisquare(6)), rho=said_rho) for _ in range(4000)]
+        return [
+            replace(
+                _pose(RIGHT, evidence), square=float(inflation * rng.chisquare(6)), rho=said_rho
+            )
+            for _ in range(4000)
+        ]
 
     fitted = fit_shared_errors([*poses(0.03, 0.02), *poses(0.02, 0.005)], before)
     assert fitted.factor == pytest.approx(3.0, rel=0.15)
@@ -121,9 +186,16 @@ def test_shared_errors_put_95_percent_inside():
 
 
 def test_pairs_are_of_one_picture_and_too_few_of_them_change_nothing():
-    strong, weak = Evidence(150, 90, 300, 900, 20, 0.8, 0.1, 0.3), Evidence(150, 60, 250, 900, 20, 0.7, 0.3, 0.05)
+    strong, weak = (
+        Evidence(150, 90, 300, 900, 20, 0.8, 0.1, 0.3),
+        Evidence(150, 60, 250, 900, 20, 0.7, 0.3, 0.05),
+    )
     before = RivalWeights(0.3, 6.0, -3.0, 2.0)
-    poses = [pose for k in range(MIN_HARD_PAIRS) for pose in (_pose(RIGHT, strong, k), _pose(WRONG, weak, k))]
+    poses = [
+        pose
+        for k in range(MIN_HARD_PAIRS)
+        for pose in (_pose(RIGHT, strong, k), _pose(WRONG, weak, k))
+    ]
     differences, is_hard = pairs_of(poses, TRUE)
     assert len(differences) == MIN_HARD_PAIRS
     assert is_hard.all()
@@ -136,13 +208,17 @@ def test_pairs_are_of_one_picture_and_too_few_of_them_change_nothing():
     assert len(pairs_of([replace(pose, error_m=None) for pose in poses], TRUE)[0]) == 0
 
 
-def test_the_command_writes_a_file_that_ships(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+def test_the_command_writes_a_file_that_ships(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
     kept, out = (tmp_path / "a.json", tmp_path / "b.json"), tmp_path / "sift.json"
     poses = _drawn(900)
     save_poses(poses[:450], kept[0])
     save_poses(poses[450:], kept[1])
     assert load_poses(kept[0]) == poses[:450]
-    monkeypatch.setattr(sys, "argv", ["fit", "--kind", "sift", "--load", *map(str, kept), "--out", str(out)])
+    monkeypatch.setattr(
+        sys, "argv", ["fit", "--kind", "sift", "--load", *map(str, kept), "--out", str(out)]
+    )
     command.main()
     weights = read_weights(out)
     assert weights.kind == "sift"
@@ -153,10 +229,17 @@ def test_the_command_writes_a_file_that_ships(tmp_path: Path, monkeypatch: pytes
     assert "corridor, fitted without it" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("kind", "said"), [("orb", "no features of kind 'orb'"), ("sift", "right and wrong poses of two families")])
-def test_what_cannot_be_fitted_is_told_in_one_line(kind: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [("orb", "no features of kind 'orb'"), ("sift", "right and wrong poses of two families")],
+)
+def test_what_cannot_be_fitted_is_told_in_one_line(
+    kind: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     save_poses([pose for pose in _drawn(50) if pose.is_wrong], tmp_path / "poses.json")
-    monkeypatch.setattr(sys, "argv", ["fit", "--kind", kind, "--load", str(tmp_path / "poses.json")])
+    monkeypatch.setattr(
+        sys, "argv", ["fit", "--kind", kind, "--load", str(tmp_path / "poses.json")]
+    )
     with pytest.raises(SystemExit, match=said):
         command.main()
 
@@ -165,7 +248,11 @@ def _on_walls(num: int, weights: FittedWeights, seed: int = 0) -> list[TriedPose
     """Poses that walls let expect, right with the probability that these weights give them."""
     rng, poses = np.random.default_rng(seed), []
     for k in range(num):
-        evidence = replace(_evidence(rng), num_distinct=int(rng.integers(0, 60)), num_lesser_side=int(rng.integers(0, 40)))
+        evidence = replace(
+            _evidence(rng),
+            num_distinct=int(rng.integers(0, 60)),
+            num_lesser_side=int(rng.integers(0, 40)),
+        )
         is_right = rng.random() < 1.0 / (1.0 + math.exp(-log_odds_of(evidence, weights)))
         poses.append(_pose(RIGHT if is_right else WRONG, evidence, k))
     return poses
@@ -173,11 +260,17 @@ def _on_walls(num: int, weights: FittedWeights, seed: int = 0) -> list[TriedPose
 
 def test_the_weights_of_walls_are_found_again_and_left_alone_where_poses_are_few():
     before = weights_of("surf")
-    true = replace(before, walls=replace(before.walls, spread=2.0, lesser_side=0.7, bias=before.walls.bias - 3.5))
+    true = replace(
+        before,
+        walls=replace(before.walls, spread=2.0, lesser_side=0.7, bias=before.walls.bias - 3.5),
+    )
     fitted, num = fit_walls(_on_walls(4000, true), before.walls)
     assert num == 4000
     told = _on_walls(500, true, seed=1)
-    there, here = (np.array([log_odds_of(pose.evidence, weights) for pose in told]) for weights in (true, replace(before, walls=fitted)))
+    there, here = (
+        np.array([log_odds_of(pose.evidence, weights) for pose in told])
+        for weights in (true, replace(before, walls=fitted))
+    )
     assert np.mean(np.abs(there - here)) < 0.4
     assert np.mean(np.abs(there - [log_odds_of(pose.evidence, before) for pose in told])) > 1.0
     assert fitted.doubt == before.walls.doubt

@@ -1,4 +1,5 @@
-"""Recordings written as bags by the formats' own libraries: ROS 1 and ROS 2 by rosbags, MCAP by mcap's writer."""
+"""Recordings written as bags by the formats' own libraries: ROS 1 and ROS 2 by rosbags, MCAP by
+mcap's writer."""
 
 from __future__ import annotations
 
@@ -25,7 +26,9 @@ from topoloc.sequences.frame import StereoFrame, StereoSequence
 LEFT, RIGHT = "/left/image_rect", "/right/image_rect"
 KINDS = ("ros1", "ros1-lz4", "ros2", "ros2-mcap", "mcap-zstd")
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
-ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+ROS1.register(
+    get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage")
+)
 ROS2 = get_typestore(Stores.ROS2_HUMBLE)
 # Writes one message of a type to a topic: (topic, type, time in ns, fields).
 Write = Callable[[str, str, int, dict[str, Any]], None]
@@ -43,7 +46,17 @@ def message(store: Any, kind: str, fields: dict[str, Any]) -> Any:
         elif value is None and node == 2:
             value = message(store, of, {})
         elif value is None:
-            value = np.zeros(of[1]) if node == 3 else [] if node == 4 else "" if of[0] == "string" else False if of[0] == "bool" else 0
+            value = (
+                np.zeros(of[1])
+                if node == 3
+                else []
+                if node == 4
+                else ""
+                if of[0] == "string"
+                else False
+                if of[0] == "bool"
+                else 0
+            )
         made[name] = value
     return store.types[kind](**made)
 
@@ -70,7 +83,11 @@ def bag_writer(path: Path, kind: str) -> Iterator[Write]:
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, type_name, typestore=store)
             made = message(store, type_name, fields)
-            data = store.serialize_ros1(made, type_name) if is_ros1 else store.serialize_cdr(made, type_name)
+            data = (
+                store.serialize_ros1(made, type_name)
+                if is_ros1
+                else store.serialize_cdr(made, type_name)
+            )
             writer.write(connections[topic], t_ns, data)
 
         yield write
@@ -87,7 +104,9 @@ def _mcap_writer(path: Path) -> Iterator[Write]:
         def write(topic: str, type_name: str, t_ns: int, fields: dict[str, Any], /) -> None:
             if topic not in channels:
                 text = ROS2.generate_msgdef(type_name, ros_version=2)[0].encode()
-                channels[topic] = writer.register_channel(topic, "cdr", writer.register_schema(type_name, "ros2msg", text))
+                channels[topic] = writer.register_channel(
+                    topic, "cdr", writer.register_schema(type_name, "ros2msg", text)
+                )
             data = bytes(ROS2.serialize_cdr(message(ROS2, type_name, fields), type_name))
             writer.add_message(channels[topic], t_ns, data, t_ns)
 
@@ -100,26 +119,44 @@ def header(t_ns: int, frame: str = "left_optical") -> dict[str, Any]:
     return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame}
 
 
-def image(pixels: np.ndarray, t_ns: int, encoding: str | None = None, frame: str = "left_optical") -> dict[str, Any]:
+def image(
+    pixels: np.ndarray, t_ns: int, encoding: str | None = None, frame: str = "left_optical"
+) -> dict[str, Any]:
     """A sensor_msgs/Image, its rows padded by three bytes."""
     encoding = encoding or ("mono8" if pixels.ndim == 2 else "rgb8")
     rows = np.ascontiguousarray(pixels).view(np.uint8).reshape(len(pixels), -1)
     data = np.pad(rows, ((0, 0), (0, 3)))
-    fields = {"header": header(t_ns, frame), "height": pixels.shape[0], "width": pixels.shape[1], "encoding": encoding}
+    fields = {
+        "header": header(t_ns, frame),
+        "height": pixels.shape[0],
+        "width": pixels.shape[1],
+        "encoding": encoding,
+    }
     return fields | {"is_bigendian": 0, "step": data.shape[1], "data": data.ravel()}
 
 
 def compressed(pixels: np.ndarray, t_ns: int, suffix: str = ".png") -> dict[str, Any]:
     """A sensor_msgs/CompressedImage."""
     bgr = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
-    return {"header": header(t_ns), "format": suffix[1:], "data": cv2.imencode(suffix, bgr)[1].ravel()}
+    return {
+        "header": header(t_ns),
+        "format": suffix[1:],
+        "data": cv2.imencode(suffix, bgr)[1].ravel(),
+    }
 
 
-def info(camera: Camera, t_ns: int, baseline: float = 0.0, frame: str = "left_optical", **fields: Any) -> dict[str, Any]:
+def info(
+    camera: Camera, t_ns: int, baseline: float = 0.0, frame: str = "left_optical", **fields: Any
+) -> dict[str, Any]:
     """A sensor_msgs/CameraInfo of a pinhole; the right camera of a pair with its `baseline`."""
     k = camera.matrix()
     p = np.column_stack([k, [-camera.fx * baseline, 0.0, 0.0]])
-    its = {"header": header(t_ns, frame), "height": camera.height, "width": camera.width, "distortion_model": "plumb_bob"}
+    its = {
+        "header": header(t_ns, frame),
+        "height": camera.height,
+        "width": camera.width,
+        "distortion_model": "plumb_bob",
+    }
     return its | {"d": np.zeros(5), "k": k.ravel(), "r": np.eye(3).ravel(), "p": p.ravel()} | fields
 
 
@@ -134,30 +171,61 @@ def transform(pose: Rigid3, t_ns: int, parent: str, child: str) -> dict[str, Any
 def as_pose(pose: Rigid3) -> dict[str, Any]:
     w, x, y, z = pose.quat_wxyz()
     tx, ty, tz = pose.translation
-    return {"position": {"x": tx, "y": ty, "z": tz}, "orientation": {"x": x, "y": y, "z": z, "w": w}}
+    return {
+        "position": {"x": tx, "y": ty, "z": tz},
+        "orientation": {"x": x, "y": y, "z": z, "w": w},
+    }
 
 
 def by_tf(write: Write, t_ns: int, world_from_cam: Rigid3) -> None:
     """A body that moves, and a camera fixed to it."""
     body_from_cam = Rigid3.exp(np.array([0.1, -0.2, 0.05, 0.3, 1.2, -0.4]))
     kind = "tf2_msgs/msg/TFMessage"
-    write("/tf", kind, t_ns, {"transforms": [transform(world_from_cam @ body_from_cam.inverse(), t_ns, "map", "base_link")]})
-    write("/tf_static", kind, t_ns, {"transforms": [transform(body_from_cam, t_ns, "base_link", "left_optical")]})
+    write(
+        "/tf",
+        kind,
+        t_ns,
+        {
+            "transforms": [
+                transform(world_from_cam @ body_from_cam.inverse(), t_ns, "map", "base_link")
+            ]
+        },
+    )
+    write(
+        "/tf_static",
+        kind,
+        t_ns,
+        {"transforms": [transform(body_from_cam, t_ns, "base_link", "left_optical")]},
+    )
 
 
 def by_pose(write: Write, t_ns: int, world_from_cam: Rigid3) -> None:
-    write("/pose", "geometry_msgs/msg/PoseStamped", t_ns, {"header": header(t_ns, "map"), "pose": as_pose(world_from_cam)})
+    write(
+        "/pose",
+        "geometry_msgs/msg/PoseStamped",
+        t_ns,
+        {"header": header(t_ns, "map"), "pose": as_pose(world_from_cam)},
+    )
 
 
 def by_odometry(write: Write, t_ns: int, world_from_cam: Rigid3) -> None:
-    fields = {"header": header(t_ns, "odom"), "child_frame_id": "left_optical", "pose": {"pose": as_pose(world_from_cam)}}
+    fields = {
+        "header": header(t_ns, "odom"),
+        "child_frame_id": "left_optical",
+        "pose": {"pose": as_pose(world_from_cam)},
+    }
     write("/odom", "nav_msgs/msg/Odometry", t_ns, fields)
 
 
 def write_stereo_bag(
-    path: Path, kind: str, sequence: StereoSequence, poses: Callable[[Write, int, Rigid3], None] = by_tf, is_compressed: bool = False
+    path: Path,
+    kind: str,
+    sequence: StereoSequence,
+    poses: Callable[[Write, int, Rigid3], None] = by_tf,
+    is_compressed: bool = False,
 ) -> Path:
-    """A stereo recording of rectified pairs as a bag. Its messages are written some milliseconds after their own times."""
+    """A stereo recording of rectified pairs as a bag. Its messages are written some milliseconds
+    after their own times."""
     with bag_writer(path, kind) as write:
         for index in range(len(sequence)):
             frame = sequence[index]
@@ -166,33 +234,61 @@ def write_stereo_bag(
             now = frame.t_ns + 7_000_000 + index % 3 * 1_000_000
             for topic, pixels in ((LEFT, frame.image), (RIGHT, frame.right)):
                 if is_compressed:
-                    write(f"{topic}/compressed", "sensor_msgs/msg/CompressedImage", now, compressed(pixels, frame.t_ns))
+                    write(
+                        f"{topic}/compressed",
+                        "sensor_msgs/msg/CompressedImage",
+                        now,
+                        compressed(pixels, frame.t_ns),
+                    )
                 else:
                     write(topic, "sensor_msgs/msg/Image", now, image(pixels, frame.t_ns))
-            for topic, camera, baseline in (("/left", frame.rig.left, 0.0), ("/right", frame.rig.right, frame.rig.baseline)):
-                write(f"{topic}/camera_info", "sensor_msgs/msg/CameraInfo", now, info(camera, frame.t_ns, baseline))
+            for topic, camera, baseline in (
+                ("/left", frame.rig.left, 0.0),
+                ("/right", frame.rig.right, frame.rig.baseline),
+            ):
+                write(
+                    f"{topic}/camera_info",
+                    "sensor_msgs/msg/CameraInfo",
+                    now,
+                    info(camera, frame.t_ns, baseline),
+                )
             if frame.world_from_cam is not None:
                 poses(write, frame.t_ns, frame.world_from_cam)
     return path
 
 
-FOXGLOVE = {"CompressedImage": "/camera/image", "CameraCalibration": "/camera/calibration", "PoseInFrame": "/pose"}
+FOXGLOVE = {
+    "CompressedImage": "/camera/image",
+    "CameraCalibration": "/camera/calibration",
+    "PoseInFrame": "/pose",
+}
 
 
-def write_foxglove(path: Path, sequence: StereoSequence, classes: dict[str, Any] | None = None) -> Path:
-    """The left pictures of a recording by Foxglove's schemas, as JSON, or as protobuf by the message `classes`."""
+def write_foxglove(
+    path: Path, sequence: StereoSequence, classes: dict[str, Any] | None = None
+) -> Path:
+    """The left pictures of a recording by Foxglove's schemas, as JSON, or as protobuf by the
+    message `classes`."""
     with path.open("wb") as file:
         writer = McapWriter(file)
         writer.start()
         channels = {}
         for name, topic in FOXGLOVE.items():
-            schema = ("jsonschema", b"{}") if classes is None else ("protobuf", classes[name].file_set)
+            schema = (
+                ("jsonschema", b"{}") if classes is None else ("protobuf", classes[name].file_set)
+            )
             number = writer.register_schema(f"foxglove.{name}", *schema)
-            channels[name] = writer.register_channel(topic, "json" if classes is None else "protobuf", number)
+            channels[name] = writer.register_channel(
+                topic, "json" if classes is None else "protobuf", number
+            )
         for index in range(len(sequence)):
             t_ns = sequence.t_ns[index]
             for name, fields in _foxglove_fields(sequence[index]).items():
-                data = _as_json(fields, t_ns) if classes is None else classes[name].written(fields, t_ns)
+                data = (
+                    _as_json(fields, t_ns)
+                    if classes is None
+                    else classes[name].written(fields, t_ns)
+                )
                 writer.add_message(channels[name], t_ns, data, t_ns)
         writer.finish()
     return path
@@ -204,9 +300,18 @@ def _foxglove_fields(frame: StereoFrame) -> dict[str, dict[str, Any]]:
     camera, k = frame.camera, frame.camera.matrix()
     matrices = {"D": [0.0] * 5, "K": k.ravel().tolist(), "R": np.eye(3).ravel().tolist()}
     matrices["P"] = np.column_stack([k, np.zeros(3)]).ravel().tolist()
-    size = {"frame_id": "camera", "width": camera.width, "height": camera.height, "distortion_model": "plumb_bob"}
+    size = {
+        "frame_id": "camera",
+        "width": camera.width,
+        "height": camera.height,
+        "distortion_model": "plumb_bob",
+    }
     return {
-        "CompressedImage": {"frame_id": "camera", "data": cv2.imencode(".png", frame.image)[1].tobytes(), "format": "png"},
+        "CompressedImage": {
+            "frame_id": "camera",
+            "data": cv2.imencode(".png", frame.image)[1].tobytes(),
+            "format": "png",
+        },
         "CameraCalibration": size | matrices,
         "PoseInFrame": {"frame_id": "map", "pose": as_pose(frame.world_from_cam)},
     }
@@ -215,4 +320,9 @@ def _foxglove_fields(frame: StereoFrame) -> dict[str, dict[str, Any]]:
 def _as_json(fields: dict[str, Any], t_ns: int) -> bytes:
     sec, nsec = divmod(t_ns, 1_000_000_000)
     data = fields | {"timestamp": {"sec": sec, "nsec": nsec}}
-    return json.dumps({key: base64.b64encode(its).decode() if isinstance(its, bytes) else its for key, its in data.items()}).encode()
+    return json.dumps(
+        {
+            key: base64.b64encode(its).decode() if isinstance(its, bytes) else its
+            for key, its in data.items()
+        }
+    ).encode()

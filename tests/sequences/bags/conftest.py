@@ -25,7 +25,9 @@ def bag_of(walk: StereoSequence, tmp_path: Path) -> Callable[..., Path]:
     """Writes `walk` as a bag of a kind."""
 
     def write(kind: str, **settings: object) -> Path:
-        return write_stereo_bag(tmp_path / f"walk_{kind}{SUFFIXES[kind]}", kind, walk, **({"poses": by_tf} | settings))  # pyright: ignore[reportArgumentType]
+        return write_stereo_bag(
+            tmp_path / f"walk_{kind}{SUFFIXES[kind]}", kind, walk, **({"poses": by_tf} | settings)
+        )  # pyright: ignore[reportArgumentType]
 
     return write
 
@@ -36,6 +38,10 @@ def file_of(bag_of: Callable[..., Path]) -> Callable[[str], Path]:
 
     def write(kind: str) -> Path:
         path = bag_of(kind)
-        return path if path.is_file() else next(part for part in path.iterdir() if part.suffix in (".db3", ".mcap"))
+        return (
+            path
+            if path.is_file()
+            else next(part for part in path.iterdir() if part.suffix in (".db3", ".mcap"))
+        )
 
     return write

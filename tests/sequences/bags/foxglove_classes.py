@@ -1,17 +1,29 @@
-"""Foxglove's protobuf schemas of pictures, calibrations and poses, as far as they are needed (github.com/foxglove/schemas)."""
+"""Foxglove's protobuf schemas of pictures, calibrations and poses, as far as they are needed
+(github.com/foxglove/schemas)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
 
-from google.protobuf import descriptor_pb2, descriptor_pool, json_format, message_factory, timestamp_pb2
+from google.protobuf import (
+    descriptor_pb2,
+    descriptor_pool,
+    json_format,
+    message_factory,
+    timestamp_pb2,
+)
 
 _FIELDS: dict[str, list[tuple[str, int, str]]] = {
     "Vector3": [("x", 1, "double"), ("y", 2, "double"), ("z", 3, "double")],
     "Quaternion": [("x", 1, "double"), ("y", 2, "double"), ("z", 3, "double"), ("w", 4, "double")],
     "Pose": [("position", 1, ".foxglove.Vector3"), ("orientation", 2, ".foxglove.Quaternion")],
-    "CompressedImage": [("timestamp", 1, "time"), ("frame_id", 4, "string"), ("data", 2, "bytes"), ("format", 3, "string")],
+    "CompressedImage": [
+        ("timestamp", 1, "time"),
+        ("frame_id", 4, "string"),
+        ("data", 2, "bytes"),
+        ("format", 3, "string"),
+    ],
     "CameraCalibration": [
         ("timestamp", 1, "time"),
         ("frame_id", 9, "string"),
@@ -23,7 +35,11 @@ _FIELDS: dict[str, list[tuple[str, int, str]]] = {
         ("R", 7, "doubles"),
         ("P", 8, "doubles"),
     ],
-    "PoseInFrame": [("timestamp", 1, "time"), ("frame_id", 2, "string"), ("pose", 3, ".foxglove.Pose")],
+    "PoseInFrame": [
+        ("timestamp", 1, "time"),
+        ("frame_id", 2, "string"),
+        ("pose", 3, ".foxglove.Pose"),
+    ],
 }
 _KINDS = {"double": 1, "doubles": 1, "string": 9, "bytes": 12, "fixed32": 7}
 
@@ -37,7 +53,9 @@ class MessageClass:
 
     def written(self, fields: dict[str, Any], t_ns: int) -> bytes:
         """A message of these fields and this time, in bytes."""
-        message = json_format.ParseDict({key: value for key, value in fields.items() if key != "data"}, self.made_by())
+        message = json_format.ParseDict(
+            {key: value for key, value in fields.items() if key != "data"}, self.made_by()
+        )
         message.timestamp.seconds, message.timestamp.nanos = divmod(t_ns, 1_000_000_000)
         if "data" in fields:
             message.data = fields["data"]
@@ -46,12 +64,19 @@ class MessageClass:
 
 def foxglove_classes() -> dict[str, MessageClass]:
     """The message types by name, without foxglove before it."""
-    file = descriptor_pb2.FileDescriptorProto(name="foxglove.proto", package="foxglove", syntax="proto3")
+    file = descriptor_pb2.FileDescriptorProto(
+        name="foxglove.proto", package="foxglove", syntax="proto3"
+    )
     file.dependency.append("google/protobuf/timestamp.proto")
     for name, fields in _FIELDS.items():
         message = file.message_type.add(name=name)
         for field_name, number, kind in fields:
-            field = message.field.add(name=field_name, number=number, label=3 if kind == "doubles" else 1, json_name=field_name)
+            field = message.field.add(
+                name=field_name,
+                number=number,
+                label=3 if kind == "doubles" else 1,
+                json_name=field_name,
+            )
             field.type = _KINDS.get(kind, 11)  # pyright: ignore[reportAttributeAccessIssue]
             if kind not in _KINDS:
                 field.type_name = ".google.protobuf.Timestamp" if kind == "time" else kind
@@ -62,4 +87,7 @@ def foxglove_classes() -> dict[str, MessageClass]:
     for part in file_set.file:
         pool.Add(part)  # pyright: ignore[reportAttributeAccessIssue]
     found = {name: pool.FindMessageTypeByName(f"foxglove.{name}") for name in _FIELDS}
-    return {name: MessageClass(message_factory.GetMessageClass(its), file_set.SerializeToString()) for name, its in found.items()}
+    return {
+        name: MessageClass(message_factory.GetMessageClass(its), file_set.SerializeToString())
+        for name, its in found.items()
+    }

@@ -1,4 +1,5 @@
-"""Bags that were cut off are used as far as they are whole; whatever the bytes are, only errors of this house come out."""
+"""Bags that were cut off are used as far as they are whole; whatever the bytes are, only errors of
+this house come out."""
 
 from __future__ import annotations
 
@@ -18,7 +19,9 @@ FileOf = Callable[[str], Path]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_bag_that_was_cut_off(kind: str, walk: StereoSequence, file_of: FileOf, capsys: pytest.CaptureFixture[str]):
+def test_a_bag_that_was_cut_off(
+    kind: str, walk: StereoSequence, file_of: FileOf, capsys: pytest.CaptureFixture[str]
+):
     path = file_of(kind)
     whole = path.read_bytes()
     path.write_bytes(whole[: int(len(whole) * 0.75)])
@@ -30,7 +33,9 @@ def test_a_bag_that_was_cut_off(kind: str, walk: StereoSequence, file_of: FileOf
         np.testing.assert_array_equal(sequence[index].image, walk[index].image)
 
 
-def test_the_command_says_that_a_bag_was_cut_off(file_of: FileOf, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_command_says_that_a_bag_was_cut_off(
+    file_of: FileOf, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     from topoloc.cli.output import open_recording
 
     path = file_of("ros2-mcap")
@@ -52,7 +57,16 @@ def test_a_bag_that_was_never_closed(file_of: FileOf, walk: StereoSequence):
     assert "never closed" in notes_of(sequence)[0]
 
 
-@pytest.mark.parametrize("content", [b"", b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\0" + bytes(200), b"something else"])
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"#ROSBAG V2.0\n",
+        b"\x89MCAP0\r\n",
+        b"SQLite format 3\0" + bytes(200),
+        b"something else",
+    ],
+)
 @pytest.mark.parametrize("suffix", [".bag", ".db3", ".mcap"])
 def test_files_that_are_no_bags(content: bytes, suffix: str, tmp_path: Path):
     path = tmp_path / f"walk{suffix}"
@@ -66,16 +80,22 @@ def test_a_folder_packed_as_a_whole(tmp_path: Path):
     with pytest.raises(RecordingError, match=r"no \.db3 and no \.mcap file here"):
         open_sequence(tmp_path)
     (tmp_path / "walk_0.db3.zstd").write_bytes(b"\x28\xb5\x2f\xfd")
-    with pytest.raises(RecordingError, match=r"walk_0\.db3\.zstd is packed as a whole: `zstd -d` unpacks it"):
+    with pytest.raises(
+        RecordingError, match=r"walk_0\.db3\.zstd is packed as a whole: `zstd -d` unpacks it"
+    ):
         open_sequence(tmp_path)
 
 
 def test_a_topic_whose_name_is_damaged_is_not_shown(file_of: FileOf):
     path = file_of("ros1")
     path.write_bytes(
-        path.read_bytes().replace(b"/left/image_rect", b"/left/imag\n\x07rect").replace(b"/right/image_rect", b"/right/imag\n\x07rect")
+        path.read_bytes()
+        .replace(b"/left/image_rect", b"/left/imag\n\x07rect")
+        .replace(b"/right/image_rect", b"/right/imag\n\x07rect")
     )
-    with pytest.raises(RecordingError, match=r"no topic of pictures; there are /left/camera_info \(sensor_msgs") as failure:
+    with pytest.raises(
+        RecordingError, match=r"no topic of pictures; there are /left/camera_info \(sensor_msgs"
+    ) as failure:
         open_sequence(path)
     assert str(failure.value).isprintable()
 

@@ -8,9 +8,13 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.bags.frame_tree import FrameTree
 from topoloc.sequences.bags.messages import TimedTransform
 
-ODOM_FROM_BASE = [Rigid3.exp(np.array([0.5 * step, 0.1, 0.0, 0.0, 0.0, 0.2 * step])) for step in range(4)]
+ODOM_FROM_BASE = [
+    Rigid3.exp(np.array([0.5 * step, 0.1, 0.0, 0.0, 0.0, 0.2 * step])) for step in range(4)
+]
 MAP_FROM_ODOM = Rigid3.exp(np.array([3.0, 1.0, 0.0, 0.0, 0.0, 0.7]))
-BASE_FROM_LINK, LINK_FROM_LEFT, LINK_FROM_RIGHT = (Rigid3.exp(0.1 * np.arange(6) + start) for start in (0.0, 0.3, -0.4))
+BASE_FROM_LINK, LINK_FROM_LEFT, LINK_FROM_RIGHT = (
+    Rigid3.exp(0.1 * np.arange(6) + start) for start in (0.0, 0.3, -0.4)
+)
 
 
 def timed(pose: Rigid3, t_ns: int, parent: str, child: str) -> TimedTransform:
@@ -37,7 +41,12 @@ def test_a_camera_at_the_end_of_a_chain():
     expected = MAP_FROM_ODOM @ ODOM_FROM_BASE[1] @ BASE_FROM_LINK @ LINK_FROM_LEFT
     np.testing.assert_allclose(poses[0].matrix(), expected.matrix(), atol=1e-12)
     assert poses[1] is not None
-    between = MAP_FROM_ODOM @ ODOM_FROM_BASE[1].interpolate(ODOM_FROM_BASE[2], 0.5) @ BASE_FROM_LINK @ LINK_FROM_LEFT
+    between = (
+        MAP_FROM_ODOM
+        @ ODOM_FROM_BASE[1].interpolate(ODOM_FROM_BASE[2], 0.5)
+        @ BASE_FROM_LINK
+        @ LINK_FROM_LEFT
+    )
     np.testing.assert_allclose(poses[1].matrix(), between.matrix(), atol=1e-12)
     assert poses[2] is None
     assert tree.moves("left")
@@ -49,10 +58,14 @@ def test_fixed_transforms_meet_below_what_moves():
     tree = robot()
     right_from_left = tree.fixed_between("right", "left")
     assert right_from_left is not None
-    np.testing.assert_allclose(right_from_left.matrix(), (LINK_FROM_RIGHT.inverse() @ LINK_FROM_LEFT).matrix(), atol=1e-12)
+    np.testing.assert_allclose(
+        right_from_left.matrix(), (LINK_FROM_RIGHT.inverse() @ LINK_FROM_LEFT).matrix(), atol=1e-12
+    )
     base_from_left = tree.fixed_between("base", "left")
     assert base_from_left is not None
-    np.testing.assert_allclose(base_from_left.matrix(), (BASE_FROM_LINK @ LINK_FROM_LEFT).matrix(), atol=1e-12)
+    np.testing.assert_allclose(
+        base_from_left.matrix(), (BASE_FROM_LINK @ LINK_FROM_LEFT).matrix(), atol=1e-12
+    )
     assert tree.fixed_between("map", "left") is None
     assert tree.fixed_between("left", "nowhere") is None
     same = tree.fixed_between("nowhere", "nowhere")

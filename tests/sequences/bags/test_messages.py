@@ -30,13 +30,19 @@ def test_foxglove_recordings(encoding: str, walk: StereoSequence, tmp_path: Path
         assert frame.camera == original.camera
         assert frame.world_from_cam is not None
         assert original.world_from_cam is not None
-        np.testing.assert_allclose(frame.world_from_cam.matrix(), original.world_from_cam.matrix(), atol=1e-9)
+        np.testing.assert_allclose(
+            frame.world_from_cam.matrix(), original.world_from_cam.matrix(), atol=1e-9
+        )
 
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1"])
 def test_the_time_of_a_beginning(encoding: str):
     fields = image(np.zeros((4, 4), np.uint8), NOW)
-    data = bytes(ROS2.serialize_cdr(message(ROS2, IMAGE, fields), IMAGE) if encoding == "cdr" else _ros1(fields))
+    data = bytes(
+        ROS2.serialize_cdr(message(ROS2, IMAGE, fields), IMAGE)
+        if encoding == "cdr"
+        else _ros1(fields)
+    )
     topic = Topic("/a", IMAGE, encoding)
     assert stamp_of_head(topic, data[:32]) == NOW
     assert frame_id(decode(topic, data)) == "left_optical"
@@ -55,7 +61,10 @@ def test_messages_that_cannot_be_read():
     with pytest.raises(RecordingError, match="no whole message of type nav/msg/Unknown"):
         decode(Topic("/a", "nav/msg/Unknown", "cdr"), b"123")
     with pytest.raises(RecordingError, match="not poses"):
-        transforms_of(Topic("/a", "foxglove.PoseInFrame", "json"), b'{"timestamp": {"sec": 1, "nsec": 2}, "frame_id": "map", "pose": 7}')
+        transforms_of(
+            Topic("/a", "foxglove.PoseInFrame", "json"),
+            b'{"timestamp": {"sec": 1, "nsec": 2}, "frame_id": "map", "pose": 7}',
+        )
     with pytest.raises(RecordingError, match="no whole message"):
         decode(Topic("/a", "foxglove.PoseInFrame", "json"), b"[" * 100_000)
 
@@ -65,4 +74,7 @@ def test_a_pose_without_a_rotation(orientation: dict[str, float]):
     kind = "geometry_msgs/msg/PoseStamped"
     fields = {"header": header(NOW, "map"), "pose": {"orientation": orientation}}
     with pytest.raises(RecordingError, match="/pose: not poses"):
-        transforms_of(Topic("/pose", kind, "cdr"), bytes(ROS2.serialize_cdr(message(ROS2, kind, fields), kind)))
+        transforms_of(
+            Topic("/pose", kind, "cdr"),
+            bytes(ROS2.serialize_cdr(message(ROS2, kind, fields), kind)),
+        )

@@ -1,4 +1,5 @@
-"""Other light: a picture stays a picture of eight bits, a seed fixes it, and what is in it can still be made out."""
+"""Other light: a picture stays a picture of eight bits, a seed fixes it, and what is in it can
+still be made out."""
 
 from __future__ import annotations
 
@@ -15,7 +16,10 @@ def textured(seed: int = 0) -> np.ndarray:
 
 def likeness(first: np.ndarray, second: np.ndarray) -> float:
     """Correlation of what is left when slow changes of brightness are taken away."""
-    flat = [np.log(image + 0.02) - cv2.GaussianBlur(np.log(image + 0.02), (0, 0), 8) for image in (first, second)]
+    flat = [
+        np.log(image + 0.02) - cv2.GaussianBlur(np.log(image + 0.02), (0, 0), 8)
+        for image in (first, second)
+    ]
     flat = [cv2.GaussianBlur(image, (0, 0), 2).ravel() for image in flat]
     return float(np.corrcoef(*flat)[0, 1])
 
@@ -30,12 +34,16 @@ def test_many_lights_are_pictures_of_the_same():
         assert np.abs(light * 255 - np.round(light * 255)).max() < 1e-3
     similar = [likeness(picture, light) for light in pictures]
     assert np.median(similar) > 0.5
-    assert np.median(similar) > np.median([likeness(textured(1), light) for light in pictures]) + 0.4
+    assert (
+        np.median(similar) > np.median([likeness(textured(1), light) for light in pictures]) + 0.4
+    )
     levels = [light.mean() for light in pictures]
     assert min(levels) < 0.25 < max(levels) - 0.2, "night and day"
 
 
 def test_a_seed_fixes_the_light():
-    first, again, other = (changed(textured(), 1.0, np.random.default_rng(seed)) for seed in (3, 3, 4))
+    first, again, other = (
+        changed(textured(), 1.0, np.random.default_rng(seed)) for seed in (3, 3, 4)
+    )
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)

@@ -1,4 +1,5 @@
-"""What training asks for: least where the descriptors are the teacher's, and rivals only where they are rivals."""
+"""What training asks for: least where the descriptors are the teacher's, and rivals only where they
+are rivals."""
 
 from __future__ import annotations
 
@@ -66,4 +67,6 @@ def test_a_key_point_is_asked_for_in_its_own_pixel():
     assert placed(right, target, inside) < 0.01 < 4 < placed(beside, target, inside)
     beside[0, 0, 4, 4] = 24
     beside[0, 0, 8:, 5] = 12
-    assert placed(beside, target, inside) < 0.01, "where the teacher sees no key point, no place is asked for"
+    assert placed(beside, target, inside) < 0.01, (
+        "where the teacher sees no key point, no place is asked for"
+    )

@@ -1,4 +1,5 @@
-"""Walls seen from both ends, as `topoloc-net-sides` learns them: pairs of rendered ways, and pictures hung on a wall."""
+"""Walls seen from both ends, as `topoloc-net-sides` learns them: pairs of rendered ways, and
+pictures hung on a wall."""
 
 from __future__ import annotations
 
@@ -19,9 +20,13 @@ from topoloc_training.net.slants import slanted
 
 def walk_back(with_pose: bool = True) -> MemorySequence:
     poses = [back(y) for y in (5.0, 6.5)]
-    pictures = [render(corridor(), pose, WIDE, noise_seed=900 + k)[0] for k, pose in enumerate(poses)]
+    pictures = [
+        render(corridor(), pose, WIDE, noise_seed=900 + k)[0] for k, pose in enumerate(poses)
+    ]
     frames = [
-        StereoFrame(f"{k}", 100_000_000 * k, picture, WIDE, world_from_cam=pose if with_pose else None)
+        StereoFrame(
+            f"{k}", 100_000_000 * k, picture, WIDE, world_from_cam=pose if with_pose else None
+        )
         for k, (picture, pose) in enumerate(zip(pictures, poses, strict=True))
     ]
     return MemorySequence(frames, "back")
@@ -32,7 +37,9 @@ def test_pairs_of_side_views_are_the_same_points_of_a_wall(tmp_path: Path):
     assert {Path(pair.other).name.split("-")[2] for pair in pairs} == {"left", "right"}
     for pair in pairs:
         assert ("left" in Path(pair.day).name) != ("left" in Path(pair.other).name)
-        first, second = (cv2.imread(path, cv2.IMREAD_GRAYSCALE).astype(float) for path in (pair.day, pair.other))
+        first, second = (
+            cv2.imread(path, cv2.IMREAD_GRAYSCALE).astype(float) for path in (pair.day, pair.other)
+        )
         x, y = np.round(pair.day_px).astype(int).T
         u, v = np.round(pair.other_px).astype(int).T
         apart = np.abs(first[y, x] - second[v, u])
@@ -47,7 +54,9 @@ def test_pairs_need_the_poses(tmp_path: Path):
 
 def test_a_slanted_wall_keeps_its_places_and_loses_what_is_far():
     texture = cv2.resize(smooth_texture(3, (1.0, 0.8)), (320, 256)).astype(np.float32) / 255
-    fine = (texture + 0.3 * (np.indices(texture.shape)[1] % 14 < 7)).astype(np.float32)  # stripes that a slant smears
+    fine = (texture + 0.3 * (np.indices(texture.shape)[1] % 14 < 7)).astype(
+        np.float32
+    )  # stripes that a slant smears
     for is_ahead_right in (True, False):
         shown = slanted(fine, is_ahead_right, np.random.default_rng(1))
         assert shown.shape == fine.shape

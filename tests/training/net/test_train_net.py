@@ -1,4 +1,5 @@
-"""Training of our own network, as small as can be: it learns, goes on where it was stopped, and leaves a network of the contract."""
+"""Training of our own network, as small as can be: it learns, goes on where it was stopped, and
+leaves a network of the contract."""
 
 from __future__ import annotations
 
@@ -42,11 +43,15 @@ def config(teacher: Path, tmp_path_factory: pytest.TempPathFactory) -> TrainNet:
     generator = np.random.default_rng(0)
     for i, size in enumerate(((400, 640), (360, 640), (600, 960))):
         noise = generator.integers(0, 256, (size[0] // 16, size[1] // 16)).astype(np.uint8)
-        cv2.imwrite(str(folder / f"{i}.png"), cv2.resize(noise, size[::-1], interpolation=cv2.INTER_CUBIC))
+        cv2.imwrite(
+            str(folder / f"{i}.png"), cv2.resize(noise, size[::-1], interpolation=cv2.INTER_CUBIC)
+        )
     return TrainNet(teacher, [str(folder)], batch=1, steps=4)
 
 
-def test_training_goes_on_where_it_was_stopped(config: TrainNet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_training_goes_on_where_it_was_stopped(
+    config: TrainNet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setattr(training, "_LOG_EVERY", 2)
     monkeypatch.setattr(training, "_SAVE_EVERY", 2)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
@@ -97,7 +102,9 @@ def test_training_begins_with_what_fits_of_an_earlier_state(config: TrainNet, tm
     earlier = TopolocNet().state_dict()
     earlier["lateral.bias"] = torch.zeros(3)
     torch.save({"average": earlier}, tmp_path / "earlier.pt")
-    network, average, _, step = training._begin(replace(config, out=tmp_path, start=tmp_path / "earlier.pt"))
+    network, average, _, step = training._begin(
+        replace(config, out=tmp_path, start=tmp_path / "earlier.pt")
+    )
     assert step == 0
     for begun in (network.state_dict(), average.state_dict()):
         assert torch.equal(begun["fusion.layer.0.weight"], earlier["fusion.layer.0.weight"])
@@ -125,13 +132,19 @@ def test_training_begins_with_an_exported_network(tmp_path: Path):
 
 def test_walls_are_learned_of_each_other_alone(config: TrainNet, tmp_path: Path):
     lessons = learn(config.pictures, config.teacher, tmp_path)
-    pixels = np.stack(np.meshgrid(np.arange(200, 420.0), np.arange(80, 260.0)), axis=-1).reshape(-1, 2).astype(np.float32)
+    pixels = (
+        np.stack(np.meshgrid(np.arange(200, 420.0), np.arange(80, 260.0)), axis=-1)
+        .reshape(-1, 2)
+        .astype(np.float32)
+    )
     pair = (0, 1, Pair(lessons.paths[0], lessons.paths[1], pixels, pixels))
     shares = Shares(pairs=0.0, walls=1.0, slants=0.0)
     sample = draw_sample(lessons, [], [pair], shares, np.random.default_rng(0))
     assert not sample.is_taught
     assert not sample.inside.any()
-    of_teacher, to_teacher, across, score, place = (float(part.detach()) for part in training._step(TopolocNet(), [sample]))
+    of_teacher, to_teacher, across, score, place = (
+        float(part.detach()) for part in training._step(TopolocNet(), [sample])
+    )
     assert of_teacher == to_teacher == score == place == 0.0
     assert across > 1.0
 
@@ -150,7 +163,10 @@ def test_scores_are_learned_where_the_teacher_saw_the_very_pixels(config: TrainN
         for x in range(teaching.WIDTH - width + 1)
         if np.array_equal(lessons.scores[picture, y, x : x + 8], learned[0, :8])
     ]
-    assert any(np.array_equal(lessons.scores[p, y : y + height, x : x + width], learned) for p, y, x in places)
+    assert any(
+        np.array_equal(lessons.scores[p, y : y + height, x : x + width], learned)
+        for p, y, x in places
+    )
 
 
 def test_a_teacher_is_asked_once(config: TrainNet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -178,11 +194,15 @@ def test_pairs_are_the_same_points_of_a_place(tmp_path: Path):
     cv2.imwrite(str(other / "images" / "000000.png"), render(room(), pose, camera)[0])
     quaternion = np.roll(pose.quat_wxyz(), -1)
     (other / "times.txt").write_text("0.0\n")
-    (other / "truth.tum").write_text("0.0 " + " ".join(f"{v:.9f}" for v in (*pose.translation, *quaternion)) + "\n")
+    (other / "truth.tum").write_text(
+        "0.0 " + " ".join(f"{v:.9f}" for v in (*pose.translation, *quaternion)) + "\n"
+    )
     pairs = find_pairs(str(day), str(other))
     assert len(pairs) == 3
     for pair in pairs:
-        first, second = (cv2.imread(path, cv2.IMREAD_GRAYSCALE).astype(float) for path in (pair.day, pair.other))
+        first, second = (
+            cv2.imread(path, cv2.IMREAD_GRAYSCALE).astype(float) for path in (pair.day, pair.other)
+        )
         assert len(pair.day_px) > 1000
         x, y = np.round(pair.day_px).astype(int).T
         u, v = np.round(pair.other_px).astype(int).T

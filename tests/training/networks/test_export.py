@@ -1,4 +1,5 @@
-"""Every network is exported by one contract and answers in ONNX Runtime as it does in PyTorch, at any size."""
+"""Every network is exported by one contract and answers in ONNX Runtime as it does in PyTorch, at
+any size."""
 
 from __future__ import annotations
 
@@ -43,7 +44,9 @@ def picture(height: int, width: int) -> torch.Tensor:
         ("topoloc-net", TopolocNet, 64, 4),
     ],
 )
-def test_the_exported_network_answers_as_the_original(kind: str, network: type, length: int, stride: int, tmp_path: Path):
+def test_the_exported_network_answers_as_the_original(
+    kind: str, network: type, length: int, stride: int, tmp_path: Path
+):
     original = of_random_weights(network())
     path = tmp_path / "network.onnx"
     export(original, path, {"topoloc_network": kind})
@@ -52,9 +55,16 @@ def test_the_exported_network_answers_as_the_original(kind: str, network: type, 
     for height, width in ((96, 160), (160, 64)):
         image = picture(height, width)
         answers = {
-            output.name: value for output, value in zip(session.get_outputs(), session.run(None, {"image": image.numpy()}), strict=True)
+            output.name: value
+            for output, value in zip(
+                session.get_outputs(), session.run(None, {"image": image.numpy()}), strict=True
+            )
         }
-        scores, places, descriptors = answers["scores"], answers.get("places"), _descriptors(answers)
+        scores, places, descriptors = (
+            answers["scores"],
+            answers.get("places"),
+            _descriptors(answers),
+        )
         with torch.no_grad():
             expected = original(image)
         assert scores.shape == (1, 1, height, width)
@@ -82,7 +92,9 @@ def test_normalisations_of_sums_become_weights(tmp_path: Path):
     export(of_random_weights(TopolocNet()), path, {"topoloc_network": "topoloc-net"})
     graph = onnx.load(path).graph
     assert not [node for node in graph.node if node.op_type == "BatchNormalization"]
-    assert {name for node in graph.node for name in node.input} >= {value.name for value in graph.initializer}
+    assert {name for node in graph.node for name in node.input} >= {
+        value.name for value in graph.initializer
+    }
 
 
 def test_the_cheap_tail_of_xfeat_is_softmax_times_enlarged_reliability():
@@ -93,7 +105,9 @@ def test_the_cheap_tail_of_xfeat_is_softmax_times_enlarged_reliability():
         _, logits, reliability = network.maps(image)
         first = network.keypoint_head(functional.pixel_unshuffle(network.norm(image), 8))
     cells = functional.pixel_shuffle(torch.softmax(first, 1)[:, :64], 8)
-    expected = cells * functional.interpolate(reliability, scale_factor=8, mode="bilinear", align_corners=False)
+    expected = cells * functional.interpolate(
+        reliability, scale_factor=8, mode="bilinear", align_corners=False
+    )
     np.testing.assert_allclose(logits.numpy(), first.numpy(), atol=1e-4)
     np.testing.assert_allclose(scores.numpy(), expected.numpy(), atol=1e-6)
 
@@ -112,7 +126,12 @@ def test_published_weights_answer_as_published(shared: Path, tmp_path: Path):
     if not weights.is_dir():
         pytest.skip(f"no weights at {weights}")
     image = picture(96, 160).numpy()
-    convert("xfeat", (weights / "xfeat" / "xfeat.pt").read_bytes(), tmp_path / "xfeat.onnx", {"topoloc_network": "xfeat"})
+    convert(
+        "xfeat",
+        (weights / "xfeat" / "xfeat.pt").read_bytes(),
+        tmp_path / "xfeat.onnx",
+        {"topoloc_network": "xfeat"},
+    )
     runs = [
         onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
         for path in (tmp_path / "xfeat.onnx", weights / "xfeat" / "xfeat_own_dyn.onnx")
@@ -122,8 +141,15 @@ def test_published_weights_answer_as_published(shared: Path, tmp_path: Path):
     np.testing.assert_allclose(descriptors, expected, atol=1e-3)
     likeliest = np.argmax(logits[0, :64], axis=0)
     cells = scores[0, 0].reshape(12, 8, 20, 8).transpose(0, 2, 1, 3).reshape(12, 20, 64)
-    assert np.mean(np.argmax(cells, axis=2) == likeliest) > 0.8  # reliability changes within a cell, a little
+    assert (
+        np.mean(np.argmax(cells, axis=2) == likeliest) > 0.8
+    )  # reliability changes within a cell, a little
     for size in ("T32", "S32", "S64", "M64", "E64"):
         kind = f"edgepoint2-{size.lower()}"
-        convert(kind, (weights / "edgepoint2" / f"{size}.pth").read_bytes(), tmp_path / "out.onnx", {"topoloc_network": kind})
+        convert(
+            kind,
+            (weights / "edgepoint2" / f"{size}.pth").read_bytes(),
+            tmp_path / "out.onnx",
+            {"topoloc_network": kind},
+        )
         assert check_network(tmp_path / "out.onnx").name == kind

@@ -36,9 +36,17 @@ def digest(surfaces: list[Surface]) -> list[tuple[str, str]]:
     """Name and hash of everything that a surface is made of."""
     result = []
     for surface in surfaces:
-        hasher = hashlib.sha256(surface.mesh.vertices.tobytes() + surface.mesh.faces.tobytes() + surface.mesh.uv.tobytes())
+        hasher = hashlib.sha256(
+            surface.mesh.vertices.tobytes()
+            + surface.mesh.faces.tobytes()
+            + surface.mesh.uv.tobytes()
+        )
         material = surface.material
-        color = material.color.tobytes() if isinstance(material.color, np.ndarray) else repr(material.color).encode()
+        color = (
+            material.color.tobytes()
+            if isinstance(material.color, np.ndarray)
+            else repr(material.color).encode()
+        )
         hasher.update(color + repr((material.kind, material.roughness, material.radiance)).encode())
         result.append((surface.name, hasher.hexdigest()))
     return result
@@ -79,13 +87,21 @@ def test_arrangement_moves_only_movables(day: Scene, rearranged: Scene):
 def test_the_condition_changes_light_but_no_fixed_geometry(day: Scene, night: Scene):
     def shapes(scene: Scene) -> list[tuple[str, bytes]]:
         lights_only = ("window pane", "lit windows")
-        return [(s.name, s.mesh.vertices.tobytes()) for s in scene.surfaces if not s.name.startswith(lights_only)]
+        return [
+            (s.name, s.mesh.vertices.tobytes())
+            for s in scene.surfaces
+            if not s.name.startswith(lights_only)
+        ]
 
     assert shapes(day) == shapes(night)
 
 
 def lit(condition: Condition) -> set[int]:
-    lamps = [surface for surface in ceiling_lamps(0, condition, Fittings.of(0)) if surface.name == "lamp cover"]
+    lamps = [
+        surface
+        for surface in ceiling_lamps(0, condition, Fittings.of(0))
+        if surface.name == "lamp cover"
+    ]
     return {number for number, lamp in enumerate(lamps) if lamp.material.kind == "light"}
 
 
@@ -114,20 +130,35 @@ def test_nothing_stands_in_the_way(day: Scene, rearranged: Scene, arrangement: i
         corners = surface.mesh.vertices[surface.mesh.faces]
         low, high = corners.min(axis=1), corners.max(axis=1)
         for start, end in zip(LOOP, (*LOOP[1:], LOOP[0]), strict=True):
-            tube_low = np.array([min(start[0], end[0]) - 0.4, min(start[1], end[1]) - 0.4, CAMERA_HEIGHT - 0.4])
-            tube_high = np.array([max(start[0], end[0]) + 0.4, max(start[1], end[1]) + 0.4, CAMERA_HEIGHT + 0.4])
+            tube_low = np.array(
+                [min(start[0], end[0]) - 0.4, min(start[1], end[1]) - 0.4, CAMERA_HEIGHT - 0.4]
+            )
+            tube_high = np.array(
+                [max(start[0], end[0]) + 0.4, max(start[1], end[1]) + 0.4, CAMERA_HEIGHT + 0.4]
+            )
             inside = np.all((low < tube_high) & (high > tube_low), axis=1)
-            assert not inside.any(), f"{surface.name} at {corners[inside].mean(axis=(0, 1)).round(2)}"
+            assert not inside.any(), (
+                f"{surface.name} at {corners[inside].mean(axis=(0, 1)).round(2)}"
+            )
 
 
 def test_the_corridor_is_closed_and_of_the_paper_s_size(day: Scene):
-    walls = triangles([surface for surface in day.surfaces if surface.name.startswith("wall ")]).reshape(-1, 3)
+    walls = triangles(
+        [surface for surface in day.surfaces if surface.name.startswith("wall ")]
+    ).reshape(-1, 3)
     assert walls.min(axis=0).round(6).tolist() == [0.0, 0.0, 0.0]
     assert walls.max(axis=0).round(6).tolist() == [LENGTH, WIDTH, HEIGHT]
     floor = triangles([surface for surface in day.surfaces if surface.name.startswith("floor ")])
-    area = 0.5 * np.linalg.norm(np.cross(floor[:, 1] - floor[:, 0], floor[:, 2] - floor[:, 0]), axis=1).sum()
+    area = (
+        0.5
+        * np.linalg.norm(
+            np.cross(floor[:, 1] - floor[:, 0], floor[:, 2] - floor[:, 0]), axis=1
+        ).sum()
+    )
     assert area == pytest.approx(LENGTH * WIDTH - (LENGTH - WEST - EAST) * (WIDTH - SOUTH - NORTH))
-    length = sum(np.hypot(a[0] - b[0], a[1] - b[1]) for a, b in zip(LOOP, (*LOOP[1:], LOOP[0]), strict=True))
+    length = sum(
+        np.hypot(a[0] - b[0], a[1] - b[1]) for a, b in zip(LOOP, (*LOOP[1:], LOOP[0]), strict=True)
+    )
     assert 70 < length < 85
 
 
@@ -139,12 +170,21 @@ def test_meshes_are_sound_and_the_world_is_small_enough(day: Scene):
         assert mesh.faces.min() >= 0, surface.name
         assert mesh.faces.max() < len(mesh.vertices), surface.name
     assert sum(len(surface.mesh.faces) for surface in day.surfaces) < 300_000
-    pictures = {id(s.material): s.material.color for s in day.surfaces if isinstance(s.material.color, np.ndarray)}
+    pictures = {
+        id(s.material): s.material.color
+        for s in day.surfaces
+        if isinstance(s.material.color, np.ndarray)
+    }
     assert sum(picture.nbytes for picture in pictures.values()) < 200e6
 
 
 def test_floor_walls_and_lamps_face_the_corridor(day: Scene):
-    towards = {"floor south": (0, 0, 1), "ceiling": (0, 0, -1), "wall south outer": (0, 1, 0), "wall east inner": (1, 0, 0)}
+    towards = {
+        "floor south": (0, 0, 1),
+        "ceiling": (0, 0, -1),
+        "wall south outer": (0, 1, 0),
+        "wall east inner": (1, 0, 0),
+    }
     for name, direction in towards.items():
         corners = triangles([surface for surface in day.surfaces if surface.name == name])
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -1,4 +1,5 @@
-"""Prints, screens and materials: sizes and types, readable contrast, each another one, the same again from the same seed."""
+"""Prints, screens and materials: sizes and types, readable contrast, each another one, the same
+again from the same seed."""
 
 from __future__ import annotations
 
@@ -51,13 +52,24 @@ def test_a_print_is_its_seeds(name: str):
     assert first.ndim == 3
     np.testing.assert_array_equal(first, again)
     others = [make(np.random.default_rng(seed)) for seed in (6, 7)]
-    assert all(other.shape != first.shape or np.mean(np.abs(other.astype(int) - first)) > 1.0 for other in others)
+    assert all(
+        other.shape != first.shape or np.mean(np.abs(other.astype(int) - first)) > 1.0
+        for other in others
+    )
     assert first.reshape(-1, 3).std(axis=0).max() > 8.0
 
 
 @pytest.mark.parametrize("size", [(97, 61), (64, 200), (300, 220)])
 def test_prints_take_any_size(size: tuple[int, int]):
-    for make in (prints.poster, prints.notice, photograph, painting, plot, prints.whiteboard, prints.calendar):
+    for make in (
+        prints.poster,
+        prints.notice,
+        photograph,
+        painting,
+        plot,
+        prints.whiteboard,
+        prints.calendar,
+    ):
         assert make(np.random.default_rng(1), size).shape == (*size, 3)
 
 

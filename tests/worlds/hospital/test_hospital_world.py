@@ -11,7 +11,16 @@ from topoloc_worlds.hospital.world import CAMERA_HEIGHT, LOOP, MOVABLE, build
 from topoloc_worlds.scene import Scene, Surface
 
 DAY, EVENING, NIGHT = (CONDITIONS[name] for name in ("day", "evening", "night"))
-REPEATED = ("panels", "handrail", "handrail brackets", "skirting", "floor", "ceiling", "lamp cover", "lamp frame")
+REPEATED = (
+    "panels",
+    "handrail",
+    "handrail brackets",
+    "skirting",
+    "floor",
+    "ceiling",
+    "lamp cover",
+    "lamp frame",
+)
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +40,10 @@ def shapes(scene: Scene, movable: bool) -> list[tuple[str, bytes]]:
 
 def colors(scene: Scene) -> list[tuple[str, bytes]]:
     pictures = [(s.name, s.material.color) for s in scene.surfaces]
-    return [(name, color.tobytes() if isinstance(color, np.ndarray) else repr(color).encode()) for name, color in pictures]
+    return [
+        (name, color.tobytes() if isinstance(color, np.ndarray) else repr(color).encode())
+        for name, color in pictures
+    ]
 
 
 def triangles(surface: Surface) -> Float64[np.ndarray, "n 3 3"]:
@@ -55,13 +67,16 @@ def test_a_panel_is_the_copy_of_the_next(day: Scene):
         long = np.ptp(quad[:, :2], axis=0).max()
         assert long == pytest.approx(BAY * round(long / BAY))
     repeats = mesh.uv.reshape(-1, 4, 2)
-    widths = np.array([np.ptp(quad[:, :2], axis=0).max() for quad in mesh.vertices.reshape(-1, 4, 3)])
+    widths = np.array(
+        [np.ptp(quad[:, :2], axis=0).max() for quad in mesh.vertices.reshape(-1, 4, 3)]
+    )
     np.testing.assert_allclose(repeats[:, :, 0].max(axis=1) * BAY, widths)
 
 
 @pytest.mark.parametrize("name", ["handrail brackets", "lamp cover"])
 def test_what_is_put_up_has_the_panels_period(day: Scene, name: str):
-    """On the south wing's outer wall, shifted by a bay: every vertex is there again, but at the doors and the wing's ends."""
+    """On the south wing's outer wall, shifted by a bay: every vertex is there again, but at the
+    doors and the wing's ends."""
     points = named(day, name).mesh.vertices
     points = points[points[:, 1] < 1.6]
     beyond = points + np.array([BAY, 0.0, 0.0])
@@ -78,10 +93,16 @@ def test_doors_are_rare_irregular_and_each_has_its_own_sign(day: Scene):
     assert panelled + 2 * len(doors) == sum(wall.num_bays for wall in walls.values())
     assert panelled / len(doors) > 6
     signs = [surface.material.color for surface in day.surfaces if surface.name == "door sign"]
-    assert len({sign.tobytes() for sign in signs if isinstance(sign, np.ndarray)}) == len(doors) == len(signs)
+    assert (
+        len({sign.tobytes() for sign in signs if isinstance(sign, np.ndarray)})
+        == len(doors)
+        == len(signs)
+    )
     for seed in range(6):
         for wall in walls_of(seed).values():
-            assert np.all(np.diff(wall.doors) >= 8), "two doors of one wall are never near each other"
+            assert np.all(np.diff(wall.doors) >= 8), (
+                "two doors of one wall are never near each other"
+            )
 
 
 def test_arrangement_moves_only_movables(day: Scene):
@@ -113,10 +134,20 @@ def test_the_passage_is_closed_and_nothing_stands_in_it(day: Scene):
         for surface in scene.surfaces:
             low, high = triangles(surface).min(axis=1), triangles(surface).max(axis=1)
             for start, end in zip(LOOP, (*LOOP[1:], LOOP[0]), strict=True):
-                tube_low = np.array([min(start[0], end[0]) - 0.4, min(start[1], end[1]) - 0.4, CAMERA_HEIGHT - 0.4])
-                tube_high = np.array([max(start[0], end[0]) + 0.4, max(start[1], end[1]) + 0.4, CAMERA_HEIGHT + 0.4])
-                assert not np.any(np.all((low < tube_high) & (high > tube_low), axis=1)), surface.name
-    walls = [s for s in day.surfaces if s.name in ("panels", "door wall", "square wall", "door leaf", "window frame")]
+                tube_low = np.array(
+                    [min(start[0], end[0]) - 0.4, min(start[1], end[1]) - 0.4, CAMERA_HEIGHT - 0.4]
+                )
+                tube_high = np.array(
+                    [max(start[0], end[0]) + 0.4, max(start[1], end[1]) + 0.4, CAMERA_HEIGHT + 0.4]
+                )
+                assert not np.any(np.all((low < tube_high) & (high > tube_low), axis=1)), (
+                    surface.name
+                )
+    walls = [
+        s
+        for s in day.surfaces
+        if s.name in ("panels", "door wall", "square wall", "door leaf", "window frame")
+    ]
     corners = np.concatenate([s.mesh.vertices for s in walls])
     np.testing.assert_allclose(np.ptp(corners, axis=0), [LENGTH, WIDTH, HEIGHT], atol=0.5)
 

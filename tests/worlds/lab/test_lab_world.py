@@ -35,7 +35,9 @@ def _rearranged() -> Scene:
 
 def _hash(surface: Surface) -> str:
     color = surface.material.color
-    digest = hashlib.sha256(f"{surface.name} {surface.material.kind} {surface.material.radiance}".encode())
+    digest = hashlib.sha256(
+        f"{surface.name} {surface.material.kind} {surface.material.radiance}".encode()
+    )
     for array in (surface.mesh.vertices, surface.mesh.faces, surface.mesh.uv, np.asarray(color)):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
@@ -61,7 +63,11 @@ def test_a_condition_changes_light_and_no_geometry():
     assert _geometry(_day()) == _geometry(_night())
 
     def shining(scene: Scene) -> set[str]:
-        return {s.name for s in scene.surfaces if s.material.kind == "light" and s.material.radiance > 0.2}
+        return {
+            s.name
+            for s in scene.surfaces
+            if s.material.kind == "light" and s.material.radiance > 0.2
+        }
 
     assert "outdoors" in shining(_day())
     assert "outdoors" not in shining(_night())
@@ -88,13 +94,16 @@ def test_another_arrangement_moves_the_movable_only():
 
 
 def _near_the_walk(scene: Scene, clearance: float) -> set[str]:
-    """Names of surfaces with a triangle whose bounding box comes into the corridor around the walked line at the camera's height."""
+    """Names of surfaces with a triangle whose bounding box comes into the corridor around the
+    walked line at the camera's height."""
     corners = np.array([*lab.LOOP, lab.LOOP[0]])
     names = set()
     for surface in scene.surfaces:
         triangles = surface.mesh.vertices[surface.mesh.faces]
         low, high = triangles.min(axis=1), triangles.max(axis=1)
-        at_height = (low[:, 2] < lab.CAMERA_HEIGHT + clearance) & (high[:, 2] > lab.CAMERA_HEIGHT - clearance)
+        at_height = (low[:, 2] < lab.CAMERA_HEIGHT + clearance) & (
+            high[:, 2] > lab.CAMERA_HEIGHT - clearance
+        )
         for a, b in itertools.pairwise(corners):
             start, end = np.minimum(a, b) - clearance, np.maximum(a, b) + clearance
             meets = np.all((low[:, :2] < end) & (high[:, :2] > start), axis=1)
@@ -120,15 +129,23 @@ def test_everything_is_in_the_room_and_sound():
         assert np.isfinite(mesh.vertices).all()
         assert np.isfinite(mesh.uv).all()
         corners = mesh.vertices[mesh.faces]
-        areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        areas = np.linalg.norm(
+            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+        )
         assert np.mean(areas > 0) >= 0.5, surface.name
         if surface.name not in outside:
             assert np.all(mesh.vertices > [-0.05, -0.05, -0.05]), surface.name
-            assert np.all(mesh.vertices < [LENGTH + 0.05, WIDTH + REVEAL + 0.05, HEIGHT + 0.01]), surface.name
+            assert np.all(mesh.vertices < [LENGTH + 0.05, WIDTH + REVEAL + 0.05, HEIGHT + 0.01]), (
+                surface.name
+            )
 
 
 def test_the_room_is_light_enough_to_render():
     scene = _day()
-    pictures = {id(s.material): s.material.color for s in scene.surfaces if not isinstance(s.material.color, tuple)}
+    pictures = {
+        id(s.material): s.material.color
+        for s in scene.surfaces
+        if not isinstance(s.material.color, tuple)
+    }
     assert sum(picture.nbytes for picture in pictures.values()) < 150e6
     assert sum(len(s.mesh.faces) for s in scene.surfaces) < 200_000

@@ -1,4 +1,5 @@
-"""Light that is known from formulas, traced; and pictures from it against pictures from paths of their own."""
+"""Light that is known from formulas, traced; and pictures from it against pictures from paths of
+their own."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +24,9 @@ LOOKING_NORTH = Rigid3(NORTH, np.array([0.0, 0.0, 1.5]))
 LOOKING_DOWN = Rigid3(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 1.5]))
 EYES = np.array([[0.0, 0.0, 1.5], [0.3, 0.0, 1.5]])
 CONFIG = RenderConfig(bake=LightBakeConfig(finest=0.1, angle=0.03, rays=4000, paths=16))
-FLOOR = Surface("floor", panel((-4, 4, 0), (8, 0, 0), (0, -8, 0)), Material("matt", (0.5, 0.5, 0.5)))
+FLOOR = Surface(
+    "floor", panel((-4, 4, 0), (8, 0, 0), (0, -8, 0)), Material("matt", (0.5, 0.5, 0.5))
+)
 GREY = 0.2140  # what 0.5 of sRGB reflects
 
 
@@ -41,7 +44,11 @@ def test_a_floor_below_an_even_sky_sends_back_its_share():
 
 
 def test_a_lamp_shines_by_the_square_of_its_distance():
-    lamp = Surface("lamp", panel((-0.1, -0.1, 3.0), (0.2, 0, 0), (0, 0.2, 0)), Material("light", (1.0, 1.0, 1.0), radiance=100.0))
+    lamp = Surface(
+        "lamp",
+        panel((-0.1, -0.1, 3.0), (0.2, 0, 0), (0, 0.2, 0)),
+        Material("light", (1.0, 1.0, 1.0), radiance=100.0),
+    )
     seen = Renderer(Scene((FLOOR, lamp)), CONFIG, EYES).render(CAMERA, LOOKING_DOWN, 0).radiance
     below = GREY * 100.0 * 0.2**2 / (np.pi * 3.0**2)
     np.testing.assert_allclose(seen[20, 32], below, rtol=0.06)
@@ -49,8 +56,14 @@ def test_a_lamp_shines_by_the_square_of_its_distance():
 
 def test_the_sun_has_sharp_shadows_and_no_noise():
     sun = Sky(np.zeros((16, 32, 3), np.float32), np.array([0.0, 0.6, 0.8]), (10.0, 10.0, 10.0))
-    pole = Surface("pole", box((0.4, -0.1, 0.0), (0.6, 0.1, 0.5)), Material("matt", (0.0, 0.0, 0.0)))
-    seen = Renderer(Scene((FLOOR, pole), sun), CONFIG, EYES).render(CAMERA, LOOKING_DOWN, 0).radiance[:, :, 0]
+    pole = Surface(
+        "pole", box((0.4, -0.1, 0.0), (0.6, 0.1, 0.5)), Material("matt", (0.0, 0.0, 0.0))
+    )
+    seen = (
+        Renderer(Scene((FLOOR, pole), sun), CONFIG, EYES)
+        .render(CAMERA, LOOKING_DOWN, 0)
+        .radiance[:, :, 0]
+    )
     np.testing.assert_allclose(seen[:, :20], GREY * 10.0 * 0.8 / np.pi, rtol=0.01)
     shadow = seen[26, 44:47]  # south of the pole
     assert shadow.max() < 0.1 * seen[0, 0]
@@ -58,7 +71,11 @@ def test_the_sun_has_sharp_shadows_and_no_noise():
 
 def test_a_polished_floor_mirrors_the_lamp_beyond():
     floor = replace(FLOOR, material=Material("polished", (0.2, 0.2, 0.2), roughness=0.0))
-    lamp = Surface("lamp", panel((-0.5, 3.9, 1.0), (1, 0, 0), (0, 0, -0.6)), Material("light", (1.0, 1.0, 1.0), radiance=5.0))
+    lamp = Surface(
+        "lamp",
+        panel((-0.5, 3.9, 1.0), (1, 0, 0), (0, 0, -0.6)),
+        Material("light", (1.0, 1.0, 1.0), radiance=5.0),
+    )
     low = Rigid3(NORTH, np.array([0.0, 0.0, 0.8]))
     seen = Renderer(Scene((floor, lamp)), CONFIG, EYES).render(CAMERA, low, 0).radiance[:, :, 1]
     in_mirror = CAMERA.img_from_cam(np.array([[0.0, 0.8 + 0.7, 3.9]]))[0].round().astype(int)
@@ -70,9 +87,15 @@ def test_pictures_agree_with_those_of_paths_of_their_own():
     room = (
         Surface("room", box((-2, -1, 0), (2, 3, 2.5), faces="nsetb"), white),
         Surface("wall", box((-2, -1, 0), (2, 3, 2.5), faces="w"), red),
-        Surface("lamp", panel((-0.5, 0.5, 2.45), (1, 0, 0), (0, 1, 0)), Material("light", (1.0, 1.0, 1.0), radiance=3.0)),
+        Surface(
+            "lamp",
+            panel((-0.5, 0.5, 2.45), (1, 0, 0), (0, 1, 0)),
+            Material("light", (1.0, 1.0, 1.0), radiance=3.0),
+        ),
     )
-    plain = RenderConfig(samples=512, bounces=4, light_filter=LightFilterConfig(levels=0, firefly=1e9))
+    plain = RenderConfig(
+        samples=512, bounces=4, light_filter=LightFilterConfig(levels=0, firefly=1e9)
+    )
     reference = Renderer(Scene(room), plain).render(CAMERA, LOOKING_NORTH, 0).radiance
     baked = Renderer(Scene(room), CONFIG, EYES).render(CAMERA, LOOKING_NORTH, 0).radiance
     np.testing.assert_allclose(baked.mean(axis=(0, 1)), reference.mean(axis=(0, 1)), rtol=0.06)

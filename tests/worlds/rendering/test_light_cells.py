@@ -1,6 +1,12 @@
 import numpy as np
 
-from topoloc_worlds.rendering.light_cells import FoundLight, LightCells, LightGatherer, divide_space, light_at
+from topoloc_worlds.rendering.light_cells import (
+    FoundLight,
+    LightCells,
+    LightGatherer,
+    divide_space,
+    light_at,
+)
 
 EYES = np.array([[0.0, 0.0, 1.4], [1.0, 0.0, 1.4]])
 GRID = divide_space(EYES, finest=0.05, angle=0.02)
@@ -13,13 +19,19 @@ def floor_points(num: int, seed: int = 0) -> np.ndarray:
 
 
 def true_light(points: np.ndarray) -> np.ndarray:
-    return np.column_stack([1.0 + 0.2 * points[:, 0], np.ones(len(points)), 1.0 - 0.2 * points[:, 1]]).astype(np.float32)
+    return np.column_stack(
+        [1.0 + 0.2 * points[:, 0], np.ones(len(points)), 1.0 - 0.2 * points[:, 1]]
+    ).astype(np.float32)
 
 
-def gathered(light: np.ndarray, points: np.ndarray, normal: np.ndarray = UP, seed: int = 1) -> LightCells:
+def gathered(
+    light: np.ndarray, points: np.ndarray, normal: np.ndarray = UP, seed: int = 1
+) -> LightCells:
     noise = np.random.default_rng(seed).exponential(1.0, (len(points), 1)).astype(np.float32)
     gatherer = LightGatherer(GRID)
-    gatherer.add(points, np.tile(normal, (len(points), 1)), FoundLight(0.1 * light, 0.9 * light * noise))
+    gatherer.add(
+        points, np.tile(normal, (len(points), 1)), FoundLight(0.1 * light, 0.9 * light * noise)
+    )
     return gatherer.cells()
 
 

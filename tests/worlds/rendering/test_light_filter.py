@@ -7,19 +7,28 @@ SIZE = (80, 120)
 
 def flat_wall() -> tuple[np.ndarray, np.ndarray]:
     y, x = np.indices(SIZE).astype(np.float32)
-    position = np.stack([(x - 60) / 100, (y - 40) / 100, np.ones_like(x)], axis=-1) * np.float32(3.0)
+    position = np.stack([(x - 60) / 100, (y - 40) / 100, np.ones_like(x)], axis=-1) * np.float32(
+        3.0
+    )
     normal = np.zeros((*SIZE, 3), np.float32)
     normal[..., 2] = -1.0
     return normal, position
 
 
-def filtered(light: np.ndarray, albedo: np.ndarray, noise: float, normal=None, mirror=None) -> np.ndarray:
+def filtered(
+    light: np.ndarray, albedo: np.ndarray, noise: float, normal=None, mirror=None
+) -> np.ndarray:
     rng = np.random.default_rng(0)
     wall, position = flat_wall()
-    grains = [np.exp(noise * rng.standard_normal((*SIZE, 1)) - noise**2 / 2).astype(np.float32) for _ in range(2)]
+    grains = [
+        np.exp(noise * rng.standard_normal((*SIZE, 1)) - noise**2 / 2).astype(np.float32)
+        for _ in range(2)
+    ]
     pictures = (light * albedo * grains[0], light * albedo * grains[1])
     mirror = np.zeros(SIZE, bool) if mirror is None else mirror
-    return filter_light(pictures, albedo, wall if normal is None else normal, position, mirror, LightFilterConfig())
+    return filter_light(
+        pictures, albedo, wall if normal is None else normal, position, mirror, LightFilterConfig()
+    )
 
 
 def grey(value: float = 0.5) -> np.ndarray:
@@ -60,7 +69,14 @@ def test_a_firefly_is_put_out():
     pictures = [grey(0.5), grey(0.5)]
     pictures[0][40, 60] = 500.0
     normal, position = flat_wall()
-    result = filter_light((pictures[0], pictures[1]), grey(), normal, position, np.zeros(SIZE, bool), LightFilterConfig())
+    result = filter_light(
+        (pictures[0], pictures[1]),
+        grey(),
+        normal,
+        position,
+        np.zeros(SIZE, bool),
+        LightFilterConfig(),
+    )
     assert result[40, 60].max() < 4.0
     assert np.abs(np.median(result) - 1.0) < 1e-3
 

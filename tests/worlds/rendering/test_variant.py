@@ -27,7 +27,9 @@ def test_unknown_variant_is_refused():
         variant.use_best_variant("llvm_hd")
 
 
-def test_a_file_that_is_no_library_is_passed_over_and_remembered(tmp_path, monkeypatch, cache, capfd):
+def test_a_file_that_is_no_library_is_passed_over_and_remembered(
+    tmp_path, monkeypatch, cache, capfd
+):
     pytest.importorskip("mitsuba")
     bad = tmp_path / "libLLVM.so.99"
     bad.write_bytes(b"no library at all")
@@ -51,7 +53,14 @@ def test_an_unwritable_cache_only_costs_time(tmp_path, monkeypatch):
 
 
 def test_llvm_libraries_come_newest_first_and_none_too_old(tmp_path, monkeypatch):
-    for name in ("libLLVM-15.so", "libLLVM-17.so", "libLLVM.so.19.1", "libLLVM-14.so.1", "libLLVMDemangle-18.so", "libLLVM-9.so"):
+    for name in (
+        "libLLVM-15.so",
+        "libLLVM-17.so",
+        "libLLVM.so.19.1",
+        "libLLVM-14.so.1",
+        "libLLVMDemangle-18.so",
+        "libLLVM-9.so",
+    ):
         (tmp_path / name).write_text("")
     os.symlink(tmp_path / "libLLVM.so.19.1", tmp_path / "libLLVM-19.so")
     monkeypatch.setattr(variant, "_PLACES", (str(tmp_path / "libLLVM*"),))

@@ -1,4 +1,5 @@
-"""The street: the same town for the same seed, nothing in the way of those who drive, the paper's size."""
+"""The street: the same town for the same seed, nothing in the way of those who drive, the paper's
+size."""
 
 from __future__ import annotations
 
@@ -35,15 +36,19 @@ def geometry(scene: Scene) -> dict[str, list[bytes]]:
     found = defaultdict(list)
     for surface in scene.surfaces:
         if not moves(surface):
-            # Panes with light behind them are another surface than dark ones, so their corners are compared as a set.
+            # Panes with light behind them are another surface than dark ones, so their corners are
+            # compared as a set.
             found[surface.name] += [row.tobytes() for row in surface.mesh.vertices]
     return {name: sorted(rows) for name, rows in found.items()}
 
 
 def outside_loop(points: np.ndarray) -> np.ndarray:
-    """Signed distance of points (x, y) to the driven line: positive outside a rectangle of 333 by 81 m rounded with 12 m."""
+    """Signed distance of points (x, y) to the driven line: positive outside a rectangle of 333 by
+    81 m rounded with 12 m."""
     beyond = np.abs(points) - (np.array([333.0, 81.0]) / 2 - 12.0)
-    return np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0) - 12.0
+    return (
+        np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0) - 12.0
+    )
 
 
 def test_same_arguments_same_bytes() -> None:
@@ -66,9 +71,15 @@ def test_another_seed_is_another_town() -> None:
 def test_condition_and_arrangement_move_only_cars_and_bins() -> None:
     day, night = built(3, "day", 0), built(3, "night", 1)
     assert geometry(day) == geometry(night)
-    cars = [np.concatenate([s.mesh.vertices for s in scene.surfaces if s.name == "parked car plates"]) for scene in (day, night)]
+    cars = [
+        np.concatenate([s.mesh.vertices for s in scene.surfaces if s.name == "parked car plates"])
+        for scene in (day, night)
+    ]
     assert cars[0].shape != cars[1].shape or not np.allclose(cars[0], cars[1])
-    bins = [np.concatenate([s.mesh.vertices for s in scene.surfaces if s.name == "bin"]) for scene in (day, night)]
+    bins = [
+        np.concatenate([s.mesh.vertices for s in scene.surfaces if s.name == "bin"])
+        for scene in (day, night)
+    ]
     assert bins[0].shape != bins[1].shape or not np.allclose(bins[0], bins[1])
 
 
@@ -80,11 +91,16 @@ def test_both_lanes_are_free(key: tuple[int, str, int]) -> None:
             continue
         corners = surface.mesh.vertices[surface.mesh.faces]
         low = corners[corners[:, :, 2].min(axis=1) < 2.5]
-        # Middles of edges too: no triangle that low is so large that it could pass over a lane between these points.
-        points = np.concatenate([low.reshape(-1, 3), (low + np.roll(low, 1, axis=1)).reshape(-1, 3) / 2])[:, :2]
+        # Middles of edges too: no triangle that low is so large that it could pass over a lane
+        # between these points.
+        points = np.concatenate(
+            [low.reshape(-1, 3), (low + np.roll(low, 1, axis=1)).reshape(-1, 3) / 2]
+        )[:, :2]
         right = outside_loop(points)
         for name, away in (("driven", right), ("other", right + street.OTHER_LANE_OFFSET)):
-            assert not len(points) or np.abs(away).min() > 1.2, f"{surface.name} at {points[np.abs(away).argmin()]} in the {name} lane"
+            assert not len(points) or np.abs(away).min() > 1.2, (
+                f"{surface.name} at {points[np.abs(away).argmin()]} in the {name} lane"
+            )
 
 
 def test_loop_has_the_papers_size() -> None:
@@ -92,7 +108,12 @@ def test_loop_has_the_papers_size() -> None:
     np.testing.assert_allclose(np.ptp(corners, axis=0), [333.0, 81.0])
     around = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).sum()
     assert 780 < around < 820
-    area = np.sum(corners[:, 0] * np.roll(corners[:, 1], -1) - corners[:, 1] * np.roll(corners[:, 0], -1)) / 2
+    area = (
+        np.sum(
+            corners[:, 0] * np.roll(corners[:, 1], -1) - corners[:, 1] * np.roll(corners[:, 0], -1)
+        )
+        / 2
+    )
     assert area > 0, "counter-clockwise"
 
 
@@ -100,7 +121,11 @@ def test_town_is_no_larger_than_it_may_be() -> None:
     for key in ((3, "day", 0), (3, "night", 1)):
         scene = built(*key)
         assert sum(len(surface.mesh.faces) for surface in scene.surfaces) < 600_000
-        pictures = {id(s.material.color): s.material.color for s in scene.surfaces if isinstance(s.material.color, np.ndarray)}
+        pictures = {
+            id(s.material.color): s.material.color
+            for s in scene.surfaces
+            if isinstance(s.material.color, np.ndarray)
+        }
         assert sum(picture.nbytes for picture in pictures.values()) < 250e6
 
 
@@ -122,13 +147,17 @@ def test_stations_run_along_the_centre_line() -> None:
     np.testing.assert_allclose(points[0], points[-1], atol=1e-9)
     x, y, yaw = position(100.0, 1.75)
     point, _ = centre_line(np.array([100.0]))
-    np.testing.assert_allclose([x - point[0, 0], y - point[0, 1]], [1.75 * np.sin(yaw), -1.75 * np.cos(yaw)], atol=1e-12)
+    np.testing.assert_allclose(
+        [x - point[0, 0], y - point[0, 1]], [1.75 * np.sin(yaw), -1.75 * np.cos(yaw)], atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_cars_stand_on_their_wheels_and_keep_their_width(shape) -> None:
     kit = car_materials(np.random.default_rng(0))
-    vertices = np.concatenate([surface.mesh.vertices for surface in car(shape, len(PAINTS) - 1, 5, kit)])
+    vertices = np.concatenate(
+        [surface.mesh.vertices for surface in car(shape, len(PAINTS) - 1, 5, kit)]
+    )
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     assert low[2] == pytest.approx(0.0, abs=0.01)
     assert high[0] - low[0] == pytest.approx(shape.length, abs=0.1)

@@ -1,4 +1,5 @@
-"""Variation of training pictures: other light, other lens, something in the way, a slightly other view; whole batches at once."""
+"""Variation of training pictures: other light, other lens, something in the way, a slightly other
+view; whole batches at once."""
 
 from __future__ import annotations
 
@@ -12,13 +13,16 @@ from topoloc_training.classifier_config import AugmentationConfig
 
 
 def augment(pictures: Tensor, config: AugmentationConfig, generator: Generator) -> Tensor:
-    """Bytes (n, h, w, 3), varied each in its own way: normalised images (n, 3, h, w) for a network."""
+    """Bytes (n, h, w, 3), varied each in its own way: normalised images (n, 3, h, w) for a
+    network."""
     images = pictures.permute(0, 3, 1, 2).float() / 255.0
     images = _moved(images, config, generator)
     images = _relit(images, config, generator)
     images = _blurred(images, config, generator)
     images = _occluded(images, config, generator)
-    return normalize_pictures(images.permute(0, 2, 3, 1) * 255.0).contiguous(memory_format=torch.channels_last)
+    return normalize_pictures(images.permute(0, 2, 3, 1) * 255.0).contiguous(
+        memory_format=torch.channels_last
+    )
 
 
 def _uniform(num: int, size: float, generator: Generator) -> Tensor:
@@ -34,7 +38,10 @@ def _moved(images: Tensor, config: AugmentationConfig, generator: Generator) -> 
     across, down = 1.0 - sides[:, 0] - sides[:, 1], 1.0 - sides[:, 2] - sides[:, 3]
     shift_x, shift_y = sides[:, 0] - sides[:, 1], sides[:, 2] - sides[:, 3]
     cos, sin, aspect = torch.cos(turn), torch.sin(turn), height / width
-    rows = [torch.stack([cos * across, -sin * down * aspect, shift_x], 1), torch.stack([sin * across / aspect, cos * down, shift_y], 1)]
+    rows = [
+        torch.stack([cos * across, -sin * down * aspect, shift_x], 1),
+        torch.stack([sin * across / aspect, cos * down, shift_y], 1),
+    ]
     grid = nn.functional.affine_grid(torch.stack(rows, 1), list(images.shape), align_corners=False)
     return nn.functional.grid_sample(images, grid, padding_mode="border", align_corners=False)
 
@@ -55,14 +62,19 @@ def _blurred(images: Tensor, config: AugmentationConfig, generator: Generator) -
     if len(chosen) == 0:
         return images
     soft = nn.functional.avg_pool2d(images[chosen], 3, stride=1, padding=1, count_include_pad=False)
-    return images.index_copy(0, chosen, nn.functional.avg_pool2d(soft, 3, stride=1, padding=1, count_include_pad=False))
+    return images.index_copy(
+        0, chosen, nn.functional.avg_pool2d(soft, 3, stride=1, padding=1, count_include_pad=False)
+    )
 
 
 def _occluded(images: Tensor, config: AugmentationConfig, generator: Generator) -> Tensor:
     """Some pictures, with a rectangle of one colour before them, of up to a third of each side."""
     n, _, height, width = images.shape
     hidden = (torch.rand(n, generator=generator) < config.occlusion).view(n, 1, 1, 1)
-    centre, half = torch.rand(n, 2, generator=generator), torch.rand(n, 2, generator=generator) / 6.0
+    centre, half = (
+        torch.rand(n, 2, generator=generator),
+        torch.rand(n, 2, generator=generator) / 6.0,
+    )
     rows = torch.linspace(0.0, 1.0, height).view(1, 1, height, 1)
     columns = torch.linspace(0.0, 1.0, width).view(1, 1, 1, width)
     inside = ((rows - centre[:, 0].view(n, 1, 1, 1)).abs() < half[:, 0].view(n, 1, 1, 1)) & (

@@ -1,4 +1,5 @@
-"""Settings of the learned coarse localizers. They stand apart from their steps so that reading them needs no torch."""
+"""Settings of the learned coarse localizers. They stand apart from their steps so that reading them
+needs no torch."""
 
 from __future__ import annotations
 
@@ -16,13 +17,15 @@ class TrainingConfig:
     max_epochs: Annotated[int, Between(1, 100_000)] = 60
     """Times that every image is shown, at most."""
     patience: Annotated[int, AtLeast(0)] = 12
-    """Training stops after this many epochs without gain on the held-out images, and the best epoch is kept."""
+    """Training stops after this many epochs without gain on the held-out images, and the best epoch
+    is kept."""
     batch_size: Annotated[int, Between(1, 4096)] = 32
     """Images that are shown together."""
     learning_rate: Annotated[float, Between(0, 10)] = 1e-3
     """Of layers that begin at random; at its height, in a cosine schedule with a short rise."""
     backbone_rate: Annotated[float, Between(0, 10)] = 0.1
-    """Learning rate of layers that begin with weights from elsewhere, as a share of `learning_rate`."""
+    """Learning rate of layers that begin with weights from elsewhere, as a share of
+    `learning_rate`."""
     weight_decay: Annotated[float, Between(0, 10)] = 1e-2
     """Of AdamW."""
     held_out: Annotated[float, Between(0, 0.9)] = 0.12
@@ -30,7 +33,8 @@ class TrainingConfig:
     seed: Annotated[int, Between(0, 1_000_000_000)] = 0
     """Of the order of the images, how they are varied, and layers that begin at random."""
     num_threads: Annotated[int | None, Between(1, 1024)] = None
-    """Threads (None: as many as there are cores). Runs are the same to the bit with the same number of threads."""
+    """Threads (None: as many as there are cores). Runs are the same to the bit with the same number
+    of threads."""
 
 
 @dataclass(frozen=True)
@@ -62,20 +66,22 @@ class CnnFcConfig(ClassifierNetwork):
     training: TrainingConfig = field(default_factory=lambda: TrainingConfig(max_epochs=40))
     augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
     num_tuned: Annotated[int, Between(0, 100)] = 2
-    """Layers of the backbone that learn, the last ones with weights; those before stay as they begin. A network that begins at random
-    learns as a whole."""
+    """Layers of the backbone that learn, the last ones with weights; those before stay as they
+    begin. A network that begins at random learns as a whole."""
     num_copies: Annotated[int, Between(1, 10_000)] = 8
-    """Varied copies of each picture that the layers that do not learn see, once; fewer where what they make of them would exceed 1 GB."""
+    """Varied copies of each picture that the layers that do not learn see, once; fewer where what
+    they make of them would exceed 1 GB."""
     tuning_epochs: Annotated[int, Between(1, 100_000)] = 8
     """Times that every image is shown where it begins with what the map's own cnn-fc knows."""
     label_spread: Annotated[float, AtLeast(0)] = 1.0
-    """An image belongs to its nearest node and, by a bell curve of D_total - D_nearest over this share of D_thresh, to those
-    about as near; 0 is the paper's single label."""
+    """An image belongs to its nearest node and, by a bell curve of D_total - D_nearest over this
+    share of D_thresh, to those about as near; 0 is the paper's single label."""
 
 
 @dataclass(frozen=True)
 class CnnNnConfig(PooledNetwork):
-    """Settings of cnn-nn: features of a pretrained network, pooled, whitened; nearest neighbours."""
+    """Settings of cnn-nn: features of a pretrained network, pooled, whitened; nearest
+    neighbours."""
 
     dimension: Annotated[int, Between(1, 65_536)] = 256
     """Length of a place vector after whitening, at most."""
@@ -90,7 +96,8 @@ class TripletConfig:
     learning_rate: Annotated[float, Between(0, 10)] = 2e-5
     """Of all that is tuned."""
     margin: Annotated[float, AtLeast(0)] = 0.1
-    """By how much a picture of the same place must be nearer than one from elsewhere (squared distance)."""
+    """By how much a picture of the same place must be nearer than one from elsewhere (squared
+    distance)."""
     num_negatives: Annotated[int, Between(1, 1000)] = 5
     """The most similar images from elsewhere that each image is compared with."""
     num_tuned: Annotated[int, Between(0, 100)] = 2

@@ -1,4 +1,5 @@
-"""cnn-fc is taught: each mapping image is labelled with its nearest node by Eq. 1 (position and heading), or with those about as near."""
+"""cnn-fc is taught: each mapping image is labelled with its nearest node by Eq. 1 (position and
+heading), or with those about as near."""
 
 from __future__ import annotations
 
@@ -32,7 +33,8 @@ def train(
     progress: Progress,
     checkpoint: Path | None = None,
 ) -> CoarseModel:
-    """Train on all mapping images but those held out. Weights of the map's own cnn-fc are tuned for a few epochs.
+    """Train on all mapping images but those held out. Weights of the map's own cnn-fc are tuned for
+    a few epochs.
 
     Raises:
         TrainingError: see `fit`.
@@ -46,37 +48,75 @@ def train(
     network = NodeClassifier(backbone, training_set.num_nodes)
     in_channels_last(network)
     pretrained = [] if weights is None else _load(network, weights)
-    trunk = _freeze(network, len(network.backbone.features) if weights is None else config.num_tuned)
+    trunk = _freeze(
+        network, len(network.backbone.features) if weights is None else config.num_tuned
+    )
     images, shape = decode_pictures(training_set)
     pictures = torch.from_numpy(network_pictures(images, shape, config.picture))
     targets = torch.from_numpy(soft_labels(training_set, config.label_spread))
     held_out = hold_out(training_set.node_ids, config.training.held_out, config.training.seed)
-    rows, judged = np.flatnonzero(~held_out), np.flatnonzero(held_out) if held_out.any() else np.arange(len(held_out))
+    rows, judged = (
+        np.flatnonzero(~held_out),
+        np.flatnonzero(held_out) if held_out.any() else np.arange(len(held_out)),
+    )
     with deterministic(config.training):
-        shown, plain = FrozenMaps(trunk, pictures, rows, config, progress), plain_maps(trunk, pictures[judged])
+        shown, plain = (
+            FrozenMaps(trunk, pictures, rows, config, progress),
+            plain_maps(trunk, pictures[judged]),
+        )
 
     def loss(rows: Tensor, generator: Generator) -> Tensor:
         outputs = network(shown.drawn(rows, generator), len(trunk))
         return nn.functional.cross_entropy(outputs.float(), targets[rows])
 
     def score() -> float:
-        return float(nn.functional.cross_entropy(_outputs(network, plain, len(trunk)), targets[judged]))
+        return float(
+            nn.functional.cross_entropy(_outputs(network, plain, len(trunk)), targets[judged])
+        )
 
     counts = np.bincount(training_set.node_ids[rows], minlength=training_set.num_nodes)
-    balance = 1.0 / counts[training_set.node_ids[rows]]  # every node is shown as often as every other
-    done = fit(Task(network, loss, score, rows, balance, pretrained, NAME), config.training, progress, checkpoint)
+    balance = (
+        1.0 / counts[training_set.node_ids[rows]]
+    )  # every node is shown as often as every other
+    done = fit(
+        Task(network, loss, score, rows, balance, pretrained, NAME),
+        config.training,
+        progress,
+        checkpoint,
+    )
     rounded_to_half(network)
     labels = torch.from_numpy(training_set.node_ids[judged])
-    temperature = calibrated_temperature(_outputs(network, plain, len(trunk)), labels) if held_out.any() else 1.0
-    facts = {"backbone": backbone, "weights": describe(weights), "config": asdict(config), "picture_shape": [shape.width, shape.height]}
-    ended = {"epochs": len(done.scores), "best_epoch": done.best_epoch, "stopped_by": done.stopped_by}
-    trained = ended | {"num_held_out": int(held_out.sum()), "widened_from": None if weights is None else weights.num_outputs}
-    settings = facts | {"trained": trained, "num_nodes": training_set.num_nodes, "temperature": temperature}
+    temperature = (
+        calibrated_temperature(_outputs(network, plain, len(trunk)), labels)
+        if held_out.any()
+        else 1.0
+    )
+    facts = {
+        "backbone": backbone,
+        "weights": describe(weights),
+        "config": asdict(config),
+        "picture_shape": [shape.width, shape.height],
+    }
+    ended = {
+        "epochs": len(done.scores),
+        "best_epoch": done.best_epoch,
+        "stopped_by": done.stopped_by,
+    }
+    trained = ended | {
+        "num_held_out": int(held_out.sum()),
+        "widened_from": None if weights is None else weights.num_outputs,
+    }
+    settings = facts | {
+        "trained": trained,
+        "num_nodes": training_set.num_nodes,
+        "temperature": temperature,
+    }
     return CoarseModel(NAME, settings, to_arrays(network))
 
 
 def soft_labels(training_set: TrainingSet, spread: float) -> Float32[np.ndarray, "n nodes"]:
-    """The share of each node in each image: a bell curve of how much farther than the nearest it is; one node where `spread` is 0."""
+    """The share of each node in each image: a bell curve of how much farther than the nearest it
+    is; one node where `spread` is 0."""
     excess = training_set.node_distances - training_set.node_distances.min(axis=1, keepdims=True)
     if spread <= 0.0:
         shares = np.zeros_like(excess)
@@ -87,7 +127,8 @@ def soft_labels(training_set: TrainingSet, spread: float) -> Float32[np.ndarray,
 
 
 def calibrated_temperature(outputs: Tensor, labels: Tensor) -> float:
-    """What to divide the outputs by, so that the labels are as likely as can be (Guo et al. 2017): golden section over its logarithm."""
+    """What to divide the outputs by, so that the labels are as likely as can be (Guo et al. 2017):
+    golden section over its logarithm."""
     low, high, ratio = float(np.log(0.05)), float(np.log(20.0)), (5.0**0.5 - 1.0) / 2.0
 
     def cost(log_temperature: float) -> float:
@@ -103,23 +144,35 @@ def _outputs(network: NodeClassifier, maps: Tensor, num_frozen: int) -> Tensor:
     """Of what the first layers, as many as are frozen, made of pictures."""
     network.eval()
     with torch.inference_mode():
-        return torch.cat([network(batch.float(), num_frozen).float() for batch in maps.split(BATCH_SIZE)])
+        return torch.cat(
+            [network(batch.float(), num_frozen).float() for batch in maps.split(BATCH_SIZE)]
+        )
 
 
 def _freeze(network: NodeClassifier, num_tuned: int) -> nn.Sequential:
-    """The layers of the backbone before the last `num_tuned` that have weights: they do not learn, and are as the map will keep them."""
+    """The layers of the backbone before the last `num_tuned` that have weights: they do not learn,
+    and are as the map will keep them."""
     layers = list(network.backbone.features)
-    learning = [len(layers), *(k for k in reversed(range(len(layers))) if any(True for _ in layers[k].parameters()))]
+    learning = [
+        len(layers),
+        *(k for k in reversed(range(len(layers))) if any(True for _ in layers[k].parameters())),
+    ]
     trunk = nn.Sequential(*layers[: learning[num_tuned] if num_tuned < len(learning) - 1 else 0])
     rounded_to_half(trunk.requires_grad_(False))
     return trunk
 
 
 def _load(network: NodeClassifier, weights: Weights) -> list[nn.Parameter]:
-    """Put in all weights that fit, which are all but the output layer's where they are not the map's own; the parameters that got one,
-    without those that learn at the full rate."""
-    parameters = {name.removeprefix("backbone."): value for name, value in network.named_parameters()}
-    fitting = {name: value for name, value in weights.tensors.items() if name in parameters and parameters[name].shape == value.shape}
+    """Put in all weights that fit, which are all but the output layer's where they are not the
+    map's own; the parameters that got one, without those that learn at the full rate."""
+    parameters = {
+        name.removeprefix("backbone."): value for name, value in network.named_parameters()
+    }
+    fitting = {
+        name: value
+        for name, value in weights.tensors.items()
+        if name in parameters and parameters[name].shape == value.shape
+    }
     with torch.no_grad():
         for name, value in fitting.items():
             parameters[name].copy_(value)
@@ -128,4 +181,8 @@ def _load(network: NodeClassifier, weights: Weights) -> list[nn.Parameter]:
 
 def _for_tuning(config: CnnFcConfig) -> CnnFcConfig:
     num_epochs = min(config.tuning_epochs, config.training.max_epochs)
-    return replace(config, num_copies=min(config.num_copies, num_epochs), training=replace(config.training, max_epochs=num_epochs))
+    return replace(
+        config,
+        num_copies=min(config.num_copies, num_epochs),
+        training=replace(config.training, max_epochs=num_epochs),
+    )

@@ -12,9 +12,14 @@ from topoloc_training.weights import Weights, describe, load_features
 
 
 def train(
-    training_set: TrainingSet, backbone: BackboneName, weights: Weights | None, config: CnnNnConfig, progress: Progress
+    training_set: TrainingSet,
+    backbone: BackboneName,
+    weights: Weights | None,
+    config: CnnNnConfig,
+    progress: Progress,
 ) -> CoarseModel:
-    """Nothing is trained but the whitening; without weights the features are those of a random network, which ranks far worse.
+    """Nothing is trained but the whitening; without weights the features are those of a random
+    network, which ranks far worse.
 
     Raises:
         MapError: a mapping image is damaged.
@@ -22,4 +27,11 @@ def train(
     network = network_of(backbone, config)
     if weights is not None:
         load_features(network.backbone, weights)
-    return fit_vectors("cnn-nn", network, training_set, config, {"backbone": backbone, "weights": describe(weights)}, progress)
+    return fit_vectors(
+        "cnn-nn",
+        network,
+        training_set,
+        config,
+        {"backbone": backbone, "weights": describe(weights)},
+        progress,
+    )

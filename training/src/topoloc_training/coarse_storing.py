@@ -1,4 +1,5 @@
-"""Keeping a taught coarse localizer in a map file: apart from the teaching, for no result of it follows from how a map is edited."""
+"""Keeping a taught coarse localizer in a map file: apart from the teaching, for no result of it
+follows from how a map is edited."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ from topoloc.places.coarse import CoarseModel
 
 
 def store_coarse(path: Path, target: Path, model: CoarseModel, make_default: bool) -> None:
-    """Write to `target`, which may be `path`, the map of `path` with this coarse localizer in it: at once or not at all.
+    """Write to `target`, which may be `path`, the map of `path` with this coarse localizer in it:
+    at once or not at all.
 
     Args:
         make_default: it answers from now on where the user names none.
@@ -32,5 +34,11 @@ def store_coarse(path: Path, target: Path, model: CoarseModel, make_default: boo
 
 
 def _with_model(topomap: TopoMetricMap, model: CoarseModel, make_default: bool) -> TopoMetricMap:
-    models = {name: topomap.coarse_models[name] for name in topomap.coarse_models} | {model.name: model}
-    return replace(topomap, coarse_models=models, default_coarse=model.name if make_default else topomap.default_coarse)
+    models = {name: topomap.coarse_models[name] for name in topomap.coarse_models} | {
+        model.name: model
+    }
+    return replace(
+        topomap,
+        coarse_models=models,
+        default_coarse=model.name if make_default else topomap.default_coarse,
+    )

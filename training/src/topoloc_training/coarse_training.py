@@ -1,4 +1,5 @@
-"""Teaching a map a learned coarse localizer, from the mapping images that it keeps: no recording is needed."""
+"""Teaching a map a learned coarse localizer, from the mapping images that it keeps: no recording is
+needed."""
 
 from __future__ import annotations
 
@@ -40,8 +41,10 @@ def train_coarse(
     """Train the coarse localizer `name` (cnn-fc, cnn-nn or vlad-nn) for this map.
 
     Args:
-        weights: a file, ``scratch``, ``map`` for what the map's own cnn-fc knows, or None for the published weights of the backbone.
-        checkpoint: cnn-fc writes its state here after each epoch, and goes on from it if it is there.
+        weights: a file, ``scratch``, ``map`` for what the map's own cnn-fc knows, or None for the
+            published weights of the backbone.
+        checkpoint: cnn-fc writes its state here after each epoch, and goes on from it if it is
+            there.
 
     Raises:
         ConfigError: a value of `config` is out of its bounds.
@@ -50,24 +53,36 @@ def train_coarse(
         EmptyMapError, MapError: the map holds no images, or is damaged.
     """
     if name == "surf-vlad":
-        raise TrainingError("surf-vlad learns from the recording's local features: `topoloc build` makes it")
+        raise TrainingError(
+            "surf-vlad learns from the recording's local features: `topoloc build` makes it"
+        )
     from topoloc_training.weights import find_weights  # PyTorch takes its time
     from topoloc_training.widening import MAP, weights_of_map
 
     if weights == MAP and name != "cnn-fc":
-        raise TrainingError(f"{name} learns new pictures as they join the map; only cnn-fc begins with what it knows")
+        raise TrainingError(
+            f"{name} learns new pictures as they join the map; only cnn-fc begins with what it"
+            " knows"
+        )
     module = importlib.import_module(f"topoloc_training.{name.replace('-', '_')}")
     config = config or CoarseTrainingConfig()
     check_bounds(config)
     of_name = {"cnn-fc": config.cnn_fc, "cnn-nn": config.cnn_nn, "vlad-nn": config.vlad_nn}[name]
     found = weights_of_map(topomap, backbone) if weights == MAP else find_weights(backbone, weights)
-    arguments = (training_set_of(topomap), backbone, found, of_name, progress or (lambda stage, done, total: None))
+    arguments = (
+        training_set_of(topomap),
+        backbone,
+        found,
+        of_name,
+        progress or (lambda stage, done, total: None),
+    )
     model = module.train(*arguments, checkpoint) if name == "cnn-fc" else module.train(*arguments)
     return in_ids(model, [summary.node_id for summary in topomap.summaries])
 
 
 def in_ids(model: CoarseModel, ids: Sequence[int]) -> CoarseModel:
-    """The inverse of `topomap.in_rows`: a model that was made of the map's rows, as the map keeps it."""
+    """The inverse of `topomap.in_rows`: a model that was made of the map's rows, as the map keeps
+    it."""
     if list(ids) == list(range(len(ids))):
         return model
     rows = model.arrays.get("node_ids", np.arange(len(ids)))
@@ -85,7 +100,9 @@ def training_set_of(topomap: TopoMetricMap) -> TrainingSet:
         jpegs=[image.jpeg for image in images],
         world_from_cams=[image.world_from_cam for image in images],
         node_ids=np.array([topomap.row_of(image.node_id) for image in images], np.int64),
-        node_distances=np.stack([node_distances(image.world_from_cam, nodes, lambda_rot) for image in images]),
+        node_distances=np.stack(
+            [node_distances(image.world_from_cam, nodes, lambda_rot) for image in images]
+        ),
         d_thresh=d_thresh,
         lambda_rot=lambda_rot,
     )

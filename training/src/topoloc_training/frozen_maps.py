@@ -1,4 +1,5 @@
-"""What the frozen layers of a network make of the mapping pictures, computed once: training the others takes a fraction of the time."""
+"""What the frozen layers of a network make of the mapping pictures, computed once: training the
+others takes a fraction of the time."""
 
 from __future__ import annotations
 
@@ -19,8 +20,9 @@ _MOST = 6e4  # half floats end at 65504
 
 
 class FrozenMaps:
-    """Feature maps of varied copies of pictures, as half floats. Where even one copy of each would be more than `MAX_BYTES`, and where no
-    layer is frozen, nothing is kept: pictures are varied anew whenever they are shown.
+    """Feature maps of varied copies of pictures, as half floats. Where even one copy of each would
+    be more than `MAX_BYTES`, and where no layer is frozen, nothing is kept: pictures are varied
+    anew whenever they are shown.
 
     Args:
         trunk: the frozen layers; takes normalised images (n, 3, h, w), gives maps (n, c, h', w').
@@ -29,11 +31,18 @@ class FrozenMaps:
     """
 
     def __init__(
-        self, trunk: nn.Sequential, pictures: Tensor, rows: Int[np.ndarray, " m"], config: CnnFcConfig, progress: Progress
+        self,
+        trunk: nn.Sequential,
+        pictures: Tensor,
+        rows: Int[np.ndarray, " m"],
+        config: CnnFcConfig,
+        progress: Progress,
     ) -> None:
         self._trunk, self._pictures, self._config = trunk, pictures, config.augmentation
         one = plain_maps(trunk, pictures[:1])
-        num_copies = min(config.num_copies, MAX_BYTES // (one.nbytes * len(rows))) if len(trunk) else 0
+        num_copies = (
+            min(config.num_copies, MAX_BYTES // (one.nbytes * len(rows))) if len(trunk) else 0
+        )
         self._maps = torch.empty((num_copies, len(rows), *one.shape[1:]), dtype=one.dtype)
         self._place = torch.zeros(len(pictures), dtype=torch.int64)
         self._place[torch.from_numpy(rows)] = torch.arange(len(rows))
@@ -60,7 +69,9 @@ def plain_maps(trunk: nn.Sequential, pictures: Tensor) -> Tensor:
     """What the frozen layers make of pictures as they are, half floats."""
     trunk.eval()
     with torch.no_grad():
-        return torch.cat([_half(trunk(normalize_pictures(batch))) for batch in pictures.split(BATCH_SIZE)])
+        return torch.cat(
+            [_half(trunk(normalize_pictures(batch))) for batch in pictures.split(BATCH_SIZE)]
+        )
 
 
 def _half(maps: Tensor) -> Tensor:

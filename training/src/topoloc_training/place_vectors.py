@@ -28,7 +28,8 @@ def fit_vectors(
     facts: Mapping[str, Any],
     progress: Progress,
 ) -> CoarseModel:
-    """The model of a network: vectors of all mapping images and their whitening; `facts` go with its settings.
+    """The model of a network: vectors of all mapping images and their whitening; `facts` go with
+    its settings.
 
     The network's weights are rounded to half floats, as the map keeps them.
 
@@ -39,12 +40,22 @@ def fit_vectors(
     predict = Predictor(rounded_to_half(network))
     raw = []
     for start in range(0, len(pictures), _CHUNK):
-        raw.append(predict(network_pictures(pictures[start : start + _CHUNK], shape, config.picture)))
+        raw.append(
+            predict(network_pictures(pictures[start : start + _CHUNK], shape, config.picture))
+        )
         progress(f"{name}: vectors", min(start + _CHUNK, len(pictures)), len(pictures))
     vectors = np.concatenate(raw)
     whitening = learn_whitening(vectors, config.dimension)
-    whitening = Whitening(whitening.mean, whitening.projection.astype(np.float16).astype(np.float32))
-    arrays = to_arrays(network) | {"mean": whitening.mean, "projection": whitening.projection.astype(np.float16)}
-    arrays |= {"vectors": whitening.apply(vectors).astype(np.float16), "node_ids": training_set.node_ids.astype(np.int32)}
+    whitening = Whitening(
+        whitening.mean, whitening.projection.astype(np.float16).astype(np.float32)
+    )
+    arrays = to_arrays(network) | {
+        "mean": whitening.mean,
+        "projection": whitening.projection.astype(np.float16),
+    }
+    arrays |= {
+        "vectors": whitening.apply(vectors).astype(np.float16),
+        "node_ids": training_set.node_ids.astype(np.int32),
+    }
     settings = {**facts, "config": asdict(config), "picture_shape": [shape.width, shape.height]}
     return CoarseModel(name, settings, arrays)

@@ -2,9 +2,10 @@
 
     python -m topoloc_training.shared_vocabulary KIND OUT.npz RECORDING ...
 
-What is shipped may be learned of rendered worlds and of recordings under a licence that allows it, and of nothing else. Each recording
-counts alike, however long it is. Words are k-means centres; the whitening is learned of whole pictures and of halves of their features,
-for a map's nodes keep those features alone that have a 3-D position.
+What is shipped may be learned of rendered worlds and of recordings under a licence that allows it,
+and of nothing else. Each recording counts alike, however long it is. Words are k-means centres; the
+whitening is learned of whole pictures and of halves of their features, for a map's nodes keep those
+features alone that have a 3-D position.
 """
 
 from __future__ import annotations
@@ -34,27 +35,48 @@ Described = tuple[Features, int, int]
 """The features of a picture, its width and height."""
 
 
-def learn_vocabulary(kind: str, recordings: dict[str, list[Described]], num_words: int, dimension: int) -> SharedVocabulary:
+def learn_vocabulary(
+    kind: str, recordings: dict[str, list[Described]], num_words: int, dimension: int
+) -> SharedVocabulary:
     """Words and whitening of pictures of several recordings, rounded to what the file keeps."""
-    config = VladConfig(num_words=num_words, dimension=dimension, position_weight=find_kind(kind).position_weight)
+    config = VladConfig(
+        num_words=num_words, dimension=dimension, position_weight=find_kind(kind).position_weight
+    )
     pictures = [picture for described in recordings.values() for picture in described]
     descriptors = np.concatenate([placed(*picture, config) for picture in pictures])
     words = _rounded(learn_words(descriptors, config))
-    unwhitened = SharedVocabulary(kind, words, Whitening(np.zeros(1, np.float32), np.zeros((1, 1), np.float32)), config, {})
+    unwhitened = SharedVocabulary(
+        kind, words, Whitening(np.zeros(1, np.float32), np.zeros((1, 1), np.float32)), config, {}
+    )
     rng = np.random.default_rng(0)
-    raw = np.stack([unwhitened.raw_vector(*picture) for picture in [*pictures, *(_half(picture, rng) for picture in pictures)]])
+    raw = np.stack(
+        [
+            unwhitened.raw_vector(*picture)
+            for picture in [*pictures, *(_half(picture, rng) for picture in pictures)]
+        ]
+    )
     whitening = learn_whitening(raw, dimension)
     about = {
         "recordings": {name: len(described) for name, described in recordings.items()},
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "topoloc": topoloc.__version__,
     }
-    return SharedVocabulary(kind, words, Whitening(_rounded(whitening.mean), _rounded(whitening.projection)), config, about)
+    return SharedVocabulary(
+        kind,
+        words,
+        Whitening(_rounded(whitening.mean), _rounded(whitening.projection)),
+        config,
+        about,
+    )
 
 
 def _half(picture: Described, rng: np.random.Generator) -> Described:
     features, width, height = picture
-    return features.select(np.sort(rng.permutation(len(features))[: len(features) // 2])), width, height
+    return (
+        features.select(np.sort(rng.permutation(len(features))[: len(features) // 2])),
+        width,
+        height,
+    )
 
 
 def _rounded(values: Float32[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
@@ -75,7 +97,10 @@ def main(args: list[str]) -> None:
     kind, out, *paths = args
     recordings = {Path(path).name: _described(path, FeatureConfig(kind=kind)) for path in paths}
     vocabulary = learn_vocabulary(kind, recordings, NUM_WORDS, DIMENSION)
-    vocabulary.about["command"] = f"python -m topoloc_training.shared_vocabulary {kind} {Path(out).name} {' '.join(recordings)}"
+    vocabulary.about["command"] = (
+        f"python -m topoloc_training.shared_vocabulary {kind} {Path(out).name}"
+        f" {' '.join(recordings)}"
+    )
     with Path(out).open("wb") as file:
         np.savez_compressed(file, **vocabulary.to_arrays())  # pyright: ignore[reportArgumentType]
     print(f"{out}: version {vocabulary.version}, {Path(out).stat().st_size} bytes")

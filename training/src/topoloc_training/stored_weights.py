@@ -8,7 +8,8 @@ from torch import nn
 
 
 def rounded_to_half(network: nn.Module) -> nn.Module:
-    """The network with weights as the map file keeps them: what is learnt from it fits what is read back."""
+    """The network with weights as the map file keeps them: what is learnt from it fits what is read
+    back."""
     with torch.no_grad():
         for value in network.state_dict().values():
             if value.is_floating_point():
@@ -19,4 +20,7 @@ def rounded_to_half(network: nn.Module) -> nn.Module:
 def to_arrays(network: nn.Module) -> dict[str, np.ndarray]:
     """The network's weights as half floats, under names that begin with ``network.``."""
     state = {name: value.detach().cpu() for name, value in network.state_dict().items()}
-    return {f"network.{name}": (value.half() if value.is_floating_point() else value).numpy() for name, value in state.items()}
+    return {
+        f"network.{name}": (value.half() if value.is_floating_point() else value).numpy()
+        for name, value in state.items()
+    }

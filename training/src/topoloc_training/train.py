@@ -27,22 +27,30 @@ class Command:
     """What `topoloc train` takes."""
 
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
-    """The map file; it gets the coarse localizer, in the place of one of the same name. Or an atlas, with --tile."""
+    """The map file; it gets the coarse localizer, in the place of one of the same name. Or an
+    atlas, with --tile."""
     coarse: Literal["cnn-fc", "cnn-nn", "vlad-nn"]
     """The coarse localizer to train."""
     backbone: BackboneName = "squeezenet1_1"
     """The network it stands on."""
-    weights: Annotated[str | None, tyro.conf.arg(metavar="FILE|scratch|map", help_behavior_hint="(default: the published)")] = None
-    """The network's weights: a PyTorch file of torchvision's or NetVLAD's layout, `scratch` for random ones, `map` (cnn-fc) for
-    what the map's own one knows: its output is widened by new nodes, and tuned."""
+    weights: Annotated[
+        str | None,
+        tyro.conf.arg(metavar="FILE|scratch|map", help_behavior_hint="(default: the published)"),
+    ] = None
+    """The network's weights: a PyTorch file of torchvision's or NetVLAD's layout, `scratch` for
+    random ones, `map` (cnn-fc) for what the map's own one knows: its output is widened by new
+    nodes, and tuned."""
     default: Flag = False
     """From now on it answers where --coarse is not given."""
     tile: TileOption = None
     """Of an atlas: the tile whose map gets it."""
-    out: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: MAP itself)")] = None
+    out: Annotated[
+        str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: MAP itself)")
+    ] = None
     """Write the map with the new coarse localizer to this file and leave MAP as it is."""
     checkpoint: File = None
-    """cnn-fc: write the state of the training to this file after each epoch, and go on from it if it is there already."""
+    """cnn-fc: write the state of the training to this file after each epoch, and go on from it if
+    it is there already."""
     json: File = None
     """Write what was trained to this file (- for standard output)."""
     config: File = None
@@ -59,22 +67,32 @@ class Command:
         )
         config = read_settings(self.config).of(CoarseTrainingConfig)
         start = time.perf_counter()
-        facts, model = edited_at(self.map, self.tile, lambda path: self._trained(path, Path(self.out or path), config))
+        facts, model = edited_at(
+            self.map, self.tile, lambda path: self._trained(path, Path(self.out or path), config)
+        )
         facts |= {"seconds": round(time.perf_counter() - start, 1), "default": self.default}
         if self.json != "-":
             size = f"{facts['bytes'] / 1e6:.2f} MB, {facts['seconds']:.0f} s"
-            print(f"{self.out or self.tile or self.map}: {self.coarse} on {self.backbone}{_widened(model)}, {size}")
+            print(
+                f"{self.out or self.tile or self.map}: {self.coarse} on"
+                f" {self.backbone}{_widened(model)}, {size}"
+            )
         for warning in warnings_of(model):
             print(f"warning: {warning}", file=sys.stderr)
         write_json(self.json, facts)
         return 0
 
-    def _trained(self, path: Path, target: Path, config: CoarseTrainingConfig) -> tuple[dict[str, Any], CoarseModel]:
-        """What `target` says of its new coarse localizer, and that, learned from the map at `path`."""
+    def _trained(
+        self, path: Path, target: Path, config: CoarseTrainingConfig
+    ) -> tuple[dict[str, Any], CoarseModel]:
+        """What `target` says of its new coarse localizer, and that, learned from the map at
+        `path`."""
         checkpoint = None if self.checkpoint is None else Path(self.checkpoint)
         with progress_bar() as progress:
             topomap = TopoMetricMap.load(path)
-            model = train_coarse(topomap, self.coarse, self.backbone, self.weights, config, progress, checkpoint)
+            model = train_coarse(
+                topomap, self.coarse, self.backbone, self.weights, config, progress, checkpoint
+            )
         store_coarse(path, target, model, self.default)
         (facts,) = [facts for facts in list_coarse(target) if facts["name"] == self.coarse]
         return facts, model
@@ -82,7 +100,9 @@ class Command:
 
 def _widened(model: CoarseModel) -> str:
     before = (model.settings.get("trained") or {}).get("widened_from")
-    return "" if before is None else f", widened from {before} to {model.settings['num_nodes']} nodes"
+    return (
+        "" if before is None else f", widened from {before} to {model.settings['num_nodes']} nodes"
+    )
 
 
 def warnings_of(model: CoarseModel) -> list[str]:
@@ -92,7 +112,12 @@ def warnings_of(model: CoarseModel) -> list[str]:
     if isinstance(trained, dict) and "not finite" in trained["stopped_by"]:
         warnings.append(f"{trained['stopped_by']}; epoch {trained['best_epoch']} is kept")
     if model.settings.get("weights") is None and model.name != "cnn-fc":
-        warnings.append(f"{model.name} stands on random features: in other light it will name wrong nodes")
+        warnings.append(
+            f"{model.name} stands on random features: in other light it will name wrong nodes"
+        )
     elif model.settings.get("weights") is None:
-        warnings.append("cnn-fc began at random and knows these images alone: in other light weights of ImageNet do better")
+        warnings.append(
+            "cnn-fc began at random and knows these images alone: in other light weights of"
+            " ImageNet do better"
+        )
     return warnings

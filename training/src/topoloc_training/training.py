@@ -1,7 +1,8 @@
-"""The training loop that cnn-fc and PoseNet share: cosine schedule, early stopping, checkpoints, the same run every time.
+"""The training loop that cnn-fc and PoseNet share: cosine schedule, early stopping, checkpoints,
+the same run every time.
 
-Every epoch draws its numbers from the seed and its own number, so that a training that was interrupted and resumed ends
-with the same bytes as one that was not.
+Every epoch draws its numbers from the seed and its own number, so that a training that was
+interrupted and resumed ends with the same bytes as one that was not.
 """
 
 from __future__ import annotations
@@ -27,12 +28,14 @@ from topoloc_training.classifier_config import TrainingConfig
 from topoloc_training.training_set import Progress
 
 BatchLoss = Callable[[Tensor, Generator], Tensor]
-"""The mean loss of these rows of the training set, a scalar with gradient; randomness from the generator."""
+"""The mean loss of these rows of the training set, a scalar with gradient; randomness from the
+generator."""
 
 
 @dataclass(frozen=True)
 class Training:
-    """How a training went. `losses` are the mean of each epoch, `scores` (lower is better) those on the held-out images."""
+    """How a training went. `losses` are the mean of each epoch, `scores` (lower is better) those on
+    the held-out images."""
 
     losses: list[float]
     scores: list[float]
@@ -45,8 +48,9 @@ class Training:
 class Task:
     """What is to be trained.
 
-    `pretrained` are the parameters that begin with weights from elsewhere; all others of `network` begin at random.
-    `draw_weights` say how often each row is shown, `score` judges the network on what is held out.
+    `pretrained` are the parameters that begin with weights from elsewhere; all others of `network`
+    begin at random. `draw_weights` say how often each row is shown, `score` judges the network on
+    what is held out.
     """
 
     network: nn.Module
@@ -58,13 +62,17 @@ class Task:
     name: str
 
 
-def fit(task: Task, config: TrainingConfig, progress: Progress, checkpoint: Path | None = None) -> Training:
-    """Train; the network ends with the weights of its best epoch. An existing checkpoint is gone on from.
+def fit(
+    task: Task, config: TrainingConfig, progress: Progress, checkpoint: Path | None = None
+) -> Training:
+    """Train; the network ends with the weights of its best epoch. An existing checkpoint is gone on
+    from.
 
     A loss that is not finite ends the training with the best weights so far.
 
     Raises:
-        TrainingError: the loss was not finite before any epoch was good, or the checkpoint is of another training.
+        TrainingError: the loss was not finite before any epoch was good, or the checkpoint is of
+            another training.
     """
     state = _State(task, config)
     if checkpoint is not None and checkpoint.exists():
@@ -79,7 +87,10 @@ def fit(task: Task, config: TrainingConfig, progress: Progress, checkpoint: Path
             if checkpoint is not None:
                 state.save(checkpoint)
     if state.best is None:
-        raise TrainingError(f"{task.name}: {state.stopped_by or 'no epoch was trained'}; a lower learning rate may help")
+        raise TrainingError(
+            f"{task.name}: {state.stopped_by or 'no epoch was trained'}; a lower learning rate may"
+            " help"
+        )
     task.network.load_state_dict(state.best)
     task.network.eval()
     return Training(state.losses, state.scores, state.best_epoch, state.stopped_by)
@@ -89,7 +100,10 @@ def hold_out(node_ids: Int[np.ndarray, " n"], share: float, seed: int) -> Bool[n
     """Images to judge by: about `share` of all, from nodes that keep at least half of theirs."""
     rng = np.random.default_rng(seed)
     held_out = np.zeros(len(node_ids), bool)
-    left = {int(node): int(count) // 2 for node, count in zip(*np.unique(node_ids, return_counts=True), strict=True)}
+    left = {
+        int(node): int(count) // 2
+        for node, count in zip(*np.unique(node_ids, return_counts=True), strict=True)
+    }
     wanted = round(share * len(node_ids))
     for row in rng.permutation(len(node_ids)):
         if wanted > 0 and left[int(node_ids[row])] > 0:
@@ -108,8 +122,12 @@ class _State:
         fresh = [p for p in task.network.parameters() if p.requires_grad and id(p) not in early]
         groups: list[dict[str, Any]] = [{"params": fresh, "peak": config.learning_rate}]
         if task.pretrained:
-            groups.append({"params": task.pretrained, "peak": config.learning_rate * config.backbone_rate})
-        self.optimizer = torch.optim.AdamW(groups, lr=config.learning_rate, weight_decay=config.weight_decay)
+            groups.append(
+                {"params": task.pretrained, "peak": config.learning_rate * config.backbone_rate}
+            )
+        self.optimizer = torch.optim.AdamW(
+            groups, lr=config.learning_rate, weight_decay=config.weight_decay
+        )
         self.epoch, self.best_epoch, self.stopped_by = 0, 0, ""
         self.losses: list[float] = []
         self.scores: list[float] = []
@@ -137,30 +155,46 @@ class _State:
 
     def save(self, path: Path) -> None:
         names = ("epoch", "best_epoch", "losses", "scores", "best")
-        content = {name: getattr(self, name) for name in names} | {"fingerprint": self._fingerprint()}
-        content |= {"network": self.task.network.state_dict(), "optimizer": self.optimizer.state_dict()}
+        content = {name: getattr(self, name) for name in names} | {
+            "fingerprint": self._fingerprint()
+        }
+        content |= {
+            "network": self.task.network.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+        }
         try:
             with replaced_file(path) as part:
                 torch.save(content, part)
         except (OSError, RuntimeError) as error:
-            raise TrainingError(f"cannot write checkpoint {path}: {' '.join(str(error).split())[:200]}") from error
+            raise TrainingError(
+                f"cannot write checkpoint {path}: {' '.join(str(error).split())[:200]}"
+            ) from error
 
     def load(self, path: Path) -> None:
         try:
             content = torch.load(path, weights_only=True)
             fingerprint = content["fingerprint"]
         except Exception as error:  # whatever PyTorch makes of bytes that are no checkpoint
-            raise TrainingError(f"checkpoint {path} is truncated, damaged or no checkpoint of a training") from error
+            raise TrainingError(
+                f"checkpoint {path} is truncated, damaged or no checkpoint of a training"
+            ) from error
         if fingerprint != self._fingerprint():
-            raise TrainingError(f"checkpoint {path} is of another training: other images, network or settings")
+            raise TrainingError(
+                f"checkpoint {path} is of another training: other images, network or settings"
+            )
         for name in ("epoch", "best_epoch", "losses", "scores", "best"):
             setattr(self, name, content[name])
         self.task.network.load_state_dict(content["network"])
         self.optimizer.load_state_dict(content["optimizer"])
 
     def _fingerprint(self) -> str:
-        shapes = [(name, tuple(value.shape)) for name, value in self.task.network.state_dict().items()]
-        drawn = np.ascontiguousarray(self.task.draw_weights).tobytes() + np.ascontiguousarray(self.task.rows).tobytes()
+        shapes = [
+            (name, tuple(value.shape)) for name, value in self.task.network.state_dict().items()
+        ]
+        drawn = (
+            np.ascontiguousarray(self.task.draw_weights).tobytes()
+            + np.ascontiguousarray(self.task.rows).tobytes()
+        )
         return hashlib.sha256(repr((asdict(self.config), shapes)).encode() + drawn).hexdigest()
 
 
@@ -171,7 +205,9 @@ def _train_epoch(task: Task, config: TrainingConfig, state: _State, progress: Pr
     torch.manual_seed(seed)  # dropout
     task.network.train()
     weights = torch.from_numpy(np.asarray(task.draw_weights, np.float64))
-    order = torch.from_numpy(task.rows)[torch.multinomial(weights, len(task.rows), replacement=True, generator=generator)]
+    order = torch.from_numpy(task.rows)[
+        torch.multinomial(weights, len(task.rows), replacement=True, generator=generator)
+    ]
     batches = order.split(config.batch_size)
     total = 0.0
     for done, rows in enumerate(batches):

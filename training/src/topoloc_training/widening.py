@@ -19,38 +19,61 @@ _OUTPUT_LAYERS = ("head.5.", "backbone.classifier.6.")
 
 
 def weights_of_map(topomap: TopoMetricMap, backbone: BackboneName) -> Weights:
-    """The network of the map's cnn-fc, its output layer by the map's nodes: a new node begins with the output of the nearest one by Eq. 1
-    that it knows, whose pictures look most like its own.
+    """The network of the map's cnn-fc, its output layer by the map's nodes: a new node begins with
+    the output of the nearest one by Eq. 1 that it knows, whose pictures look most like its own.
 
     Raises:
-        TrainingError: the map has none, it stands on another backbone, or knows none of the map's nodes.
+        TrainingError: the map has none, it stands on another backbone, or knows none of the map's
+            nodes.
         MapError: it is damaged.
     """
     model = topomap.coarse_models.get(NAME)
     if model is None:
-        raise TrainingError(f"the map has no {NAME} to begin with; train one without --weights {MAP}")
+        raise TrainingError(
+            f"the map has no {NAME} to begin with; train one without --weights {MAP}"
+        )
     open_model(model)  # a damaged one is named
     if (its := model.settings["backbone"]) != backbone:
-        raise TrainingError(f"the map's {NAME} stands on {its}, not on {backbone}; give --backbone {its}")
-    outputs = _output_of_each_node(topomap, np.asarray(model.arrays.get("node_ids", np.arange(model.settings["num_nodes"]))))
+        raise TrainingError(
+            f"the map's {NAME} stands on {its}, not on {backbone}; give --backbone {its}"
+        )
+    outputs = _output_of_each_node(
+        topomap, np.asarray(model.arrays.get("node_ids", np.arange(model.settings["num_nodes"])))
+    )
     tensors = {}
     for name, array in model.arrays.items():
         if name.startswith("network."):
             name = name.removeprefix("network.")
             values = torch.from_numpy(np.asarray(array, np.float32))
-            tensors[name.removeprefix("backbone.")] = values[torch.from_numpy(outputs)] if name.startswith(_OUTPUT_LAYERS) else values
+            tensors[name.removeprefix("backbone.")] = (
+                values[torch.from_numpy(outputs)] if name.startswith(_OUTPUT_LAYERS) else values
+            )
     origin = model.settings.get("weights") or {"file": "", "sha256": ""}
-    return Weights(backbone, tensors, origin["file"], origin["sha256"], num_outputs=int(model.settings["num_nodes"]))
+    return Weights(
+        backbone,
+        tensors,
+        origin["file"],
+        origin["sha256"],
+        num_outputs=int(model.settings["num_nodes"]),
+    )
 
 
-def _output_of_each_node(topomap: TopoMetricMap, node_ids: Int[np.ndarray, " outputs"]) -> Int[np.ndarray, " nodes"]:
+def _output_of_each_node(
+    topomap: TopoMetricMap, node_ids: Int[np.ndarray, " outputs"]
+) -> Int[np.ndarray, " nodes"]:
     output_of = {int(node_id): output for output, node_id in enumerate(node_ids)}
     known = [row for row, summary in enumerate(topomap.summaries) if summary.node_id in output_of]
     if not known:
-        raise TrainingError(f"the map's {NAME} knows none of its nodes; train one without --weights {MAP}")
+        raise TrainingError(
+            f"the map's {NAME} knows none of its nodes; train one without --weights {MAP}"
+        )
     poses = NodePoses.of([topomap.summaries[row].world_from_cam for row in known])
     outputs = []
     for summary in topomap.summaries:
-        nearest = known[int(node_distances(summary.world_from_cam, poses, topomap.config.lambda_rot).argmin())]
-        outputs.append(output_of.get(summary.node_id, output_of[topomap.summaries[nearest].node_id]))
+        nearest = known[
+            int(node_distances(summary.world_from_cam, poses, topomap.config.lambda_rot).argmin())
+        ]
+        outputs.append(
+            output_of.get(summary.node_id, output_of[topomap.summaries[nearest].node_id])
+        )
     return np.array(outputs, np.int64)

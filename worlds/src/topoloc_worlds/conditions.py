@@ -1,4 +1,5 @@
-"""Times of day and weather: a condition is a parameter of a world, so that the same camera pose is true under each of them."""
+"""Times of day and weather: a condition is a parameter of a world, so that the same camera pose is
+true under each of them."""
 
 from __future__ import annotations
 
@@ -48,4 +49,6 @@ def find_condition(name: str) -> Condition:
     try:
         return CONDITIONS[ALIASES.get(name, name)]
     except KeyError:
-        raise TopolocError(f"unknown condition {name!r}; conditions: {', '.join([*CONDITIONS, *ALIASES])}") from None
+        raise TopolocError(
+            f"unknown condition {name!r}; conditions: {', '.join([*CONDITIONS, *ALIASES])}"
+        ) from None

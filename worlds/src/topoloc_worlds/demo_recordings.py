@@ -1,4 +1,5 @@
-"""The recordings of `topoloc demo` made: the lab by day for the map, and what the map is asked about.
+"""The recordings of `topoloc demo` made: the lab by day for the map, and what the map is asked
+about.
 
 topoloc brings them along (`topoloc/demo/lab`), so that the demo needs no renderer.
 """
@@ -48,15 +49,21 @@ def _mapping(name: str, route: RouteConfig) -> DemoRecording:
     return DemoRecording(name, "lab", "day", RecordConfig(route=route, jpeg=JPEG_QUALITY))
 
 
-def _asking(name: str, condition: str, arrangement: int, route: RouteConfig, camera: Camera = ZED) -> DemoRecording:
-    config = RecordConfig(arrangement=arrangement, route=route, camera=camera, baseline=None, jpeg=JPEG_QUALITY)
+def _asking(
+    name: str, condition: str, arrangement: int, route: RouteConfig, camera: Camera = ZED
+) -> DemoRecording:
+    config = RecordConfig(
+        arrangement=arrangement, route=route, camera=camera, baseline=None, jpeg=JPEG_QUALITY
+    )
     return DemoRecording(name, "lab", condition, config)
 
 
 def _elsewhere(name: str, condition: str, spacing: float, num_frames: int) -> DemoRecording:
     """Single pictures from all round another world."""
     walk = replace(find_world(name).route(), spacing=spacing, num_frames=num_frames, seed=9)
-    return DemoRecording(name, name, condition, RecordConfig(route=walk, baseline=None, jpeg=JPEG_QUALITY))
+    return DemoRecording(
+        name, name, condition, RecordConfig(route=walk, baseline=None, jpeg=JPEG_QUALITY)
+    )
 
 
 RECORDINGS = (
@@ -70,8 +77,11 @@ RECORDINGS = (
 )
 
 
-def render_recordings(folder: Path, progress: Callable[[str, int, int], None] = lambda stage, done, total: None) -> None:
-    """Render all of the demo's recordings into `folder`; what was begun before goes on where it stopped.
+def render_recordings(
+    folder: Path, progress: Callable[[str, int, int], None] = lambda stage, done, total: None
+) -> None:
+    """Render all of the demo's recordings into `folder`; what was begun before goes on where it
+    stopped.
 
     Raises:
         MissingExtraError: Mitsuba is not installed.
@@ -82,7 +92,10 @@ def render_recordings(folder: Path, progress: Callable[[str, int, int], None] = 
     except OSError as error:
         raise TopolocError(f"cannot write {folder}: {error.strerror}") from error
     for recording in RECORDINGS:
-        stages = {"frames": f"rendering {recording.name.replace('_', ' ')}", "light": f"light for {recording.name.replace('_', ' ')}"}
+        stages = {
+            "frames": f"rendering {recording.name.replace('_', ' ')}",
+            "light": f"light for {recording.name.replace('_', ' ')}",
+        }
         record(
             find_world(recording.world),
             find_condition(recording.condition),
@@ -94,7 +107,8 @@ def render_recordings(folder: Path, progress: Callable[[str, int, int], None] = 
 
 
 def draw_pictures_of_nothing(folder: Path) -> None:
-    """Pictures that show no place at all, with a camera.json: black, white, noise of one pixel and of clouds, stripes.
+    """Pictures that show no place at all, with a camera.json: black, white, noise of one pixel and
+    of clouds, stripes.
 
     Raises:
         TopolocError: the folder cannot be written.
@@ -114,5 +128,7 @@ def _pictures_of_nothing() -> dict[str, UInt8[np.ndarray, "h w"]]:
     clouds = 128.0 + 45.0 * fractal_noise(rng, shape, 60.0)
     stripes = 128.0 + 90.0 * np.sin(np.arange(ZED.width) / 5.0)[None, :].repeat(ZED.height, axis=0)
     levels = {"clouds": clouds, "noise": rng.normal(128.0, 40.0, shape), "stripes": stripes}
-    drawn = {name: np.clip(picture, 0.0, 255.0).astype(np.uint8) for name, picture in levels.items()}
+    drawn = {
+        name: np.clip(picture, 0.0, 255.0).astype(np.uint8) for name, picture in levels.items()
+    }
     return {"black": np.zeros(shape, np.uint8), "white": np.full(shape, 255, np.uint8), **drawn}

@@ -1,9 +1,11 @@
-"""The files of a rendered recording: where they lie, what is in them, and which of them are there already.
+"""The files of a rendered recording: where they lie, what is in them, and which of them are there
+already.
 
-A stereo recording is laid out as KITTI's (``image_2/ image_3/``, grey ``image_0/ image_1/``; depth pictures in ``depth_2/`` or
-``depth_0/``), one of a single camera as a plain folder (``images/``; with depth ``rgb/ depth/``) with its ``camera.json``. Times,
-calibration and truth are those of the whole recording from the beginning, so that one whose pictures are not all there is
-refused when it is opened.
+A stereo recording is laid out as KITTI's (``image_2/ image_3/``, grey ``image_0/ image_1/``; depth
+pictures in ``depth_2/`` or ``depth_0/``), one of a single camera as a plain folder (``images/``;
+with depth ``rgb/ depth/``) with its ``camera.json``. Times, calibration and truth are those of the
+whole recording from the beginning, so that one whose pictures are not all there is refused when it
+is opened.
 """
 
 from __future__ import annotations
@@ -78,12 +80,15 @@ class Layout:
         return files
 
 
-def prepare(layout: Layout, settings: dict[str, object], trajectory: Trajectory, overwrite: bool) -> None:
-    """Make the folders and write all but the pictures, or hold that a recording begun before is this very one.
+def prepare(
+    layout: Layout, settings: dict[str, object], trajectory: Trajectory, overwrite: bool
+) -> None:
+    """Make the folders and write all but the pictures, or hold that a recording begun before is
+    this very one.
 
     Raises:
-        TopolocError: the folder holds something else, or a recording with other settings (unless `overwrite`, which removes
-            it), or it cannot be written.
+        TopolocError: the folder holds something else, or a recording with other settings (unless
+            `overwrite`, which removes it), or it cannot be written.
     """
     folder = layout.folder
     try:
@@ -93,10 +98,13 @@ def prepare(layout: Layout, settings: dict[str, object], trajectory: Trajectory,
                 _remove(folder)
             elif different := _differences(before, json.loads(json.dumps(settings))):
                 raise TopolocError(
-                    f"{folder} was begun with other settings ({'; '.join(different[:5])}); name another folder, or give --overwrite"
+                    f"{folder} was begun with other settings ({'; '.join(different[:5])}); name"
+                    " another folder, or give --overwrite"
                 )
         folder.mkdir(parents=True, exist_ok=True)
-        write_text(folder / SETTINGS, json.dumps({"made_by": _MADE_BY, **settings}, indent=1) + "\n")
+        write_text(
+            folder / SETTINGS, json.dumps({"made_by": _MADE_BY, **settings}, indent=1) + "\n"
+        )
         for name in (layout.left, layout.right, layout.depth):
             if name is not None:
                 (folder / name).mkdir(exist_ok=True)
@@ -104,7 +112,9 @@ def prepare(layout: Layout, settings: dict[str, object], trajectory: Trajectory,
     except OSError as error:
         raise TopolocError(f"cannot write {error.filename or folder}: {error.strerror}") from error
     assert trajectory.t_ns is not None
-    write_text(folder / "times.txt", "".join(f"{Decimal(t).scaleb(-9):.9f}\n" for t in trajectory.t_ns))
+    write_text(
+        folder / "times.txt", "".join(f"{Decimal(t).scaleb(-9):.9f}\n" for t in trajectory.t_ns)
+    )
     write_tum(folder / "truth.tum", trajectory)
     if layout.baseline is not None:
         write_text(folder / "calib.txt", _calib(layout.camera, layout.baseline))
@@ -115,7 +125,11 @@ def prepare(layout: Layout, settings: dict[str, object], trajectory: Trajectory,
 
 def missing_frames(layout: Layout, num_frames: int) -> list[int]:
     """The frames of which a file is not there."""
-    return [i for i in range(num_frames) if not all(path.is_file() for path in layout.pictures(i).values())]
+    return [
+        i
+        for i in range(num_frames)
+        if not all(path.is_file() for path in layout.pictures(i).values())
+    ]
 
 
 def write_shot(layout: Layout, index: int, shot: Shot) -> None:
@@ -132,14 +146,23 @@ def write_shot(layout: Layout, index: int, shot: Shot) -> None:
 
 def _encoded(image: Image | UInt16[np.ndarray, "h w"], jpeg: int | None) -> bytes:
     pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    suffix, settings = (".png", [cv2.IMWRITE_PNG_COMPRESSION, 3]) if jpeg is None else (".jpg", [cv2.IMWRITE_JPEG_QUALITY, jpeg])
+    suffix, settings = (
+        (".png", [cv2.IMWRITE_PNG_COMPRESSION, 3])
+        if jpeg is None
+        else (".jpg", [cv2.IMWRITE_JPEG_QUALITY, jpeg])
+    )
     done, data = cv2.imencode(suffix, pixels, settings)
     if not done:
-        raise TopolocError(f"a picture of {pixels.shape[1]}x{pixels.shape[0]} pixels cannot be stored as {suffix[1:]}")
+        raise TopolocError(
+            f"a picture of {pixels.shape[1]}x{pixels.shape[0]} pixels cannot be stored as"
+            f" {suffix[1:]}"
+        )
     return data.tobytes()
 
 
-def _depth_units(depth: Float32[np.ndarray, "h w"], depth_factor: float) -> UInt16[np.ndarray, "h w"]:
+def _depth_units(
+    depth: Float32[np.ndarray, "h w"], depth_factor: float
+) -> UInt16[np.ndarray, "h w"]:
     """Depth as it is stored; what is too far for 16 bits, or sky, is unknown."""
     units = np.rint(np.nan_to_num(depth.astype(np.float64), nan=0.0, posinf=0.0) * depth_factor)
     return np.where((units > 0) & (units < 65535), units, _UNKNOWN_DEPTH).astype(np.uint16)
@@ -150,7 +173,20 @@ def _calib(camera: Camera, baseline: float) -> str:
     rows = []
     for number in range(4):
         shift = -camera.fx * baseline if number % 2 else 0.0
-        matrix = [camera.fx, 0.0, camera.cx, shift, 0.0, camera.fy, camera.cy, 0.0, 0.0, 0.0, 1.0, 0.0]
+        matrix = [
+            camera.fx,
+            0.0,
+            camera.cx,
+            shift,
+            0.0,
+            camera.fy,
+            camera.cy,
+            0.0,
+            0.0,
+            0.0,
+            1.0,
+            0.0,
+        ]
         rows.append(f"P{number}: " + " ".join(f"{value:.12e}" for value in matrix))
     return "\n".join(rows) + "\n"
 
@@ -182,7 +218,10 @@ def _differences(before: object, now: object, name: str = "") -> list[str]:
     """What two settings do not share, each as words."""
     if isinstance(before, dict) and isinstance(now, dict):
         keys = [*before, *(key for key in now if key not in before)]
-        below = [_differences(before.get(key), now.get(key), f"{name}.{key}" if name else key) for key in keys]
+        below = [
+            _differences(before.get(key), now.get(key), f"{name}.{key}" if name else key)
+            for key in keys
+        ]
         return [text for texts in below for text in texts]
     return [] if before == now else [f"{name} was {json.dumps(before)}, now {json.dumps(now)}"]
 

@@ -1,4 +1,5 @@
-"""Walk a world with a camera and write the recording: resumable, in several processes, the same bytes however it came about."""
+"""Walk a world with a camera and write the recording: resumable, in several processes, the same
+bytes however it came about."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ from topoloc_worlds.worlds import World
 Progress = Callable[[str, int, int], None]
 
 ZED = Camera.pinhole(640, 400, 380.0, 380.0, 319.5, 199.5)
-"""Size and field of view (80 degrees) of a ZED camera's pictures as they are used for localization."""
+"""Size and field of view (80 degrees) of a ZED camera's pictures as they are used for
+localization."""
 
 _FEW_FRAMES = 20
 
@@ -65,9 +67,14 @@ class RecordConfig:
 
     def __post_init__(self) -> None:
         if self.camera.is_distorted:
-            raise CalibrationError(f"only undistorted cameras can be rendered, not {self.camera.model} {self.camera.params}")
+            raise CalibrationError(
+                f"only undistorted cameras can be rendered, not {self.camera.model}"
+                f" {self.camera.params}"
+            )
         if self.baseline is not None and not 1e-3 <= self.baseline <= 10.0:
-            raise CalibrationError(f"stereo rig: a baseline of {self.baseline:g} m cannot be rendered")
+            raise CalibrationError(
+                f"stereo rig: a baseline of {self.baseline:g} m cannot be rendered"
+            )
         if self.jpeg is not None and not 1 <= self.jpeg <= 100:
             raise TopolocError(f"the quality of JPEG is 1 to 100, not {self.jpeg}")
         if self.num_renderings < 1 or self.lens_drops < 0:
@@ -76,7 +83,8 @@ class RecordConfig:
 
 @dataclass(frozen=True)
 class Recorded:
-    """What lies in the folder now: its frames, how many of them this run rendered, and metres travelled."""
+    """What lies in the folder now: its frames, how many of them this run rendered, and metres
+    travelled."""
 
     num_frames: int
     num_rendered: int
@@ -94,13 +102,14 @@ def record(
 ) -> Recorded:
     """Render a recording into the folder `out`. One that was interrupted goes on where it stopped.
 
-    Frames are written one by one, each file whole or not at all, so that an interruption at any time loses only the frames
-    being rendered.
+    Frames are written one by one, each file whole or not at all, so that an interruption at any
+    time loses only the frames being rendered.
 
     Args:
-        progress: called with ("light", done, total) while the light of the world is traced, if it has to be, then with
-            ("frames", done, total), last of all if this fails.
-        processes: each renders frames of its own; None chooses. They have no influence on the pictures.
+        progress: called with ("light", done, total) while the light of the world is traced, if it
+            has to be, then with ("frames", done, total), last of all if this fails.
+        processes: each renders frames of its own; None chooses. They have no influence on the
+            pictures.
         overwrite: remove a recording of other settings that lies there.
 
     Raises:
@@ -110,20 +119,33 @@ def record(
     variant = use_best_variant()
     route = plan_route(world.loop, world.camera_height, config.route)
     layout = _layout(world, out, config)
-    prepare(layout, _settings(world, condition, config, variant, route), Trajectory(frame_poses(route), route.t_ns), overwrite)
+    prepare(
+        layout,
+        _settings(world, condition, config, variant, route),
+        Trajectory(frame_poses(route), route.t_ns),
+        overwrite,
+    )
     missing = missing_frames(layout, route.num_frames)
     done = route.num_frames - len(missing)
     progress("frames", done, route.num_frames)
     job = _Job(world, condition, config, layout, variant)
     num = min(len(missing), processes or _num_processes(len(missing)))
-    in_turn = _render_here(job, missing, progress) if num <= 1 else _render_in_processes(job, missing, num, progress)
+    in_turn = (
+        _render_here(job, missing, progress)
+        if num <= 1
+        else _render_in_processes(job, missing, num, progress)
+    )
     try:
         with closing(in_turn):
             for _ in in_turn:
                 done += 1
                 progress("frames", done, route.num_frames)
     except BaseException:  # processes have finished their frames meanwhile
-        progress("frames", route.num_frames - len(missing_frames(layout, route.num_frames)), route.num_frames)
+        progress(
+            "frames",
+            route.num_frames - len(missing_frames(layout, route.num_frames)),
+            route.num_frames,
+        )
         raise
     return Recorded(route.num_frames, len(missing), route.length)
 
@@ -140,7 +162,8 @@ class _Job:
 
 
 def _num_processes(num_frames: int) -> int:
-    """One for a few frames, as each process has to build the world first; else two, so that one renders while the other stores."""
+    """One for a few frames, as each process has to build the world first; else two, so that one
+    renders while the other stores."""
     return min(2, os.cpu_count() or 1) if num_frames > _FEW_FRAMES else 1
 
 
@@ -153,18 +176,25 @@ def _render_here(job: _Job, frames: list[int], progress: Progress) -> Generator[
         yield index
 
 
-def _render_in_processes(job: _Job, frames: list[int], num: int, progress: Progress) -> Generator[int, None, None]:
+def _render_in_processes(
+    job: _Job, frames: list[int], num: int, progress: Progress
+) -> Generator[int, None, None]:
     if job.variant == LLVM:  # the light is traced here, and the processes find it in the cache
         _shooting(job, progress)
     # Not forked: a child of a process in which Mitsuba's threads run would wait for them for ever.
-    with ProcessPoolExecutor(num, get_context("spawn"), initializer=_start, initargs=(job,)) as pool:
+    with ProcessPoolExecutor(
+        num, get_context("spawn"), initializer=_start, initargs=(job,)
+    ) as pool:
         try:
             with _children_ignore_interrupts():
                 futures: list[Future[int]] = [pool.submit(_render_one, index) for index in frames]
             for future in as_completed(futures):
                 yield future.result()
         except BrokenProcessPool:
-            raise TopolocError("a rendering process was ended from outside (out of memory?); fewer --processes need less") from None
+            raise TopolocError(
+                "a rendering process was ended from outside (out of memory?); fewer --processes"
+                " need less"
+            ) from None
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
 
@@ -220,10 +250,19 @@ def _shooting(job: _Job, progress: Progress = lambda stage, done, total: None) -
 
 def _layout(world: World, out: Path, config: RecordConfig) -> Layout:
     depth_factor = world.depth_factor if config.depth else None
-    return Layout(Path(os.path.abspath(out)), config.camera, config.baseline, config.grey, config.jpeg, depth_factor)
+    return Layout(
+        Path(os.path.abspath(out)),
+        config.camera,
+        config.baseline,
+        config.grey,
+        config.jpeg,
+        depth_factor,
+    )
 
 
-def _settings(world: World, condition: Condition, config: RecordConfig, variant: str, route: Route) -> dict[str, object]:
+def _settings(
+    world: World, condition: Condition, config: RecordConfig, variant: str, route: Route
+) -> dict[str, object]:
     """All that the pictures depend on, for world.json."""
     return {
         "world": world.name,

@@ -1,7 +1,9 @@
-"""Routes: a closed line on the ground becomes the path of a camera in time, with the sway of who carries it.
+"""Routes: a closed line on the ground becomes the path of a camera in time, with the sway of who
+carries it.
 
-The path is a function of time, so that a motion blur can ask between frames, and smooth: the line's corners are rounded by a
-Gaussian kernel and the sway is band-limited, with the bands and sizes of human gait and of a car on its springs.
+The path is a function of time, so that a motion blur can ask between frames, and smooth: the line's
+corners are rounded by a Gaussian kernel and the sway is band-limited, with the bands and sizes of
+human gait and of a car on its springs.
 """
 
 from __future__ import annotations
@@ -20,7 +22,8 @@ Motion = Literal["walk", "drive"]
 
 _STEPS_PER_RADIUS = 40
 _SIGMA_PER_RADIUS = 1.13
-"""A right angle smoothed by a Gaussian of this width (in radii) has a smallest radius of curvature of 1."""
+"""A right angle smoothed by a Gaussian of this width (in radii) has a smallest radius of curvature
+of 1."""
 _NUM_WAVES = 16
 _AXES = ("forward", "left", "up", "roll", "pitch", "yaw")
 
@@ -33,7 +36,8 @@ class RouteConfig:
         laps: times round; a part of a lap is allowed.
         length: metres along the line instead of `laps`.
         num_frames: stop after so many frames.
-        spacing: metres between frames on the straight; in bends frames come closer, as everybody slows down there.
+        spacing: metres between frames on the straight; in bends frames come closer, as everybody
+            slows down there.
         speed: metres a second on the straight; with `spacing` it gives the frame rate.
         start: metres along the line from its first corner to the first frame.
         lateral: metres to the left of the line, in the direction of travel.
@@ -64,8 +68,17 @@ class RouteConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        positive = {"laps": self.laps, "spacing": self.spacing, "speed": self.speed, "corner radius": self.corner_radius}
-        positive |= {"turn rate": self.turn_rate, "length": self.length, "number of frames": self.num_frames}
+        positive = {
+            "laps": self.laps,
+            "spacing": self.spacing,
+            "speed": self.speed,
+            "corner radius": self.corner_radius,
+        }
+        positive |= {
+            "turn rate": self.turn_rate,
+            "length": self.length,
+            "number of frames": self.num_frames,
+        }
         for name, value in positive.items():
             if value is not None and not 0 < value < np.inf:
                 raise TopolocError(f"route: the {name} must be positive, not {value:g}")
@@ -76,7 +89,8 @@ class RouteConfig:
 
 @dataclass(frozen=True)
 class _Band:
-    """Movement along one axis: root mean square (metres or radians) of waves between two frequencies (Hz)."""
+    """Movement along one axis: root mean square (metres or radians) of waves between two
+    frequencies (Hz)."""
 
     axis: str
     low_hz: float
@@ -89,7 +103,8 @@ def _deg(angle: float) -> float:
 
 
 _SWAY: dict[Motion, tuple[_Band, ...]] = {
-    # Slow wandering of body and gaze, then the steps: up and down with each, from side to side with every second one.
+    # Slow wandering of body and gaze, then the steps: up and down with each, from side to side with
+    # every second one.
     "walk": (
         _Band("forward", 0.1, 0.4, 0.02),
         _Band("left", 0.05, 0.3, 0.045),
@@ -131,8 +146,9 @@ class _Waves:
 class Route:
     """A camera's path in time; `world_from_cam_at` and `frame_poses` ask it.
 
-    `points` are one lap, closed (the last is the first again), `yaw` the direction there, `paced` the metres that would have
-    been made on the straight in the time until there, `travelled` the metres that were.
+    `points` are one lap, closed (the last is the first again), `yaw` the direction there, `paced`
+    the metres that would have been made on the straight in the time until there, `travelled` the
+    metres that were.
     """
 
     config: RouteConfig
@@ -147,7 +163,9 @@ class Route:
     @property
     def t_ns(self) -> list[int]:
         """The time of each frame: a steady rate from 0."""
-        return [round(i * self.config.spacing / self.config.speed * 1e9) for i in range(self.num_frames)]
+        return [
+            round(i * self.config.spacing / self.config.speed * 1e9) for i in range(self.num_frames)
+        ]
 
     @property
     def length(self) -> float:
@@ -155,11 +173,14 @@ class Route:
         return _travelled_at(self, (self.num_frames - 1) * self.config.spacing)
 
 
-def plan_route(loop: tuple[tuple[float, float], ...], camera_height: float, config: RouteConfig) -> Route:
+def plan_route(
+    loop: tuple[tuple[float, float], ...], camera_height: float, config: RouteConfig
+) -> Route:
     """Round the corners of a closed line (x, y in metres, in order) and lay out the frames on it.
 
     Raises:
-        TopolocError: fewer than three corners, or `config.lateral` is more than the line's bends allow.
+        TopolocError: fewer than three corners, or `config.lateral` is more than the line's bends
+            allow.
     """
     corners = np.asarray(loop, dtype=np.float64)
     if corners.ndim != 2 or len(corners) < 3:
@@ -186,15 +207,24 @@ def plan_route(loop: tuple[tuple[float, float], ...], camera_height: float, conf
 
 def frame_poses(route: Route) -> list[Rigid3]:
     """world_from_cam of each frame."""
-    return [world_from_cam_at(route, i * route.config.spacing / route.config.speed) for i in range(route.num_frames)]
+    return [
+        world_from_cam_at(route, i * route.config.spacing / route.config.speed)
+        for i in range(route.num_frames)
+    ]
 
 
 def world_from_cam_at(route: Route, t: float) -> Rigid3:
-    """The camera's pose `t` seconds after the first frame: x right, y down, z forward; world z up."""
+    """The camera's pose `t` seconds after the first frame: x right, y down, z forward; world z
+    up."""
     at = (_paced_at(route, route.config.start) + t * route.config.speed) % route.paced[-1]
-    x, y, heading = (float(np.interp(at, route.paced, values)) for values in (*route.points.T, route.yaw))
+    x, y, heading = (
+        float(np.interp(at, route.paced, values)) for values in (*route.points.T, route.yaw)
+    )
     forward, left, up, roll, pitch, yaw = _sway(route.waves, t)
-    direction, side = np.array([np.cos(heading), np.sin(heading), 0.0]), np.array([-np.sin(heading), np.cos(heading), 0.0])
+    direction, side = (
+        np.array([np.cos(heading), np.sin(heading), 0.0]),
+        np.array([-np.sin(heading), np.cos(heading), 0.0]),
+    )
     centre = np.array([x, y, route.camera_height + up]) + forward * direction + left * side
     facing = heading + route.config.look
     c, s = np.cos(facing), np.sin(facing)
@@ -204,7 +234,9 @@ def world_from_cam_at(route: Route, t: float) -> Rigid3:
 
 def velocity_at(route: Route, t: float, interval: float = 0.02) -> Float[np.ndarray, "3"]:
     """The camera's velocity in the world, m/s, as the mean over `interval` seconds."""
-    before, after = (world_from_cam_at(route, t + sign * interval / 2).translation for sign in (-1, 1))
+    before, after = (
+        world_from_cam_at(route, t + sign * interval / 2).translation for sign in (-1, 1)
+    )
     return (after - before) / interval
 
 
@@ -214,9 +246,13 @@ def _paced_at(route: Route, travelled: float) -> float:
 
 
 def _travelled_at(route: Route, paced: float) -> float:
-    """Metres made along the line when, from the start on, `paced` metres would have been made on the straight."""
+    """Metres made along the line when, from the start on, `paced` metres would have been made on
+    the straight."""
     laps, rest = divmod(_paced_at(route, route.config.start) + paced, route.paced[-1])
-    return float(laps * route.travelled[-1] + np.interp(rest, route.paced, route.travelled)) - route.config.start
+    return (
+        float(laps * route.travelled[-1] + np.interp(rest, route.paced, route.travelled))
+        - route.config.start
+    )
 
 
 def _beside(corners: Float64[np.ndarray, "n 2"], lateral: float) -> Float64[np.ndarray, "n 2"]:
@@ -247,18 +283,26 @@ def _rounded(corners: Float64[np.ndarray, "n 2"], radius: float) -> Float64[np.n
 
 
 def _waves(config: RouteConfig) -> _Waves:
-    """Every band as cosines of random phase, one in each of equal parts of the band: smooth for ever, repeating never."""
+    """Every band as cosines of random phase, one in each of equal parts of the band: smooth for
+    ever, repeating never."""
     sized = [(band, config.wobble, f"{i}") for i, band in enumerate(_SWAY[config.motion])]
     sized += [(band, config.shake, f"shake {i}") for i, band in enumerate(_TREMBLE)]
     axis_idx, amplitude, omega, phase = [], [], [], []
     for band, scale, name in sized:
         rng = rng_of(config.seed, f"sway/{config.motion}/{name}")
-        frequency = band.low_hz + (band.high_hz - band.low_hz) * (np.arange(_NUM_WAVES) + rng.uniform(size=_NUM_WAVES)) / _NUM_WAVES
+        frequency = (
+            band.low_hz
+            + (band.high_hz - band.low_hz)
+            * (np.arange(_NUM_WAVES) + rng.uniform(size=_NUM_WAVES))
+            / _NUM_WAVES
+        )
         axis_idx.append(np.full(_NUM_WAVES, _AXES.index(band.axis)))
         amplitude.append(np.full(_NUM_WAVES, scale * band.rms * np.sqrt(2.0 / _NUM_WAVES)))
         omega.append(2 * np.pi * frequency)
         phase.append(rng.uniform(0.0, 2 * np.pi, _NUM_WAVES))
-    return _Waves(np.concatenate(axis_idx), *(np.concatenate(part) for part in (amplitude, omega, phase)))
+    return _Waves(
+        np.concatenate(axis_idx), *(np.concatenate(part) for part in (amplitude, omega, phase))
+    )
 
 
 def _sway(waves: _Waves, t: float) -> Float64[np.ndarray, "6"]:

@@ -1,6 +1,7 @@
 """From light to the picture that a camera stores: exposure, clipping, vignetting, noise, sRGB.
 
-The automatic exposure stops where real ones do, at a longest time and a largest gain: dark places stay dark, and noisy.
+The automatic exposure stops where real ones do, at a longest time and a largest gain: dark places
+stay dark, and noisy.
 """
 
 from __future__ import annotations
@@ -56,17 +57,27 @@ class Exposure:
 
 
 def choose_exposure(radiance: Float32[np.ndarray, "h w 3"], config: SensorConfig) -> Exposure:
-    """The time, then the gain, that bring the picture's centre-weighted geometric mean to the target, within the camera's limits.
+    """The time, then the gain, that bring the picture's centre-weighted geometric mean to the
+    target, within the camera's limits.
 
-    The geometric mean hardly heeds how bright a bright window is, so that the room around it stays visible and the window
-    saturates, but never more of the picture than `config.max_clipped`.
+    The geometric mean hardly heeds how bright a bright window is, so that the room around it stays
+    visible and the window saturates, but never more of the picture than `config.max_clipped`.
     """
-    luminance = radiance[::_METERED_STEP, ::_METERED_STEP].astype(np.float64) @ _LUMA.astype(np.float64)
+    luminance = radiance[::_METERED_STEP, ::_METERED_STEP].astype(np.float64) @ _LUMA.astype(
+        np.float64
+    )
     weight = _centre_weight(luminance.shape)
     mean = float(np.exp(np.sum(weight * np.log(np.maximum(luminance, _DARKEST)))))
     order = np.argsort(luminance, axis=None)
     brighter = 1.0 - np.cumsum(weight.ravel()[order])
-    limit = max(float(luminance.ravel()[order][min(int(np.argmax(brighter <= config.max_clipped)), order.size - 1)]), _DARKEST)
+    limit = max(
+        float(
+            luminance.ravel()[order][
+                min(int(np.argmax(brighter <= config.max_clipped)), order.size - 1)
+            ]
+        ),
+        _DARKEST,
+    )
     needed = min(config.target / mean, 1.0 / limit) / config.sensitivity
     time = min(needed, config.max_time)
     return Exposure(time, min(needed / time, config.max_gain))
@@ -79,19 +90,29 @@ def take_picture(
     rng: np.random.Generator,
     white_balance: Float64[np.ndarray, "3"],
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The sRGB picture of this light: shot and read noise by the gain, highlights compressed, then clipped."""
+    """The sRGB picture of this light: shot and read noise by the gain, highlights compressed, then
+    clipped."""
     height, width = radiance.shape[:2]
     scale = np.float32(config.sensitivity * exposure.time * exposure.gain)
     light = radiance * (scale * _vignetting(height, width, config.vignetting))[:, :, None]
     per_electron = np.float32(exposure.gain / config.full_well)
-    variance = np.clip(light, 0.0, 4.0) * per_electron + (np.float32(config.read_noise) * per_electron) ** 2
+    variance = (
+        np.clip(light, 0.0, 4.0) * per_electron
+        + (np.float32(config.read_noise) * per_electron) ** 2
+    )
     signal = light + np.sqrt(variance) * rng.standard_normal(light.shape, dtype=np.float32)
     return _encode(signal * white_balance.astype(np.float32))
 
 
-def white_balance_of(condition: Condition, seed: int, config: SensorConfig) -> Float64[np.ndarray, "3"]:
-    """Gains of red, green and blue that the camera has settled on: slightly wrong, each time otherwise."""
-    red, blue = rng_of(seed, f"white balance/{condition.name}").standard_normal(2) * config.white_balance_error
+def white_balance_of(
+    condition: Condition, seed: int, config: SensorConfig
+) -> Float64[np.ndarray, "3"]:
+    """Gains of red, green and blue that the camera has settled on: slightly wrong, each time
+    otherwise."""
+    red, blue = (
+        rng_of(seed, f"white balance/{condition.name}").standard_normal(2)
+        * config.white_balance_error
+    )
     return np.array([np.exp(red), 1.0, np.exp(blue)])
 
 
@@ -114,5 +135,7 @@ def _encode(signal: Float32[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     power = (2.0 - _SHOULDER) / (1.0 - _SHOULDER)
     compressed = _SHOULDER + (1.0 - _SHOULDER) * (1.0 - (1.0 - over) ** power)
     linear = np.clip(np.where(signal > _SHOULDER, compressed, signal), 0.0, 1.0)
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** np.float32(1 / 2.4) - 0.055)
+    encoded = np.where(
+        linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** np.float32(1 / 2.4) - 0.055
+    )
     return np.rint(encoded * 255.0).astype(np.uint8)

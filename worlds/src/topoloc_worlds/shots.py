@@ -24,7 +24,8 @@ class Shooting:
     Attributes:
         renderer: the world as it is under `condition`.
         baseline: metres to the right camera; None without one.
-        num_renderings: over how many moments of the exposure the light is averaged; 1 is a picture without motion blur.
+        num_renderings: over how many moments of the exposure the light is averaged; 1 is a picture
+            without motion blur.
         lens_drops: drops on each lens.
         rain: whether the condition's rain falls here.
     """
@@ -50,7 +51,8 @@ class Shot:
 
 
 def shoot(shooting: Shooting, index: int) -> Shot:
-    """Take frame `index`: the same bytes whenever and in whatever order frames are taken. Both pictures share one exposure."""
+    """Take frame `index`: the same bytes whenever and in whatever order frames are taken. Both
+    pictures share one exposure."""
     t = index * shooting.route.config.spacing / shooting.route.config.speed
     seed = shooting.route.config.seed
     middle = _render(shooting, t, "left", index, 0)
@@ -62,7 +64,14 @@ def shoot(shooting: Shooting, index: int) -> Shot:
         rendering = middle if side == "left" else _render(shooting, t, side, index, 0)
         light = _while_open(shooting, t, side, index, exposure.time, rendering.radiance)
         if drops is not None:
-            light = draw_rain(light, rendering.depth, shooting.camera, _cam_from_left(shooting, side), drops, exposure.time)
+            light = draw_rain(
+                light,
+                rendering.depth,
+                shooting.camera,
+                _cam_from_left(shooting, side),
+                drops,
+                exposure.time,
+            )
         if shooting.lens_drops:
             light = draw_lens_drops(light, shooting.lens_drops, rng_of(seed, f"lens drops/{side}"))
         noise = rng_of(seed, f"sensor/{index}/{side}")
@@ -72,19 +81,31 @@ def shoot(shooting: Shooting, index: int) -> Shot:
 
 def _render(shooting: Shooting, t: float, side: str, index: int, moment: int) -> Rendering:
     world_from_cam = world_from_cam_at(shooting.route, t) @ _cam_from_left(shooting, side).inverse()
-    seed = int(rng_of(shooting.route.config.seed, f"render/{index}/{side}/{moment}").integers(2**31))
+    seed = int(
+        rng_of(shooting.route.config.seed, f"render/{index}/{side}/{moment}").integers(2**31)
+    )
     return shooting.renderer.render(shooting.camera, world_from_cam, seed)
 
 
 def _while_open(
-    shooting: Shooting, t: float, side: str, index: int, time: float, middle: Float32[np.ndarray, "h w 3"]
+    shooting: Shooting,
+    t: float,
+    side: str,
+    index: int,
+    time: float,
+    middle: Float32[np.ndarray, "h w 3"],
 ) -> Float32[np.ndarray, "h w 3"]:
-    """The mean light of the moments of an exposure around `t`; `middle` is that of the moment in the middle."""
+    """The mean light of the moments of an exposure around `t`; `middle` is that of the moment in
+    the middle."""
     num = shooting.num_renderings
     total = np.zeros(middle.shape, np.float64)
     for moment in range(num):
         offset = (moment + 0.5) / num - 0.5
-        total += middle if offset == 0.0 else _render(shooting, t + offset * time, side, index, moment + 1).radiance
+        total += (
+            middle
+            if offset == 0.0
+            else _render(shooting, t + offset * time, side, index, moment + 1).radiance
+        )
     return (total / num).astype(np.float32)
 
 

@@ -10,7 +10,15 @@ from typing import Annotated, Literal
 
 import tyro
 
-from topoloc.cli.output import File, Flag, UsageError, check_outputs, interruptible, progress_bar, write_json
+from topoloc.cli.output import (
+    File,
+    Flag,
+    UsageError,
+    check_outputs,
+    interruptible,
+    progress_bar,
+    write_json,
+)
 from topoloc.errors import CalibrationError, TopolocError
 from topoloc.geometry.camera import Camera
 from topoloc.sequences.camera_json import read_camera_json
@@ -24,7 +32,11 @@ from topoloc_worlds.worlds import World, find_world
 _MOMENTS_OF_BLUR = 5
 Sway = Literal["none", "natural", "hand"]
 # Sizes of the sway of who walks or drives, and of the tremble of a hand.
-_WOBBLE_AND_SHAKE: dict[Sway, tuple[float, float]] = {"none": (0.0, 0.0), "natural": (1.0, 0.0), "hand": (1.0, 1.0)}
+_WOBBLE_AND_SHAKE: dict[Sway, tuple[float, float]] = {
+    "none": (0.0, 0.0),
+    "natural": (1.0, 0.0),
+    "hand": (1.0, 1.0),
+}
 
 
 @dataclass(frozen=True)
@@ -37,7 +49,9 @@ class RouteOptions:
     """Stop after N frames."""
     start: Annotated[float, tyro.conf.arg(metavar="METRES")] = 0.0
     """Where on the line the first frame is."""
-    spacing: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="(default: the world's)")] = None
+    spacing: Annotated[
+        float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="(default: the world's)")
+    ] = None
     """Metres between frames on the straight; in bends they come closer."""
     lateral: Annotated[float, tyro.conf.arg(metavar="METRES")] = 0.0
     """Metres to the left of the line, seen in the direction of travel; negative is to the right."""
@@ -53,11 +67,19 @@ class RouteOptions:
 class PictureOptions:
     """What is recorded."""
 
-    camera: Annotated[str | None, tyro.conf.arg(metavar="FILE|fx,fy,cx,cy", help_behavior_hint="(default: 380,380, in the middle)")] = None
+    camera: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="FILE|fx,fy,cx,cy", help_behavior_hint="(default: 380,380, in the middle)"
+        ),
+    ] = None
     """A camera.json, or four numbers in pixels with --size."""
     size: Annotated[str, tyro.conf.arg(metavar="WxH")] = "640x400"
     """Size of the pictures. Without --camera the field of view stays 80 degrees across."""
-    baseline: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="(default: 0.12, street 0.54)")] = None
+    baseline: Annotated[
+        float | None,
+        tyro.conf.arg(metavar="METRES", help_behavior_hint="(default: 0.12, street 0.54)"),
+    ] = None
     """Metres between the left and the right camera."""
     mono: Flag = False
     """A single camera: pictures in images/, and a camera.json."""
@@ -65,7 +87,9 @@ class PictureOptions:
     """Exact depth pictures, too; with --mono this makes an RGB-D recording."""
     grey: Flag = False
     """Grey pictures."""
-    jpeg: Annotated[int | None, tyro.conf.arg(metavar="QUALITY", help_behavior_hint="(default: PNG)")] = None
+    jpeg: Annotated[
+        int | None, tyro.conf.arg(metavar="QUALITY", help_behavior_hint="(default: PNG)")
+    ] = None
     """JPEG files of this quality, 1 to 100."""
     motion_blur: Flag = False
     """Average several moments of the exposure. Five times as slow."""
@@ -78,9 +102,11 @@ class Command:
     """What `topoloc simulate` takes."""
 
     world: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="WORLD")]
-    """lab, corridor, hospital or street; `demo` renders the recordings of `topoloc demo` into the folder OUT, and takes no setting."""
+    """lab, corridor, hospital or street; `demo` renders the recordings of `topoloc demo` into the
+    folder OUT, and takes no setting."""
     out: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="OUT")]
-    """The recording's folder, which is made. A recording that was interrupted goes on where it stopped."""
+    """The recording's folder, which is made. A recording that was interrupted goes on where it
+    stopped."""
     condition: Annotated[str, tyro.conf.arg(metavar="NAME")] = "day"
     """day (or clear), evening, night, cloudy or rain."""
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
@@ -91,7 +117,10 @@ class Command:
     """Another arrangement: chairs, boxes, cars are moved."""
     route: tyro.conf.OmitArgPrefixes[RouteOptions] = field(default_factory=RouteOptions)
     picture: tyro.conf.OmitArgPrefixes[PictureOptions] = field(default_factory=PictureOptions)
-    processes: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: by the number of cores)")] = None
+    processes: Annotated[
+        int | None,
+        tyro.conf.arg(metavar="N", help_behavior_hint="(default: by the number of cores)"),
+    ] = None
     """Processes that render; they have no influence on the pictures."""
     overwrite: Flag = False
     """Remove the recording in OUT if its settings are others."""
@@ -108,11 +137,17 @@ class Command:
             with interruptible(), progress_bar() as draw:
                 render_recordings(Path(self.out), draw)
         except KeyboardInterrupt:
-            raise TopolocError(f"interrupted; the same command goes on from what is in {self.out}") from None
+            raise TopolocError(
+                f"interrupted; the same command goes on from what is in {self.out}"
+            ) from None
         return 0
 
     def _record(self) -> int:
-        world, condition, out = find_world(self.world), find_condition(self.condition), Path(self.out)
+        world, condition, out = (
+            find_world(self.world),
+            find_condition(self.condition),
+            Path(self.out),
+        )
         config = self._config(world)
         check_outputs([self.json])
         began, done, total = time.monotonic(), 0, 0
@@ -125,12 +160,17 @@ class Command:
 
         try:
             with interruptible(), progress_bar() as draw:
-                recorded = record(world, condition, out, config, count, self.processes, self.overwrite)
+                recorded = record(
+                    world, condition, out, config, count, self.processes, self.overwrite
+                )
         except (KeyboardInterrupt, TopolocError) as stopped:
             if not total:
                 raise
             what = "interrupted" if isinstance(stopped, KeyboardInterrupt) else str(stopped)
-            raise TopolocError(f"{what} ({done} of {total} frames are in {out}; the same command goes on from there)") from stopped
+            raise TopolocError(
+                f"{what} ({done} of {total} frames are in {out}; the same command goes on from"
+                " there)"
+            ) from stopped
         self._tell(out, recorded, time.monotonic() - began)
         return 0
 
@@ -143,7 +183,13 @@ class Command:
             arrangement=self.arrangement,
             route=self._route(world),
             camera=_camera(pictures),
-            baseline=None if pictures.mono else world.baseline if pictures.baseline is None else pictures.baseline,
+            baseline=(
+                None
+                if pictures.mono
+                else world.baseline
+                if pictures.baseline is None
+                else pictures.baseline
+            ),
             render=RenderConfig.draft() if pictures.draft else RenderConfig(),
             num_renderings=_MOMENTS_OF_BLUR if pictures.motion_blur else 1,
             grey=pictures.grey,
@@ -173,7 +219,10 @@ class Command:
             kept = recorded.num_frames - recorded.num_rendered
             before = f" ({kept} of them were there)" if kept else ""
             what = "single pictures" if self.picture.mono else "stereo pairs"
-            print(f"{out}: {recorded.num_frames} {what}{before}, {recorded.length:.1f} m, in {seconds:.0f} s")
+            print(
+                f"{out}: {recorded.num_frames} {what}{before}, {recorded.length:.1f} m, in"
+                f" {seconds:.0f} s"
+            )
         write_json(
             self.json,
             {
@@ -198,16 +247,27 @@ def _camera(pictures: PictureOptions) -> Camera:
         try:
             fx, fy, cx, cy = map(float, pictures.camera.split(","))
         except ValueError:
-            raise CalibrationError(f"--camera {pictures.camera}: neither a file nor four numbers fx,fy,cx,cy") from None
+            raise CalibrationError(
+                f"--camera {pictures.camera}: neither a file nor four numbers fx,fy,cx,cy"
+            ) from None
         return Camera.pinhole(width, height, fx, fy, cx, cy)
     camera = read_camera_json(Path(pictures.camera)).camera
     if camera.is_distorted:
-        raise CalibrationError(f"{pictures.camera}: only undistorted cameras can be rendered, not {camera.model}")
+        raise CalibrationError(
+            f"{pictures.camera}: only undistorted cameras can be rendered, not {camera.model}"
+        )
     return Camera.pinhole(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
 
 
 def _size(text: str) -> tuple[int, int]:
     width, _, height = text.lower().partition("x")
-    if not (width.isdigit() and height.isdigit() and 16 <= int(width) <= 8192 and 16 <= int(height) <= 8192):
-        raise UsageError(f"--size {text}: width and height in pixels are expected, 16 to 8192, as 640x400")
+    if not (
+        width.isdigit()
+        and height.isdigit()
+        and 16 <= int(width) <= 8192
+        and 16 <= int(height) <= 8192
+    ):
+        raise UsageError(
+            f"--size {text}: width and height in pixels are expected, 16 to 8192, as 640x400"
+        )
     return int(width), int(height)

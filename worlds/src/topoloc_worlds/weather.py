@@ -1,7 +1,9 @@
-"""Rain before the camera: drops that fall while the shutter is open, each at a place in space, and drops on the lens.
+"""Rain before the camera: drops that fall while the shutter is open, each at a place in space, and
+drops on the lens.
 
-A falling drop shows the light of a wide cone of the scene, mostly sky, smeared over its path (Garg and Nayar, *Vision and Rain*,
-IJCV 2007): bright before dark walls, hardly seen before the sky. Both cameras of a rig see the same drops.
+A falling drop shows the light of a wide cone of the scene, mostly sky, smeared over its path (Garg
+and Nayar, *Vision and Rain*, IJCV 2007): bright before dark walls, hardly seen before the sky. Both
+cameras of a rig see the same drops.
 """
 
 from __future__ import annotations
@@ -27,7 +29,8 @@ _APERTURE = 1.2e-3
 
 @dataclass(frozen=True, eq=False)
 class Drops:
-    """Falling drops in the frame of the left camera: `position` (m) when the shutter opens, `velocity` (m/s), `radius` (m)."""
+    """Falling drops in the frame of the left camera: `position` (m) when the shutter opens,
+    `velocity` (m/s), `radius` (m)."""
 
     position: Float64[np.ndarray, "n 3"]
     velocity: Float64[np.ndarray, "n 3"]
@@ -35,7 +38,11 @@ class Drops:
 
 
 def falling_drops(
-    num: int, camera: Camera, world_from_cam: Rigid3, camera_velocity: Float64[np.ndarray, "3"], rng: np.random.Generator
+    num: int,
+    camera: Camera,
+    world_from_cam: Rigid3,
+    camera_velocity: Float64[np.ndarray, "3"],
+    rng: np.random.Generator,
 ) -> Drops:
     """Drops spread evenly over the air before the camera, `num` of them in its view.
 
@@ -43,9 +50,12 @@ def falling_drops(
         camera_velocity: in the world, m/s; a moving camera sees the rain come towards it.
     """
     inverse_far, inverse_near = 1.0 / _FAR, 1.0 / _NEAR
-    # Evenly in the volume would put all but a few far off, where they are one grey veil (the haze); evenly in 1/z^(1/2) shows both.
+    # Evenly in the volume would put all but a few far off, where they are one grey veil (the haze);
+    # evenly in 1/z^(1/2) shows both.
     z = rng.uniform(inverse_far**0.5, inverse_near**0.5, num) ** -2.0
-    corner = camera.normalized_from_img(np.array([[-0.5, -0.5], [camera.width - 0.5, camera.height - 0.5]]))
+    corner = camera.normalized_from_img(
+        np.array([[-0.5, -0.5], [camera.width - 0.5, camera.height - 0.5]])
+    )
     x, y = (rng.uniform(corner[0, axis], corner[1, axis], num) * z for axis in (0, 1))
     fall = np.zeros((num, 3))
     fall[:, 2] = -rng.uniform(*_FALL_SPEED, num)
@@ -62,7 +72,8 @@ def draw_rain(
     drops: Drops,
     exposure_time: float,
 ) -> Float32[np.ndarray, "h w 3"]:
-    """The light with the drops in it, those that are nearer than what is behind them; near ones are thick and out of focus."""
+    """The light with the drops in it, those that are nearer than what is behind them; near ones are
+    thick and out of focus."""
     rainy = radiance.copy()
     time = min(exposure_time, _LONGEST)
     start = cam_from_left.apply(drops.position)
@@ -75,13 +86,19 @@ def draw_rain(
         thickness = float(np.hypot(camera.fx * drops.radius[i] / z, blur))
         sigma = max(thickness, 0.45)
         share = _CONTRAST * camera.fx * drops.radius[i] / z / sigma
-        share *= min(2.0 * drops.radius[i] / max(np.linalg.norm(drops.velocity[i]) * time, 1e-6), 1.0) ** 0.5
+        share *= (
+            min(2.0 * drops.radius[i] / max(np.linalg.norm(drops.velocity[i]) * time, 1e-6), 1.0)
+            ** 0.5
+        )
         _draw_streak(rainy, depth, heads[i], tails[i], z, sigma, min(float(share), 1.0), glow)
     return rainy
 
 
-def draw_lens_drops(radiance: Float32[np.ndarray, "h w 3"], num: int, rng: np.random.Generator) -> Float32[np.ndarray, "h w 3"]:
-    """The light through a lens with `num` drops on it, each a soft blot that shows the surroundings upside down."""
+def draw_lens_drops(
+    radiance: Float32[np.ndarray, "h w 3"], num: int, rng: np.random.Generator
+) -> Float32[np.ndarray, "h w 3"]:
+    """The light through a lens with `num` drops on it, each a soft blot that shows the surroundings
+    upside down."""
     height, width = radiance.shape[:2]
     y, x = np.mgrid[:height, :width].astype(np.float32)
     wet = radiance.copy()
@@ -105,7 +122,8 @@ def _draw_streak(
     share: float,
     glow: Float32[np.ndarray, "3"],
 ) -> None:
-    """Replace this share of the light along a line by `glow`, with a Gaussian profile across, where nothing nearer is in front."""
+    """Replace this share of the light along a line by `glow`, with a Gaussian profile across, where
+    nothing nearer is in front."""
     height, width = depth.shape
     reach = 3.0 * sigma
     low = np.maximum(np.floor(np.minimum(head, tail) - reach), 0).astype(int)
@@ -115,7 +133,11 @@ def _draw_streak(
     part = (slice(low[1], high[1]), slice(low[0], high[0]))
     y, x = np.mgrid[part]
     along = tail - head
-    fraction = np.clip(((x - head[0]) * along[0] + (y - head[1]) * along[1]) / max(float(along @ along), 1e-9), 0.0, 1.0)
+    fraction = np.clip(
+        ((x - head[0]) * along[0] + (y - head[1]) * along[1]) / max(float(along @ along), 1e-9),
+        0.0,
+        1.0,
+    )
     squared = (x - head[0] - fraction * along[0]) ** 2 + (y - head[1] - fraction * along[1]) ** 2
     alpha = share * np.exp(-0.5 * squared / sigma**2) * ~(depth[part] < z)
     image[part] += alpha.astype(np.float32)[:, :, None] * (glow - image[part])

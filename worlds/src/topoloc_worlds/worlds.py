@@ -17,7 +17,8 @@ from topoloc_worlds.scene import Scene
 
 @dataclass(frozen=True)
 class World:
-    """A place that code builds, and how it is usually recorded. The module that builds it is imported when it is needed.
+    """A place that code builds, and how it is usually recorded. The module that builds it is
+    imported when it is needed.
 
     Attributes:
         module: has ``build(seed, condition, arrangement)``, ``LOOP`` and ``CAMERA_HEIGHT``.
@@ -27,7 +28,8 @@ class World:
         corner_radius: metres, of the bends.
         baseline: metres between left and right camera.
         depth_factor: units a metre of depth pictures of 16 bits.
-        view_spacing: metres between the places along the line from which the light of the world is traced.
+        view_spacing: metres between the places along the line from which the light of the world is
+            traced.
         view_offsets: metres to the left of the line, of the same.
     """
 
@@ -45,7 +47,8 @@ class World:
     view_offsets: tuple[float, ...] = (-0.3, 0.3)
 
     def build(self, seed: int, condition: Condition, arrangement: int = 0) -> Scene:
-        """All that can be seen. Another seed is another place of the kind; `arrangement` is where people left what they move."""
+        """All that can be seen. Another seed is another place of the kind; `arrangement` is where
+        people left what they move."""
         return self._module().build(seed, condition, arrangement)
 
     @property
@@ -60,12 +63,20 @@ class World:
 
     def route(self) -> RouteConfig:
         """One natural lap."""
-        return RouteConfig(spacing=self.spacing, speed=self.speed, motion=self.motion, corner_radius=self.corner_radius)
+        return RouteConfig(
+            spacing=self.spacing,
+            speed=self.speed,
+            motion=self.motion,
+            corner_radius=self.corner_radius,
+        )
 
     def viewpoints(self) -> Float64[np.ndarray, "n 3"]:
         """Places all over where cameras usually are, for `Renderer`."""
         still = replace(self.route(), spacing=self.view_spacing, wobble=0.0)
-        routes = [plan_route(self.loop, self.camera_height, replace(still, lateral=offset)) for offset in self.view_offsets]
+        routes = [
+            plan_route(self.loop, self.camera_height, replace(still, lateral=offset))
+            for offset in self.view_offsets
+        ]
         return np.array([pose.translation for route in routes for pose in frame_poses(route)])
 
     def _module(self) -> ModuleType:
@@ -82,7 +93,8 @@ WORLDS = {
         ),
         World(
             "corridor",
-            "a loop of 25 x 18 m: doors, notice boards, windows to the floor, polished linoleum, long bare walls",
+            "a loop of 25 x 18 m: doors, notice boards, windows to the floor, polished linoleum,"
+            " long bare walls",
             "topoloc_worlds.corridor.world",
             speed=1.2,
             spacing=0.2,
@@ -93,7 +105,8 @@ WORLDS = {
         ),
         World(
             "hospital",
-            "a loop of 21 x 13 m: walls of panels a metre wide, each the copy of the next; a door now and then",
+            "a loop of 21 x 13 m: walls of panels a metre wide, each the copy of the next; a door"
+            " now and then",
             "topoloc_worlds.hospital.world",
             speed=1.2,
             spacing=0.2,

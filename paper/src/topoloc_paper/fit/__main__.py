@@ -1,15 +1,19 @@
 """Fit the weights of a kind of features, and try them on places that they were not fitted to.
 
-    python -m topoloc_paper.fit --kind KIND [--shared ../shared] [--rendered FOLDER] [--step N] [--families NAME ...] [--walls]
+    python -m topoloc_paper.fit --kind KIND [--shared ../shared] [--rendered FOLDER] [--step N]
+    [--families NAME ...] [--walls]
                                 [--save POSES | --load POSES ...] [--out FILE]
 
-Each place of `corpus.py` is mapped with features of this kind, and asked about its own pictures (in good light and bad), about those of
-other places and about drawn pictures; every pose that was tried is kept, not only the one answered. A pose is right within 0.25 m (5 % of
-the distance, where that is less) and 2 degrees, wrong beyond 0.5 m or 10 degrees; what lies between is left out. The walls to both sides
-are asked where a place is walked back that was mapped in one direction; --walls asks these places alone and fits the weights of the walls,
-the others are taken over. --step N asks every N-th of the pictures, --families only of the
-maps of these places; --by-recording tries each recording's poses on what was fitted to all others, not each family's; --save keeps the
-poses, after each place, and --load fits to poses that were kept. FILE is what ships as `localization/weights/KIND.json`.
+Each place of `corpus.py` is mapped with features of this kind, and asked about its own pictures (in
+good light and bad), about those of other places and about drawn pictures; every pose that was tried
+is kept, not only the one answered. A pose is right within 0.25 m (5 % of the distance, where that
+is less) and 2 degrees, wrong beyond 0.5 m or 10 degrees; what lies between is left out. The walls
+to both sides are asked where a place is walked back that was mapped in one direction; --walls asks
+these places alone and fits the weights of the walls, the others are taken over. --step N asks every
+N-th of the pictures, --families only of the maps of these places; --by-recording tries each
+recording's poses on what was fitted to all others, not each family's; --save keeps the poses, after
+each place, and --load fits to poses that were kept. FILE is what ships as
+`localization/weights/KIND.json`.
 """
 
 from __future__ import annotations
@@ -47,10 +51,14 @@ from topoloc_paper.fit.walls import fit_walls, told_by_walls
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        prog="python -m topoloc_paper.fit", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="python -m topoloc_paper.fit",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--kind", required=True)
-    parser.add_argument("--shared", type=Path, default=Path(os.environ.get("TOPOLOC_SHARED", "../shared")))
+    parser.add_argument(
+        "--shared", type=Path, default=Path(os.environ.get("TOPOLOC_SHARED", "../shared"))
+    )
     parser.add_argument("--rendered", type=Path)
     parser.add_argument("--step", type=int, default=1)
     parser.add_argument("--families", nargs="+", choices=sorted(set(FAMILIES.values()) - {"drawn"}))
@@ -67,14 +75,33 @@ def main() -> None:
     if asked.load:
         poses = [pose for path in asked.load for pose in load_poses(path)]
     else:
-        places = [place for place in PLACES if asked.families is None or family_of(place.mapping) in asked.families]
+        places = [
+            place
+            for place in PLACES
+            if asked.families is None or family_of(place.mapping) in asked.families
+        ]
         places = [place for place in places if place.asks_walls] if asked.walls else places
-        poses = ask_places(asked.kind, asked.shared.resolve() / "data", asked.rendered, asked.step, asked.save, places)
+        poses = ask_places(
+            asked.kind,
+            asked.shared.resolve() / "data",
+            asked.rendered,
+            asked.step,
+            asked.save,
+            places,
+        )
     if asked.walls:
         _write(fit_walls_alone(asked.kind, poses), asked.out)
         return
-    wrong_of = {pose.queries if asked.by_recording else family_of(pose.mapping) for pose in decided(poses) if pose.is_wrong}
-    right_of = {pose.queries if asked.by_recording else family_of(pose.mapping) for pose in decided(poses) if pose.is_right}
+    wrong_of = {
+        pose.queries if asked.by_recording else family_of(pose.mapping)
+        for pose in decided(poses)
+        if pose.is_wrong
+    }
+    right_of = {
+        pose.queries if asked.by_recording else family_of(pose.mapping)
+        for pose in decided(poses)
+        if pose.is_right
+    }
     if len(wrong_of) < 2 or len(right_of) < 2:
         parts = "recordings" if asked.by_recording else "families of places"
         raise SystemExit(f"error: right and wrong poses of two {parts} are needed")
@@ -87,7 +114,12 @@ def _write(weights: FittedWeights, path: Path | None) -> None:
 
 
 def ask_places(
-    kind: str, data: Path, rendered: Path | None, step: int, kept: Path | None, places: Sequence[AskedPlace] = PLACES
+    kind: str,
+    data: Path,
+    rendered: Path | None,
+    step: int,
+    kept: Path | None,
+    places: Sequence[AskedPlace] = PLACES,
 ) -> list[TriedPose]:
     """Every pose that these places lead to; written to `kept` after each place."""
     recordings = open_recordings(data, rendered)
@@ -95,26 +127,38 @@ def ask_places(
     for place in places:
         here = ask_place(place, recordings, data, kind, step)
         poses += here
-        print(f"{place.mapping}: {len(here)} poses of {len({pose.picture for pose in here})} pictures", flush=True)
+        print(
+            f"{place.mapping}: {len(here)} poses of {len({pose.picture for pose in here})}"
+            " pictures",
+            flush=True,
+        )
         if kept:
             save_poses(poses, kept)
     return poses
 
 
 def fit(kind: str, poses: list[TriedPose], step: int, by_recording: bool) -> FittedWeights:
-    """Fitted weights of this kind, with a report of how they do beside those in use; `by_recording`: see `try_on_others`."""
+    """Fitted weights of this kind, with a report of how they do beside those in use;
+    `by_recording`: see `try_on_others`."""
     before, prior = weights_of(kind), weights_of(STAND_IN).evidence
     walls, num_walls = fit_walls(poses, before.walls)
     poses = [pose for pose in poses if pose.evidence.num_distinct is None]
     strength = best_strength(poses, prior, by_recording)
-    evidence, held_out = fit_evidence(poses, prior, strength), try_on_others(poses, prior, strength, by_recording)
-    log_odds, is_right = (np.concatenate([getattr(part, name) for part in held_out]) for name in ("log_odds", "is_right"))
+    evidence, held_out = (
+        fit_evidence(poses, prior, strength),
+        try_on_others(poses, prior, strength, by_recording),
+    )
+    log_odds, is_right = (
+        np.concatenate([getattr(part, name) for part in held_out])
+        for name in ("log_odds", "is_right")
+    )
     rivals, num_hard = fit_rivals(poses, evidence, before.rivals)
     fitted = FittedWeights(
         kind,
         corpus_of(poses, strength, num_hard, num_walls, by_recording),
         datetime.date.today().isoformat(),
-        f"python -m topoloc_paper.fit --kind {kind} --rendered FOLDER --step {step}{' --by-recording' if by_recording else ''} --out FILE",
+        f"python -m topoloc_paper.fit --kind {kind} --rendered FOLDER --step"
+        f" {step}{' --by-recording' if by_recording else ''} --out FILE",
         round(calibration_error(log_odds, is_right), 4),
         evidence,
         rivals,
@@ -127,62 +171,101 @@ def fit(kind: str, poses: list[TriedPose], step: int, by_recording: bool) -> Fit
 
 
 def fit_walls_alone(kind: str, poses: list[TriedPose]) -> FittedWeights:
-    """The weights in use with those of the walls fitted anew, for the kind by which the walls are described."""
+    """The weights in use with those of the walls fitted anew, for the kind by which the walls are
+    described."""
     before = weights_of(find_kind(kind).kind_of_sides)
     walls, num = fit_walls(poses, before.walls)
     told = told_by_walls(poses)
     for name, weights in (("in use", before.walls), ("fitted", walls)):
-        log_odds = np.array([log_odds_of(pose.evidence, replace(before, walls=weights)) for pose in told])
+        log_odds = np.array(
+            [log_odds_of(pose.evidence, replace(before, walls=weights)) for pose in told]
+        )
         part = Judged("walls", log_odds, np.array([pose.is_right for pose in told], dtype=bool))
         clearest = max(log_odds[~part.is_right], default=-99.0)
-        print(f"{name}: {weights}\n  {verdict(part)}; log odds of the clearest wrong pose {clearest:.1f}")
+        print(
+            f"{name}: {weights}\n  {verdict(part)}; log odds of the clearest wrong pose"
+            f" {clearest:.1f}"
+        )
     places = ", ".join(dict.fromkeys(pose.queries for pose in told))
     said = f"walls fitted to {num} poses of {places} (--walls)"
-    corpus = re.sub(r"[Ww]alls:? (taken over|fitted to [^;]*)", said, before.corpus) if num else before.corpus
+    corpus = (
+        re.sub(r"[Ww]alls:? (taken over|fitted to [^;]*)", said, before.corpus)
+        if num
+        else before.corpus
+    )
     return replace(before, walls=walls, corpus=corpus, date=datetime.date.today().isoformat())
 
 
-def corpus_of(poses: list[TriedPose], strength: float, num_hard: int, num_walls: int, by_recording: bool) -> str:
+def corpus_of(
+    poses: list[TriedPose], strength: float, num_hard: int, num_walls: int, by_recording: bool
+) -> str:
     """One sentence on what was fitted to."""
     num_right, told = sum(pose.is_right for pose in poses), decided(poses)
     places = ", ".join(dict.fromkeys(pose.mapping for pose in poses))
     elsewhere = sum(pose.error_m is None for pose in poses)
-    rivals = f"fitted to {num_hard} hard pairs" if num_hard >= MIN_HARD_PAIRS else f"taken over, {num_hard} hard pairs being too few"
+    rivals = (
+        f"fitted to {num_hard} hard pairs"
+        if num_hard >= MIN_HARD_PAIRS
+        else f"taken over, {num_hard} hard pairs being too few"
+    )
     return (
-        f"{len(told)} poses tried, {num_right} of them right, {elsewhere} of pictures from elsewhere, of maps of {places}; "
-        f"drawn to the weights of {STAND_IN} with the strength {strength:g}; rivals {rivals}; "
-        f"walls {f'fitted to {num_walls} poses' if num_walls else 'taken over'}; "
-        "taken over: the weights of the doubt; shared_errors where fewer than 200 right poses tell. "
-        f"Calibration error: of poses that would be answered, each {'recording' if by_recording else 'family of places'} judged by a fit "
-        "without it"
+        f"{len(told)} poses tried, {num_right} of them right, {elsewhere} of pictures from"
+        f" elsewhere, of maps of {places}; drawn to the weights of {STAND_IN} with the strength"
+        f" {strength:g}; rivals {rivals}; walls"
+        f" {f'fitted to {num_walls} poses' if num_walls else 'taken over'}; taken over: the weights"
+        " of the doubt; shared_errors where fewer than 200 right poses tell. Calibration error: of"
+        f" poses that would be answered, each {'recording' if by_recording else 'family of places'}"
+        " judged by a fit without it"
     )
 
 
-def report(poses: list[TriedPose], before: FittedWeights, fitted: FittedWeights, held_out: list[Judged]) -> None:
+def report(
+    poses: list[TriedPose], before: FittedWeights, fitted: FittedWeights, held_out: list[Judged]
+) -> None:
     num_right, told = sum(pose.is_right for pose in poses), decided(poses)
-    print(f"{len(told)} poses, {num_right} of them right; {len(poses) - len(told)} more are neither right nor wrong")
+    print(
+        f"{len(told)} poses, {num_right} of them right; {len(poses) - len(told)} more are neither"
+        " right nor wrong"
+    )
     for name, weights in (("in use", before), ("fitted", fitted)):
         all_poses = judged("all", told, weights.evidence)
-        elsewhere = judged("elsewhere", [pose for pose in told if pose.error_m is None], weights.evidence)
-        clearest, most = (max(part.log_odds[~part.is_right], default=-99.0) for part in (all_poses, elsewhere))
+        elsewhere = judged(
+            "elsewhere", [pose for pose in told if pose.error_m is None], weights.evidence
+        )
+        clearest, most = (
+            max(part.log_odds[~part.is_right], default=-99.0) for part in (all_poses, elsewhere)
+        )
         print(f"{name}: {weights.evidence}")
         print(f"  {verdict(all_poses)}; log odds of the clearest wrong pose {clearest:.1f},")
-        print(f"  probability of the most probable of {len(elsewhere.is_right)} from elsewhere {1 / (1 + np.exp(-most)):.2f}")
+        print(
+            f"  probability of the most probable of {len(elsewhere.is_right)} from elsewhere"
+            f" {1 / (1 + np.exp(-most)):.2f}"
+        )
     for part in held_out:
-        in_use = judged(part.family, [pose for pose in told if part.family in (family_of(pose.mapping), pose.queries)], before.evidence)
+        in_use = judged(
+            part.family,
+            [pose for pose in told if part.family in (family_of(pose.mapping), pose.queries)],
+            before.evidence,
+        )
         print(f"{part.family}, fitted without it: {verdict(part)}\n  in use: {verdict(in_use)}")
     differences, is_hard = pairs_of(poses, fitted.evidence)
-    was, now = (num_mistaken(differences[is_hard], rivals) for rivals in (before.rivals, fitted.rivals))
+    was, now = (
+        num_mistaken(differences[is_hard], rivals) for rivals in (before.rivals, fitted.rivals)
+    )
     print(f"rivals: {fitted.rivals}, {now} of {np.sum(is_hard)} hard pairs mistaken ({was})")
     print(f"{fitted.shared_errors} ({before.shared_errors})")
     print(f"calibration error, each part judged by a fit without it: {fitted.calibration_error}")
 
 
 def verdict(part: Judged) -> str:
-    wrong, lost = np.sum((part.log_odds > 0) & ~part.is_right), np.sum((part.log_odds <= 0) & part.is_right)
+    wrong, lost = (
+        np.sum((part.log_odds > 0) & ~part.is_right),
+        np.sum((part.log_odds <= 0) & part.is_right),
+    )
     error = calibration_error(part.log_odds, part.is_right)
     return (
-        f"accepts {wrong} of {np.sum(~part.is_right)} wrong, loses {lost} of {np.sum(part.is_right)} right, calibration error {error:.3f}"
+        f"accepts {wrong} of {np.sum(~part.is_right)} wrong, loses {lost} of"
+        f" {np.sum(part.is_right)} right, calibration error {error:.3f}"
     )
 
 

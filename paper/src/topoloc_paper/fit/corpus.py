@@ -1,7 +1,8 @@
 """The places that weights are fitted to: what is mapped, and what it is asked about.
 
-The demo's lab ships; the other rendered recordings are made by `topoloc simulate` (docs/benchmarks.md has the commands); kitchen, ZED lab
-and KITTI are those of `../shared/data`. What is missing is left out, with a line.
+The demo's lab ships; the other rendered recordings are made by `topoloc simulate`
+(docs/benchmarks.md has the commands); kitchen, ZED lab and KITTI are those of `../shared/data`.
+What is missing is left out, with a line.
 """
 
 from __future__ import annotations
@@ -18,7 +19,14 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.sequences.frame import StereoSequence
 from topoloc.sequences.open import open_sequence
 
-FAMILIES = {"corridor": "corridor", "demo": "lab", "lab": "lab", "street": "street", "seven_scenes": "kitchen", "zed_lab": "ZED lab"}
+FAMILIES = {
+    "corridor": "corridor",
+    "demo": "lab",
+    "lab": "lab",
+    "street": "street",
+    "seven_scenes": "kitchen",
+    "zed_lab": "ZED lab",
+}
 FAMILIES |= {"kitti": "KITTI", "drawn": "drawn"}
 GAMMAS = {"as it is": None, "dark": 0.6, "darker": 1 / 0.6}
 _KITCHEN, _ZED = "seven_scenes/kitchen@60-99/100", "zed_lab/session2@0:99"
@@ -29,7 +37,8 @@ _STREET_1, _STREET_2 = "kitti/sequences/street1@1::2", "kitti/sequences/street2@
 class AskedPlace:
     """A map, and of each recording every how manieth picture it is asked about.
 
-    Names that begin with `demo` are what ships, those without a slash are rendered, the others real.
+    Names that begin with `demo` are what ships, those without a slash are rendered, the others
+    real.
     """
 
     mapping: str
@@ -47,19 +56,33 @@ PLACES = (
         {"corridor_night": 1, "corridor_evening": 1, "corridor_day": 6},
         {"demo/night": 3, "street_rain": 8, _KITCHEN: 12, _ZED: 10, _STREET_1: 8},
     ),
-    AskedPlace("corridor_map@0:268:2", {"corridor_reverse": 1}, {_KITCHEN: 12, _ZED: 10, "demo/night": 3}, asks_walls=True),  # one lap
+    AskedPlace(
+        "corridor_map@0:268:2",
+        {"corridor_reverse": 1},
+        {_KITCHEN: 12, _ZED: 10, "demo/night": 3},
+        asks_walls=True,
+    ),  # one lap
     AskedPlace(
         "demo/map_lap1",
         {"demo/day": 1, "demo/night": 1},
         {"demo/corridor": 1, "corridor_night": 4, _KITCHEN: 12, _ZED: 10, "street_cloudy": 10},
     ),
-    AskedPlace("lab_map", {"lab_night": 1}, {"corridor_night": 4, _KITCHEN: 12, _ZED: 10, "street_cloudy": 10}),
+    AskedPlace(
+        "lab_map",
+        {"lab_night": 1},
+        {"corridor_night": 4, _KITCHEN: 12, _ZED: 10, "street_cloudy": 10},
+    ),
     AskedPlace(
         "street_map",
         {"street_cloudy": 2, "street_rain": 2, "street_clear": 5, "street_reverse": 3},
         {"corridor_night": 8, "demo/night": 8, _STREET_1: 4, _STREET_2: 4, _ZED: 10},
     ),
-    AskedPlace("seven_scenes/kitchen@0-59/100", {_KITCHEN: 6}, {"corridor_night": 8, _ZED: 5, "demo/night": 8, _STREET_1: 8}, True),
+    AskedPlace(
+        "seven_scenes/kitchen@0-59/100",
+        {_KITCHEN: 6},
+        {"corridor_night": 8, _ZED: 5, "demo/night": 8, _STREET_1: 8},
+        True,
+    ),
     AskedPlace(
         "zed_lab/session1",
         {_ZED: 4},
@@ -67,15 +90,24 @@ PLACES = (
         True,
         "zed_lab/session1_from_session2.json",
     ),
-    AskedPlace("kitti/sequences/street1@0::2", {_STREET_1: 3}, {_KITCHEN: 10, "street_cloudy": 4, "corridor_night": 10, _ZED: 8}, True),
     AskedPlace(
-        "kitti/sequences/street2@0::2", {_STREET_2: 3}, {_KITCHEN: 10, "street_rain": 4, "corridor_night": 10, "demo/night": 10}, True
+        "kitti/sequences/street1@0::2",
+        {_STREET_1: 3},
+        {_KITCHEN: 10, "street_cloudy": 4, "corridor_night": 10, _ZED: 8},
+        True,
+    ),
+    AskedPlace(
+        "kitti/sequences/street2@0::2",
+        {_STREET_2: 3},
+        {_KITCHEN: 10, "street_rain": 4, "corridor_night": 10, "demo/night": 10},
+        True,
     ),
 )
 
 
 def family_of(name: str) -> str:
-    """The kind of place that a recording shows: poses of one family are never fitted to where they are to be tried."""
+    """The kind of place that a recording shows: poses of one family are never fitted to where they
+    are to be tried."""
     return next(family for prefix, family in FAMILIES.items() if name.startswith(prefix))
 
 
@@ -86,7 +118,9 @@ def open_recordings(data: Path, rendered: Path | None) -> dict[str, StereoSequen
         data: the folder of real recordings; rendered: that of the rendered ones.
     """
     recordings: dict[str, StereoSequence] = {}
-    for name in dict.fromkeys(name for place in PLACES for name in (place.mapping, *place.own, *place.others)):
+    for name in dict.fromkeys(
+        name for place in PLACES for name in (place.mapping, *place.own, *place.others)
+    ):
         folder = SHIPPED.parent if name.startswith("demo/") else data if "/" in name else rendered
         if folder is None:
             print(f"left out: {name}, which is rendered")
@@ -103,5 +137,7 @@ def open_recordings(data: Path, rendered: Path | None) -> dict[str, StereoSequen
 
 def read_rigid(path: Path) -> Rigid3:
     """The one 4x4 matrix in a JSON file."""
-    (matrix,) = [value for value in json.loads(path.read_text()).values() if isinstance(value, list)]
+    (matrix,) = [
+        value for value in json.loads(path.read_text()).values() if isinstance(value, list)
+    ]
     return Rigid3.from_matrix(np.array(matrix))

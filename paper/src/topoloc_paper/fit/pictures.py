@@ -11,7 +11,9 @@ def darkened(image: np.ndarray, gamma: float, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     gradient = np.linspace(1.0, 0.3, image.shape[1])[None, :]
     light = image / 255.0 / 3.0 * (gradient if image.ndim == 2 else gradient[..., None])
-    return np.clip(255.0 * light**gamma + rng.normal(0.0, 4.0, image.shape), 0, 255).astype(np.uint8)
+    return np.clip(255.0 * light**gamma + rng.normal(0.0, 4.0, image.shape), 0, 255).astype(
+        np.uint8
+    )
 
 
 def drawn_pictures(num: int) -> list[np.ndarray]:
@@ -27,7 +29,9 @@ def _noise(rng: np.random.Generator) -> np.ndarray:
 
 def _clouds(rng: np.random.Generator) -> np.ndarray:
     step = int(rng.integers(2, 9))
-    return cv2.resize(rng.normal(128, 60, (480 // step, 640 // step)), (640, 480), interpolation=cv2.INTER_CUBIC)
+    return cv2.resize(
+        rng.normal(128, 60, (480 // step, 640 // step)), (640, 480), interpolation=cv2.INTER_CUBIC
+    )
 
 
 def _lettering(rng: np.random.Generator) -> np.ndarray:
@@ -36,7 +40,13 @@ def _lettering(rng: np.random.Generator) -> np.ndarray:
         word = "".join(chr(letter) for letter in rng.integers(65, 90, 8))
         place = (int(rng.integers(-50, 640)), int(rng.integers(0, 480)))
         cv2.putText(
-            picture, word, place, cv2.FONT_HERSHEY_SIMPLEX, float(rng.uniform(0.4, 3)), int(rng.uniform(0, 255)), int(rng.integers(1, 6))
+            picture,
+            word,
+            place,
+            cv2.FONT_HERSHEY_SIMPLEX,
+            float(rng.uniform(0.4, 3)),
+            int(rng.uniform(0, 255)),
+            int(rng.integers(1, 6)),
         )
     return picture
 
@@ -44,7 +54,12 @@ def _lettering(rng: np.random.Generator) -> np.ndarray:
 def _shapes(rng: np.random.Generator) -> np.ndarray:
     picture = np.full((480, 640), 200, np.uint8)
     for _ in range(120):
-        x, y, size, level = int(rng.integers(0, 640)), int(rng.integers(0, 480)), int(rng.integers(3, 120)), int(rng.uniform(0, 255))
+        x, y, size, level = (
+            int(rng.integers(0, 640)),
+            int(rng.integers(0, 480)),
+            int(rng.integers(3, 120)),
+            int(rng.uniform(0, 255)),
+        )
         if rng.random() < 0.5:
             cv2.circle(picture, (x, y), size // 2 + 1, level, -1)
         else:

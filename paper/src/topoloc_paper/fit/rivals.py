@@ -1,7 +1,9 @@
-"""The weights with which one of two poses of one picture, far from each other, is taken for the right one.
+"""The weights with which one of two poses of one picture, far from each other, is taken for the
+right one.
 
-Of each picture's poses that are not wrong the strongest is paired with every wrong pose that could be taken for it. A pair is hard
-where the wrong pose comes near to being believed on its own; the weights are fitted to hard pairs, by logistic regression without a bias.
+Of each picture's poses that are not wrong the strongest is paired with every wrong pose that could
+be taken for it. A pair is hard where the wrong pose comes near to being believed on its own; the
+weights are fitted to hard pairs, by logistic regression without a bias.
 """
 
 from __future__ import annotations
@@ -19,13 +21,16 @@ from topoloc_paper.fit.tried_poses import TriedPose
 MIN_HARD_PAIRS = 80
 """To fewer nothing is fitted."""
 _COULD_BE_TAKEN = -1.5
-"""Logarithm of the odds of a wrong pose that makes a pair; one that is less than `_NEAR` behind the right one makes a pair, too."""
+"""Logarithm of the odds of a wrong pose that makes a pair; one that is less than `_NEAR` behind the
+right one makes a pair, too."""
 _NEAR = 2.0
 _HARD = -0.5
 _SHRINKAGE = 5e-4
 
 
-def fit_rivals(poses: list[TriedPose], weights: EvidenceWeights, before: RivalWeights) -> tuple[RivalWeights, int]:
+def fit_rivals(
+    poses: list[TriedPose], weights: EvidenceWeights, before: RivalWeights
+) -> tuple[RivalWeights, int]:
     """The weights, and the number of hard pairs; `before` where these are too few."""
     differences, is_hard = pairs_of(poses, weights)
     num_hard = int(np.count_nonzero(is_hard))
@@ -37,13 +42,21 @@ def fit_rivals(poses: list[TriedPose], weights: EvidenceWeights, before: RivalWe
         return float(np.sum(np.logaddexp(0.0, -hard @ w)) + _SHRINKAGE * len(hard) * np.sum(w**2))
 
     # neither odds nor even share may count against a pose, nor doubt for it
-    fitted = minimize(loss, np.array([0.1, 0.1, -0.1]), bounds=[(0.0, None), (0.0, None), (None, 0.0)], method="L-BFGS-B").x
+    fitted = minimize(
+        loss,
+        np.array([0.1, 0.1, -0.1]),
+        bounds=[(0.0, None), (0.0, None), (None, 0.0)],
+        method="L-BFGS-B",
+    ).x
     odds, even_share, doubt = (float(w) for w in np.round(fitted, 2))
     return replace(before, odds=odds, even_share=even_share, doubt=doubt), num_hard
 
 
-def pairs_of(poses: list[TriedPose], weights: EvidenceWeights) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """By how much the right pose of each pair leads in the log odds, the even share and the doubt (logarithms); is it hard?"""
+def pairs_of(
+    poses: list[TriedPose], weights: EvidenceWeights
+) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+    """By how much the right pose of each pair leads in the log odds, the even share and the doubt
+    (logarithms); is it hard?"""
     of_picture: dict[tuple[str, str, int, str], list[TriedPose]] = {}
     for pose in poses:
         if pose.error_m is not None:
@@ -63,7 +76,11 @@ def pairs_of(poses: list[TriedPose], weights: EvidenceWeights) -> tuple[Float[np
 
 def num_mistaken(differences: Float[np.ndarray, "n 3"], weights: RivalWeights) -> int:
     """How many pairs the weights get wrong."""
-    return int(np.count_nonzero(differences @ np.array([weights.odds, weights.even_share, weights.doubt]) < 0))
+    return int(
+        np.count_nonzero(
+            differences @ np.array([weights.odds, weights.even_share, weights.doubt]) < 0
+        )
+    )
 
 
 def _terms(pose: TriedPose, weights: EvidenceWeights) -> np.ndarray:

@@ -1,4 +1,5 @@
-"""Every pose that a picture led to, not only the one answered, with what spoke for it and whether it is right."""
+"""Every pose that a picture led to, not only the one answered, with what spoke for it and whether
+it is right."""
 
 from __future__ import annotations
 
@@ -34,9 +35,10 @@ _NUM_DRAWN = 25
 class TriedPose:
     """A pose that a picture led to, and what spoke for it.
 
-    `error_m`, `error_deg`: None for a picture from elsewhere. `depth`: median distance (metres) of the points that it stands on.
-    `first_evidence`: that of the matches that it came from; None where these were guided. `square`: its squared error in standard
-    deviations of a covariance that takes all matches for independent; `rho` is what the map says of errors that they share.
+    `error_m`, `error_deg`: None for a picture from elsewhere. `depth`: median distance (metres) of
+    the points that it stands on. `first_evidence`: that of the matches that it came from; None
+    where these were guided. `square`: its squared error in standard deviations of a covariance that
+    takes all matches for independent; `rho` is what the map says of errors that they share.
     """
 
     mapping: str
@@ -55,19 +57,30 @@ class TriedPose:
     def is_right(self) -> bool:
         if self.error_m is None or self.error_deg is None:
             return False
-        return self.error_m < tolerated_translation(self.depth, ASKED) and self.error_deg < ASKED.max_rotation_deg
+        return (
+            self.error_m < tolerated_translation(self.depth, ASKED)
+            and self.error_deg < ASKED.max_rotation_deg
+        )
 
     @property
     def is_wrong(self) -> bool:
-        return self.error_m is None or self.error_deg is None or self.error_m >= 0.5 or self.error_deg >= 10.0
+        return (
+            self.error_m is None
+            or self.error_deg is None
+            or self.error_m >= 0.5
+            or self.error_deg >= 10.0
+        )
 
     @property
     def picture(self) -> tuple[str, str, int, str]:
         return (self.mapping, self.queries, self.index, self.light)
 
 
-def ask_place(place: AskedPlace, recordings: dict[str, StereoSequence], data: Path, kind: str, step: int) -> list[TriedPose]:
-    """Every pose that the place's map, of features of this kind, leads to; none where its recording is missing.
+def ask_place(
+    place: AskedPlace, recordings: dict[str, StereoSequence], data: Path, kind: str, step: int
+) -> list[TriedPose]:
+    """Every pose that the place's map, of features of this kind, leads to; none where its recording
+    is missing.
 
     Args:
         step: only every so manieth of the place's pictures is asked.
@@ -81,18 +94,26 @@ def ask_place(place: AskedPlace, recordings: dict[str, StereoSequence], data: Pa
         config = BuildConfig(features=FeatureConfig(kind=kind), other_kinds=(), sides=sides)
         build_map(recordings[place.mapping], config).save(path)
         localizer = Localizer(TopoMetricMap.load(path))
-        world_from_truth = read_rigid(data / place.map_from_truth) if place.map_from_truth else Rigid3.identity()
+        world_from_truth = (
+            read_rigid(data / place.map_from_truth) if place.map_from_truth else Rigid3.identity()
+        )
         for name, index, frame in _frames(place.own, recordings, step):
             truth = world_from_truth @ frame.world_from_cam
             for light, gamma in GAMMAS.items():
                 if gamma is None or place.is_darkened:
                     image = frame.image if gamma is None else darkened(frame.image, gamma, index)
-                    poses += _tried(localizer, image, frame.camera, truth, (place.mapping, name, index, light))
+                    poses += _tried(
+                        localizer, image, frame.camera, truth, (place.mapping, name, index, light)
+                    )
         for name, index, frame in _frames(place.others, recordings, step):
-            poses += _tried(localizer, frame.image, frame.camera, None, (place.mapping, name, index, "as it is"))
+            poses += _tried(
+                localizer, frame.image, frame.camera, None, (place.mapping, name, index, "as it is")
+            )
         camera = Camera.pinhole(640, 480, 525.0, 525.0, 319.5, 239.5)
         for index, image in enumerate(drawn_pictures(_NUM_DRAWN)[::step] if place.others else []):
-            poses += _tried(localizer, image, camera, None, (place.mapping, "drawn", index, "as it is"))
+            poses += _tried(
+                localizer, image, camera, None, (place.mapping, "drawn", index, "as it is")
+            )
     return poses
 
 
@@ -107,10 +128,15 @@ def load_poses(path: Path) -> list[TriedPose]:
         return None if saved is None else Evidence(**saved)
 
     read = json.loads(path.read_text())
-    return [TriedPose(**row | {key: evidence(row[key]) for key in ("evidence", "first_evidence")}) for row in read]
+    return [
+        TriedPose(**row | {key: evidence(row[key]) for key in ("evidence", "first_evidence")})
+        for row in read
+    ]
 
 
-def _frames(asked: dict[str, int], recordings: dict[str, StereoSequence], step: int) -> Iterator[tuple[str, int, Any]]:
+def _frames(
+    asked: dict[str, int], recordings: dict[str, StereoSequence], step: int
+) -> Iterator[tuple[str, int, Any]]:
     for name, every in asked.items():
         if name in recordings:
             for index in range(0, len(recordings[name]), every * step):
@@ -118,24 +144,35 @@ def _frames(asked: dict[str, int], recordings: dict[str, StereoSequence], step: 
 
 
 def _tried(
-    localizer: Localizer, image: np.ndarray, camera: Camera, world_from_cam: Rigid3 | None, picture: tuple[str, str, int, str]
+    localizer: Localizer,
+    image: np.ndarray,
+    camera: Camera,
+    world_from_cam: Rigid3 | None,
+    picture: tuple[str, str, int, str],
 ) -> Iterator[TriedPose]:
     """`world_from_cam` is the truth, in the map's world; None for a picture from elsewhere."""
     trace = Trace()
     localizer.localize(image, camera, trace=trace)
     rho = localizer.correlated_errors
     for tried in trace.tried:
-        if tried.hypothesis is None or tried.source == "repetition":  # that counts the matches of another pose
+        if (
+            tried.hypothesis is None or tried.source == "repetition"
+        ):  # that counts the matches of another pose
             continue
         final, evidence = tried.hypothesis.fit, tried.hypothesis.evidence
         assert final.pose is not None
         first_evidence = None
         if tried.source not in ("viewpoints", "walls"):
-            first_evidence = replace(evidence, num_matches=len(tried.first.matches), num_inliers=tried.first.num_inliers)
+            first_evidence = replace(
+                evidence, num_matches=len(tried.first.matches), num_inliers=tried.first.num_inliers
+            )
         cam_from_world, error_m, error_deg, square = final.pose.cam_from_world, None, None, None
         if world_from_cam is not None:
             error = cam_from_world @ world_from_cam
-            error_m, error_deg = float(np.linalg.norm(error.translation)), math.degrees(error.angle())
+            error_m, error_deg = (
+                float(np.linalg.norm(error.translation)),
+                math.degrees(error.angle()),
+            )
             xi = error.log()
             square = float(xi @ np.linalg.solve(final.pose.covariance, xi))
         points_world = final.local_map.points_world[final.matches.train_idx[final.pose.inliers]]

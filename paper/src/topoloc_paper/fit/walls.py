@@ -1,8 +1,9 @@
 """The weights of the evidence for a pose that the walls along the way let expect.
 
-As those of the nodes: a logistic regression in which nothing that speaks for a pose may count against it, drawn to the weights in use, for
-there are few such poses. Whether a pose is precise enough is asked apart (`evidence.precision_of`), so a wrong one is one of another place;
-the weight of the doubt is given.
+As those of the nodes: a logistic regression in which nothing that speaks for a pose may count
+against it, drawn to the weights in use, for there are few such poses. Whether a pose is precise
+enough is asked apart (`evidence.precision_of`), so a wrong one is one of another place; the weight
+of the doubt is given.
 """
 
 from __future__ import annotations
@@ -25,31 +26,58 @@ _STRENGTH = 3.0
 
 
 def told_by_walls(poses: list[TriedPose]) -> list[TriedPose]:
-    """The poses of walls that are right or of another place: one that is a metre off at its own place is only imprecise."""
-    return [pose for pose in decided(poses) if pose.evidence.num_distinct is not None and (pose.is_right or _is_elsewhere(pose))]
+    """The poses of walls that are right or of another place: one that is a metre off at its own
+    place is only imprecise."""
+    return [
+        pose
+        for pose in decided(poses)
+        if pose.evidence.num_distinct is not None and (pose.is_right or _is_elsewhere(pose))
+    ]
 
 
 def _is_elsewhere(pose: TriedPose) -> bool:
-    return pose.error_m is None or pose.error_deg is None or pose.error_m > _OTHER_PLACE_M or pose.error_deg > _OTHER_PLACE_DEG
+    return (
+        pose.error_m is None
+        or pose.error_deg is None
+        or pose.error_m > _OTHER_PLACE_M
+        or pose.error_deg > _OTHER_PLACE_DEG
+    )
 
 
 def fit_walls(poses: list[TriedPose], before: WallWeights) -> tuple[WallWeights, int]:
-    """The weights, and the number of poses that they were fitted to; `before` and 0 where these are too few."""
+    """The weights, and the number of poses that they were fitted to; `before` and 0 where these are
+    too few."""
     told = told_by_walls(poses)
     is_right = np.array([pose.is_right for pose in told], dtype=bool)
     if min(np.count_nonzero(is_right), np.count_nonzero(~is_right)) < MIN_POSES:
         return before, 0
     x = np.array([wall_score_features(pose.evidence) for pose in told])
     signs, given = 2.0 * is_right - 1.0, before.doubt * x[:, -1]
-    x, start = np.column_stack([x[:, :-1], np.ones(len(x))]), np.array([*before.in_order[:-1], before.bias])
+    x, start = (
+        np.column_stack([x[:, :-1], np.ones(len(x))]),
+        np.array([*before.in_order[:-1], before.bias]),
+    )
 
     def loss(weights: np.ndarray) -> float:
-        return float(np.sum(np.logaddexp(0.0, -signs * (x @ weights + given))) + _STRENGTH * np.sum((weights - start) ** 2))
+        return float(
+            np.sum(np.logaddexp(0.0, -signs * (x @ weights + given)))
+            + _STRENGTH * np.sum((weights - start) ** 2)
+        )
 
     bounds = [(0.0, None)] * (len(start) - 1) + [(None, None)]
     found, chance, inliers, share, spread, distinct, lesser_side, even, bias = (
-        float(weight) for weight in np.round(minimize(loss, start, bounds=bounds, method="L-BFGS-B").x, 3)
+        float(weight)
+        for weight in np.round(minimize(loss, start, bounds=bounds, method="L-BFGS-B").x, 3)
     )
     by_sides = {"distinct": distinct, "lesser_side": lesser_side}
     shares = {"inlier_share": share, "even_share": even}
-    return replace(before, found=found, chance=chance, inliers=inliers, spread=spread, bias=bias, **by_sides, **shares), len(told)
+    return replace(
+        before,
+        found=found,
+        chance=chance,
+        inliers=inliers,
+        spread=spread,
+        bias=bias,
+        **by_sides,
+        **shares,
+    ), len(told)

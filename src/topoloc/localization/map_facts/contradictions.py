@@ -1,8 +1,9 @@
 """Nodes whose recorded poses contradict what their neighbours show.
 
-Neighbouring nodes see the same things. Each is localized by the points of one neighbour at a time, from nothing, and the pose found is
-compared with the recorded one. Nodes that agree belong together; a part of the map that agrees within itself but not with the rest
-was moved. Which of two parts is in its place nothing can tell: the larger one is believed.
+Neighbouring nodes see the same things. Each is localized by the points of one neighbour at a time,
+from nothing, and the pose found is compared with the recorded one. Nodes that agree belong
+together; a part of the map that agrees within itself but not with the rest was moved. Which of two
+parts is in its place nothing can tell: the larger one is believed.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ class ContradictionsConfig:
     min_inliers: int = 30
     """Fewer points in common say nothing."""
     max_square: float = 60.0
-    """Squared difference of two poses, in units of their covariance (6 numbers), above which they contradict each other ..."""
+    """Squared difference of two poses, in units of their covariance (6 numbers), above which they
+    contradict each other ..."""
     min_distance: float = 0.5
     """... where it is also more than so many D_thresh (Eq. 1): below that no answer is far off."""
 
@@ -47,17 +49,29 @@ class Contradiction:
 
     def __str__(self) -> str:
         apart = f"{self.metres:.2f} m and {self.degrees:.1f} degrees"
-        return f"node {self.node_id} contradicts node {self.other_id}: {apart} from where that one's points see it"
+        return (
+            f"node {self.node_id} contradicts node {self.other_id}: {apart} from where that one's"
+            " points see it"
+        )
 
 
-def contradictions(topomap: TopoMetricMap, config: ContradictionsConfig | None = None) -> list[Contradiction]:
-    """One for each node that is not where the larger part of the map sees it. Raises MapError from reading the map."""
+def contradictions(
+    topomap: TopoMetricMap, config: ContradictionsConfig | None = None
+) -> list[Contradiction]:
+    """One for each node that is not where the larger part of the map sees it. Raises MapError from
+    reading the map."""
     config = config or ContradictionsConfig()
     poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
-    rho = topomap.shared_errors.rho if topomap.shared_errors is not None else weights_of(topomap.kind).shared_errors.unknown
+    rho = (
+        topomap.shared_errors.rho
+        if topomap.shared_errors is not None
+        else weights_of(topomap.kind).shared_errors.unknown
+    )
     group, found = list(range(len(topomap.summaries))), []
     for row, summary in enumerate(topomap.summaries):
-        order = np.argsort(node_distances(summary.world_from_cam, poses, topomap.config.lambda_rot), kind="stable")
+        order = np.argsort(
+            node_distances(summary.world_from_cam, poses, topomap.config.lambda_rot), kind="stable"
+        )
         neighbours = [int(k) for k in order if k != row][: config.num_neighbours]
         neighbours += [k for k in (row - 1, row + 1) if 0 <= k < len(group) and k not in neighbours]
         node = topomap.nodes[row]
@@ -66,16 +80,22 @@ def contradictions(topomap: TopoMetricMap, config: ContradictionsConfig | None =
             if difference is None:
                 continue
             square, metres, radians = difference
-            if square > config.max_square and metres + topomap.config.lambda_rot * radians > config.min_distance * topomap.config.d_thresh:
+            if (
+                square > config.max_square
+                and metres + topomap.config.lambda_rot * radians
+                > config.min_distance * topomap.config.d_thresh
+            ):
                 found.append((row, other_row, metres, radians))
             else:
                 _join(group, row, other_row)
     return _outside_the_largest(topomap, group, found)
 
 
-def _difference(node: TopoNode, other: TopoNode, rho: float, config: ContradictionsConfig) -> tuple[float, float, float] | None:
-    """How far the node's pose is from where the points of the other see it: squared, in covariances; metres; radians. None where they
-    have too little in common."""
+def _difference(
+    node: TopoNode, other: TopoNode, rho: float, config: ContradictionsConfig
+) -> tuple[float, float, float] | None:
+    """How far the node's pose is from where the points of the other see it: squared, in
+    covariances; metres; radians. None where they have too little in common."""
     points = LocalMap.of_node(other)
     matches = match_features(node.features.descriptors, points.descriptors, MatchingConfig())
     if len(matches) < config.min_inliers:
@@ -92,7 +112,11 @@ def _difference(node: TopoNode, other: TopoNode, rho: float, config: Contradicti
     error = found.cam_from_world @ node.summary.world_from_cam
     xi = error.log()
     covariance = inflation(int(np.count_nonzero(found.inliers)), rho) * found.covariance
-    way = float(np.linalg.norm(found.cam_from_world.inverse().translation - node.summary.world_from_cam.translation))
+    way = float(
+        np.linalg.norm(
+            found.cam_from_world.inverse().translation - node.summary.world_from_cam.translation
+        )
+    )
     return float(xi @ np.linalg.solve(covariance, xi)), way, error.angle()
 
 
@@ -103,13 +127,18 @@ def _join(group: list[int], a: int, b: int) -> None:
         group[:] = [low if number == high else number for number in group]
 
 
-def _outside_the_largest(topomap: TopoMetricMap, group: list[int], found: list[tuple[int, int, float, float]]) -> list[Contradiction]:
-    """The contradictions across groups, each told of the node in the smaller one, and of the nodes that were moved with it."""
+def _outside_the_largest(
+    topomap: TopoMetricMap, group: list[int], found: list[tuple[int, int, float, float]]
+) -> list[Contradiction]:
+    """The contradictions across groups, each told of the node in the smaller one, and of the nodes
+    that were moved with it."""
     sizes, worst = Counter(group), {}
     for row, other_row, metres, radians in found:
         if group[row] == group[other_row]:
             continue
-        one, other = (row, other_row) if sizes[group[row]] <= sizes[group[other_row]] else (other_row, row)
+        one, other = (
+            (row, other_row) if sizes[group[row]] <= sizes[group[other_row]] else (other_row, row)
+        )
         if one not in worst or metres > worst[one][1]:
             worst[one] = (other, metres, radians)
     moved = {group[one]: one for one in worst}
@@ -117,4 +146,7 @@ def _outside_the_largest(topomap: TopoMetricMap, group: list[int], found: list[t
     for row, number in enumerate(group):  # the rest of a part that was moved as one
         if row not in worst and number in moved:
             worst[row] = worst[moved[number]]
-    return [Contradiction(ids[row], ids[k], metres, float(np.degrees(radians))) for row, (k, metres, radians) in sorted(worst.items())]
+    return [
+        Contradiction(ids[row], ids[k], metres, float(np.degrees(radians)))
+        for row, (k, metres, radians) in sorted(worst.items())
+    ]

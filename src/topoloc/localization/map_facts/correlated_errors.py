@@ -1,13 +1,16 @@
 """What the errors of a map's points have in common, and what that does to a pose's covariance.
 
-PnP's covariance takes the errors of n matches for independent, and shrinks with n. But points of one node move together when the
-node's pose is wrong, when its depth is, or its calibration: a thousand matches share that error. With rho the share of a match's variance
-that is common to all of them, the variance of what n matches say together is not v / n but v / n (1 + (n - 1) rho): the design effect of
-samples taken in clusters (Kish, *Survey Sampling*, 1965). So PnP's covariance is multiplied by 1 + n rho.
+PnP's covariance takes the errors of n matches for independent, and shrinks with n. But points of
+one node move together when the node's pose is wrong, when its depth is, or its calibration: a
+thousand matches share that error. With rho the share of a match's variance that is common to all of
+them, the variance of what n matches say together is not v / n but v / n (1 + (n - 1) rho): the
+design effect of samples taken in clusters (Kish, *Survey Sampling*, 1965). So PnP's covariance is
+multiplied by 1 + n rho.
 
-rho is the map's own, and the map knows it: a node is localized by nodes a few steps away, as if it were a query, and its recorded
-pose is compared with the pose found. That takes a second; a map's file keeps what came out, with a digest of what it was measured
-of and with, and where that is not what is asked for, it is measured anew.
+rho is the map's own, and the map knows it: a node is localized by nodes a few steps away, as if it
+were a query, and its recorded pose is compared with the pose found. That takes a second; a map's
+file keeps what came out, with a digest of what it was measured of and with, and where that is not
+what is asked for, it is measured anew.
 """
 
 from __future__ import annotations
@@ -38,8 +41,9 @@ class CorrelatedErrorsConfig:
     num_nodes: Annotated[int, Between(0, 1000)] = 20
     """Nodes that are localized by others, evenly along the map."""
     min_distances: Annotated[tuple[float, ...], AtLeast(0)] = (3.0, 1.0)
-    """Neighbours nearer than so many D_thresh (Eq. 1) do not help to localize a node, for their points were refined with its picture.
-    The second number counts where the first leaves too few nodes to compare."""
+    """Neighbours nearer than so many D_thresh (Eq. 1) do not help to localize a node, for their
+    points were refined with its picture. The second number counts where the first leaves too few
+    nodes to compare."""
     num_helpers: Annotated[int, Between(1, 100)] = 3
     """The nearest of the others, whose points do."""
     min_inliers: Annotated[int, AtLeast(4)] = 20
@@ -56,9 +60,14 @@ def inflation(num_inliers: int, rho: float) -> float:
 
 
 def correlated_errors_of(
-    topomap: TopoMetricMap, guided: GuidedConfig, pose: AbsolutePoseConfig, config: CorrelatedErrorsConfig, weights: SharedErrorWeights
+    topomap: TopoMetricMap,
+    guided: GuidedConfig,
+    pose: AbsolutePoseConfig,
+    config: CorrelatedErrorsConfig,
+    weights: SharedErrorWeights,
 ) -> float:
-    """rho as the map tells it, where it was measured of these nodes and with these settings; else measured now.
+    """rho as the map tells it, where it was measured of these nodes and with these settings; else
+    measured now.
 
     Args:
         guided, pose: as queries are matched and localized.
@@ -70,7 +79,11 @@ def correlated_errors_of(
 
 
 def correlated_errors_to_keep(
-    topomap: TopoMetricMap, guided: GuidedConfig, pose: AbsolutePoseConfig, config: CorrelatedErrorsConfig, weights: SharedErrorWeights
+    topomap: TopoMetricMap,
+    guided: GuidedConfig,
+    pose: AbsolutePoseConfig,
+    config: CorrelatedErrorsConfig,
+    weights: SharedErrorWeights,
 ) -> SharedErrors:
     """rho measured, for the map to keep."""
     rho = measure_correlated_errors(topomap, guided, pose, config, weights)
@@ -78,12 +91,18 @@ def correlated_errors_to_keep(
 
 
 def measure_correlated_errors(
-    topomap: TopoMetricMap, guided: GuidedConfig, pose: AbsolutePoseConfig, config: CorrelatedErrorsConfig, weights: SharedErrorWeights
+    topomap: TopoMetricMap,
+    guided: GuidedConfig,
+    pose: AbsolutePoseConfig,
+    config: CorrelatedErrorsConfig,
+    weights: SharedErrorWeights,
 ) -> float:
     """rho of the map: see above."""
     poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
     lambda_rot, d_thresh = topomap.config.lambda_rot, topomap.config.d_thresh
-    node_ids = np.unique(np.linspace(0, len(topomap.summaries) - 1, config.num_nodes).round().astype(int))
+    node_ids = np.unique(
+        np.linspace(0, len(topomap.summaries) - 1, config.num_nodes).round().astype(int)
+    )
     for min_distance in config.min_distances:
         rhos = []
         for node_id in node_ids:
@@ -91,16 +110,24 @@ def measure_correlated_errors(
             distances = node_distances(node.summary.world_from_cam, poses, lambda_rot)
             order = np.argsort(distances, kind="stable")
             helpers = order[distances[order] > min_distance * d_thresh][: config.num_helpers]
-            rho = _rho_of_node(node, [topomap.nodes[int(k)] for k in helpers], guided, pose, config.min_inliers)
+            rho = _rho_of_node(
+                node, [topomap.nodes[int(k)] for k in helpers], guided, pose, config.min_inliers
+            )
             if rho is not None:
                 rhos.append(rho)
         if len(rhos) >= config.min_nodes:
-            return max(weights.factor * float(np.percentile(rhos, config.percentile)), weights.least)
+            return max(
+                weights.factor * float(np.percentile(rhos, config.percentile)), weights.least
+            )
     return weights.unknown
 
 
 def _digest(
-    topomap: TopoMetricMap, guided: GuidedConfig, pose: AbsolutePoseConfig, config: CorrelatedErrorsConfig, weights: SharedErrorWeights
+    topomap: TopoMetricMap,
+    guided: GuidedConfig,
+    pose: AbsolutePoseConfig,
+    config: CorrelatedErrorsConfig,
+    weights: SharedErrorWeights,
 ) -> str:
     """A short name for all that rho follows from."""
     settings = {
@@ -109,7 +136,9 @@ def _digest(
         "config": asdict(config) | asdict(weights),
         "nodes": asdict(topomap.config.nodes),
     }
-    return digest_of_nodes(topomap.summaries, json.dumps([_METHOD, settings], sort_keys=True).encode())
+    return digest_of_nodes(
+        topomap.summaries, json.dumps([_METHOD, settings], sort_keys=True).encode()
+    )
 
 
 def _rho_of_node(
@@ -119,7 +148,8 @@ def _rho_of_node(
     config: AbsolutePoseConfig,
     min_inliers: int,
 ) -> float | None:
-    """rho by which the node's pose differs from what its neighbours (`helpers`) say; None where they do not see what it sees."""
+    """rho by which the node's pose differs from what its neighbours (`helpers`) say; None where
+    they do not see what it sees."""
     if not helpers:
         return None
     cam_from_world = node.summary.world_from_cam.inverse()

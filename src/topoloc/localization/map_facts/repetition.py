@@ -1,14 +1,18 @@
-"""Where a place repeats itself: a wall of equal panels, a row of equal windows, tiles; and the same wall on the other side of the house.
+"""Where a place repeats itself: a wall of equal panels, a row of equal windows, tiles; and the same
+wall on the other side of the house.
 
-No picture of such a wall tells one panel from the next. Its features fail the ratio test, since the next panel has the same ones, and a
-pose that is found all the same is one of many. So for each node it is looked up once how the place can be moved onto itself:
+No picture of such a wall tells one panel from the next. Its features fail the ratio test, since the
+next panel has the same ones, and a pose that is found all the same is one of many. So for each node
+it is looked up once how the place can be moved onto itself:
 
-- by **shifts**: its points that look like other points nearby vote for the shift between the two, and what many points vote for is one;
-- by **moves** in general: it is localized by nodes far from it that look like it. Where it is found among their points, as if it were
-  there, it has a copy there.
+- by **shifts**: its points that look like other points nearby vote for the shift between the two,
+  and what many points vote for is one;
+- by **moves** in general: it is localized by nodes far from it that look like it. Where it is found
+  among their points, as if it were there, it has a copy there.
 
-A hypothesis there is not alone: the poses moved so are proposed as well (`propose.py`), and a match with any copy of a point speaks for
-all of them (`refine.py`). What tells them apart is what does not repeat itself, if the picture shows any of it.
+A hypothesis there is not alone: the poses moved so are proposed as well (`propose.py`), and a match
+with any copy of a point speaks for all of them (`refine.py`). What tells them apart is what does
+not repeat itself, if the picture shows any of it.
 """
 
 from __future__ import annotations
@@ -47,17 +51,20 @@ def digest_of(summaries: Sequence[NodeSummary]) -> str:
 
 
 def may_repeat(node: LocalMap) -> bool:
-    """Is there anything in what a node shows that its own picture shows twice? What repeats itself mostly does."""
+    """Is there anything in what a node shows that its own picture shows twice? What repeats itself
+    mostly does."""
     return len(shifts_of(node, node, _LEAST_WITHIN)) > 0
 
 
 def shifts_of(node: LocalMap, around: LocalMap, min_share: float = 0.5) -> Float[np.ndarray, "k 3"]:
-    """The shifts (metres, world) by which what a node shows is there once more, those with most votes first; none in most places.
+    """The shifts (metres, world) by which what a node shows is there once more, those with most
+    votes first; none in most places.
 
     Args:
         around: the points of the nodes nearby that look the same way.
-        min_share: of the node's points must find a copy by the first shift, half as many by each other one: parts of a panel may
-            resemble each other, too, and smooth surfaces any part of themselves.
+        min_share: of the node's points must find a copy by the first shift, half as many by each
+            other one: parts of a panel may resemble each other, too, and smooth surfaces any part
+            of themselves.
     """
     points, descriptors = node.points_world[:_NUM_POINTS], node.descriptors[:_NUM_POINTS]
     rows, columns = alike_pairs(descriptors, around.descriptors, _MIN_SIMILARITY)
@@ -66,10 +73,14 @@ def shifts_of(node: LocalMap, around: LocalMap, min_share: float = 0.5) -> Float
     rows, shifts = rows[far], shifts[far]
     found: list[Float[np.ndarray, " 3"]] = []
     least, left = max(_MIN_VOTES, min_share * len(points)), np.ones(len(shifts), np.bool_)
-    grids = [_Votes.of(shifts, rows, offset) for offset in (0.0, 0.5)]  # that overlap: no shift lies at the borders of both
+    grids = [
+        _Votes.of(shifts, rows, offset) for offset in (0.0, 0.5)
+    ]  # that overlap: no shift lies at the borders of both
     while left.any() and len(found) < _MAX_SHIFTS:
         _, voters = max((grid.densest(left) for grid in grids), key=lambda most: most[0])
-        near = left & (np.linalg.norm(shifts - np.median(shifts[voters], axis=0), axis=1) < 1.5 * _CELL)
+        near = left & (
+            np.linalg.norm(shifts - np.median(shifts[voters], axis=0), axis=1) < 1.5 * _CELL
+        )
         votes = len(np.unique(rows[near]))
         if votes < least:
             break
@@ -81,7 +92,8 @@ def shifts_of(node: LocalMap, around: LocalMap, min_share: float = 0.5) -> Float
 
 
 def copy_of(node: TopoNode, others: LocalMap) -> Rigid3 | None:
-    """The move (world) that takes what a node shows onto its copy among these points; None where there is none, or it is itself."""
+    """The move (world) that takes what a node shows onto its copy among these points; None where
+    there is none, or it is itself."""
     features = node.features.select(np.arange(min(_NUM_POINTS, len(node.features))))
     matches = match_features(features.descriptors, others.descriptors, _NEAREST)
     alike = 1.0 - matches.distances**2 / 2.0 >= _MIN_SIMILARITY
@@ -91,18 +103,23 @@ def copy_of(node: TopoNode, others: LocalMap) -> Rigid3 | None:
         return None
     points_img = features.points_img[rows].astype(np.float64)
     points_world, covariances = others.points_world[columns], others.covariances[columns]
-    found = estimate_absolute_pose(points_img, points_world, node.camera, _POSE, point_covariances=covariances)
+    found = estimate_absolute_pose(
+        points_img, points_world, node.camera, _POSE, point_covariances=covariances
+    )
     if found is None or np.count_nonzero(found.inliers) < least:
         return None
     move = found.cam_from_world.inverse() @ node.summary.world_from_cam.inverse()
-    points_world = node.summary.world_from_cam.apply(node.points_cam[rows[found.inliers]].astype(np.float64))
+    points_world = node.summary.world_from_cam.apply(
+        node.points_cam[rows[found.inliers]].astype(np.float64)
+    )
     way = np.linalg.norm(move.apply(points_world) - points_world, axis=1)
     return move if float(np.median(way)) > LEAST_SHIFT else None
 
 
 @dataclass(frozen=True, eq=False)
 class _Votes:
-    """Shifts by the cells of a grid that they lie in: `order` sorts them by cell and point, `cells` and `points` are sorted so."""
+    """Shifts by the cells of a grid that they lie in: `order` sorts them by cell and point, `cells`
+    and `points` are sorted so."""
 
     order: Int[np.ndarray, " n"]
     cells: Int[np.ndarray, " n"]
@@ -116,17 +133,25 @@ class _Votes:
         return _Votes(order, *np.divmod(keys[order], _NUM_POINTS))
 
     def densest(self, left: Bool[np.ndarray, " n"]) -> tuple[int, Int[np.ndarray, " k"]]:
-        """The most points that vote for one cell, and the shifts that lie in it, of those that are left (some are)."""
+        """The most points that vote for one cell, and the shifts that lie in it, of those that are
+        left (some are)."""
         is_left = left[self.order]
         cells, points = self.cells[is_left], self.points[is_left]
         begins = np.append(True, cells[1:] != cells[:-1])
-        votes = np.add.reduceat(begins | np.append(True, points[1:] != points[:-1]), np.flatnonzero(begins), dtype=np.int64)
+        votes = np.add.reduceat(
+            begins | np.append(True, points[1:] != points[:-1]),
+            np.flatnonzero(begins),
+            dtype=np.int64,
+        )
         cell = cells[begins][votes.argmax()]
         return int(votes.max()), self.order[is_left & (self.cells == cell)]
 
 
-def folded(points_world: Float[np.ndarray, "n 3"], shifts: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "n 3"]:
-    """The points with all copies moved onto one: along the shortest shift, by whole shifts, into one period of it."""
+def folded(
+    points_world: Float[np.ndarray, "n 3"], shifts: Float[np.ndarray, "k 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """The points with all copies moved onto one: along the shortest shift, by whole shifts, into
+    one period of it."""
     if len(shifts) == 0:
         return points_world
     shift = shifts[np.argmin(np.linalg.norm(shifts, axis=1))]
@@ -138,6 +163,8 @@ def folded(points_world: Float[np.ndarray, "n 3"], shifts: Float[np.ndarray, "k 
     return points_world - np.floor(along - cut)[:, None] * shift
 
 
-def copies(points_world: Float[np.ndarray, "n 3"], shifts: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "c n 3"]:
+def copies(
+    points_world: Float[np.ndarray, "n 3"], shifts: Float[np.ndarray, "k 3"]
+) -> Float[np.ndarray, "c n 3"]:
     """The points themselves, and moved by each shift."""
     return np.stack([points_world, *(points_world + shift for shift in shifts)])

@@ -1,10 +1,12 @@
-"""First poses from the walls along the way: the last resort, for who comes back along a way that was mapped in one direction only.
+"""First poses from the walls along the way: the last resort, for who comes back along a way that
+was mapped in one direction only.
 
-The image's views to the left and to the right (`features/side_views.py`) are compared with the side nodes that must show the same from
-the places that both look like (`wall_places.py`); what the matches of both agree on (`wall_poses.py`) is followed up in both together
-(`wall_matching.py`). Walls repeat themselves, doors above all: so it also counts how many of the key points found look more like the
-map's point here than like any that the side nodes show elsewhere. Where the map has nodes
-that look the same way, they would have been recognised, so poses there are not considered.
+The image's views to the left and to the right (`features/side_views.py`) are compared with the side
+nodes that must show the same from the places that both look like (`wall_places.py`); what the
+matches of both agree on (`wall_poses.py`) is followed up in both together (`wall_matching.py`).
+Walls repeat themselves, doors above all: so it also counts how many of the key points found look
+more like the map's point here than like any that the side nodes show elsewhere. Where the map has
+nodes that look the same way, they would have been recognised, so poses there are not considered.
 """
 
 from __future__ import annotations
@@ -34,7 +36,15 @@ from topoloc.localization.map_facts.correlated_errors import inflation
 from topoloc.localization.pose_fit import PoseFit
 from topoloc.localization.search import Proposal, Search
 from topoloc.localization.walls.wall_index import WallIndex
-from topoloc.localization.walls.wall_matching import SeenSide, SideMatches, count_sides, estimate_pose, match_sides, nearest_sides, together
+from topoloc.localization.walls.wall_matching import (
+    SeenSide,
+    SideMatches,
+    count_sides,
+    estimate_pose,
+    match_sides,
+    nearest_sides,
+    together,
+)
 from topoloc.localization.walls.wall_places import NamedPlaces, likeliest_places
 from topoloc.localization.walls.wall_poses import agreeing_pose
 
@@ -43,7 +53,8 @@ _NEAREST = MatchingConfig(ratio=0.0, mutual=False)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class WallProposal(Proposal):
-    """A first pose on which `num_agreeing` of the matches of both views with the walls of one place agree."""
+    """A first pose on which `num_agreeing` of the matches of both views with the walls of one place
+    agree."""
 
     num_agreeing: int
     cam_from_world: Rigid3
@@ -52,7 +63,8 @@ class WallProposal(Proposal):
 
 @dataclass(frozen=True, eq=False)
 class SeenWalls:
-    """Both sides of a query image, and the places that both look like (world_from_cam), the likeliest first."""
+    """Both sides of a query image, and the places that both look like (world_from_cam), the
+    likeliest first."""
 
     search: Search
     index: WallIndex
@@ -66,11 +78,15 @@ class SeenWalls:
         for view in side_views(query.lens, index.view_config):
             picture = view.picture(query.grey)
             seen_by = (view.name, index.view_config, index.feature_config)
-            features = query.shared.once(query, seen_by, partial(_features_of, index.feature_config, view, picture))
+            features = query.shared.once(
+                query, seen_by, partial(_features_of, index.feature_config, view, picture)
+            )
             seen.append(SeenSide(view, features, view.in_picture(features, query.lens)))
             named.append(NamedPlaces.of(view, index, index.likeness(picture, features)))
         apart = search.config.walls.apart * search.map.d_thresh
-        return SeenWalls(search, index, seen, likeliest_places(named, search.config.walls.num_places, apart))
+        return SeenWalls(
+            search, index, seen, likeliest_places(named, search.config.walls.num_places, apart)
+        )
 
     @property
     def camera(self) -> Camera:
@@ -78,16 +94,31 @@ class SeenWalls:
 
     def rows_around(self, side: SeenSide, cam_from_world: Rigid3) -> list[int]:
         """The side nodes that show what a side must show from a pose."""
-        return nearest_sides(side.view, cam_from_world, self.index.centres, self.index.axes, self.search.config.walls.num_nodes)
+        return nearest_sides(
+            side.view,
+            cam_from_world,
+            self.index.centres,
+            self.index.axes,
+            self.search.config.walls.num_nodes,
+        )
 
     @cached_property
     def of_places(self) -> LocalMap:
         """All that must be seen of the walls from any of the places."""
-        rows = sorted({row for place in self.places for side in self.seen for row in self.rows_around(side, place.inverse())})
+        rows = sorted(
+            {
+                row
+                for place in self.places
+                for side in self.seen
+                for row in self.rows_around(side, place.inverse())
+            }
+        )
         return LocalMap.pooled([self.index.local_map(row) for row in rows])
 
 
-def _features_of(config: FeatureConfig, view: SideView, picture: UInt8[np.ndarray, "a b"]) -> Features:
+def _features_of(
+    config: FeatureConfig, view: SideView, picture: UInt8[np.ndarray, "a b"]
+) -> Features:
     """Those of what a view shows."""
     return view.within(extract_normalized(normalize_image(picture, config), config))
 
@@ -95,7 +126,11 @@ def _features_of(config: FeatureConfig, view: SideView, picture: UInt8[np.ndarra
 def propose_walls(search: Search) -> Iterator[Proposal]:
     """The first poses that most matches of a view agree with, some for each view."""
     config, best = search.config.walls, search.best
-    is_settled = best is not None and best.probability >= search.config.evidence.min_probability and best.log_odds > config.clear_log_odds
+    is_settled = (
+        best is not None
+        and best.probability >= search.config.evidence.min_probability
+        and best.log_odds > config.clear_log_odds
+    )
     if (
         is_settled
         or search.is_repeated
@@ -106,7 +141,9 @@ def propose_walls(search: Search) -> Iterator[Proposal]:
         return
     with search.query.clock.stage("walls"):
         walls = SeenWalls.of(search, index)
-        found = [proposal for place in walls.places if (proposal := _compared(walls, place)) is not None]
+        found = [
+            proposal for place in walls.places if (proposal := _compared(walls, place)) is not None
+        ]
         chosen = _best([_looked_again(proposal) for proposal in _best(found)])
     yield from chosen
 
@@ -118,13 +155,16 @@ def _best(found: list[WallProposal]) -> list[WallProposal]:
         search = proposal.walls.search
         if len(kept) == search.config.walls.num_hypotheses:
             break
-        if not any(_are_near(search, proposal.cam_from_world, other.cam_from_world) for other in kept):
+        if not any(
+            _are_near(search, proposal.cam_from_world, other.cam_from_world) for other in kept
+        ):
             kept.append(proposal)
     return kept
 
 
 def _looked_again(proposal: WallProposal) -> WallProposal:
-    """Compared with what must be seen from the pose itself, where more agrees then: the place that named it was only near."""
+    """Compared with what must be seen from the pose itself, where more agrees then: the place that
+    named it was only near."""
     again = _compared(proposal.walls, proposal.cam_from_world.inverse())
     return again if again is not None and again.num_agreeing > proposal.num_agreeing else proposal
 
@@ -133,20 +173,37 @@ def _compared(walls: SeenWalls, place: Rigid3) -> WallProposal | None:
     """Both views compared with what they must show from a place."""
     config, cam_from_place = walls.search.config.walls, place.inverse()
     sides = _sides_around(walls, cam_from_place)
-    matches = [match_pooled(side.features.descriptors, m.descriptors, m.points_world, m.radii, config.matching) for side, m in sides]
+    matches = [
+        match_pooled(
+            side.features.descriptors, m.descriptors, m.points_world, m.radii, config.matching
+        )
+        for side, m in sides
+    ]
     found = together(sides, matches)
     if found is None:
         return None
-    seen = walls.camera.normalized_from_img(found.features.points_img[found.matches.query_idx].astype(np.float64))
-    agreeing = agreeing_pose(seen, cam_from_place.apply(found.local_map.points_world[found.matches.train_idx]))
+    seen = walls.camera.normalized_from_img(
+        found.features.points_img[found.matches.query_idx].astype(np.float64)
+    )
+    agreeing = agreeing_pose(
+        seen, cam_from_place.apply(found.local_map.points_world[found.matches.train_idx])
+    )
     if agreeing is None or agreeing[0] < config.min_agreeing:
         return None
     fit = PoseFit(found.features, walls.camera, walls.camera, found.local_map, found.matches, None)
-    return WallProposal("walls", fit, is_guided=True, num_agreeing=agreeing[0], cam_from_world=agreeing[1] @ cam_from_place, walls=walls)
+    return WallProposal(
+        "walls",
+        fit,
+        is_guided=True,
+        num_agreeing=agreeing[0],
+        cam_from_world=agreeing[1] @ cam_from_place,
+        walls=walls,
+    )
 
 
 def refine_wall(proposal: WallProposal) -> PoseFit | None:
-    """What both sides show around the first pose, and the pose that follows; None where too little does, or the map's nodes see it."""
+    """What both sides show around the first pose, and the pose that follows; None where too little
+    does, or the map's nodes see it."""
     walls, config = proposal.walls, proposal.walls.search.config
     cam_from_world, found, pose = proposal.cam_from_world, None, None
     for radius_px, max_error_px in config.walls.rounds:
@@ -167,10 +224,19 @@ def weigh_wall(proposal: WallProposal, final: PoseFit) -> Hypothesis | None:
     walls, search, pose, camera = proposal.walls, proposal.walls.search, final.pose, final.camera
     if pose is None or final.num_inliers < search.config.walls.min_found:
         return None
-    counts = count_sides(_sides_around(walls, pose.cam_from_world), pose.cam_from_world, _guided(walls, search.config.walls.rounds[-1][0]))
-    inflated = inflation(final.num_inliers, search.rho) + search.weights.walls.few_points / final.num_inliers
+    counts = count_sides(
+        _sides_around(walls, pose.cam_from_world),
+        pose.cam_from_world,
+        _guided(walls, search.config.walls.rounds[-1][0]),
+    )
+    inflated = (
+        inflation(final.num_inliers, search.rho)
+        + search.weights.walls.few_points / final.num_inliers
+    )
     covariance = inflated * pose.covariance
-    depths = pose.cam_from_world.apply(final.local_map.points_world[final.matches.train_idx[pose.inliers]])[:, 2]
+    depths = pose.cam_from_world.apply(
+        final.local_map.points_world[final.matches.train_idx[pose.inliers]]
+    )[:, 2]
     points_img = final.features.points_img[final.matches.query_idx[pose.inliers]].astype(np.float64)
     num_left = int(np.count_nonzero(points_img[:, 0] < camera.cx))
     agreeing_img = points_img if counts.agreeing_img is None else counts.agreeing_img
@@ -186,14 +252,23 @@ def weigh_wall(proposal: WallProposal, final: PoseFit) -> Hypothesis | None:
         num_distinct=_num_distinct(walls, final),
         num_lesser_side=min(num_left, len(points_img) - num_left),
     )
-    return Hypothesis("walls", final, evidence, covariance, 1.0 / inflated, log_odds_of(evidence, search.weights))
+    return Hypothesis(
+        "walls", final, evidence, covariance, 1.0 / inflated, log_odds_of(evidence, search.weights)
+    )
 
 
-def _matched(proposal: WallProposal, cam_from_world: Rigid3, radius_px: float) -> SideMatches | None:
-    """The matches of the proposal itself, or, with a radius, those of both sides around the pose."""
+def _matched(
+    proposal: WallProposal, cam_from_world: Rigid3, radius_px: float
+) -> SideMatches | None:
+    """The matches of the proposal itself, or, with a radius, those of both sides around the
+    pose."""
     if radius_px == 0.0:
         return SideMatches(proposal.fit.features, proposal.fit.local_map, proposal.fit.matches)
-    return match_sides(_sides_around(proposal.walls, cam_from_world), cam_from_world, _guided(proposal.walls, radius_px))
+    return match_sides(
+        _sides_around(proposal.walls, cam_from_world),
+        cam_from_world,
+        _guided(proposal.walls, radius_px),
+    )
 
 
 def _guided(walls: SeenWalls, radius_px: float) -> GuidedConfig:
@@ -202,29 +277,55 @@ def _guided(walls: SeenWalls, radius_px: float) -> GuidedConfig:
 
 def _sides_around(walls: SeenWalls, cam_from_world: Rigid3) -> list[tuple[SeenSide, LocalMap]]:
     """Each side with the points of the side nodes that show what it must show."""
-    return [(side, local_map) for side in walls.seen if (local_map := _around(walls, side, cam_from_world)) is not None]
+    return [
+        (side, local_map)
+        for side in walls.seen
+        if (local_map := _around(walls, side, cam_from_world)) is not None
+    ]
 
 
 def _around(walls: SeenWalls, side: SeenSide, cam_from_world: Rigid3) -> LocalMap | None:
     rows = walls.rows_around(side, cam_from_world)
-    return LocalMap.pooled([walls.index.local_map(row) for row in rows]) if rows and len(side.features) else None
+    return (
+        LocalMap.pooled([walls.index.local_map(row) for row in rows])
+        if rows and len(side.features)
+        else None
+    )
 
 
-def _estimate(walls: SeenWalls, found: SideMatches, near: Rigid3, max_error_px: float) -> AbsolutePose | None:
-    """The pose refined, or sought anew where that has more inliers and is near: a wall has a second pose."""
+def _estimate(
+    walls: SeenWalls, found: SideMatches, near: Rigid3, max_error_px: float
+) -> AbsolutePose | None:
+    """The pose refined, or sought anew where that has more inliers and is near: a wall has a second
+    pose."""
     sigma_px = walls.search.weights.walls.sigma_px
-    config = AbsolutePoseConfig(max_reprojection_error_px=max_error_px, sigma_px=sigma_px, max_iterations=400)
-    refined, anew = estimate_pose(found, walls.camera, config, near), estimate_pose(found, walls.camera, config, None)
+    config = AbsolutePoseConfig(
+        max_reprojection_error_px=max_error_px, sigma_px=sigma_px, max_iterations=400
+    )
+    refined, anew = (
+        estimate_pose(found, walls.camera, config, near),
+        estimate_pose(found, walls.camera, config, None),
+    )
     if anew is None or not _are_near(walls.search, anew.cam_from_world, near):
         return refined
-    return anew if refined is None or np.count_nonzero(anew.inliers) > np.count_nonzero(refined.inliers) else refined
+    return (
+        anew
+        if refined is None or np.count_nonzero(anew.inliers) > np.count_nonzero(refined.inliers)
+        else refined
+    )
 
 
 def _num_distinct(walls: SeenWalls, final: PoseFit) -> int:
-    """How many inliers look more like the map's point here than like any point that the side nodes of the other places show elsewhere."""
+    """How many inliers look more like the map's point here than like any point that the side nodes
+    of the other places show elsewhere."""
     assert final.pose is not None
-    rows, columns = (index[final.pose.inliers] for index in (final.matches.query_idx, final.matches.train_idx))
-    descriptors, points_world = final.features.descriptors[rows], final.local_map.points_world[columns]
+    rows, columns = (
+        index[final.pose.inliers] for index in (final.matches.query_idx, final.matches.train_idx)
+    )
+    descriptors, points_world = (
+        final.features.descriptors[rows],
+        final.local_map.points_world[columns],
+    )
     products = np.sum(descriptors * final.local_map.descriptors[columns], axis=1)
     distances = np.sqrt(np.maximum(2.0 - 2.0 * products, 0.0))
     away = 1.5 * walls.search.config.walls.min_distance * walls.search.map.d_thresh
@@ -244,5 +345,7 @@ def _is_mapped(search: Search, cam_from_world: Rigid3) -> bool:
 def _are_near(search: Search, a_from_world: Rigid3, b_from_world: Rigid3) -> bool:
     """Are two first poses, neither of them precise, worth looking into but once?"""
     apart = a_from_world @ b_from_world.inverse()
-    way = float(np.linalg.norm(a_from_world.inverse().translation - b_from_world.inverse().translation))
+    way = float(
+        np.linalg.norm(a_from_world.inverse().translation - b_from_world.inverse().translation)
+    )
     return way < 1.5 * search.map.d_thresh and math.degrees(apart.angle()) < 20.0

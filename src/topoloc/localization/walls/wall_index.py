@@ -1,4 +1,5 @@
-"""The walls along a map's way, opened for queries: side nodes, what ranks them, and their points. Side nodes go by their rows."""
+"""The walls along a map's way, opened for queries: side nodes, what ranks them, and their points.
+Side nodes go by their rows."""
 
 from __future__ import annotations
 
@@ -18,8 +19,8 @@ from topoloc.places.vlad import SurfVlad
 class WallIndex:
     """A map's side nodes, opened: what ranks them, where they are, and their points.
 
-    Row k: `rotations` and `positions` are the poses (world_from_side, metres), `centres` the middle of what is shown in the world and
-    `middles` the same in the side camera's frame.
+    Row k: `rotations` and `positions` are the poses (world_from_side, metres), `centres` the middle
+    of what is shown in the world and `middles` the same in the side camera's frame.
 
     Raises:
         MapError: what ranks the side nodes is missing or not of them.
@@ -28,9 +29,14 @@ class WallIndex:
     def __init__(self, topomap: TopoMetricMap, sides: SideNodes) -> None:
         self.coarse, self.centres = _ranking_of(sides)
         self.rotations = np.array([summary.world_from_cam.rotation for summary in sides.summaries])
-        self.positions = np.array([summary.world_from_cam.translation for summary in sides.summaries])
+        self.positions = np.array(
+            [summary.world_from_cam.translation for summary in sides.summaries]
+        )
         self.middles = np.einsum("nji,nj->ni", self.rotations, self.centres - self.positions)
-        self.view_config, self.feature_config = topomap.config.sides.views, topomap.config.features_of(sides.kind)
+        self.view_config, self.feature_config = (
+            topomap.config.sides.views,
+            topomap.config.features_of(sides.kind),
+        )
         self.local_map = RememberedNodes(lambda row: _read(sides, row))
 
     @property
@@ -53,8 +59,12 @@ def _read(sides: SideNodes, row: int) -> LocalMap:
 
 
 def _ranking_of(sides: SideNodes) -> tuple[SurfVlad, Float[np.ndarray, "nodes 3"]]:
-    """What names the side nodes that look most like a view, and the middles (metres, world) of what they show."""
-    models = [in_rows(model, [summary.node_id for summary in sides.summaries]) for model in sides.coarse_models.values()]
+    """What names the side nodes that look most like a view, and the middles (metres, world) of what
+    they show."""
+    models = [
+        in_rows(model, [summary.node_id for summary in sides.summaries])
+        for model in sides.coarse_models.values()
+    ]
     centres = models[0].arrays.get("centres") if len(models) == 1 else None
     if centres is None or centres.shape != (len(sides.summaries), 3):
         raise MapError("the map's side nodes come without what ranks them; build it again")

@@ -11,8 +11,9 @@ from topoloc.compiled import kernel
 def largest_agreement(seen, points, turns, shifts, tolerances, nearest):
     """Row of the pose that most matches agree with, and how many these are.
 
-    Match k sees the point `points[k]` at the tangents `seen[k]`; pose j turns it by `turns[j]` about the vertical (y) and shifts it. The
-    two agree within `tolerances[k]`, where the point is at least `nearest` metres before the camera.
+    Match k sees the point `points[k]` at the tangents `seen[k]`; pose j turns it by `turns[j]`
+    about the vertical (y) and shifts it. The two agree within `tolerances[k]`, where the point is
+    at least `nearest` metres before the camera.
     """
     best, most = 0, 0
     for j in range(len(turns)):

@@ -21,7 +21,8 @@ _NUM_COMPARED = 512  # of the points in view of a side that are compared with de
 
 @dataclass(frozen=True, eq=False)
 class SeenSide:
-    """One side of a picture: its view, what was found in it, and the same features at the pixels of the picture."""
+    """One side of a picture: its view, what was found in it, and the same features at the pixels of
+    the picture."""
 
     view: SideView
     features: Features
@@ -30,7 +31,8 @@ class SeenSide:
 
 @dataclass(frozen=True, eq=False)
 class SideMatches:
-    """Features of both sides, at pixels of the picture, matched with points of side nodes around a pose."""
+    """Features of both sides, at pixels of the picture, matched with points of side nodes around a
+    pose."""
 
     features: Features
     local_map: LocalMap
@@ -41,9 +43,11 @@ class SideMatches:
 class SideCounts:
     """What must be seen of the walls from a pose, and what would be found were it wrong.
 
-    `num_visible` counts cells of 8 pixels in which a point must be seen, since neighbouring side nodes hold the same wall; `num_by_chance`
-    the matches that would be found were the pose wrong. `visible_img` are the pixels of the picture where points must be seen, at most 512
-    of each side; `agreeing_img` those of them where a network's dense descriptors agree, None of features without such.
+    `num_visible` counts cells of 8 pixels in which a point must be seen, since neighbouring side
+    nodes hold the same wall; `num_by_chance` the matches that would be found were the pose wrong.
+    `visible_img` are the pixels of the picture where points must be seen, at most 512 of each side;
+    `agreeing_img` those of them where a network's dense descriptors agree, None of features without
+    such.
     """
 
     num_visible: int
@@ -52,9 +56,16 @@ class SideCounts:
     agreeing_img: Float[np.ndarray, "a 2"] | None
 
 
-def match_sides(sides: list[tuple[SeenSide, LocalMap]], cam_from_world: Rigid3, config: GuidedConfig) -> SideMatches | None:
+def match_sides(
+    sides: list[tuple[SeenSide, LocalMap]], cam_from_world: Rigid3, config: GuidedConfig
+) -> SideMatches | None:
     """Both sides' guided matches, each with the points that it is given. None without any."""
-    guided = [match_guided(side.features, m, side.view.from_world(cam_from_world), side.view.camera, config) for side, m in sides]
+    guided = [
+        match_guided(
+            side.features, m, side.view.from_world(cam_from_world), side.view.camera, config
+        )
+        for side, m in sides
+    ]
     return together(sides, guided)
 
 
@@ -65,35 +76,64 @@ def together(sides: list[tuple[SeenSide, LocalMap]], matches: list[Matches]) -> 
     first_features = np.cumsum([0, *(len(side.features) for side, _ in sides)])
     first_points = np.cumsum([0, *(len(local_map.radii) for _, local_map in sides)])
     joined = Matches(
-        np.concatenate([one.query_idx + first for one, first in zip(matches, first_features, strict=False)]).astype(np.int32),
-        np.concatenate([one.train_idx + first for one, first in zip(matches, first_points, strict=False)]).astype(np.int32),
+        np.concatenate(
+            [one.query_idx + first for one, first in zip(matches, first_features, strict=False)]
+        ).astype(np.int32),
+        np.concatenate(
+            [one.train_idx + first for one, first in zip(matches, first_points, strict=False)]
+        ).astype(np.int32),
         np.concatenate([one.distances for one in matches]).astype(np.float32),
     )
     features = Features.concatenate([side.in_picture for side, _ in sides])
     return SideMatches(features, LocalMap.pooled([local_map for _, local_map in sides]), joined)
 
 
-def count_sides(sides: list[tuple[SeenSide, LocalMap]], cam_from_world: Rigid3, config: GuidedConfig) -> SideCounts:
+def count_sides(
+    sides: list[tuple[SeenSide, LocalMap]], cam_from_world: Rigid3, config: GuidedConfig
+) -> SideCounts:
     """What both sides must show, and what of it agrees."""
-    num_visible, num_by_chance, visible_img, agreeing_img = 0, 0, [np.zeros((0, 2))], [np.zeros((0, 2))]
+    num_visible, num_by_chance, visible_img, agreeing_img = (
+        0,
+        0,
+        [np.zeros((0, 2))],
+        [np.zeros((0, 2))],
+    )
     for side, local_map in sides:
         view, side_from_world = side.view, side.view.from_world(cam_from_world)
         rows, visible = visible_points(local_map, side_from_world, view.camera)
-        columns, lines = np.clip(np.rint(visible).astype(int), 0, [view.camera.width - 1, view.camera.height - 1]).T
+        columns, lines = np.clip(
+            np.rint(visible).astype(int), 0, [view.camera.width - 1, view.camera.height - 1]
+        ).T
         seen = np.flatnonzero(view.inside[lines, columns])
         cells = (lines[seen] // _CELL_PX) * view.camera.width + columns[seen] // _CELL_PX
         num_visible += len(np.unique(cells))
-        num_by_chance += count_by_chance(side.features, local_map, side_from_world, view.camera, config)
-        seen = seen[np.unique(np.linspace(0, len(seen) - 1, _NUM_COMPARED).astype(int))] if len(seen) else seen
+        num_by_chance += count_by_chance(
+            side.features, local_map, side_from_world, view.camera, config
+        )
+        seen = (
+            seen[np.unique(np.linspace(0, len(seen) - 1, _NUM_COMPARED).astype(int))]
+            if len(seen)
+            else seen
+        )
         visible_img.append(view.points_img[lines[seen], columns[seen]].astype(np.float64))
         if (dense := side.features.dense) is not None and len(seen):
-            agreeing_img.append(visible_img[-1][dense.agrees(visible[seen], local_map.descriptors[rows[seen]])])
+            agreeing_img.append(
+                visible_img[-1][dense.agrees(visible[seen], local_map.descriptors[rows[seen]])]
+            )
     has_dense = any(side.features.dense is not None for side, _ in sides)
-    return SideCounts(num_visible, num_by_chance, np.concatenate(visible_img), np.concatenate(agreeing_img) if has_dense else None)
+    return SideCounts(
+        num_visible,
+        num_by_chance,
+        np.concatenate(visible_img),
+        np.concatenate(agreeing_img) if has_dense else None,
+    )
 
 
-def estimate_pose(found: SideMatches, camera: Camera, config: AbsolutePoseConfig, start: Rigid3 | None) -> AbsolutePose | None:
-    """cam_from_world of the picture from the matches of both sides together; refined from `start`, or sought anew."""
+def estimate_pose(
+    found: SideMatches, camera: Camera, config: AbsolutePoseConfig, start: Rigid3 | None
+) -> AbsolutePose | None:
+    """cam_from_world of the picture from the matches of both sides together; refined from `start`,
+    or sought anew."""
     rows = found.matches.train_idx
     return estimate_absolute_pose(
         found.features.points_img[found.matches.query_idx].astype(np.float64),
@@ -114,17 +154,23 @@ def nearest_sides(
 ) -> list[int]:
     """Side nodes that look the same way at what lies in the view, those in its middle first.
 
-    Where a side node stands says little: it shows what lies well ahead of it, and who comes the other way sees that from beyond.
+    Where a side node stands says little: it shows what lies well ahead of it, and who comes the
+    other way sees that from beyond.
 
     Args:
-        centres: the world points (metres) in the middle of what the side nodes show; axes: the directions in which they look.
+        centres: the world points (metres) in the middle of what the side nodes show; axes: the
+            directions in which they look.
     """
     side_from_world = view.from_world(cam_from_world)
     looks_alike = side_from_world.rotation[2] @ axes.T > 0.7
     size = np.array([view.camera.width, view.camera.height])
-    off_middle = np.linalg.norm((view.camera.img_from_cam(side_from_world.apply(centres)) - size / 2.0) / size[0], axis=1)
+    off_middle = np.linalg.norm(
+        (view.camera.img_from_cam(side_from_world.apply(centres)) - size / 2.0) / size[0], axis=1
+    )
     off_middle = np.where(looks_alike & np.isfinite(off_middle), off_middle, np.inf)
-    return [int(k) for k in np.argsort(off_middle, kind="stable")[:num_nodes] if off_middle[k] < 1.0]
+    return [
+        int(k) for k in np.argsort(off_middle, kind="stable")[:num_nodes] if off_middle[k] < 1.0
+    ]
 
 
 def of_picture(local_map: LocalMap, node_id: int) -> LocalMap:

@@ -1,8 +1,9 @@
 """Where along the way might a picture have been taken by somebody who comes back?
 
-Who walks back sees to the left what the mapping camera saw to the right, and the other way round. So each side node that looks like one of
-the picture's views names a place, about where its wall would be seen as far ahead from the other direction; and where both views name the
-same place, far more speaks for it than for a door that looks like another door.
+Who walks back sees to the left what the mapping camera saw to the right, and the other way round.
+So each side node that looks like one of the picture's views names a place, about where its wall
+would be seen as far ahead from the other direction; and where both views name the same place, far
+more speaks for it than for a door that looks like another door.
 """
 
 from __future__ import annotations
@@ -17,33 +18,42 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.walls.wall_index import WallIndex
 
 _NUM_NAMED = 64  # of the side nodes that a view looks like, those that may name a place first
-_SAME_WAY = 0.5  # cosine of the angle between the ways in which two cameras look that stand in the same place
+# cosine of the angle between the ways in which two cameras look that stand in the same place
+_SAME_WAY = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class NamedPlaces:
-    """The places that one view names, row k by one side node: `rotations` and `centres` are those of the camera (world_from_cam, metres),
-    `likeness` says how alike the two look."""
+    """The places that one view names, row k by one side node: `rotations` and `centres` are those
+    of the camera (world_from_cam, metres), `likeness` says how alike the two look."""
 
     rotations: Float[np.ndarray, "n 3 3"]
     centres: Float[np.ndarray, "n 3"]
     likeness: Float32[np.ndarray, " n"]
 
     @staticmethod
-    def of(view: SideView, index: WallIndex, likeness: Float32[np.ndarray, " sides"]) -> NamedPlaces:
-        """By all side nodes of the other hand: one of the same hand was seen by who walked the same way.
+    def of(
+        view: SideView, index: WallIndex, likeness: Float32[np.ndarray, " sides"]
+    ) -> NamedPlaces:
+        """By all side nodes of the other hand: one of the same hand was seen by who walked the same
+        way.
 
         Args:
             likeness: how much each side node looks like the view.
         """
-        ahead = -view.cam_from_side.rotation[0, 2]  # on the left a side camera's x axis points ahead, on the right back
+        ahead = -view.cam_from_side.rotation[
+            0, 2
+        ]  # on the left a side camera's x axis points ahead, on the right back
         along = index.middles[:, 0]
         rows = np.flatnonzero(ahead * along < 0.0)
         centres = index.positions[rows] + 2.0 * along[rows, None] * index.rotations[rows, :, 0]
-        return NamedPlaces(index.rotations[rows] @ view.cam_from_side.rotation.T, centres, likeness[rows])
+        return NamedPlaces(
+            index.rotations[rows] @ view.cam_from_side.rotation.T, centres, likeness[rows]
+        )
 
     def near(self, other: NamedPlaces, apart: float) -> Bool[np.ndarray, "n m"]:
-        """Is each of these the same place as each of the others, `apart` metres from it at most and less than 60 degrees turned?"""
+        """Is each of these the same place as each of the others, `apart` metres from it at most and
+        less than 60 degrees turned?"""
         away = np.linalg.norm(self.centres[:, None] - other.centres[None], axis=2)
         return (away < apart) & (self.rotations[:, :, 2] @ other.rotations[:, :, 2].T > _SAME_WAY)
 
@@ -52,7 +62,8 @@ class NamedPlaces:
 
 
 def likeliest_places(named: list[NamedPlaces], num_places: int, apart: float) -> list[Rigid3]:
-    """The places (world_from_cam) that all views together name first, `apart` (metres) and more from each other.
+    """The places (world_from_cam) that all views together name first, `apart` (metres) and more
+    from each other.
 
     Each view counts with the most alike side node by which it names the place.
     """
@@ -60,7 +71,12 @@ def likeliest_places(named: list[NamedPlaces], num_places: int, apart: float) ->
     if not named:
         return chosen
     first = [view.rows(np.argsort(-view.likeness, kind="stable")[:_NUM_NAMED]) for view in named]
-    places = NamedPlaces(*(np.concatenate([getattr(view, name) for view in first]) for name in ("rotations", "centres", "likeness")))
+    places = NamedPlaces(
+        *(
+            np.concatenate([getattr(view, name) for view in first])
+            for name in ("rotations", "centres", "likeness")
+        )
+    )
     together = np.zeros(len(places.likeness))
     for view in named:
         together += np.where(places.near(view, apart), view.likeness, 0.0).max(axis=1, initial=0.0)

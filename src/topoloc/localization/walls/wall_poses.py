@@ -1,9 +1,11 @@
 """First poses from walls seen from the other side: where might a picture have been taken?
 
-PnP on matches with a wall does not say from where it was seen: the points lie in one plane, and a plane has a second pose that looks
-nearly the same from the other slant. But people and robots carry cameras upright: two cameras that saw the same walls differ by a turn
-about the vertical and a shift, which two matches give (Kukelova, Bujnak and Pajdla, 2010: pose of a camera
-with known vertical direction). The pose that most of the matches agree with is the first one; how level the cameras were follows later.
+PnP on matches with a wall does not say from where it was seen: the points lie in one plane, and a
+plane has a second pose that looks nearly the same from the other slant. But people and robots carry
+cameras upright: two cameras that saw the same walls differ by a turn about the vertical and a
+shift, which two matches give (Kukelova, Bujnak and Pajdla, 2010: pose of a camera with known
+vertical direction). The pose that most of the matches agree with is the first one; how level the
+cameras were follows later.
 """
 
 from __future__ import annotations
@@ -18,18 +20,26 @@ from topoloc.localization.walls.wall_kernels import largest_agreement
 
 _NUM_PAIRS = 1500
 _LARGEST_TURN = math.radians(35.0)
-_LEAST_APART = 0.1  # tangents of angles between the two key points of a pair: nearer ones say little of the distance
+# tangents of angles between the two key points of a pair: nearer ones say little of the distance
+_LEAST_APART = 0.1
 _NEAREST, _FARTHEST = 0.2, 100.0  # metres of depth that the points of a pair may have
-_TOLERANCE, _TOLERANCE_SHARE = 0.02, 0.015  # in tangents: for a camera that is not quite level, more off the axis
+_TOLERANCE, _TOLERANCE_SHARE = (
+    0.02,
+    0.015,
+)  # in tangents: for a camera that is not quite level, more off the axis
 
 
-def agreeing_pose(seen: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "n 3"]) -> tuple[int, Rigid3] | None:
-    """How many matches agree on one upright pose, and that cam_from_upright. None with fewer than three matches that agree.
+def agreeing_pose(
+    seen: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "n 3"]
+) -> tuple[int, Rigid3] | None:
+    """How many matches agree on one upright pose, and that cam_from_upright. None with fewer than
+    three matches that agree.
 
     Args:
         seen: where the camera sees each matched point, as tangents (x / z, y / z).
-        points: the same points (metres) in the frame of a camera that is held upright as well and looks about the same way: poses turned
-            by more than 35 degrees from it are not considered.
+        points: the same points (metres) in the frame of a camera that is held upright as well and
+            looks about the same way: poses turned by more than 35 degrees from it are not
+            considered.
     """
     if len(seen) < 3:
         return None
@@ -51,10 +61,12 @@ def _upright(turn: float, shift: Float[np.ndarray, " 3"]) -> Rigid3:
 def _poses_of_pairs(
     seen: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k 3"]]:
-    """Turns about the vertical and shifts (cam_from_upright) that explain pairs of matches; the pairs are the same at every call.
+    """Turns about the vertical and shifts (cam_from_upright) that explain pairs of matches; the
+    pairs are the same at every call.
 
-    With depths d of the two points, (u, v) where they are seen and e = d1 - d2 = z' cos - x' sin for the turn, where ' is a difference:
-    v1 d1 - v2 d2 = y' and u1 d1 - u2 d2 = x' cos + z' sin. Without d2 that is a cos + b sin + c = 0.
+    With depths d of the two points, (u, v) where they are seen and e = d1 - d2 = z' cos - x' sin
+    for the turn, where ' is a difference: v1 d1 - v2 d2 = y' and u1 d1 - u2 d2 = x' cos + z' sin.
+    Without d2 that is a cos + b sin + c = 0.
     """
     first, second = np.random.default_rng(0).integers(0, len(seen), (2, _NUM_PAIRS))
     apart = seen[first] - seen[second]

@@ -1,4 +1,5 @@
-"""A bag: one file of messages, or a folder of the parts that a recorder split it into; topics and messages of all of them together."""
+"""A bag: one file of messages, or a folder of the parts that a recorder split it into; topics and
+messages of all of them together."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ _MAX_MESSAGE_BYTES = 1 << 29
 
 @dataclass(eq=False)
 class Bag:
-    """The files of a recording, opened. `notes` is what the user should know of them: what was cut off."""
+    """The files of a recording, opened. `notes` is what the user should know of them: what was cut
+    off."""
 
     path: Path
     files: list[MessageFile]
@@ -34,11 +36,16 @@ class Bag:
 
     def messages(self, topic: str) -> list[MessageRef]:
         """The messages of a topic in all files, in the order in which they were written."""
-        found = [(number, file.messages(topic)) for number, file in enumerate(self.files) if topic in file.topics]
+        found = [
+            (number, file.messages(topic))
+            for number, file in enumerate(self.files)
+            if topic in file.topics
+        ]
         return sorted(ref._replace(file=number) for number, refs in found for ref in refs)
 
     def read(self, ref: MessageRef, most: int | None = None) -> bytes:
-        """The bytes of a message, or at least the first `most` of them; unpacked where each message is packed.
+        """The bytes of a message, or at least the first `most` of them; unpacked where each message
+        is packed.
 
         Raises:
             RecordingError: they are not there.
@@ -49,12 +56,21 @@ class Bag:
 
     def listed(self) -> str:
         """The topics with their types, for errors."""
-        names = [f"{topic.name} ({topic.type or topic.encoding})" for topic in sorted(self.topics.values(), key=lambda its: its.name)]
-        return ", ".join(names[:40]) + (f" and {len(names) - 40} more" if len(names) > 40 else "") if names else "none"
+        names = [
+            f"{topic.name} ({topic.type or topic.encoding})"
+            for topic in sorted(self.topics.values(), key=lambda its: its.name)
+        ]
+        return (
+            ", ".join(names[:40]) + (f" and {len(names) - 40} more" if len(names) > 40 else "")
+            if names
+            else "none"
+        )
 
     def note_faults(self) -> None:
         """Adds what is wrong with the files; after the messages that are used were looked for."""
-        self.notes += [f"{self.path}: {file.fault}; what is whole is used" for file in self.files if file.fault]
+        self.notes += [
+            f"{self.path}: {file.fault}; what is whole is used" for file in self.files if file.fault
+        ]
 
 
 def is_bag(path: Path, suffixes: tuple[str, ...] = BAG_SUFFIXES) -> bool:
@@ -74,13 +90,21 @@ def open_bag_files(path: Path) -> Bag:
     paths = _parts(path) if path.is_dir() else [path]
     if not paths:
         packed = [part.name for part in sorted(path.iterdir()) if part.name.endswith(_PACKED_FILE)]
-        said = f"{packed[0]} is packed as a whole: `zstd -d` unpacks it" if packed else "no .db3 and no .mcap file here"
+        said = (
+            f"{packed[0]} is packed as a whole: `zstd -d` unpacks it"
+            if packed
+            else "no .db3 and no .mcap file here"
+        )
         raise RecordingError(f"{path}: {said}")
     return Bag(path, [_open_file(part) for part in paths])
 
 
 def _parts(folder: Path) -> list[Path]:
-    parts = [part for part in folder.iterdir() if part.suffix.lower() in (".db3", ".mcap") and part.is_file()]
+    parts = [
+        part
+        for part in folder.iterdir()
+        if part.suffix.lower() in (".db3", ".mcap") and part.is_file()
+    ]
     return sorted(parts, key=lambda part: natural_key(part.name))
 
 
@@ -96,14 +120,24 @@ def _open_file(path: Path) -> MessageFile:
                 return kind(path)
             except ModuleNotFoundError as error:
                 raise missing_bags(error, path) from error
-    raise RecordingError(f"{path}: {'empty' if not begin else 'neither a ROS bag (2.0, or SQLite) nor an MCAP file'}")
+    raise RecordingError(
+        f"{path}: {'empty' if not begin else 'neither a ROS bag (2.0, or SQLite) nor an MCAP file'}"
+    )
 
 
 def missing_bags(error: ModuleNotFoundError, path: Path) -> Exception:
     """What is said where a library of the extra is missing."""
-    if error.name is None or error.name.split(".")[0] not in ("rosbags", "mcap", "lz4", "zstandard", "google"):
+    if error.name is None or error.name.split(".")[0] not in (
+        "rosbags",
+        "mcap",
+        "lz4",
+        "zstandard",
+        "google",
+    ):
         return error
-    return MissingExtraError(f"{path}: bags and MCAP files need the extra bags: pip install 'topoloc[bags]'")
+    return MissingExtraError(
+        f"{path}: bags and MCAP files need the extra bags: pip install 'topoloc[bags]'"
+    )
 
 
 def _ros1(path: Path) -> MessageFile:
@@ -124,13 +158,21 @@ def _sqlite(path: Path) -> MessageFile:
     return SqliteFile(path)
 
 
-_KINDS: dict[bytes, Callable[[Path], MessageFile]] = {b"#ROSBAG V2.0\n": _ros1, b"\x89MCAP0\r\n": _mcap, b"SQLite format 3\0": _sqlite}
+_KINDS: dict[bytes, Callable[[Path], MessageFile]] = {
+    b"#ROSBAG V2.0\n": _ros1,
+    b"\x89MCAP0\r\n": _mcap,
+    b"SQLite format 3\0": _sqlite,
+}
 
 
 def _unpacked(data: bytes) -> bytes:
     import zstandard
 
     try:
-        return zstandard.ZstdDecompressor().stream_reader(data).read(min(_MAX_MESSAGE_BYTES, sys.maxsize))
+        return (
+            zstandard.ZstdDecompressor()
+            .stream_reader(data)
+            .read(min(_MAX_MESSAGE_BYTES, sys.maxsize))
+        )
     except zstandard.ZstdError:
         raise RecordingError("a packed message is damaged") from None

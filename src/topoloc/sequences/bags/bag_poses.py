@@ -1,4 +1,5 @@
-"""Poses of a bag's pictures: from TF, odometry or a topic of poses, brought to the camera of the pictures."""
+"""Poses of a bag's pictures: from TF, odometry or a topic of poses, brought to the camera of the
+pictures."""
 
 from __future__ import annotations
 
@@ -14,7 +15,8 @@ from topoloc.sequences.trajectory import poses_at, read_truth
 
 
 def read_frames(bag: Bag) -> FrameTree:
-    """All transforms of the bag. Messages that are damaged are left out, and counted in the bag's notes."""
+    """All transforms of the bag. Messages that are damaged are left out, and counted in the bag's
+    notes."""
     tree, num_damaged = FrameTree(), 0
     for name, topic in bag.topics.items():
         if topic.type not in TRANSFORMS:
@@ -26,15 +28,21 @@ def read_frames(bag: Bag) -> FrameTree:
             except RecordingError:
                 num_damaged += 1
     if num_damaged:
-        bag.notes.append(f"{bag.path}: {num_damaged} messages of transforms are damaged and left out")
+        bag.notes.append(
+            f"{bag.path}: {num_damaged} messages of transforms are damaged and left out"
+        )
     return tree
 
 
-def camera_poses(bag: Bag, roles: Roles, camera_frame: str, tree: FrameTree, t_ns: list[int]) -> list[Rigid3 | None]:
-    """world_from_cam of each frame, None where unknown; without a topic of poses those of a TUM file beside the bag.
+def camera_poses(
+    bag: Bag, roles: Roles, camera_frame: str, tree: FrameTree, t_ns: list[int]
+) -> list[Rigid3 | None]:
+    """world_from_cam of each frame, None where unknown; without a topic of poses those of a TUM
+    file beside the bag.
 
     Raises:
-        TrajectoryError: what was asked for (`--topics pose=`) gives no frame a pose, or the TUM file is malformed.
+        TrajectoryError: what was asked for (`--topics pose=`) gives no frame a pose, or the TUM
+            file is malformed.
     """
     if not roles.poses:
         beside = bag.path / "truth.tum" if bag.path.is_dir() else bag.path.with_suffix(".tum")
@@ -48,20 +56,28 @@ def camera_poses(bag: Bag, roles: Roles, camera_frame: str, tree: FrameTree, t_n
         if any(pose is not None for pose in poses):
             return poses
         del bag.notes[num_notes:]
-    said = f"{bag.path}: no pose of {camera_frame or 'the camera'} at the times of the pictures in {' or '.join(roles.poses)}"
+    said = (
+        f"{bag.path}: no pose of {camera_frame or 'the camera'} at the times of the pictures in"
+        f" {' or '.join(roles.poses)}"
+    )
     if roles.is_pose_said:
         raise TrajectoryError(said)
     bag.notes.append(f"{said}; the recording is taken as one without poses")
     return [None] * len(t_ns)
 
 
-def _poses_of_tf(roles: Roles, camera_frame: str, tree: FrameTree, t_ns: list[int]) -> list[Rigid3 | None]:
+def _poses_of_tf(
+    roles: Roles, camera_frame: str, tree: FrameTree, t_ns: list[int]
+) -> list[Rigid3 | None]:
     frame = roles.pose_frame or camera_frame
     return tree.poses(frame, t_ns) if tree.moves(frame) else [None] * len(t_ns)
 
 
-def _poses_of_topic(bag: Bag, name: str, frame: str | None, camera_frame: str, tree: FrameTree, t_ns: list[int]) -> list[Rigid3 | None]:
-    """Poses of a topic, which are those of `frame`, or else of what its messages name, brought to the camera."""
+def _poses_of_topic(
+    bag: Bag, name: str, frame: str | None, camera_frame: str, tree: FrameTree, t_ns: list[int]
+) -> list[Rigid3 | None]:
+    """Poses of a topic, which are those of `frame`, or else of what its messages name, brought to
+    the camera."""
     transforms = _transforms(bag, name)
     if not transforms:
         return [None] * len(t_ns)
@@ -70,8 +86,15 @@ def _poses_of_topic(bag: Bag, name: str, frame: str | None, camera_frame: str, t
     if body_from_cam is None:
         body_from_cam = Rigid3.identity()
         if frame:
-            raise TrajectoryError(f"{bag.path}: no fixed transform from {camera_frame or 'the camera'} to {frame}, which {name} is of")
-        why = f"no fixed transform from {camera_frame} to {whose}" if whose else "it does not say whose they are (pose_frame=FRAME would)"
+            raise TrajectoryError(
+                f"{bag.path}: no fixed transform from {camera_frame or 'the camera'} to {frame},"
+                f" which {name} is of"
+            )
+        why = (
+            f"no fixed transform from {camera_frame} to {whose}"
+            if whose
+            else "it does not say whose they are (pose_frame=FRAME would)"
+        )
         bag.notes.append(f"{bag.path}: poses of {name} are taken for the camera's: {why}")
     world_from_bodies = poses_at(trajectory_of(transforms), t_ns)
     return [pose @ body_from_cam if pose is not None else None for pose in world_from_bodies]

@@ -1,4 +1,5 @@
-"""ROS bags and MCAP files as recordings: opened by an index of their messages, a picture read when its frame is asked for."""
+"""ROS bags and MCAP files as recordings: opened by an index of their messages, a picture read when
+its frame is asked for."""
 
 from __future__ import annotations
 
@@ -20,7 +21,13 @@ from topoloc.sequences.bags.camera_info import CameraInfo, camera_info
 from topoloc.sequences.bags.frame_tree import FrameTree
 from topoloc.sequences.bags.message_file import MessageRef, Topic
 from topoloc.sequences.bags.messages import decode, frame_id, head_size, stamp_of_head
-from topoloc.sequences.bags.topics import Roles, choose_topics, is_rectified, is_registered, parse_topics
+from topoloc.sequences.bags.topics import (
+    Roles,
+    choose_topics,
+    is_rectified,
+    is_registered,
+    parse_topics,
+)
 from topoloc.sequences.camera_json import FILE_NAME, read_camera_json
 from topoloc.sequences.frame import DepthImage, Image, StereoFrame
 from topoloc.sequences.recording import nearest_rows
@@ -50,7 +57,8 @@ class Pictures:
 
 @dataclass(frozen=True, eq=False)
 class BagRecording:
-    """A StereoSequence in a bag. `names` are the times of the frames in seconds; `notes` what the user should know."""
+    """A StereoSequence in a bag. `names` are the times of the frames in seconds; `notes` what the
+    user should know."""
 
     name: str
     bag: Bag
@@ -63,7 +71,10 @@ class BagRecording:
     names: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.names.extend(f"{t_ns // 1_000_000_000}.{t_ns % 1_000_000_000:09d}" for t_ns in self.t_ns[len(self.names) :])
+        self.names.extend(
+            f"{t_ns // 1_000_000_000}.{t_ns % 1_000_000_000:09d}"
+            for t_ns in self.t_ns[len(self.names) :]
+        )
 
     @property
     def notes(self) -> list[str]:
@@ -97,8 +108,18 @@ class BagRecording:
 
     def left_frame(self, index: int) -> StereoFrame:
         """Read one frame but for its right or depth picture. Raises as the whole frame does."""
-        image, rig = self._picture(self.left, index, self.camera), None if self.right is None else self.right[1]
-        return StereoFrame(self.names[index], self.t_ns[index], image, self.camera, rig=rig, world_from_cam=self.poses[index])
+        image, rig = (
+            self._picture(self.left, index, self.camera),
+            None if self.right is None else self.right[1],
+        )
+        return StereoFrame(
+            self.names[index],
+            self.t_ns[index],
+            image,
+            self.camera,
+            rig=rig,
+            world_from_cam=self.poses[index],
+        )
 
     def _picture(self, pictures: Pictures, index: int, camera: Camera | None) -> Image:
         message, name = self._message(pictures, index)
@@ -119,12 +140,13 @@ def open_bag(path: Path, topics: str | Mapping[str, str] | None = None) -> BagRe
     """Open a bag: its topics are guessed but for those that are said. No picture is read.
 
     Args:
-        topics: the topic of a role (``left``, ``right``, ``depth``, ``left_info``, ``right_info``, ``depth_info``, ``pose``), and
-            ``pose_frame``, the frame that the poses are of; as a dictionary or ``left=/cam0/image_raw,pose=/odom``. ``pose`` may be
-            ``tf`` or ``none``.
+        topics: the topic of a role (``left``, ``right``, ``depth``, ``left_info``, ``right_info``,
+            ``depth_info``, ``pose``), and ``pose_frame``, the frame that the poses are of; as a
+            dictionary or ``left=/cam0/image_raw,pose=/odom``. ``pose`` may be ``tf`` or ``none``.
 
     Raises:
-        RecordingError: no bag, a topic that is not in it, no pictures, or none with its right picture or depth.
+        RecordingError: no bag, a topic that is not in it, no pictures, or none with its right
+            picture or depth.
         CalibrationError: the calibration of a pair or of depth is missing or not usable.
         TrajectoryError: the poses that were asked for fit no frame.
         MissingExtraError: the extra `bags` is not installed.
@@ -152,7 +174,10 @@ def _opened(bag: Bag, roles: Roles) -> BagRecording:
         camera, right = rig.left, (pictures, rig)
     elif roles.depth is not None:
         if camera is None:
-            raise CalibrationError(f"{bag.path}: no calibration of {roles.left}; --topics left_info=TOPIC, or a camera.json beside the bag")
+            raise CalibrationError(
+                f"{bag.path}: no calibration of {roles.left}; --topics left_info=TOPIC, or a"
+                " camera.json beside the bag"
+            )
         t_ns, left, pictures = _paired(bag, (t_ns, left), roles.depth, MAX_DEPTH_DELAY_MS)
         depth = (pictures, *_depth_camera(bag, roles, camera, frame, tree))
     poses = camera_poses(bag, roles, frame, tree, t_ns)
@@ -163,35 +188,57 @@ def _timed(bag: Bag, name: str) -> tuple[list[int], Pictures]:
     """The messages of a topic by their own times, in order; damaged ones are left out, and said."""
     topic, num_damaged = bag.topics[name], 0
     stamped: list[tuple[int | None, MessageRef]] = []
-    for ref in sorted(bag.messages(name), key=lambda ref: (ref.file, ref.chunk, ref.offset)):  # as they lie: a chunk is unpacked once
+    for ref in sorted(
+        bag.messages(name), key=lambda ref: (ref.file, ref.chunk, ref.offset)
+    ):  # as they lie: a chunk is unpacked once
         try:
             stamped.append((stamp_of_head(topic, bag.read(ref, head_size(topic))), ref))
         except RecordingError:
             num_damaged += 1
     if num_damaged:
         bag.notes.append(f"{bag.path}: {num_damaged} messages of {name} are damaged and left out")
-    is_stamped = sum(not stamp for stamp, _ in stamped) <= 1  # a driver that sets no times writes 0 into each
-    by_time = {stamp if is_stamped and stamp is not None else ref.log_t_ns: ref for stamp, ref in stamped}
+    is_stamped = (
+        sum(not stamp for stamp, _ in stamped) <= 1
+    )  # a driver that sets no times writes 0 into each
+    by_time = {
+        stamp if is_stamped and stamp is not None else ref.log_t_ns: ref for stamp, ref in stamped
+    }
     if not by_time:
         raise RecordingError(f"{bag.path}: no whole message of {name}")
     t_ns = sorted(by_time)
     return t_ns, Pictures(topic, [by_time[time] for time in t_ns])
 
 
-def _paired(bag: Bag, first: tuple[list[int], Pictures], name: str, delay_ms: int) -> tuple[list[int], Pictures, Pictures]:
-    """Times and pictures that have a partner on the topic `name` within `delay_ms`, and the partners."""
+def _paired(
+    bag: Bag, first: tuple[list[int], Pictures], name: str, delay_ms: int
+) -> tuple[list[int], Pictures, Pictures]:
+    """Times and pictures that have a partner on the topic `name` within `delay_ms`, and the
+    partners."""
     t_ns, left = first
     others, pictures = _timed(bag, name)
     nearest = nearest_rows(np.array(t_ns), np.array(others))
-    kept = [row for row, other in enumerate(nearest) if abs(t_ns[row] - others[other]) <= delay_ms * 1_000_000]
-    lacking = f"of {len(t_ns)} pictures of {left.topic.name} have none of {name} ({len(others)}) within {delay_ms} ms"
+    kept = [
+        row
+        for row, other in enumerate(nearest)
+        if abs(t_ns[row] - others[other]) <= delay_ms * 1_000_000
+    ]
+    lacking = (
+        f"of {len(t_ns)} pictures of {left.topic.name} have none of {name} ({len(others)}) within"
+        f" {delay_ms} ms"
+    )
     if not kept:
-        off = min(abs(time - others[other]) for time, other in zip(t_ns, nearest, strict=True)) / 1e6
+        off = (
+            min(abs(time - others[other]) for time, other in zip(t_ns, nearest, strict=True)) / 1e6
+        )
         raise RecordingError(f"{bag.path}: {len(t_ns)} {lacking}; the nearest is {off:.1f} ms away")
     if len(kept) < len(t_ns):
         bag.notes.append(f"{bag.path}: {len(t_ns) - len(kept)} {lacking} and are left out")
     times, refs = [t_ns[row] for row in kept], [left.refs[row] for row in kept]
-    return times, Pictures(left.topic, refs), Pictures(pictures.topic, [pictures.refs[nearest[row]] for row in kept])
+    return (
+        times,
+        Pictures(left.topic, refs),
+        Pictures(pictures.topic, [pictures.refs[nearest[row]] for row in kept]),
+    )
 
 
 def _read_info(bag: Bag, name: str | None) -> CameraInfo | None:
@@ -216,31 +263,44 @@ def _frame_of(bag: Bag, pictures: Pictures) -> str:
 
 
 def _rig(bag: Bag, roles: Roles, left: CameraInfo | None, tree: FrameTree) -> StereoRig:
-    """By P of both calibrations; else by the transform between their frames; else by a camera.json with a baseline."""
+    """By P of both calibrations; else by the transform between their frames; else by a camera.json
+    with a baseline."""
     right = _read_info(bag, roles.right_info)
     if left is not None and right is not None:
         rig = left.rig(right, is_rectified(roles.left))
         if rig is not None:
             return rig
-        right_from_left = tree.fixed_between(right.frame, left.frame) if left.frame != right.frame else None
+        right_from_left = (
+            tree.fixed_between(right.frame, left.frame) if left.frame != right.frame else None
+        )
         if right_from_left is not None:
             if is_rectified(roles.left):
-                return StereoRig.rectified(left.camera(True), float(np.linalg.norm(right_from_left.translation)))
+                return StereoRig.rectified(
+                    left.camera(True), float(np.linalg.norm(right_from_left.translation))
+                )
             return StereoRig(left.camera(False), right.camera(False), right_from_left)
     camera, baseline = _camera_beside(bag)
     if camera is not None and baseline is not None:
         return StereoRig.rectified(camera, baseline)
-    lacking = " and ".join(side for side, info in (("left", left), ("right", right)) if info is None)
+    lacking = " and ".join(
+        side for side, info in (("left", left), ("right", right)) if info is None
+    )
     what = (
-        f"no calibration of the {lacking} camera" if lacking else f"neither P of {roles.right_info} nor TF says where the right camera is"
+        f"no calibration of the {lacking} camera"
+        if lacking
+        else f"neither P of {roles.right_info} nor TF says where the right camera is"
     )
     raise CalibrationError(
-        f"{bag.path}: {what}; --topics left_info=TOPIC,right_info=TOPIC, or a camera.json with a baseline beside the bag"
+        f"{bag.path}: {what}; --topics left_info=TOPIC,right_info=TOPIC, or a camera.json with a"
+        " baseline beside the bag"
     )
 
 
-def _depth_camera(bag: Bag, roles: Roles, camera: Camera, frame: str, tree: FrameTree) -> tuple[Camera, Rigid3]:
-    """The camera of the depth pictures, and cam_from_depth; registered ones are the colour camera's."""
+def _depth_camera(
+    bag: Bag, roles: Roles, camera: Camera, frame: str, tree: FrameTree
+) -> tuple[Camera, Rigid3]:
+    """The camera of the depth pictures, and cam_from_depth; registered ones are the colour
+    camera's."""
     info = _read_info(bag, roles.depth_info)
     if info is None:
         return camera, Rigid3.identity()
@@ -249,7 +309,8 @@ def _depth_camera(bag: Bag, roles: Roles, camera: Camera, frame: str, tree: Fram
         cam_from_depth = Rigid3.identity()
         if not is_registered(roles.depth or ""):
             bag.notes.append(
-                f"{bag.path}: no fixed transform from that of {roles.depth} to the camera of the pictures: taken for the same place"
+                f"{bag.path}: no fixed transform from that of {roles.depth} to the camera of the"
+                " pictures: taken for the same place"
             )
     return info.camera(is_rectified(roles.depth or "")), cam_from_depth
 
@@ -264,4 +325,7 @@ def _camera_beside(bag: Bag) -> tuple[Camera | None, float | None]:
 
 def _check_size(name: str, shape: tuple[int, ...], camera: Camera) -> None:
     if shape[:2] != (camera.height, camera.width):
-        raise UnreadableImageError(f"{name}: {shape[1]}x{shape[0]} pixels, but its camera is of {camera.width}x{camera.height}")
+        raise UnreadableImageError(
+            f"{name}: {shape[1]}x{shape[0]} pixels, but its camera is of"
+            f" {camera.width}x{camera.height}"
+        )

@@ -1,6 +1,8 @@
-"""Bytes of a chunked file: of the file itself, and of its chunks, unpacked when they are asked for and no more of them kept than needed.
+"""Bytes of a chunked file: of the file itself, and of its chunks, unpacked when they are asked for
+and no more of them kept than needed.
 
-Sizes are what the file says of itself, so nothing is read or unpacked beyond them, whatever the packed bytes say.
+Sizes are what the file says of itself, so nothing is read or unpacked beyond them, whatever the
+packed bytes say.
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ _KEPT_BYTES = 1 << 26  # of unpacked chunks; pictures of a pair lie in neighbour
 
 @dataclass(frozen=True)
 class Chunk:
-    """Where a chunk's bytes begin in the file, how many there are, how they are packed, and how many they are unpacked."""
+    """Where a chunk's bytes begin in the file, how many there are, how they are packed, and how
+    many they are unpacked."""
 
     start: int
     num_packed: int
@@ -60,12 +63,17 @@ class ChunkedBytes:
         """Adds a chunk; of one that was cut off, what is left and can be unpacked."""
         left = self.size - chunk.start
         if chunk.is_packed and chunk.num_packed > left:
-            content = _unpacked(self.read(WHOLE_FILE, chunk.start, left), chunk.compression, min(chunk.num_bytes, MAX_CHUNK_BYTES))
+            content = _unpacked(
+                self.read(WHOLE_FILE, chunk.start, left),
+                chunk.compression,
+                min(chunk.num_bytes, MAX_CHUNK_BYTES),
+            )
             chunk = Chunk(chunk.start, left, len(content), chunk.compression)
         self.chunks.append(chunk)
 
     def end_of(self, chunk: int) -> int:
-        """How many bytes there are to read in a chunk, or in the file: of an open chunk that was cut off, those that are left."""
+        """How many bytes there are to read in a chunk, or in the file: of an open chunk that was
+        cut off, those that are left."""
         if chunk == WHOLE_FILE:
             return self.size
         its = self.chunks[chunk]
@@ -87,7 +95,8 @@ class ChunkedBytes:
         return data
 
     def _unpack(self, chunk: int, end: int) -> bytes:
-        """At least the first `end` bytes of a chunk. Where few are needed, as for a message's time, the others stay packed."""
+        """At least the first `end` bytes of a chunk. Where few are needed, as for a message's time,
+        the others stay packed."""
         with self._lock:
             content = self._unpacked.pop(chunk, b"")
             self._num_kept -= len(content)
@@ -108,7 +117,9 @@ class ChunkedBytes:
     def _whole(self, its: Chunk) -> bytes:
         if its.num_bytes > MAX_CHUNK_BYTES:
             raise CutShortError
-        content = _unpacked(self.read(WHOLE_FILE, its.start, its.num_packed), its.compression, its.num_bytes)
+        content = _unpacked(
+            self.read(WHOLE_FILE, its.start, its.num_packed), its.compression, its.num_bytes
+        )
         if len(content) != its.num_bytes:
             raise CutShortError
         return content
@@ -128,4 +139,6 @@ def _unpacked(packed: bytes, compression: str, num_bytes: int) -> bytes:
             return bz2.BZ2Decompressor().decompress(packed, max_length=num_bytes)
     except (zstandard.ZstdError, RuntimeError, OSError, ValueError, EOFError):
         raise CutShortError from None
-    raise RecordingError(f"chunks packed by {compression!r} cannot be read; known are lz4, zstd and bz2")
+    raise RecordingError(
+        f"chunks packed by {compression!r} cannot be read; known are lz4, zstd and bz2"
+    )

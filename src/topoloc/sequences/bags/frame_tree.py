@@ -1,4 +1,5 @@
-"""Frames and the transforms between them, as TF has them: each frame has one parent, and stands or moves in it."""
+"""Frames and the transforms between them, as TF has them: each frame has one parent, and stands or
+moves in it."""
 
 from __future__ import annotations
 
@@ -22,7 +23,9 @@ def trajectory_of(transforms: list[TimedTransform]) -> Trajectory:
 
 def poses_of(transforms: Sequence[TimedTransform]) -> Sequence[Rigid3]:
     """Transforms as poses."""
-    rows = np.array([(*its.translation, *its.quat_xyzw) for its in transforms], dtype=np.float64).reshape(-1, 7)
+    rows = np.array(
+        [(*its.translation, *its.quat_xyzw) for its in transforms], dtype=np.float64
+    ).reshape(-1, 7)
     return LazyPoses(rows, pose_of_quaternion)
 
 
@@ -46,7 +49,8 @@ class FrameTree:
         return any(not self._is_fixed(below) for below, _ in self._edges(frame))
 
     def poses(self, frame: str, t_ns: Sequence[int]) -> list[Rigid3 | None]:
-        """world_from_frame at each time, the root being the world; None where a transform on the way is not known then.
+        """world_from_frame at each time, the root being the world; None where a transform on the
+        way is not known then.
 
         Raises:
             TrajectoryError: a quaternion without length.
@@ -54,7 +58,10 @@ class FrameTree:
         poses: list[Rigid3 | None] = [Rigid3.identity()] * len(t_ns)
         for child, _ in self._edges(frame):
             steps = self._at(child, t_ns)
-            poses = [step @ pose if step is not None and pose is not None else None for step, pose in zip(steps, poses, strict=True)]
+            poses = [
+                step @ pose if step is not None and pose is not None else None
+                for step, pose in zip(steps, poses, strict=True)
+            ]
         return poses
 
     def fixed_between(self, to: str, of: str) -> Rigid3 | None:

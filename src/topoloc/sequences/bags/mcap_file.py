@@ -1,6 +1,8 @@
-"""MCAP files (mcap.dev/spec), gone through record by record without their messages, so that one that was cut off is read as any other.
+"""MCAP files (mcap.dev/spec), gone through record by record without their messages, so that one
+that was cut off is read as any other.
 
-What a chunk holds is said by the index behind it; a chunk without one (the last of a file that was cut off) is gone through itself.
+What a chunk holds is said by the index behind it; a chunk without one (the last of a file that was
+cut off) is gone through itself.
 """
 
 from __future__ import annotations
@@ -38,7 +40,8 @@ class McapFile:
     _bytes: ChunkedBytes = field(init=False)
     _schemas: dict[int, Schema] = field(default_factory=dict)
     _channels: dict[int, Channel] = field(default_factory=dict)
-    # Of each channel: (chunk, where its index lies, its length in bytes), and messages that no index names.
+    # Of each channel: (chunk, where its index lies, its length in bytes), and messages that no
+    # index names.
     _indexes: dict[int, list[tuple[int, int, int]]] = field(default_factory=dict)
     _found: dict[int, list[MessageRef]] = field(default_factory=dict)
 
@@ -53,16 +56,23 @@ class McapFile:
             schema = self._schemas.get(channel.schema_id)
             name = _ros_type(schema.name) if schema is not None else ""
             data = schema.data if schema is not None else b""
-            self.topics.setdefault(channel.topic, Topic(channel.topic, name, channel.message_encoding, data))
+            self.topics.setdefault(
+                channel.topic, Topic(channel.topic, name, channel.message_encoding, data)
+            )
 
     def messages(self, topic: str) -> list[MessageRef]:
         """The messages of a topic, in the order in which they were written."""
         refs: list[MessageRef] = []
-        for number in (number for number, channel in self._channels.items() if channel.topic == topic):
+        for number in (
+            number for number, channel in self._channels.items() if channel.topic == topic
+        ):
             refs += self._found.get(number, [])
             for chunk, start, length in self._indexes.get(number, []):
                 entries = np.frombuffer(self._bytes.read(WHOLE_FILE, start, length), _INDEX_ENTRY)
-                refs += [MessageRef(min(t_ns, _LATEST), chunk, offset) for t_ns, offset in entries.tolist()]
+                refs += [
+                    MessageRef(min(t_ns, _LATEST), chunk, offset)
+                    for t_ns, offset in entries.tolist()
+                ]
         return sorted(refs)
 
     def read(self, ref: MessageRef, most: int | None = None) -> bytes:
@@ -104,8 +114,14 @@ class McapFile:
                     self._note_chunk(position, length)
                 elif opcode == Opcode.MESSAGE_INDEX and self._bytes.chunks:
                     channel, size = struct.unpack("<HI", self._bytes.read(WHOLE_FILE, position, 6))
-                    size = max(min(size, length - 6), 0) // _INDEX_ENTRY.itemsize * _INDEX_ENTRY.itemsize
-                    self._indexes.setdefault(channel, []).append((len(self._bytes.chunks) - 1, position + 6, size))
+                    size = (
+                        max(min(size, length - 6), 0)
+                        // _INDEX_ENTRY.itemsize
+                        * _INDEX_ENTRY.itemsize
+                    )
+                    self._indexes.setdefault(channel, []).append(
+                        (len(self._bytes.chunks) - 1, position + 6, size)
+                    )
                     indexed.add(len(self._bytes.chunks) - 1)
                 elif opcode == Opcode.MESSAGE:
                     self._note_message(WHOLE_FILE, opcode, position, length)
@@ -125,10 +141,15 @@ class McapFile:
             return
 
     def _find_channels(self) -> None:
-        """Channels that are described within chunks alone, as in a file whose summary is missing."""
+        """Channels that are described within chunks alone, as in a file whose summary is
+        missing."""
         for number in [*self._indexes, *self._found]:
             if number not in self._channels:
-                chunk = self._indexes[number][0][0] if number in self._indexes else self._found[number][0].chunk
+                chunk = (
+                    self._indexes[number][0][0]
+                    if number in self._indexes
+                    else self._found[number][0].chunk
+                )
                 self._walk(chunk, self._note_definition)
 
     def _note_chunk(self, position: int, length: int) -> None:
@@ -144,8 +165,12 @@ class McapFile:
 
     def _note_message(self, chunk: int, opcode: int, position: int, length: int) -> None:
         if opcode == Opcode.MESSAGE and length >= _MESSAGE.size:
-            channel, _, log_t_ns, _ = _MESSAGE.unpack(self._bytes.read(chunk, position, _MESSAGE.size))
-            self._found.setdefault(channel, []).append(MessageRef(min(log_t_ns, _LATEST), chunk, position - _RECORD.size))
+            channel, _, log_t_ns, _ = _MESSAGE.unpack(
+                self._bytes.read(chunk, position, _MESSAGE.size)
+            )
+            self._found.setdefault(channel, []).append(
+                MessageRef(min(log_t_ns, _LATEST), chunk, position - _RECORD.size)
+            )
 
     def _note_definition(self, chunk: int, opcode: int, position: int, length: int) -> None:
         if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL) or length > _MAX_DEFINITION:

@@ -1,4 +1,5 @@
-"""What a file of messages is, whatever its container: topics, where each message lies, and its bytes when they are asked for."""
+"""What a file of messages is, whatever its container: topics, where each message lies, and its
+bytes when they are asked for."""
 
 from __future__ import annotations
 
@@ -10,9 +11,11 @@ from topoloc.errors import RecordingError
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic: `type` as ROS 2 writes it (``sensor_msgs/msg/Image``) or Foxglove's (``foxglove.CompressedImage``).
+    """A topic: `type` as ROS 2 writes it (``sensor_msgs/msg/Image``) or Foxglove's
+    (``foxglove.CompressedImage``).
 
-    `encoding` is how its messages are written: cdr, ros1, json or protobuf; `schema` what protobuf is decoded by.
+    `encoding` is how its messages are written: cdr, ros1, json or protobuf; `schema` what protobuf
+    is decoded by.
     """
 
     name: str
@@ -22,7 +25,8 @@ class Topic:
 
 
 class MessageRef(NamedTuple):
-    """Where a message lies: the chunk's number (-1: in none) and the place in it, or a table's row. `log_t_ns`: when it was written."""
+    """Where a message lies: the chunk's number (-1: in none) and the place in it, or a table's row.
+    `log_t_ns`: when it was written."""
 
     log_t_ns: int
     chunk: int
@@ -59,5 +63,9 @@ class CutShortError(Exception):
 
 def damaged(name: str, ref: MessageRef) -> RecordingError:
     """What is said of a message that the index names and that is not there."""
-    place = f"row {ref.offset}" if ref.chunk < -1 else f"byte {ref.offset}" + (f" of chunk {ref.chunk}" if ref.chunk >= 0 else "")
+    place = (
+        f"row {ref.offset}"
+        if ref.chunk < -1
+        else f"byte {ref.offset}" + (f" of chunk {ref.chunk}" if ref.chunk >= 0 else "")
+    )
     return RecordingError(f"{name}: the message at {place} is damaged or cut off")

@@ -1,6 +1,8 @@
-"""ROS 1 bags (format 2.0, wiki.ros.org/Bags/Format/2.0), gone through record by record without their messages.
+"""ROS 1 bags (format 2.0, wiki.ros.org/Bags/Format/2.0), gone through record by record without
+their messages.
 
-The index at the end of the file is not needed, so a bag that was never closed (``.bag.active``), or was cut off, is read as any other.
+The index at the end of the file is not needed, so a bag that was never closed (``.bag.active``), or
+was cut off, is read as any other.
 """
 
 from __future__ import annotations
@@ -49,7 +51,8 @@ class Ros1File:
     fault: str | None = None
     _bytes: ChunkedBytes = field(init=False)
     _connections: dict[int, Topic] = field(default_factory=dict)
-    # Of each connection: (chunk, where its index lies, its length in bytes), and messages that no index names.
+    # Of each connection: (chunk, where its index lies, its length in bytes), and messages that no
+    # index names.
     _indexes: dict[int, list[tuple[int, int, int]]] = field(default_factory=dict)
     _found: dict[int, list[MessageRef]] = field(default_factory=dict)
 
@@ -60,8 +63,14 @@ class Ros1File:
             if chunk not in indexed:
                 self._walk(chunk, self._note_message)
         for number in [*self._indexes, *self._found]:
-            if number not in self._connections:  # described within chunks alone: the index at the end is missing
-                chunk = self._indexes[number][0][0] if number in self._indexes else self._found[number][0].chunk
+            if (
+                number not in self._connections
+            ):  # described within chunks alone: the index at the end is missing
+                chunk = (
+                    self._indexes[number][0][0]
+                    if number in self._indexes
+                    else self._found[number][0].chunk
+                )
                 self._walk(chunk, self._note_connection)
         for topic in self._connections.values():
             self.topics.setdefault(topic.name, topic)
@@ -73,16 +82,25 @@ class Ros1File:
             refs += self._found.get(number, [])
             for chunk, start, length in self._indexes.get(number, []):
                 entries = np.frombuffer(self._bytes.read(WHOLE_FILE, start, length), _INDEX_ENTRY)
-                refs += [MessageRef(s * 1_000_000_000 + ns, chunk, offset) for s, ns, offset in entries.tolist()]
+                refs += [
+                    MessageRef(s * 1_000_000_000 + ns, chunk, offset)
+                    for s, ns, offset in entries.tolist()
+                ]
         return sorted(refs)
 
     def read(self, ref: MessageRef, most: int | None = None) -> bytes:
         """The bytes of a message, or the first `most` of them. Raises RecordingError."""
         try:
-            record = next(record for record in self._records(ref.chunk, ref.offset) if record.op != _CONNECTION)
+            record = next(
+                record
+                for record in self._records(ref.chunk, ref.offset)
+                if record.op != _CONNECTION
+            )
             if record.op != _MESSAGE:
                 raise CutShortError
-            return self._bytes.read(ref.chunk, record.start, record.length if most is None else min(record.length, most))
+            return self._bytes.read(
+                ref.chunk, record.start, record.length if most is None else min(record.length, most)
+            )
         except (StopIteration, *_BROKEN):
             raise damaged(self.path.name, ref) from None
 
@@ -95,7 +113,9 @@ class Ros1File:
             if length > _MAX_HEADER:
                 raise CutShortError
             header = self._bytes.read(chunk, begin + 4, length + 4)
-            record = _Record(_fields(header[:-4]), begin, begin + length + 8, _U32.unpack(header[-4:])[0])
+            record = _Record(
+                _fields(header[:-4]), begin, begin + length + 8, _U32.unpack(header[-4:])[0]
+            )
             position = record.start + record.length
             if position > end and record.op != _CHUNK:
                 raise CutShortError
@@ -116,7 +136,9 @@ class Ros1File:
                     self._note_chunk(record)
                 elif record.op == _INDEX and chunk >= 0:
                     size = record.length // _INDEX_ENTRY.itemsize * _INDEX_ENTRY.itemsize
-                    self._indexes.setdefault(record.number(b"conn"), []).append((chunk, record.start, size))
+                    self._indexes.setdefault(record.number(b"conn"), []).append(
+                        (chunk, record.start, size)
+                    )
                     indexed.add(chunk)
                 else:
                     self._note_connection(WHOLE_FILE, record)
@@ -135,19 +157,30 @@ class Ros1File:
             return
 
     def _note_chunk(self, record: _Record) -> None:
-        self._bytes.add(Chunk(record.start, record.length, record.number(b"size"), record.fields[b"compression"].decode()))
+        self._bytes.add(
+            Chunk(
+                record.start,
+                record.length,
+                record.number(b"size"),
+                record.fields[b"compression"].decode(),
+            )
+        )
 
     def _note_message(self, chunk: int, record: _Record) -> None:
         if record.op == _MESSAGE:
             s, ns = struct.unpack("<II", record.fields[b"time"])
-            self._found.setdefault(record.number(b"conn"), []).append(MessageRef(s * 1_000_000_000 + ns, chunk, record.begin))
+            self._found.setdefault(record.number(b"conn"), []).append(
+                MessageRef(s * 1_000_000_000 + ns, chunk, record.begin)
+            )
 
     def _note_connection(self, chunk: int, record: _Record) -> None:
         if record.op == _CONNECTION and record.length <= _MAX_HEADER:
             its = _fields(self._bytes.read(chunk, record.start, record.length))
             package, _, name = its[b"type"].decode().partition("/")
             kind = f"{package}/msg/{name}"
-            self._connections[record.number(b"conn")] = Topic(record.fields[b"topic"].decode(), kind, "ros1")
+            self._connections[record.number(b"conn")] = Topic(
+                record.fields[b"topic"].decode(), kind, "ros1"
+            )
 
 
 def _fields(header: bytes) -> dict[bytes, bytes]:

@@ -1,1 +1,2 @@
-"""Recordings made: frames of a camera that runs now, or of CARLA, written as a folder that every command reads."""
+"""Recordings made: frames of a camera that runs now, or of CARLA, written as a folder that every
+command reads."""

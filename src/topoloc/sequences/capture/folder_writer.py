@@ -1,7 +1,8 @@
 """Frames become a recording on disk while they come: a plain folder, readable after every frame.
 
-Stereo lies in ``left/ right/``, RGB-D in ``rgb/ depth/``, single pictures in ``images/``; depth of a stereo pair in ``depth/`` beside it.
-Each picture is whole or not there; the line of its time follows once all pictures of the frame are.
+Stereo lies in ``left/ right/``, RGB-D in ``rgb/ depth/``, single pictures in ``images/``; depth of
+a stereo pair in ``depth/`` beside it. Each picture is whole or not there; the line of its time
+follows once all pictures of the frame are.
 """
 
 from __future__ import annotations
@@ -53,12 +54,19 @@ class FolderWriter:
         except OSError as error:
             raise TopolocError(f"cannot write {folder}: {error.strerror}") from None
         if other is not None:
-            raise TopolocError(f"cannot write {folder}: it holds other things, such as {other}; name a new folder")
+            raise TopolocError(
+                f"cannot write {folder}: it holds other things, such as {other}; name a new folder"
+            )
 
     def __enter__(self) -> FolderWriter:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         for file in (self._times, self._truth):
             if file is not None:
                 file.close()
@@ -74,11 +82,18 @@ class FolderWriter:
         pictures = self._pictures(frame)
         if self._times is None:
             self._begin(frame, pictures)
-        if set(pictures) != set(self._kinds) or (self._truth is None) != (frame.world_from_cam is None):
+        if set(pictures) != set(self._kinds) or (self._truth is None) != (
+            frame.world_from_cam is None
+        ):
             raise RecordingError(f"{frame.name}: of another kind than the frames before")
         suffix = "png" if self._jpeg is None else "jpg"
         paths = {
-            kind: self.folder / self._kinds[kind] / f"{self.num_frames:06d}.{'png' if kind == 'depth' else suffix}" for kind in pictures
+            kind: (
+                self.folder
+                / self._kinds[kind]
+                / f"{self.num_frames:06d}.{'png' if kind == 'depth' else suffix}"
+            )
+            for kind in pictures
         }
         try:
             for kind, path in paths.items():
@@ -117,7 +132,9 @@ class FolderWriter:
             for name in self._kinds.values():
                 (self.folder / name).mkdir()
             if frame.camera is not None:
-                write_text(self.folder / FILE_NAME, json.dumps(calibration_json(frame), indent=1) + "\n")
+                write_text(
+                    self.folder / FILE_NAME, json.dumps(calibration_json(frame), indent=1) + "\n"
+                )
             if frame.world_from_cam is not None:
                 self._truth = (self.folder / "truth.tum").open("x", encoding="utf-8")
                 self._truth.write(TUM_HEADER + "\n")
@@ -136,7 +153,11 @@ def calibration_json(frame: StereoFrame) -> dict[str, Any]:
 def _rig_json(rig: StereoRig) -> dict[str, Any]:
     if rig.is_rectified:
         return rig.left.to_json() | {"baseline": rig.baseline}
-    return {"left": rig.left.to_json(), "right": rig.right.to_json(), "right_from_left": rig.right_from_left.matrix().tolist()}
+    return {
+        "left": rig.left.to_json(),
+        "right": rig.right.to_json(),
+        "right_from_left": rig.right_from_left.matrix().tolist(),
+    }
 
 
 def _units(depth: Float32[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
@@ -147,8 +168,15 @@ def _units(depth: Float32[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
 
 def _encoded(pixels: Image | UInt16[np.ndarray, "h w"], jpeg: int | None) -> bytes:
     bgr = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
-    suffix, settings = (".png", [cv2.IMWRITE_PNG_COMPRESSION, 1]) if jpeg is None else (".jpg", [cv2.IMWRITE_JPEG_QUALITY, jpeg])
+    suffix, settings = (
+        (".png", [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        if jpeg is None
+        else (".jpg", [cv2.IMWRITE_JPEG_QUALITY, jpeg])
+    )
     is_done, data = cv2.imencode(suffix, bgr, settings)
     if not is_done:
-        raise RecordingError(f"a picture of {pixels.shape[1]}x{pixels.shape[0]} pixels cannot be stored as {suffix[1:]}")
+        raise RecordingError(
+            f"a picture of {pixels.shape[1]}x{pixels.shape[0]} pixels cannot be stored as"
+            f" {suffix[1:]}"
+        )
     return data.tobytes()

@@ -1,4 +1,5 @@
-"""Frames of a ZED that is plugged in: through Stereolabs' SDK, or without it as the side-by-side USB camera that it is."""
+"""Frames of a ZED that is plugged in: through Stereolabs' SDK, or without it as the side-by-side
+USB camera that it is."""
 
 from __future__ import annotations
 
@@ -32,13 +33,20 @@ def side_by_side_frames(source: LiveSource, calibration: Path) -> Iterator[Stere
         height, width = picture.image.shape[:2]
         if not is_side_by_side(width, height):
             raise RecordingError(
-                f"{source.source}: {width}x{height} pixels are not two pictures side by side; --size asks the device for others"
+                f"{source.source}: {width}x{height} pixels are not two pictures side by side;"
+                " --size asks the device for others"
             )
         if rig is None:
             rig = rig_of_file(calibration, (width // 2, height))
         if (rig.left.width, rig.left.height) != (width // 2, height):
-            raise CalibrationError(f"{calibration}: of {rig.left.width}x{rig.left.height}, but each half is {width // 2}x{height}")
-        left, right = (np.ascontiguousarray(half) for half in (picture.image[:, : width // 2], picture.image[:, width // 2 :]))
+            raise CalibrationError(
+                f"{calibration}: of {rig.left.width}x{rig.left.height}, but each half is"
+                f" {width // 2}x{height}"
+            )
+        left, right = (
+            np.ascontiguousarray(half)
+            for half in (picture.image[:, : width // 2], picture.image[:, width // 2 :])
+        )
         yield StereoFrame(f"{picture.number:06d}", picture.t_ns, left, rig.left, right, rig)
 
 

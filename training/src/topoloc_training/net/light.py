@@ -1,6 +1,7 @@
 """Light and weather put onto a grey picture: what the same place looks like at another hour.
 
-A picture is (h, w) float32 in [0, 1]. Every change is drawn from the generator that is given, so that a seed fixes all.
+A picture is (h, w) float32 in [0, 1]. Every change is drawn from the generator that is given, so
+that a seed fixes all.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ Grey = Float[np.ndarray, "h w"]
 
 
 def changed(picture: Grey, strength: float, generator: Generator) -> Grey:
-    """The picture in another light. `strength` in [0, 1]: how many changes, and whether it may be night, rain or fog."""
+    """The picture in another light. `strength` in [0, 1]: how many changes, and whether it may be
+    night, rain or fog."""
     result = picture.astype(np.float32)
     if generator.random() < 0.8 * strength:
         result = _relit(result, generator, 0.3 + 0.9 * strength * generator.random())
@@ -30,7 +32,9 @@ def changed(picture: Grey, strength: float, generator: Generator) -> Grey:
     result = _exposed(result, generator, strength)
     if generator.random() < 0.25 * strength:
         quality = int(generator.integers(25, 90))
-        encoded = cv2.imencode(".jpg", (result * 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+        encoded = cv2.imencode(
+            ".jpg", (result * 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, quality]
+        )[1]
         result = np.asarray(cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE), np.float32) / 255
     return result
 
@@ -65,11 +69,15 @@ def _night(picture: Grey, generator: Generator) -> Grey:
     light = np.full_like(picture, generator.uniform(0.03, 0.3))
     glare = np.zeros_like(picture)
     for _ in range(int(generator.integers(0, 4))):
-        distance = (x - generator.uniform(-0.2, 1.2) * width) ** 2 + (y - generator.uniform(-0.3, 1.1) * height) ** 2
+        distance = (x - generator.uniform(-0.2, 1.2) * width) ** 2 + (
+            y - generator.uniform(-0.3, 1.1) * height
+        ) ** 2
         reach = generator.uniform(0.1, 0.6) * width
         light += generator.uniform(0.2, 1.2) * np.exp(-distance / reach**2)
         if generator.random() < 0.6:
-            glare += generator.uniform(0.2, 1.0) * np.exp(-distance / (generator.uniform(0.01, 0.06) * width) ** 2)
+            glare += generator.uniform(0.2, 1.0) * np.exp(
+                -distance / (generator.uniform(0.01, 0.06) * width) ** 2
+            )
     middle = (x / width - 0.5) ** 2 + (y / height - 0.5) ** 2
     light *= 1 - generator.uniform(0, 0.9) * middle
     return picture ** generator.uniform(1.0, 1.5) * light + glare
@@ -91,7 +99,11 @@ def _fog(picture: Grey, generator: Generator, thickest: float = 0.85) -> Grey:
     """Blended with one grey, most where the picture would be far away."""
     rows = np.linspace(-1, 1, picture.shape[0], dtype=np.float32)[:, None]
     far = np.exp(-(((rows - generator.uniform(-0.5, 0.3)) / generator.uniform(0.4, 1.2)) ** 2))
-    veil = np.clip(generator.uniform(0.1, thickest) * far * (1 + 0.3 * _field(picture.shape, generator, 4)), 0, 0.9)
+    veil = np.clip(
+        generator.uniform(0.1, thickest) * far * (1 + 0.3 * _field(picture.shape, generator, 4)),
+        0,
+        0.9,
+    )
     return picture * (1 - veil) + generator.uniform(0.3, 0.9) * veil
 
 
@@ -127,5 +139,7 @@ def _exposed(picture: Grey, generator: Generator, strength: float) -> Grey:
     read = generator.uniform(1, 4) / electrons
     noise = generator.standard_normal(light.shape, dtype=np.float32)
     light = light + noise * np.sqrt(np.minimum(light, 1) / electrons + read**2)
-    curve = cv2.pow(np.clip(light, 0, 1), 1 / generator.uniform(2.2 - 0.6 * strength, 2.2 + 0.6 * strength))
+    curve = cv2.pow(
+        np.clip(light, 0, 1), 1 / generator.uniform(2.2 - 0.6 * strength, 2.2 + 0.6 * strength)
+    )
     return (np.round(curve * 255) / 255).astype(np.float32)

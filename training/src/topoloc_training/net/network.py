@@ -1,8 +1,11 @@
-"""The network `topoloc-net`: grey picture to key point scores and 64-number descriptors, made for two plain CPU cores.
+"""The network `topoloc-net`: grey picture to key point scores and 64-number descriptors, made for
+two plain CPU cores.
 
-Where the time of such networks goes (ONNX Runtime, one thread): a 3x3 convolution of 8 channels at half resolution costs twice what one of
-32 channels costs at an eighth, of as many multiplications. So half resolution sees one strided convolution alone, the depth lies at 1/8 and
-1/16, descriptors get their fine detail from one 1x1 at a quarter, and scores are made there, of what half resolution saw, and unfolded.
+Where the time of such networks goes (ONNX Runtime, one thread): a 3x3 convolution of 8 channels at
+half resolution costs twice what one of 32 channels costs at an eighth, of as many multiplications.
+So half resolution sees one strided convolution alone, the depth lies at 1/8 and 1/16, descriptors
+get their fine detail from one 1x1 at a quarter, and scores are made there, of what half resolution
+saw, and unfolded.
 """
 
 from __future__ import annotations
@@ -22,7 +25,8 @@ _SHADOWS = 0.002  # grey below this is noise; also keeps the root's slope finite
 
 
 class TopolocNet(nn.Module):
-    """Levels at 1/4 (16 channels), 1/8 (32), 1/16 (64) and 1/32 (64), added up from coarse to fine."""
+    """Levels at 1/4 (16 channels), 1/8 (32), 1/16 (64) and 1/32 (64), added up from coarse to
+    fine."""
 
     stride = STRIDE
     outputs = ("scores", "descriptors", "places")
@@ -30,7 +34,9 @@ class TopolocNet(nn.Module):
     def __init__(self):
         super().__init__()
         self.norm = nn.InstanceNorm2d(1)
-        self.quarter = nn.Sequential(ConvNormReLU(1, 16, 4, 2), ConvNormReLU(16, 16, 3, 2), ConvNormReLU(16, 16))
+        self.quarter = nn.Sequential(
+            ConvNormReLU(1, 16, 4, 2), ConvNormReLU(16, 16, 3, 2), ConvNormReLU(16, 16)
+        )
         self.eighth = nn.Sequential(ConvNormReLU(16, 32, 3, 2), Residual(32, 32))
         self.sixteenth = nn.Sequential(ConvNormReLU(32, 64, 3, 2), Residual(64, 64))
         self.context = nn.Sequential(nn.AvgPool2d(2), ConvNormReLU(64, 64))
@@ -56,8 +62,11 @@ class TopolocNet(nn.Module):
 
     def _maps(
         self, image: Float[Tensor, "b 1 h w"]
-    ) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 64 h4 w4"], Float[Tensor, "b 64 h16 w16"]]:
-        # The root evens out photon noise and keeps lamps from pressing a night picture into the lowest greys.
+    ) -> tuple[
+        Float[Tensor, "b 1 h w"], Float[Tensor, "b 64 h4 w4"], Float[Tensor, "b 64 h16 w16"]
+    ]:
+        # The root evens out photon noise and keeps lamps from pressing a night picture into the
+        # lowest greys.
         grey = self.norm(torch.sqrt(image + _SHADOWS))
         stem, *deeper = self.quarter
         half = stem(grey)
@@ -67,12 +76,19 @@ class TopolocNet(nn.Module):
         eighth = self.eighth(quarter)
         places = self.sixteenth(eighth)
         sixteenth = places + enlarged(self.context(places), 2)
-        fused = self.fusion(functional.relu(self.lateral(eighth) + enlarged(self.across(sixteenth), 2)))
+        fused = self.fusion(
+            functional.relu(self.lateral(eighth) + enlarged(self.across(sixteenth), 2))
+        )
         descriptors = enlarged(self.coarse_descriptor(fused), 2) + self.fine_descriptor(quarter)
-        logits = self.score(enlarged(self.coarse_score(fused), 2) + self.fine_score(quarter) + self.detail_score(half))
+        logits = self.score(
+            enlarged(self.coarse_score(fused), 2)
+            + self.fine_score(quarter)
+            + self.detail_score(half)
+        )
         return logits, descriptors, places
 
     def forward(self, image: Float[Tensor, "b 1 h w"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Scores, descriptors, and the level by which places are known again: of all levels it keeps best through the night."""
+        """Scores, descriptors, and the level by which places are known again: of all levels it
+        keeps best through the night."""
         logits, descriptors, places = self._maps(image)
         return torch.sigmoid(logits), descriptors, places

@@ -1,6 +1,8 @@
-"""The same points by day and in other light: pixels of a stereo recording, seen again in single pictures of the same rendered place.
+"""The same points by day and in other light: pixels of a stereo recording, seen again in single
+pictures of the same rendered place.
 
-Depth comes from the day's stereo pair, poses from the truth; what the other picture sees behind something nearer is left out.
+Depth comes from the day's stereo pair, poses from the truth; what the other picture sees behind
+something nearer is left out.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ _FEWEST = 200
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Pixels of the day's picture and the same points' pixels in the other, both by path of the picture."""
+    """Pixels of the day's picture and the same points' pixels in the other, both by path of the
+    picture."""
 
     day: str
     other: str
@@ -38,7 +41,8 @@ class Pair:
 
 
 def find_pairs(day_folder: str, other_folder: str) -> list[Pair]:
-    """Pairs of pictures that see the same, for each picture of the other recording up to three of the day's.
+    """Pairs of pictures that see the same, for each picture of the other recording up to three of
+    the day's.
 
     Raises:
         RecordingError: a frame has no pose, no calibration or, of the day's, no right picture.
@@ -64,16 +68,34 @@ def find_pairs(day_folder: str, other_folder: str) -> list[Pair]:
             pixels, points = clouds[i]
             seen, at = seen_by(points, np.linalg.inv(pose) @ day_poses[i], frame.camera)
             if len(seen) >= _FEWEST:
-                pairs.append(Pair(str(days.root / days.names[i]), str(others.root / others.names[j]), pixels[seen], at))
+                pairs.append(
+                    Pair(
+                        str(days.root / days.names[i]),
+                        str(others.root / others.names[j]),
+                        pixels[seen],
+                        at,
+                    )
+                )
     return pairs
 
 
 def located_pixels(frame: StereoFrame) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels of the left picture, every other row and column, and their points in the left camera."""
+    """Pixels of the left picture, every other row and column, and their points in the left
+    camera."""
     if frame.right is None or frame.rig is None:
         raise RecordingError(f"{frame.name}: no stereo pair")
     left, right = grey_image(frame.image), grey_image(frame.right)
-    matcher = cv2.StereoSGBM.create(0, 64, 5, 200, 800, disp12MaxDiff=1, uniquenessRatio=10, speckleWindowSize=80, speckleRange=2)
+    matcher = cv2.StereoSGBM.create(
+        0,
+        64,
+        5,
+        200,
+        800,
+        disp12MaxDiff=1,
+        uniquenessRatio=10,
+        speckleWindowSize=80,
+        speckleRange=2,
+    )
     disparity = matcher.compute(left, right).astype(np.float32) / 16
     y, x = np.nonzero(disparity > 1.0)
     chosen = (x % 2 == 0) & (y % 2 == 0)
@@ -84,15 +106,24 @@ def located_pixels(frame: StereoFrame) -> tuple[np.ndarray, np.ndarray]:
     return np.column_stack([x, y]).astype(np.float32), points
 
 
-def seen_by(points: np.ndarray, other_from_day: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+def seen_by(
+    points: np.ndarray, other_from_day: np.ndarray, camera: Camera
+) -> tuple[np.ndarray, np.ndarray]:
     """Which points the other picture sees, and where. Nearest in its cell wins."""
     local = points @ other_from_day[:3, :3].T + other_from_day[:3, 3]
     front = np.flatnonzero(local[:, 2] > 0.3)
     local = local[front]
     at = local[:, :2] / local[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-    inside = (at[:, 0] > 2) & (at[:, 1] > 2) & (at[:, 0] < camera.width - 3) & (at[:, 1] < camera.height - 3)
+    inside = (
+        (at[:, 0] > 2)
+        & (at[:, 1] > 2)
+        & (at[:, 0] < camera.width - 3)
+        & (at[:, 1] < camera.height - 3)
+    )
     front, at, z = front[inside], at[inside], local[inside, 2]
-    cell = (at[:, 1] // _CELL).astype(int) * (camera.width // _CELL + 1) + (at[:, 0] // _CELL).astype(int)
+    cell = (at[:, 1] // _CELL).astype(int) * (camera.width // _CELL + 1) + (
+        at[:, 0] // _CELL
+    ).astype(int)
     nearest = np.full(cell.max() + 1 if len(cell) else 1, np.inf)
     np.minimum.at(nearest, cell, z)
     visible = z < nearest[cell] * _SLACK

@@ -1,8 +1,10 @@
-"""A wall as a camera shows it that looks along it, and as `topoloc.features.side_views` turns that to the front again.
+"""A wall as a camera shows it that looks along it, and as `topoloc.features.side_views` turns that
+to the front again.
 
-What lies ahead on a wall is seen at a slant: it fills fewer and fewer pixels, so that its picture from the front is smeared, most where the
-camera saw it from farthest. Who comes back sees it from the other end, smeared the other way. What is learned of both pictures of one
-wall, is learned for the way back.
+What lies ahead on a wall is seen at a slant: it fills fewer and fewer pixels, so that its picture
+from the front is smeared, most where the camera saw it from farthest. Who comes back sees it from
+the other end, smeared the other way. What is learned of both pictures of one wall, is learned for
+the way back.
 """
 
 from __future__ import annotations
@@ -13,14 +15,21 @@ from jaxtyping import Float
 from numpy.random import Generator
 
 _FOCAL_PX = 380.0  # of a picture of 640 pixels, and of its side views
-_NEAREST, _FARTHEST = 1.15, 3.2  # how far ahead of the camera a wall is looked at, as tangents of the angle off the side camera's axis
+_NEAREST, _FARTHEST = (
+    1.15,
+    3.2,
+)  # how far ahead of the camera a wall is looked at, as tangents of the angle off the side camera's axis  # noqa: E501
 _FINER = 3  # the camera's pixels are means of so many samples each way
 
 
-def slanted(front: Float[np.ndarray, "h w"], is_ahead_right: bool, generator: Generator) -> Float[np.ndarray, "h w"]:
-    """The picture of a wall from the front, as what is left of it that a camera saw which stands to one side and looks along it.
+def slanted(
+    front: Float[np.ndarray, "h w"], is_ahead_right: bool, generator: Generator
+) -> Float[np.ndarray, "h w"]:
+    """The picture of a wall from the front, as what is left of it that a camera saw which stands to
+    one side and looks along it.
 
-    Every pixel stays where it is; the picture is as sharp as the camera saw it. The tangent of pixel x grows to the right or to the left.
+    Every pixel stays where it is; the picture is as sharp as the camera saw it. The tangent of
+    pixel x grows to the right or to the left.
     """
     height, width = front.shape
     first = generator.uniform(_NEAREST, max(_NEAREST, _FARTHEST - width / _FOCAL_PX))
@@ -30,25 +39,44 @@ def slanted(front: Float[np.ndarray, "h w"], is_ahead_right: bool, generator: Ge
     low = np.floor(corners.min(axis=0)) - 1.0
     size = np.ceil(corners.max(axis=0) - low + 2.0).astype(int)
     moved = np.array([[1.0, 0.0, -low[0]], [0.0, 1.0, -low[1]], [0.0, 0.0, 1.0]]) @ to_camera
-    finer = np.array([[_FINER, 0.0, (_FINER - 1) / 2], [0.0, _FINER, (_FINER - 1) / 2], [0.0, 0.0, 1.0]])
+    finer = np.array(
+        [[_FINER, 0.0, (_FINER - 1) / 2], [0.0, _FINER, (_FINER - 1) / 2], [0.0, 0.0, 1.0]]
+    )
     samples = cv2.warpPerspective(
-        np.ascontiguousarray(picture), finer @ moved, (int(size[0]) * _FINER, int(size[1]) * _FINER), borderMode=cv2.BORDER_REPLICATE
+        np.ascontiguousarray(picture),
+        finer @ moved,
+        (int(size[0]) * _FINER, int(size[1]) * _FINER),
+        borderMode=cv2.BORDER_REPLICATE,
     )
     seen = cv2.resize(samples, (int(size[0]), int(size[1])), interpolation=cv2.INTER_AREA)
     sigma = generator.uniform(0.3, 0.8)  # of the lens and of the pixels' colour filter
     seen = cv2.GaussianBlur(seen, (0, 0), sigma)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    shown = cv2.warpPerspective(seen, moved, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    shown = cv2.warpPerspective(
+        seen, moved, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
+    )
     return shown if is_ahead_right else np.ascontiguousarray(shown[:, ::-1])
 
 
-def _camera_from_front(width: int, height: int, first: float, above: float) -> Float[np.ndarray, "3 3"]:
-    """Pixels of the camera that looks along the wall, of those of the view from its front; tangents grow from `first` at the left end, the
-    horizon lies `above` (a tangent) the middle."""
-    front = np.array([[1.0 / _FOCAL_PX, 0.0, first], [0.0, 1.0 / _FOCAL_PX, above - height / 2.0 / _FOCAL_PX], [0.0, 0.0, 1.0]])
-    turned = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # (ahead, down, 1) as (to the side, down, ahead)
+def _camera_from_front(
+    width: int, height: int, first: float, above: float
+) -> Float[np.ndarray, "3 3"]:
+    """Pixels of the camera that looks along the wall, of those of the view from its front; tangents
+    grow from `first` at the left end, the horizon lies `above` (a tangent) the middle."""
+    front = np.array(
+        [
+            [1.0 / _FOCAL_PX, 0.0, first],
+            [0.0, 1.0 / _FOCAL_PX, above - height / 2.0 / _FOCAL_PX],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    turned = np.array(
+        [[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]
+    )  # (ahead, down, 1) as (to the side, down, ahead)
     return np.diag([_FOCAL_PX, _FOCAL_PX, 1.0]) @ turned @ front
 
 
 def _corners(width: int, height: int) -> Float[np.ndarray, "4 2"]:
-    return np.array([[0.0, 0.0], [width - 1.0, 0.0], [width - 1.0, height - 1.0], [0.0, height - 1.0]])
+    return np.array(
+        [[0.0, 0.0], [width - 1.0, 0.0], [width - 1.0, height - 1.0], [0.0, height - 1.0]]
+    )

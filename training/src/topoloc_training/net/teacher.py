@@ -1,4 +1,5 @@
-"""Training pictures and what a teacher says of each, computed once and kept in files: the teacher sees every picture as it is."""
+"""Training pictures and what a teacher says of each, computed once and kept in files: the teacher
+sees every picture as it is."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ _UNIT = 127.0
 
 @dataclass(frozen=True, eq=False)
 class Lessons:
-    """Pictures and the teacher's answers, mapped from files. `pictures[i]` comes from `paths[i]`, scaled by `scales[i]`, top rows."""
+    """Pictures and the teacher's answers, mapped from files. `pictures[i]` comes from `paths[i]`,
+    scaled by `scales[i]`, top rows."""
 
     paths: list[str]
     scales: Float[np.ndarray, " n"]
@@ -31,7 +33,9 @@ class Lessons:
     scores: UInt8[np.ndarray, "n h w"]
     descriptors: Int8[np.ndarray, "n 64 h4 w4"]
 
-    def described(self, index: int, pixels: Float[np.ndarray, "m 2"]) -> Float32[np.ndarray, "m 64"]:
+    def described(
+        self, index: int, pixels: Float[np.ndarray, "m 2"]
+    ) -> Float32[np.ndarray, "m 64"]:
         """The teacher's unit descriptors at pixels of a picture, bilinearly."""
         place = (pixels + 0.5) / STRIDE - 0.5
         limit = np.array([WIDTH // STRIDE, HEIGHT // STRIDE]) - 1.001
@@ -42,13 +46,17 @@ class Lessons:
         maps = self.descriptors[index]
         weights = [(1 - right) * (1 - down), right * (1 - down), (1 - right) * down, right * down]
         corners = [(0, 0), (1, 0), (0, 1), (1, 1)]
-        parts = [w * maps[:, y + dy, x + dx].astype(np.float32) for w, (dx, dy) in zip(weights, corners, strict=True)]
+        parts = [
+            w * maps[:, y + dy, x + dx].astype(np.float32)
+            for w, (dx, dy) in zip(weights, corners, strict=True)
+        ]
         values = np.sum(parts, axis=0).T
         return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-6)
 
 
 def learn(folders: list[str], teacher: Path, cache: Path) -> Lessons:
-    """Read the cache, or ask the teacher (an ONNX file of the contract, 64 numbers, stride 4) about every picture of the folders.
+    """Read the cache, or ask the teacher (an ONNX file of the contract, 64 numbers, stride 4) about
+    every picture of the folders.
 
     A folder may end with `::step` to take every so manieth picture.
     """
@@ -61,15 +69,21 @@ def learn(folders: list[str], teacher: Path, cache: Path) -> Lessons:
     lessons = _opened(cache, paths, [0.0] * len(paths), "w+")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
-    session = onnxruntime.InferenceSession(str(teacher), options, providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(
+        str(teacher), options, providers=["CPUExecutionProvider"]
+    )
     for i, path in enumerate(paths):
         lessons.pictures[i], lessons.scales[i] = _fitted(grey_image(read_image(Path(path))))
-        outputs = session.run(None, {"image": lessons.pictures[i].astype(np.float32)[None, None] / 255})
+        outputs = session.run(
+            None, {"image": lessons.pictures[i].astype(np.float32)[None, None] / 255}
+        )
         scores, descriptors = (np.asarray(output)[0] for output in outputs)
         descriptors = descriptors / np.linalg.norm(descriptors, axis=0, keepdims=True)
         lessons.scores[i] = np.round(scores[0] * 255)
         lessons.descriptors[i] = np.round(descriptors * _UNIT)
-    index_file.write_text(json.dumps({"key": key, "paths": paths, "scales": lessons.scales.tolist()}))
+    index_file.write_text(
+        json.dumps({"key": key, "paths": paths, "scales": lessons.scales.tolist()})
+    )
     return lessons
 
 
@@ -78,7 +92,9 @@ def _listed(folder: str) -> list[Path]:
     return list_pictures(Path(name))[:: int(step or 1)]
 
 
-def _opened(cache: Path, paths: list[str], scales: list[float], mode: Literal["r", "w+"]) -> Lessons:
+def _opened(
+    cache: Path, paths: list[str], scales: list[float], mode: Literal["r", "w+"]
+) -> Lessons:
     def mapped(name: str, dtype: type, shape: tuple[int, ...]) -> np.ndarray:
         return np.memmap(cache / name, dtype, mode, shape=(len(paths), *shape))
 
@@ -97,6 +113,8 @@ def _fitted(picture: UInt8[np.ndarray, "h w"]) -> tuple[UInt8[np.ndarray, "384 6
     scale = WIDTH / picture.shape[1]
     if scale != 1:
         interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-        picture = cv2.resize(picture, (WIDTH, round(picture.shape[0] * scale)), interpolation=interpolation)
+        picture = cv2.resize(
+            picture, (WIDTH, round(picture.shape[0] * scale)), interpolation=interpolation
+        )
     missing = max(0, HEIGHT - picture.shape[0])
     return cv2.copyMakeBorder(picture[:HEIGHT], 0, missing, 0, 0, cv2.BORDER_REFLECT_101), scale

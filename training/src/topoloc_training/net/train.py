@@ -1,6 +1,8 @@
-"""Train `topoloc-net`: `python -m topoloc_training.net.train --teacher edgepoint2-e64.onnx --pictures FOLDER... --out FOLDER`.
+"""Train `topoloc-net`: `python -m topoloc_training.net.train --teacher edgepoint2-e64.onnx
+--pictures FOLDER... --out FOLDER`.
 
-Resumable: started again with the same folder it goes on from its last state. One line of JSON a hundred steps goes to `log.jsonl`.
+Resumable: started again with the same folder it goes on from its last state. One line of JSON a
+hundred steps goes to `log.jsonl`.
 """
 
 from __future__ import annotations
@@ -39,20 +41,25 @@ _KEPT_AVERAGE = 0.998
 
 @dataclass(frozen=True)
 class TrainNet:
-    """Distil `topoloc-net` from a teacher on pictures and on day and night pairs of rendered places."""
+    """Distil `topoloc-net` from a teacher on pictures and on day and night pairs of rendered
+    places."""
 
     teacher: Path
-    """ONNX file of a network of 64-number descriptors and stride 4, of the contract of `networks/export.py`."""
+    """ONNX file of a network of 64-number descriptors and stride 4, of the contract of
+    `networks/export.py`."""
     pictures: list[str] = field(default_factory=list)
     """Folders of pictures; `FOLDER::2` takes every other one."""
     pairs: list[str] = field(default_factory=list)
-    """Pairs of recordings of one rendered place, `DAY:OTHER`: the day's with stereo, both with truth."""
+    """Pairs of recordings of one rendered place, `DAY:OTHER`: the day's with stereo, both with
+    truth."""
     walls: list[str] = field(default_factory=list)
-    """The same, `OUT:BACK`, of a way that was walked both ways: its walls are learned as views to the sides show them."""
+    """The same, `OUT:BACK`, of a way that was walked both ways: its walls are learned as views to
+    the sides show them."""
     out: Path = Path("net")
     """Folder of the state, of the log and of the network."""
     name: Literal["topoloc-net", "topoloc-net-sides"] = KIND
-    """Which of the two networks that ship it is to be: the one of pictures, or of what they show to the sides."""
+    """Which of the two networks that ship it is to be: the one of pictures, or of what they show to
+    the sides."""
     steps: int = 8000
     batch: int = 4
     """Samples a step; each gives two views."""
@@ -63,12 +70,15 @@ class TrainNet:
     wall_share: float = 0.0
     """Share of samples that come from walls."""
     slants: float = 0.0
-    """Share of the other samples that show a picture as if it hung on a wall, from both of its ends (`slants.py`)."""
+    """Share of the other samples that show a picture as if it hung on a wall, from both of its ends
+    (`slants.py`)."""
     seed: int = 1
     start: Path | None = None
-    """State of an earlier training to begin with, what it lacks begins at random; or the network's ONNX file, with `--frozen-norms`."""
+    """State of an earlier training to begin with, what it lacks begins at random; or the network's
+    ONNX file, with `--frozen-norms`."""
     frozen_norms: bool = False
-    """Leave the batch norms as they are: in an ONNX file they were folded into what comes before them."""
+    """Leave the batch norms as they are: in an ONNX file they were folded into what comes before
+    them."""
     threads: int = 1
     minutes: float = 1e9
     """Stop after so long; the state is kept."""
@@ -78,27 +88,49 @@ def train(config: TrainNet) -> None:
     """Train, or go on training, and export the averaged network."""
     torch.set_num_threads(config.threads)
     config.out.mkdir(parents=True, exist_ok=True)
-    pairs = [pair for names in config.pairs for pair in _cached_pairs(names, config.out, find_pairs)]
-    walls = [pair for names in config.walls for pair in _cached_pairs(names, config.out, partial(_side_pairs, config.out / "sides"))]
-    folders = config.pictures + sorted({path for names in config.pairs for path in _picture_folders(names)})
+    pairs = [
+        pair for names in config.pairs for pair in _cached_pairs(names, config.out, find_pairs)
+    ]
+    walls = [
+        pair
+        for names in config.walls
+        for pair in _cached_pairs(names, config.out, partial(_side_pairs, config.out / "sides"))
+    ]
+    folders = config.pictures + sorted(
+        {path for names in config.pairs for path in _picture_folders(names)}
+    )
     folders += [str(config.out / "sides")] if walls else []
     lessons = learn(folders, config.teacher, config.out / "lessons")
     rows = {os.path.realpath(path): i for i, path in enumerate(lessons.paths)}
-    known, known_walls = ([(rows[os.path.realpath(p.day)], rows[os.path.realpath(p.other)], _cut(p)) for p in of] for of in (pairs, walls))
+    known, known_walls = (
+        [(rows[os.path.realpath(p.day)], rows[os.path.realpath(p.other)], _cut(p)) for p in of]
+        for of in (pairs, walls)
+    )
     shares = Shares(config.pair_share if known else 0.0, config.wall_share, config.slants)
     torch.manual_seed(config.seed)
     network, average, optimizer, step = _begin(config)
     begun = step
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda taken: _rate(begun + taken, config.steps))
+    schedule = torch.optim.lr_scheduler.LambdaLR(
+        optimizer, lambda taken: _rate(begun + taken, config.steps)
+    )
     network.train()
     if config.frozen_norms:
         freeze_norms(network)
     end, sums, since = time.monotonic() + 60 * config.minutes, np.zeros(5), time.monotonic()
     while step < config.steps and time.monotonic() < end:
-        # The generator follows from the step, so that a resumed run goes on as the first would have.
+        # The generator follows from the step, so that a resumed run goes on as the first would
+        # have.
         generator = np.random.default_rng([config.seed, step])
-        parts = _step(network, [draw_sample(lessons, known, known_walls, shares, generator) for _ in range(config.batch)])
-        loss = torch.stack([weight * part for weight, part in zip(_WEIGHTS, parts, strict=True)]).sum()
+        parts = _step(
+            network,
+            [
+                draw_sample(lessons, known, known_walls, shares, generator)
+                for _ in range(config.batch)
+            ],
+        )
+        loss = torch.stack(
+            [weight * part for weight, part in zip(_WEIGHTS, parts, strict=True)]
+        ).sum()
         optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(network.parameters(), 5.0)
@@ -109,8 +141,16 @@ def train(config: TrainNet) -> None:
         sums += [float(part.detach()) for part in parts]
         if step % _LOG_EVERY == 0:
             names = ("cosine", "to_teacher", "across_light", "score", "place")
-            line = {"step": step, "rate": schedule.get_last_lr()[0], "seconds": round(time.monotonic() - since, 1)}
-            _log(config.out, line | {n: round(float(v) / _LOG_EVERY, 4) for n, v in zip(names, sums, strict=True)})
+            line = {
+                "step": step,
+                "rate": schedule.get_last_lr()[0],
+                "seconds": round(time.monotonic() - since, 1),
+            }
+            _log(
+                config.out,
+                line
+                | {n: round(float(v) / _LOG_EVERY, 4) for n, v in zip(names, sums, strict=True)},
+            )
             sums, since = np.zeros(5), time.monotonic()
         if step % _SAVE_EVERY == 0:
             _save(config, network, average, optimizer, step)
@@ -118,7 +158,8 @@ def train(config: TrainNet) -> None:
 
 
 def _step(network: TopolocNet, samples: list[Sample]) -> tuple[Tensor, ...]:
-    """Cosine to the teacher, told apart against the teacher, told apart across light, score, place of key points."""
+    """Cosine to the teacher, told apart against the teacher, told apart across light, score, place
+    of key points."""
 
     def both(name: str) -> Tensor:
         """First views of all samples, then second ones."""
@@ -166,29 +207,51 @@ def _begin(config: TrainNet) -> tuple[TopolocNet, TopolocNet, torch.optim.Optimi
 
 def _begin_with(network: nn.Module, earlier: dict[str, Tensor]) -> None:
     own = network.state_dict()
-    network.load_state_dict({n: value for n, value in earlier.items() if n in own and own[n].shape == value.shape}, strict=False)
+    network.load_state_dict(
+        {n: value for n, value in earlier.items() if n in own and own[n].shape == value.shape},
+        strict=False,
+    )
 
 
 def _rate(step: int, steps: int) -> float:
     """Share of the full rate: up within a hundred steps, then down by a cosine."""
-    return min(1.0, (step + 1) / 100) * (0.5 + 0.5 * math.cos(math.pi * min(1.0, step / steps))) + 1e-3
+    return (
+        min(1.0, (step + 1) / 100) * (0.5 + 0.5 * math.cos(math.pi * min(1.0, step / steps))) + 1e-3
+    )
 
 
 def _follow(average: nn.Module, network: nn.Module, kept: float) -> None:
     with torch.no_grad():
-        for old, new in zip(average.state_dict().values(), network.state_dict().values(), strict=True):
+        for old, new in zip(
+            average.state_dict().values(), network.state_dict().values(), strict=True
+        ):
             if old.dtype.is_floating_point:
                 old.lerp_(new, 1 - kept)
             else:
                 old.copy_(new)
 
 
-def _save(config: TrainNet, network: nn.Module, average: TopolocNet, optimizer: torch.optim.Optimizer, step: int) -> None:
+def _save(
+    config: TrainNet,
+    network: nn.Module,
+    average: TopolocNet,
+    optimizer: torch.optim.Optimizer,
+    step: int,
+) -> None:
     part = config.out / "state.part"
-    state = {"network": network.state_dict(), "average": average.state_dict(), "optimizer": optimizer.state_dict(), "step": step}
+    state = {
+        "network": network.state_dict(),
+        "average": average.state_dict(),
+        "optimizer": optimizer.state_dict(),
+        "step": step,
+    }
     torch.save(state, part)
     part.replace(config.out / "state.pt")
-    origin = {"topoloc_network": config.name, "licence": "Apache-2.0", "source": f"trained by topoloc_training.net.train, {step} steps"}
+    origin = {
+        "topoloc_network": config.name,
+        "licence": "Apache-2.0",
+        "source": f"trained by topoloc_training.net.train, {step} steps",
+    }
     export(copy.deepcopy(average).eval(), config.out / f"{config.name}.onnx", origin)
 
 
@@ -207,11 +270,23 @@ def _cached_pairs(names: str, out: Path, find: Callable[[str, str], list[Pair]])
     if not file.is_file():
         day, _, other = names.partition(":")
         pairs = find(day, other)
-        arrays = {f"{i}{part}": getattr(p, part) for i, p in enumerate(pairs) for part in ("day", "other", "day_px", "other_px")}
+        arrays = {
+            f"{i}{part}": getattr(p, part)
+            for i, p in enumerate(pairs)
+            for part in ("day", "other", "day_px", "other_px")
+        }
         np.savez(file, **arrays)
     with np.load(file) as kept:
         count = len(kept.files) // 4
-        return [Pair(str(kept[f"{i}day"]), str(kept[f"{i}other"]), kept[f"{i}day_px"], kept[f"{i}other_px"]) for i in range(count)]
+        return [
+            Pair(
+                str(kept[f"{i}day"]),
+                str(kept[f"{i}other"]),
+                kept[f"{i}day_px"],
+                kept[f"{i}other_px"],
+            )
+            for i in range(count)
+        ]
 
 
 def _side_pairs(pictures: Path, out: str, back: str) -> list[Pair]:

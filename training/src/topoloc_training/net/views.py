@@ -1,4 +1,5 @@
-"""What one step of training looks at: two views of the same points in different light, and what the teacher says of the points."""
+"""What one step of training looks at: two views of the same points in different light, and what the
+teacher says of the points."""
 
 from __future__ import annotations
 
@@ -24,11 +25,12 @@ _CLEAN = 0.3  # share of first views in unchanged light
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Two views (2, h, w) in [0, 1], the teacher's scores seen the same way and where they are to be learned. Of a sample that is not
-    taught the teacher says nothing: its points are learned of each other alone.
+    """Two views (2, h, w) in [0, 1], the teacher's scores seen the same way and where they are to
+    be learned. Of a sample that is not taught the teacher says nothing: its points are learned of
+    each other alone.
 
-    Points (2, n, 2), the teacher's descriptors of them (n, 64), whether a point lies in each view (2, n), and which points are so
-    near each other that they are no rivals (n, n).
+    Points (2, n, 2), the teacher's descriptors of them (n, 64), whether a point lies in each view
+    (2, n), and which points are so near each other that they are no rivals (n, n).
     """
 
     views: np.ndarray
@@ -47,15 +49,22 @@ KnownPair = tuple[int, int, Pair]
 
 @dataclass(frozen=True)
 class Shares:
-    """Of samples: those that are pairs in different light, pairs of views to the sides of walls that were walked along both ways, and, of
-    the other ones, those that show a picture as if it hung on such a wall."""
+    """Of samples: those that are pairs in different light, pairs of views to the sides of walls
+    that were walked along both ways, and, of the other ones, those that show a picture as if it
+    hung on such a wall."""
 
     pairs: float
     walls: float
     slants: float
 
 
-def draw_sample(lessons: Lessons, pairs: list[KnownPair], walls: list[KnownPair], shares: Shares, generator: Generator) -> Sample:
+def draw_sample(
+    lessons: Lessons,
+    pairs: list[KnownPair],
+    walls: list[KnownPair],
+    shares: Shares,
+    generator: Generator,
+) -> Sample:
     """A picture and its copy in another light, or seen from the two ends of a wall; or a pair."""
     drawn = generator.random()
     if pairs and drawn < shares.pairs:
@@ -66,25 +75,48 @@ def draw_sample(lessons: Lessons, pairs: list[KnownPair], walls: list[KnownPair]
         return replace(of_wall, is_taught=False)
     index = int(generator.integers(len(lessons.paths)))
     place = _crop(generator.uniform((0.25, 0.25), (0.75, 0.75)) * (WIDTH, HEIGHT))
-    other = _nudged(place @ _random_homography(generator, np.array([VIEW_WIDTH, VIEW_HEIGHT]) / 2, 0.8), generator)
+    other = _nudged(
+        place @ _random_homography(generator, np.array([VIEW_WIDTH, VIEW_HEIGHT]) / 2, 0.8),
+        generator,
+    )
     is_wall = generator.random() < shares.slants
-    strengths = (0.0 if generator.random() < _CLEAN else generator.random(), 0.3 + 0.7 * generator.random())
+    strengths = (
+        0.0 if generator.random() < _CLEAN else generator.random(),
+        0.3 + 0.7 * generator.random(),
+    )
     if is_wall:
         strengths = (0.4 * strengths[0], 0.4 * strengths[1])
-    views, scores, inside = _seen(lessons, [index, index], [place, other], strengths, generator, is_wall)
+    views, scores, inside = _seen(
+        lessons, [index, index], [place, other], strengths, generator, is_wall
+    )
     inside[1] = False
     points = _chosen_points(scores[0], generator)
     source = _mapped(points, place)
-    return _sample(lessons, index, source, [points, _mapped(source, np.linalg.inv(other))], views, scores, inside)
+    return _sample(
+        lessons,
+        index,
+        source,
+        [points, _mapped(source, np.linalg.inv(other))],
+        views,
+        scores,
+        inside,
+    )
 
 
 def _of_pair(
-    lessons: Lessons, known: list[KnownPair], strengths: tuple[float, float], generator: Generator, is_wall: bool = False
+    lessons: Lessons,
+    known: list[KnownPair],
+    strengths: tuple[float, float],
+    generator: Generator,
+    is_wall: bool = False,
 ) -> Sample:
-    """Of walls, most of which are bare, points are drawn where the teacher sees key points; of other pairs anywhere."""
+    """Of walls, most of which are bare, points are drawn where the teacher sees key points; of
+    other pairs anywhere."""
     first, second, pair = known[int(generator.integers(len(known)))]
     weights = (
-        _told(lessons.scores[first], pair.day_px) + _told(lessons.scores[second], pair.other_px) if is_wall else np.ones(len(pair.day_px))
+        _told(lessons.scores[first], pair.day_px) + _told(lessons.scores[second], pair.other_px)
+        if is_wall
+        else np.ones(len(pair.day_px))
     )
     places, here, there, both = _looks(pair, weights, generator)
     for _ in range(_TRIES):
@@ -93,29 +125,51 @@ def _of_pair(
         places, here, there, both = _looks(pair, weights, generator)
     candidates = both if len(both) else np.arange(len(here))
     shares = weights[candidates] / weights[candidates].sum()
-    chosen = generator.choice(candidates, NUM_POINTS, replace=len(candidates) < NUM_POINTS, p=shares)
+    chosen = generator.choice(
+        candidates, NUM_POINTS, replace=len(candidates) < NUM_POINTS, p=shares
+    )
     views, scores, inside = _seen(lessons, [first, second], places, strengths, generator)
-    return _sample(lessons, first, pair.day_px[chosen], [here[chosen], there[chosen]], views, scores, inside)
+    return _sample(
+        lessons, first, pair.day_px[chosen], [here[chosen], there[chosen]], views, scores, inside
+    )
 
 
 def _told(scores: np.ndarray, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-    """How much of a key point the teacher sees at most within two pixels of each; a little anywhere."""
+    """How much of a key point the teacher sees at most within two pixels of each; a little
+    anywhere."""
     x, y = np.rint(pixels).astype(int).T
     return cv2.dilate(np.asarray(scores), np.ones((5, 5), np.uint8))[y, x] / 255.0 + 0.02
 
 
-def _looks(pair: Pair, weights: np.ndarray, generator: Generator) -> tuple[list[np.ndarray], np.ndarray, np.ndarray, np.ndarray]:
-    """Two views around the same point: their homographies, the pair's points in each, and the numbers of those that both see."""
+def _looks(
+    pair: Pair, weights: np.ndarray, generator: Generator
+) -> tuple[list[np.ndarray], np.ndarray, np.ndarray, np.ndarray]:
+    """Two views around the same point: their homographies, the pair's points in each, and the
+    numbers of those that both see."""
     middle = int(generator.choice(len(weights), p=weights / weights.sum()))
     places = [_crop(pair.day_px[middle]), _crop(pair.other_px[middle])]
-    here, there = (_mapped(px, np.linalg.inv(place)) for px, place in zip((pair.day_px, pair.other_px), places, strict=True))
+    here, there = (
+        _mapped(px, np.linalg.inv(place))
+        for px, place in zip((pair.day_px, pair.other_px), places, strict=True)
+    )
     return places, here, there, np.flatnonzero(_within(here) & _within(there))
 
 
 def _sample(
-    lessons: Lessons, index: int, source: np.ndarray, points: list[np.ndarray], views: np.ndarray, scores: np.ndarray, inside: np.ndarray
+    lessons: Lessons,
+    index: int,
+    source: np.ndarray,
+    points: list[np.ndarray],
+    views: np.ndarray,
+    scores: np.ndarray,
+    inside: np.ndarray,
 ) -> Sample:
-    known = (source[:, 0] >= 0) & (source[:, 1] >= 0) & (source[:, 0] <= WIDTH - 1) & (source[:, 1] <= HEIGHT - 1)
+    known = (
+        (source[:, 0] >= 0)
+        & (source[:, 1] >= 0)
+        & (source[:, 0] <= WIDTH - 1)
+        & (source[:, 1] <= HEIGHT - 1)
+    )
     valid = np.array([_within(view) & known for view in points])
     x, y = source.astype(np.float32).T
     near = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2 < _NEAR**2
@@ -136,29 +190,46 @@ def _seen(
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     views, scores, inside = [], [], []
     for index, place, strength in zip(indices, places, strengths, strict=True):
-        picture = cv2.warpPerspective(lessons.pictures[index], place, size, flags=flags, borderMode=cv2.BORDER_REFLECT_101)
+        picture = cv2.warpPerspective(
+            lessons.pictures[index], place, size, flags=flags, borderMode=cv2.BORDER_REFLECT_101
+        )
         shown = picture.astype(np.float32) / 255
         if is_wall:
             shown, is_ahead_right = slanted(shown, is_ahead_right, generator), not is_ahead_right
         views.append(changed(shown, strength, generator))
-        scores.append(cv2.warpPerspective(lessons.scores[index], place, size, flags=flags).astype(np.float32) / 255)
-        inside.append(cv2.warpPerspective(np.ones((HEIGHT, WIDTH), np.uint8), place, size, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP))
+        scores.append(
+            cv2.warpPerspective(lessons.scores[index], place, size, flags=flags).astype(np.float32)
+            / 255
+        )
+        inside.append(
+            cv2.warpPerspective(
+                np.ones((HEIGHT, WIDTH), np.uint8),
+                place,
+                size,
+                flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+            )
+        )
     return np.array(views), np.array(scores), np.array(inside, bool)
 
 
 def _crop(middle: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3 3"]:
-    """Whole pixels of the source: there alone are the teacher's scores exact, for they change when a picture is scaled or turned."""
+    """Whole pixels of the source: there alone are the teacher's scores exact, for they change when
+    a picture is scaled or turned."""
     size = np.array([VIEW_WIDTH, VIEW_HEIGHT])
     x, y = np.clip(np.round(middle - size / 2), 0, np.array([WIDTH, HEIGHT]) - size)
     return np.array([[1, 0, x], [0, 1, y], [0, 0, 1.0]])
 
 
-def _random_homography(generator: Generator, middle: Float[np.ndarray, "2"], spread: float) -> Float[np.ndarray, "3 3"]:
+def _random_homography(
+    generator: Generator, middle: Float[np.ndarray, "2"], spread: float
+) -> Float[np.ndarray, "3 3"]:
     """Source pixels from a view's pixels: the view's middle comes to `middle`."""
     angle = np.deg2rad(generator.normal(0, 12)) * spread
     scale = np.exp(generator.normal(0.05, 0.3 * spread))
     cosine, sine = scale * np.cos(angle), scale * np.sin(angle)
-    to_origin = np.array([[1, 0, -(VIEW_WIDTH - 1) / 2], [0, 1, -(VIEW_HEIGHT - 1) / 2], [0, 0, 1.0]])
+    to_origin = np.array(
+        [[1, 0, -(VIEW_WIDTH - 1) / 2], [0, 1, -(VIEW_HEIGHT - 1) / 2], [0, 0, 1.0]]
+    )
     bend = generator.normal(0, 3e-4 * spread, 2)
     turn = np.array([[cosine, -sine, 0], [sine, cosine, 0], [bend[0], bend[1], 1]])
     return np.array([[1, 0, middle[0]], [0, 1, middle[1]], [0, 0, 1.0]]) @ turn @ to_origin
@@ -166,13 +237,16 @@ def _random_homography(generator: Generator, middle: Float[np.ndarray, "2"], spr
 
 def _nudged(place: Float[np.ndarray, "3 3"], generator: Generator) -> Float[np.ndarray, "3 3"]:
     """Another look at about the same: corners of the view moved by up to a sixth of its size."""
-    corners = np.array([[0, 0], [VIEW_WIDTH, 0], [VIEW_WIDTH, VIEW_HEIGHT], [0, VIEW_HEIGHT]], np.float32)
+    corners = np.array(
+        [[0, 0], [VIEW_WIDTH, 0], [VIEW_WIDTH, VIEW_HEIGHT], [0, VIEW_HEIGHT]], np.float32
+    )
     moved = corners + generator.uniform(-1 / 6, 1 / 6, (4, 2)) * (VIEW_WIDTH, VIEW_HEIGHT)
     return place @ cv2.getPerspectiveTransform(corners, moved.astype(np.float32))
 
 
 def _chosen_points(score: np.ndarray, generator: Generator) -> Float[np.ndarray, "n 2"]:
-    """Two thirds where the teacher sees key points, the rest anywhere; with fractions of a pixel."""
+    """Two thirds where the teacher sees key points, the rest anywhere; with fractions of a
+    pixel."""
     inner = score[_EDGE:-_EDGE, _EDGE:-_EDGE]
     weight = inner.ravel().astype(np.float64) + 1e-5
     flat = generator.choice(weight.size, NUM_POINTS * 2 // 3, p=weight / weight.sum())

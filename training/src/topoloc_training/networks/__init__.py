@@ -1,1 +1,2 @@
-"""Published networks of local features, written anew under their published key names, and their export to ONNX."""
+"""Published networks of local features, written anew under their published key names, and their
+export to ONNX."""

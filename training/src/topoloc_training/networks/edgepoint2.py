@@ -1,4 +1,5 @@
-"""EdgePoint2 (H. Yao et al., 2025, arXiv 2504.17280), written from its description; its weights are MIT (HITCSC/EdgePoint2)."""
+"""EdgePoint2 (H. Yao et al., 2025, arXiv 2504.17280), written from its description; its weights are
+MIT (HITCSC/EdgePoint2)."""
 
 from __future__ import annotations
 
@@ -37,7 +38,8 @@ SIZES = {
 
 
 class EdgePoint2(nn.Module):
-    """Grey picture to scores and descriptors. Levels at 1/2, 1/8 and 1/32; attributes carry the published key names."""
+    """Grey picture to scores and descriptors. Levels at 1/2, 1/8 and 1/32; attributes carry the
+    published key names."""
 
     stride = STRIDE
 
@@ -47,7 +49,9 @@ class EdgePoint2(nn.Module):
         channels = widths.half + widths.eighth + widths.coarse
         self.norm = nn.InstanceNorm2d(1)
         self.block1 = nn.Sequential(
-            ConvNormReLU(1, widths.stem, 4, 2), ConvNormReLU(widths.stem, widths.half), Residual(widths.half, widths.half)
+            ConvNormReLU(1, widths.stem, 4, 2),
+            ConvNormReLU(widths.stem, widths.half),
+            Residual(widths.half, widths.half),
         )
         self.block2 = Residual(widths.half, widths.eighth)
         self.block3 = Residual(widths.eighth, widths.coarse)
@@ -68,12 +72,19 @@ class EdgePoint2(nn.Module):
             nn.PixelShuffle(2),
         )
 
-    def forward(self, image: Float[Tensor, "b 1 h w"]) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b d h4 w4"]]:
+    def forward(
+        self, image: Float[Tensor, "b 1 h w"]
+    ) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b d h4 w4"]]:
         half = self.block1(self.norm(image))
         quarter = functional.avg_pool2d(half, 2)
         eighth = self.block2(functional.avg_pool2d(quarter, 2))
         coarse = self.block3(functional.avg_pool2d(eighth, 4))
-        descriptors = self.desc_head(torch.cat([quarter, enlarged(eighth, 2), enlarged(coarse, 8)], dim=1))
-        # A sum of 1x1 convolutions, enlarged in two steps: 16 times bilinear is not 4 times bilinear twice, so each by itself.
-        score = self.conv1(half) + enlarged(self.conv2(eighth), 4) + enlarged(self.conv3(coarse), 16)
+        descriptors = self.desc_head(
+            torch.cat([quarter, enlarged(eighth, 2), enlarged(coarse, 8)], dim=1)
+        )
+        # A sum of 1x1 convolutions, enlarged in two steps: 16 times bilinear is not 4 times
+        # bilinear twice, so each by itself.
+        score = (
+            self.conv1(half) + enlarged(self.conv2(eighth), 4) + enlarged(self.conv3(coarse), 16)
+        )
         return torch.sigmoid(self.score_head(score)), descriptors

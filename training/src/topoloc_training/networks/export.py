@@ -1,9 +1,10 @@
 """Networks of local features to ONNX, all by one contract, so that one extractor serves every kind.
 
-Input `image` (1, 1, h, w) float32, grey in [0, 1], h and w multiples of 32. Outputs `scores` (1, 1, h, w) in [0, 1] and
-`descriptors` (1, c, h/s, w/s), not of unit length: pixel (x, y) lies at ((x + 0.5) / s - 0.5, (y + 0.5) / s - 0.5) of it, or the two
-levels that these are the sum of (`lean.py`). A network may have a third, `places` (1, c, h/p, w/p), by which places are known again; its
-class then names all three as `outputs`.
+Input `image` (1, 1, h, w) float32, grey in [0, 1], h and w multiples of 32. Outputs `scores` (1, 1,
+h, w) in [0, 1] and `descriptors` (1, c, h/s, w/s), not of unit length: pixel (x, y) lies at ((x +
+0.5) / s - 0.5, (y + 0.5) / s - 0.5) of it, or the two levels that these are the sum of (`lean.py`).
+A network may have a third, `places` (1, c, h/p, w/p), by which places are known again; its class
+then names all three as `outputs`.
 """
 
 from __future__ import annotations
@@ -44,12 +45,14 @@ def build_network(kind: str, tensors: dict[str, Tensor]) -> nn.Module:
 
 
 def export(network: nn.Module, path: Path, properties: dict[str, str]) -> None:
-    """Write the network as ONNX, atomically. `properties` join `topoloc_version` in the file's metadata."""
+    """Write the network as ONNX, atomically. `properties` join `topoloc_version` in the file's
+    metadata."""
     outputs = getattr(network, "outputs", ("scores", "descriptors"))
     axes = {name: {2: f"h_{name}", 3: f"w_{name}"} for name in outputs}
     with replaced_file(path) as part:
         with warnings.catch_warnings():
-            # The exporter by tracing is called old, but needs no further package and gives the smaller graph.
+            # The exporter by tracing is called old, but needs no further package and gives the
+            # smaller graph.
             warnings.simplefilter("ignore")
             torch.onnx.export(
                 network,
@@ -68,7 +71,8 @@ def export(network: nn.Module, path: Path, properties: dict[str, str]) -> None:
 
 
 def convert(kind: str, weights: bytes, target: Path, properties: dict[str, str]) -> None:
-    """Published weights (the bytes of their file) to ONNX. Called by `topoloc weights` through an entry point.
+    """Published weights (the bytes of their file) to ONNX. Called by `topoloc weights` through an
+    entry point.
 
     Raises:
         ValueError: as `build_network`.

@@ -1,4 +1,5 @@
-"""A network that was exported, to learn on: its file's weights in the modules that they came from."""
+"""A network that was exported, to learn on: its file's weights in the modules that they came
+from."""
 
 from __future__ import annotations
 
@@ -16,8 +17,8 @@ _OUTPUT = "/Conv_output_0"
 def load_exported(network: nn.Module, path: Path) -> None:
     """Give a network the weights of the file that it was exported to.
 
-    Batch norms were folded into the convolutions before them, so here they do nothing but add what these had as a bias: they must stay as
-    they are while the network learns on.
+    Batch norms were folded into the convolutions before them, so here they do nothing but add what
+    these had as a bias: they must stay as they are while the network learns on.
 
     Raises:
         ValueError: the file holds another network.

@@ -8,9 +8,19 @@ from torch.nn import functional
 
 
 class ConvNormReLU(nn.Module):
-    """A convolution without bias, batch norm, ReLU. `affine`: whether the norm has a scale and a shift of its own."""
+    """A convolution without bias, batch norm, ReLU. `affine`: whether the norm has a scale and a
+    shift of its own."""
 
-    def __init__(self, inputs: int, outputs: int, kernel: int = 3, stride: int = 1, padding: int = 1, groups: int = 1, affine: bool = True):
+    def __init__(
+        self,
+        inputs: int,
+        outputs: int,
+        kernel: int = 3,
+        stride: int = 1,
+        padding: int = 1,
+        groups: int = 1,
+        affine: bool = True,
+    ):
         super().__init__()
         convolution = nn.Conv2d(inputs, outputs, kernel, stride, padding, groups=groups, bias=False)
         self.layer = nn.Sequential(convolution, nn.BatchNorm2d(outputs, affine=affine), nn.ReLU())
@@ -20,7 +30,8 @@ class ConvNormReLU(nn.Module):
 
 
 class Residual(nn.Module):
-    """Two 3x3 convolutions with batch norm beside the identity, or a 1x1 convolution where the number of channels changes."""
+    """Two 3x3 convolutions with batch norm beside the identity, or a 1x1 convolution where the
+    number of channels changes."""
 
     def __init__(self, inputs: int, outputs: int):
         super().__init__()
@@ -39,4 +50,6 @@ class Residual(nn.Module):
 
 def enlarged(features: Float[Tensor, "b c h w"], factor: int) -> Float[Tensor, "b c h2 w2"]:
     """Bilinearly, pixel centres at half numbers."""
-    return functional.interpolate(features, scale_factor=factor, mode="bilinear", align_corners=False)
+    return functional.interpolate(
+        features, scale_factor=factor, mode="bilinear", align_corners=False
+    )

@@ -1,8 +1,10 @@
 """What a finished network need not do: an exported graph that gives the same in less time.
 
-Two rewritings, both of what is linear. A normalisation after a sum of convolutions becomes a part of their weights. And where descriptors
-are a sum of an enlarged coarse level and a 1x1 convolution of a fine one, the two levels are given instead of the sum, pixel after pixel
-(`topoloc.features.dense.TwoLevels`): asked for at a thousand key points, the sum costs next to nothing; everywhere, a tenth of the network.
+Two rewritings, both of what is linear. A normalisation after a sum of convolutions becomes a part
+of their weights. And where descriptors are a sum of an enlarged coarse level and a 1x1 convolution
+of a fine one, the two levels are given instead of the sum, pixel after pixel
+(`topoloc.features.dense.TwoLevels`): asked for at a thousand key points, the sum costs next to
+nothing; everywhere, a tenth of the network.
 """
 
 from __future__ import annotations
@@ -25,20 +27,29 @@ def _fold_normalization(graph: onnx.GraphProto) -> None:
         if not convolutions:
             continue
         scale, bias, mean, variance = (_values(graph, name) for name in norm.input[1:])
-        epsilon = next((attribute.f for attribute in norm.attribute if attribute.name == "epsilon"), 1e-5)
+        epsilon = next(
+            (attribute.f for attribute in norm.attribute if attribute.name == "epsilon"), 1e-5
+        )
         factor = scale / np.sqrt(variance + epsilon)
         for k, convolution in enumerate(convolutions):
             weights, own_bias = (_values(graph, name) for name in convolution.input[1:3])
             _set_values(graph, convolution.input[1], weights * factor[:, None, None, None])
-            _set_values(graph, convolution.input[2], own_bias * factor + (bias - mean * factor if k == 0 else 0.0))
+            _set_values(
+                graph,
+                convolution.input[2],
+                own_bias * factor + (bias - mean * factor if k == 0 else 0.0),
+            )
         for node in graph.node:
-            node.input[:] = [norm.input[0] if name == norm.output[0] else name for name in node.input]
+            node.input[:] = [
+                norm.input[0] if name == norm.output[0] else name for name in node.input
+            ]
         graph.node.remove(norm)
         _drop_unused(graph)
 
 
 def _summed_convolutions(graph: onnx.GraphProto, name: str) -> list[onnx.NodeProto]:
-    """Those, with a bias, that a value is the sum of, enlarged or not; none where it is anything else."""
+    """Those, with a bias, that a value is the sum of, enlarged or not; none where it is anything
+    else."""
     node = _maker(graph, name)
     if node is not None and node.op_type == "Add":
         parts = [_summed_convolutions(graph, one) for one in node.input]
@@ -52,18 +63,28 @@ def _give_levels(graph: onnx.GraphProto) -> None:
     total = _maker(graph, "descriptors")
     if total is None or total.op_type != "Add":
         return
-    parts = {node.op_type: node for node in (_maker(graph, name) for name in total.input) if node is not None}
+    parts = {
+        node.op_type: node
+        for node in (_maker(graph, name) for name in total.input)
+        if node is not None
+    }
     if set(parts) != {"Resize", "Conv"}:
         return
     enlarged, fine = parts["Resize"], parts["Conv"]
     coarse = _maker(graph, enlarged.input[0])
     weights, bias = (_values(graph, name) for name in fine.input[1:3])
-    is_plain = weights.shape[2:] == (1, 1) and weights.shape[1] % 4 == 0 and _doubles(graph, enlarged)
+    is_plain = (
+        weights.shape[2:] == (1, 1) and weights.shape[1] % 4 == 0 and _doubles(graph, enlarged)
+    )
     if coarse is None or coarse.op_type != "Conv" or len(coarse.input) < 3 or not is_plain:
         return
     # what enlarges adds up to one everywhere, so one bias may stand for both
     _set_values(graph, coarse.input[2], _values(graph, coarse.input[2]) + bias)
-    graph.initializer.append(numpy_helper.from_array(np.ascontiguousarray(weights[:, :, 0, 0].T, np.float32), "fine_of_both"))
+    graph.initializer.append(
+        numpy_helper.from_array(
+            np.ascontiguousarray(weights[:, :, 0, 0].T, np.float32), "fine_of_both"
+        )
+    )
     last = [0, 2, 3, 1]  # numbers of one pixel beside each other
     graph.node.extend(
         [
@@ -75,9 +96,16 @@ def _give_levels(graph: onnx.GraphProto) -> None:
     for node in (total, enlarged, fine):
         graph.node.remove(node)
     size, narrow = weights.shape[:2]
-    levels = {"coarse": [1, "h_coarse", "w_coarse", size], "fine": [1, "h_fine", "w_fine", narrow], "fine_weights": [narrow, size]}
+    levels = {
+        "coarse": [1, "h_coarse", "w_coarse", size],
+        "fine": [1, "h_fine", "w_fine", narrow],
+        "fine_weights": [narrow, size],
+    }
     outputs = [output for output in graph.output if output.name != "descriptors"]
-    outputs[1:1] = [helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, shape) for name, shape in levels.items()]
+    outputs[1:1] = [
+        helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, shape)
+        for name, shape in levels.items()
+    ]
     del graph.output[:]
     graph.output.extend(outputs)
     _drop_unused(graph)
@@ -86,9 +114,17 @@ def _give_levels(graph: onnx.GraphProto) -> None:
 def _doubles(graph: onnx.GraphProto, resize: onnx.NodeProto) -> bool:
     """Does it enlarge to twice the rows and columns, bilinear, with the borders where they are?"""
     attributes = {attribute.name: attribute.s.decode() for attribute in resize.attribute}
-    mode, coordinates = attributes.get("mode"), attributes.get("coordinate_transformation_mode", "half_pixel")
+    mode, coordinates = (
+        attributes.get("mode"),
+        attributes.get("coordinate_transformation_mode", "half_pixel"),
+    )
     scales = _maker(graph, resize.input[2]) if len(resize.input) == 3 else None
-    if mode != "linear" or not coordinates.endswith("half_pixel") or scales is None or scales.op_type != "Constant":
+    if (
+        mode != "linear"
+        or not coordinates.endswith("half_pixel")
+        or scales is None
+        or scales.op_type != "Constant"
+    ):
         return False
     return numpy_helper.to_array(scales.attribute[0].t).tolist() == [1.0, 1.0, 2.0, 2.0]
 

@@ -1,4 +1,5 @@
-"""What the corridor's walls and floor are covered with: pictures as long as the wall, so that no metre is the copy of another."""
+"""What the corridor's walls and floor are covered with: pictures as long as the wall, so that no
+metre is the copy of another."""
 
 from __future__ import annotations
 
@@ -14,8 +15,11 @@ _Layer = Float32[np.ndarray, "h w"]
 _Painting = Float32[np.ndarray, "h w 3"]
 
 
-def wall_paint(rng: np.random.Generator, length: float, height: float, tint: Color, dado: Color | None = None) -> Picture:
-    """A painted wall: nearly bare, with roller marks, faint stains, mended spots and the scuffs of trolleys and chairs.
+def wall_paint(
+    rng: np.random.Generator, length: float, height: float, tint: Color, dado: Color | None = None
+) -> Picture:
+    """A painted wall: nearly bare, with roller marks, faint stains, mended spots and the scuffs of
+    trolleys and chairs.
 
     Args:
         dado: colour of the lower part, up to 1.1 m, in washable paint.
@@ -35,14 +39,21 @@ def wall_paint(rng: np.random.Generator, length: float, height: float, tint: Col
     return _picture(paint)
 
 
-def linoleum_floor(rng: np.random.Generator, length: float, width: float, field: Color, border: Color) -> Picture:
-    """Marbled sheets laid lengthwise between two darker borders, welded every few metres, with the black marks of soles."""
+def linoleum_floor(
+    rng: np.random.Generator, length: float, width: float, field: Color, border: Color
+) -> Picture:
+    """Marbled sheets laid lengthwise between two darker borders, welded every few metres, with the
+    black marks of soles."""
     size = _pixels(width), _pixels(length)
     floor = np.broadcast_to(np.asarray(field, np.float32), (*size, 3)).copy()
     edge = _pixels(0.22)
     floor[:edge] = border
     floor[-edge:] = border
-    marble = cv2.resize(fractal_noise(rng, (size[0], size[1] // 5), coarsest_px=7.0, octaves=4), size[::-1], interpolation=cv2.INTER_LINEAR)
+    marble = cv2.resize(
+        fractal_noise(rng, (size[0], size[1] // 5), coarsest_px=7.0, octaves=4),
+        size[::-1],
+        interpolation=cv2.INTER_LINEAR,
+    )
     floor *= (1.0 + 0.05 * marble + 0.02 * _stains(rng, size))[..., None]
     veins = np.clip(np.abs(marble) < 0.06, 0, 1).astype(np.float32)
     floor *= (1.0 - 0.06 * cv2.GaussianBlur(veins, (0, 0), 0.8))[..., None]
@@ -51,7 +62,9 @@ def linoleum_floor(rng: np.random.Generator, length: float, width: float, field:
             column = _pixels(float(x))
             floor[:, column : column + 1] *= 0.84
     floor[size[0] // 2 : size[0] // 2 + 1] *= 0.88
-    _blend(floor, _scuffs(rng, size, int(3 * length), low=0.1, high=width - 0.1), (0.12, 0.11, 0.11))
+    _blend(
+        floor, _scuffs(rng, size, int(3 * length), low=0.1, high=width - 0.1), (0.12, 0.11, 0.11)
+    )
     return _picture(floor)
 
 
@@ -64,7 +77,9 @@ def paving(rng: np.random.Generator, slabs: int = 6) -> Picture:
     for i in range(slabs):
         for image in (ground, ground.T):
             image[i * slab : i * slab + 2] *= 0.55
-    return _picture(np.repeat(ground[..., None], 3, axis=2) * np.array([1.0, 0.98, 0.94], np.float32))
+    return _picture(
+        np.repeat(ground[..., None], 3, axis=2) * np.array([1.0, 0.98, 0.94], np.float32)
+    )
 
 
 def lawn(rng: np.random.Generator) -> Picture:
@@ -89,27 +104,50 @@ def _blend(painting: _Painting, mask: _Layer, color: Color) -> None:
 
 def _stains(rng: np.random.Generator, size: tuple[int, int]) -> _Layer:
     """Clouds from hand's size up to a metre, made small and enlarged: they have no fine grain."""
-    small = fractal_noise(rng, (max(size[0] // 6, 8), max(size[1] // 6, 8)), coarsest_px=18.0, octaves=4)
+    small = fractal_noise(
+        rng, (max(size[0] // 6, 8), max(size[1] // 6, 8)), coarsest_px=18.0, octaves=4
+    )
     return cv2.resize(small, size[::-1], interpolation=cv2.INTER_CUBIC)
 
 
-def _scuffs(rng: np.random.Generator, size: tuple[int, int], count: int, low: float, high: float) -> _Layer:
+def _scuffs(
+    rng: np.random.Generator, size: tuple[int, int], count: int, low: float, high: float
+) -> _Layer:
     """Short, nearly level strokes between two distances from the lower edge (metres)."""
     mask = np.zeros(size, np.float32)
     for _ in range(count):
         x, y = rng.uniform(0, size[1]), size[0] - PIXELS_PER_METRE * rng.uniform(low, high)
         reach, slope = PIXELS_PER_METRE * rng.exponential(0.09), rng.normal(0.0, 0.18)
         end = (int(x + reach), int(y + slope * reach))
-        cv2.line(mask, (int(x), int(y)), end, float(rng.uniform(0.08, 0.4)), int(rng.integers(1, 3)), cv2.LINE_AA)
+        cv2.line(
+            mask,
+            (int(x), int(y)),
+            end,
+            float(rng.uniform(0.08, 0.4)),
+            int(rng.integers(1, 3)),
+            cv2.LINE_AA,
+        )
     return cv2.GaussianBlur(mask, (0, 0), 0.7)
 
 
 def _hand_marks(rng: np.random.Generator, size: tuple[int, int], count: int) -> _Layer:
     mask = np.zeros(size, np.float32)
     for _ in range(count):
-        centre = int(rng.uniform(0, size[1])), int(size[0] - PIXELS_PER_METRE * rng.uniform(0.8, 1.6))
+        centre = (
+            int(rng.uniform(0, size[1])),
+            int(size[0] - PIXELS_PER_METRE * rng.uniform(0.8, 1.6)),
+        )
         axes = int(rng.uniform(4, 16)), int(rng.uniform(3, 9))
-        cv2.ellipse(mask, centre, axes, float(rng.uniform(0, 180)), 0, 360, float(rng.uniform(0.02, 0.08)), -1)
+        cv2.ellipse(
+            mask,
+            centre,
+            axes,
+            float(rng.uniform(0, 180)),
+            0,
+            360,
+            float(rng.uniform(0.02, 0.08)),
+            -1,
+        )
     return cv2.GaussianBlur(mask, (0, 0), 4.0)
 
 
@@ -122,4 +160,10 @@ def _mend(rng: np.random.Generator, paint: _Painting, length: float) -> None:
         paint[y : y + h, x : x + w] *= rng.uniform(0.97, 1.02)
     for _ in range(int(2 * length)):
         x, y = int(rng.uniform(0, width)), int(height - PIXELS_PER_METRE * rng.uniform(1.1, 2.2))
-        cv2.circle(paint, (x, y), 1, [float(v) * 0.75 for v in paint[min(y, height - 1), min(x, width - 1)]], -1)
+        cv2.circle(
+            paint,
+            (x, y),
+            1,
+            [float(v) * 0.75 for v in paint[min(y, height - 1), min(x, width - 1)]],
+            -1,
+        )

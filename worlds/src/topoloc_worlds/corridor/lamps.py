@@ -29,7 +29,10 @@ _AT_NIGHT = 0.3
 
 def ceiling_lamps(seed: int, condition: Condition, fittings: Fittings) -> list[Surface]:
     """All lamps, lit or not, each with the colour of its own tubes."""
-    lit, warmth = _lit_lamps(seed, condition), rng_of(seed, "corridor/lamps").uniform(0.0, 1.0, len(_lamp_sites()))
+    lit, warmth = (
+        _lit_lamps(seed, condition),
+        rng_of(seed, "corridor/lamps").uniform(0.0, 1.0, len(_lamp_sites())),
+    )
     level = _AT_NIGHT if condition.daylight <= 0.0 else 1.0
     surfaces = []
     for number, (x, y, lengthwise) in enumerate(_lamp_sites()):
@@ -39,14 +42,19 @@ def ceiling_lamps(seed: int, condition: Condition, fittings: Fittings) -> list[S
 
 
 def _lit_lamps(seed: int, condition: Condition) -> set[int]:
-    """Which lamps burn: spread over the loop, by day away from the windows; of all of them, two are broken."""
+    """Which lamps burn: spread over the loop, by day away from the windows; of all of them, two are
+    broken."""
     sites = _lamp_sites()
     rng = rng_of(seed, f"corridor/lit lamps/{condition.name}")
     wanted = round(condition.lamps * len(sites))
     if wanted >= len(sites):
-        return set(range(len(sites))) - {int(number) for number in rng.choice(len(sites), 2, replace=False)}
+        return set(range(len(sites))) - {
+            int(number) for number in rng.choice(len(sites), 2, replace=False)
+        }
     by_day = condition.daylight > 0.05
-    useful = [number for number, (x, y, _) in enumerate(sites) if not (by_day and _by_windows(x, y))]
+    useful = [
+        number for number, (x, y, _) in enumerate(sites) if not (by_day and _by_windows(x, y))
+    ]
     bounds = np.linspace(0, len(useful), min(wanted, len(useful)) + 1).round().astype(int)
     return {useful[int(rng.integers(low, high))] for low, high in pairwise(bounds.tolist())}
 

@@ -1,7 +1,8 @@
-"""The corridor's plan: eight walls round a closed loop, what opens in them, and how things are put up on a wall.
+"""The corridor's plan: eight walls round a closed loop, what opens in them, and how things are put
+up on a wall.
 
-Everything on a wall is built in the wall's own frame: x to the right as one stands before it, y into the wall, z up; the
-corridor is where y < 0.
+Everything on a wall is built in the wall's own frame: x to the right as one stands before it, y
+into the wall, z up; the corridor is where y < 0.
 """
 
 from __future__ import annotations
@@ -45,7 +46,8 @@ class Opening:
 
 @dataclass(frozen=True)
 class Wall:
-    """One side of one wing. `start` is its left end on the floor, `yaw` turns the world's x axis along it."""
+    """One side of one wing. `start` is its left end on the floor, `yaw` turns the world's x axis
+    along it."""
 
     name: str
     start: tuple[float, float]
@@ -64,7 +66,8 @@ _BARE_WALLS = (
     Wall("north inner", (LENGTH - EAST, WIDTH - NORTH), np.pi, LENGTH - WEST - EAST),
     Wall("west inner", (WEST, WIDTH - NORTH), -np.pi / 2, WIDTH - SOUTH - NORTH),
 )
-# Stretches with doors, as (from, to, number); the rest of a wall is bare. Rooms stand open in some arrangements.
+# Stretches with doors, as (from, to, number); the rest of a wall is bare. Rooms stand open in some
+# arrangements.
 _DOORS = {
     "south outer": ((2.6, 9.6, 2), (17.4, 23.4, 2)),
     "east outer": ((1.4, 4.6, 1), (13.6, 16.4, 1)),
@@ -75,7 +78,14 @@ _DOORS = {
     "north inner": ((0.8, 5.2, 2), (15.6, 19.6, 1)),
     "west inner": ((0.8, 4.0, 1), (8.4, 12.4, 2)),
 }
-_ROOMS = {("south outer", 1), ("south outer", 3), ("north outer", 0), ("west outer", 2), ("east outer", 1), ("north outer", 3)}
+_ROOMS = {
+    ("south outer", 1),
+    ("south outer", 3),
+    ("north outer", 0),
+    ("west outer", 2),
+    ("east outer", 1),
+    ("north outer", 3),
+}
 _OTHERS = {
     "south inner": (Opening("windows", 4.6, 13.4, 2.62),),
     "east outer": (Opening("windows", 5.4, 12.6, 2.62),),
@@ -100,15 +110,25 @@ def _openings(name: str, seed: int) -> tuple[Opening, ...]:
             slack = max(0.0, 0.5 * (pitch - DOOR_WIDTH) - 0.25)
             centre = start + (i + 0.5) * pitch + rng.uniform(-slack, slack)
             kind = "room" if (name, number) in _ROOMS else "door"
-            openings.append(Opening(kind, centre - DOOR_WIDTH / 2, centre + DOOR_WIDTH / 2, DOOR_HEIGHT))
+            openings.append(
+                Opening(kind, centre - DOOR_WIDTH / 2, centre + DOOR_WIDTH / 2, DOOR_HEIGHT)
+            )
             number += 1
     return tuple(sorted(openings, key=lambda opening: opening.left))
 
 
 def stretches(wall: Wall) -> list[tuple[float, float]]:
     """The pieces of wall between its openings, over the whole height."""
-    ends = [0.0, *(x for opening in wall.openings for x in (opening.left, opening.right)), wall.length]
-    return [(left, right) for left, right in zip(ends[::2], ends[1::2], strict=True) if right - left > 1e-6]
+    ends = [
+        0.0,
+        *(x for opening in wall.openings for x in (opening.left, opening.right)),
+        wall.length,
+    ]
+    return [
+        (left, right)
+        for left, right in zip(ends[::2], ends[1::2], strict=True)
+        if right - left > 1e-6
+    ]
 
 
 def wall_mesh(wall: Wall) -> Mesh:
@@ -117,7 +137,9 @@ def wall_mesh(wall: Wall) -> Mesh:
     pieces += [(opening.left, opening.right, opening.top, HEIGHT) for opening in wall.openings]
     meshes = []
     for left, right, low, high in pieces:
-        corners = np.array([[left, 0.0, high], [left, 0.0, low], [right, 0.0, low], [right, 0.0, high]])
+        corners = np.array(
+            [[left, 0.0, high], [left, 0.0, low], [right, 0.0, low], [right, 0.0, high]]
+        )
         uv = np.column_stack([corners[:, 0] / wall.length, 1.0 - corners[:, 2] / HEIGHT])
         meshes.append(Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32), uv))
     return on_wall_mesh(wall, join(meshes))
@@ -125,7 +147,10 @@ def wall_mesh(wall: Wall) -> Mesh:
 
 def skirting_mesh(wall: Wall) -> Mesh:
     """The board along the foot of the wall."""
-    return on_wall_mesh(wall, join([box((left, -0.012, 0.0), (right, 0.0, 0.09)) for left, right in stretches(wall)]))
+    return on_wall_mesh(
+        wall,
+        join([box((left, -0.012, 0.0), (right, 0.0, 0.09)) for left, right in stretches(wall)]),
+    )
 
 
 def on_wall_mesh(wall: Wall, mesh: Mesh, x: float = 0.0) -> Mesh:

@@ -1,4 +1,5 @@
-"""Pictures in the prints and on the screens of a world: views, paintings, diagrams; each another one, sizes (height, width) in pixels."""
+"""Pictures in the prints and on the screens of a world: views, paintings, diagrams; each another
+one, sizes (height, width) in pixels."""
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ _LANDS = ((0.3, 0.45, 0.2), (0.45, 0.38, 0.25), (0.2, 0.3, 0.4), (0.55, 0.5, 0.4
 
 
 def photograph(rng: np.random.Generator, size: tuple[int, int]) -> Picture:
-    """A view: mountains or a town behind water, under a sky; or patches of colour such as modern painters make."""
+    """A view: mountains or a town behind water, under a sky; or patches of colour such as modern
+    painters make."""
     kind = rng.integers(0, 3)
     if kind == 2:
         return painting(rng, size)
@@ -26,8 +28,12 @@ def photograph(rng: np.random.Generator, size: tuple[int, int]) -> Picture:
     clouds = np.clip(fractal_noise(rng, size, w / 6), 0, 2)[..., None] * (1 - share)
     picture = (top * (1 - share) + low * share) * (1 - 0.3 * clouds) + 0.25 * clouds
     for layer in range(3):
-        ridge = horizon - h * (0.28 - 0.09 * layer) * np.abs(fractal_noise(rng, (1, w), w / (4 + 3 * layer), 5)[0]) * (0.6 if kind else 1.0)
-        shade = np.array(_LANDS[int(rng.integers(0, 4))]) * (0.45 + 0.2 * layer) + low * (0.4 - 0.2 * layer)
+        ridge = horizon - h * (0.28 - 0.09 * layer) * np.abs(
+            fractal_noise(rng, (1, w), w / (4 + 3 * layer), 5)[0]
+        ) * (0.6 if kind else 1.0)
+        shade = np.array(_LANDS[int(rng.integers(0, 4))]) * (0.45 + 0.2 * layer) + low * (
+            0.4 - 0.2 * layer
+        )
         land = shade + (0.03 if kind else 0.07) * fractal_noise(rng, size, 12)[..., None]
         if kind:
             house = max(w // 22, 2)
@@ -36,7 +42,9 @@ def photograph(rng: np.random.Generator, size: tuple[int, int]) -> Picture:
         below = np.arange(h)[:, None] > np.resize(ridge, w)[None]
         picture[below] = land[below]
     mirrored = picture[horizon - 1 :: -1][: h - horizon]
-    picture[horizon : horizon + len(mirrored)] = mirrored * 0.7 + 0.03 * smooth_noise(rng, mirrored.shape[:2], 2.0)[..., None]
+    picture[horizon : horizon + len(mirrored)] = (
+        mirrored * 0.7 + 0.03 * smooth_noise(rng, mirrored.shape[:2], 2.0)[..., None]
+    )
     return np.clip(picture * 255, 0, 255).astype(np.uint8)
 
 
@@ -51,7 +59,12 @@ def painting(rng: np.random.Generator, size: tuple[int, int]) -> Picture:
             cv2.circle(picture, centre, reach, to_bytes(vivid(rng)), -1, cv2.LINE_AA)
         else:
             corners = np.array(centre) + rng.integers(-reach, reach + 1, (4, 2))
-            cv2.fillPoly(picture, [cv2.convexHull(corners.astype(np.int32))], to_bytes(vivid(rng)), cv2.LINE_AA)
+            cv2.fillPoly(
+                picture,
+                [cv2.convexHull(corners.astype(np.int32))],
+                to_bytes(vivid(rng)),
+                cv2.LINE_AA,
+            )
     return picture
 
 
@@ -69,12 +82,29 @@ def plot(rng: np.random.Generator, size: tuple[int, int], paper: Color = PAPER) 
         for k in range(num):
             left = x0 + (x1 - x0) * k // num
             top = y1 - int((y1 - y0) * rng.uniform(0.1, 0.95))
-            cv2.rectangle(picture, (left + 2, top), (left + (x1 - x0) * 7 // (10 * num), y1), to_bytes(vivid(rng)), -1)
+            cv2.rectangle(
+                picture,
+                (left + 2, top),
+                (left + (x1 - x0) * 7 // (10 * num), y1),
+                to_bytes(vivid(rng)),
+                -1,
+            )
     else:
         xs = np.linspace(0, 1, 60)
         for _ in range(rng.integers(2, 5)):
-            ys = 0.5 + 0.4 * np.sin(xs * rng.uniform(1, 9) + rng.uniform(0, 6)) * np.exp(-xs * rng.uniform(0, 3))
+            ys = 0.5 + 0.4 * np.sin(xs * rng.uniform(1, 9) + rng.uniform(0, 6)) * np.exp(
+                -xs * rng.uniform(0, 3)
+            )
             curve = np.column_stack([x0 + xs * (x1 - x0), y1 - ys * (y1 - y0)]).astype(np.int32)
-            cv2.polylines(picture, [curve], False, to_bytes(vivid(rng)), max(1, h // 90), cv2.LINE_AA)
-    cv2.polylines(picture, [np.array([[x0, y0], [x0, y1], [x1, y1]], np.int32)], False, ink, max(1, h // 120), cv2.LINE_AA)
+            cv2.polylines(
+                picture, [curve], False, to_bytes(vivid(rng)), max(1, h // 90), cv2.LINE_AA
+            )
+    cv2.polylines(
+        picture,
+        [np.array([[x0, y0], [x0, y1], [x1, y1]], np.int32)],
+        False,
+        ink,
+        max(1, h // 120),
+        cv2.LINE_AA,
+    )
     return picture

@@ -1,7 +1,8 @@
-"""The hospital's plan: eight walls round a closed loop, cut into bays of a metre; most are panelled, two bays together hold a door.
+"""The hospital's plan: eight walls round a closed loop, cut into bays of a metre; most are
+panelled, two bays together hold a door.
 
-Everything on a wall is built in the wall's own frame, as in the corridor: x to the right as one stands before it, y into the wall,
-z up; the passage is where y < 0.
+Everything on a wall is built in the wall's own frame, as in the corridor: x to the right as one
+stands before it, y into the wall, z up; the passage is where y < 0.
 """
 
 from __future__ import annotations
@@ -49,13 +50,24 @@ class PanelledWall:
     doors: tuple[int, ...]
 
     def panelled(self) -> list[tuple[float, int]]:
-        """Stretches of panels between the doors: metres from the wall's left end, and number of bays."""
-        ends = [0, *(bay for door in self.doors for bay in (door, door + _DOOR_BAYS)), self.num_bays]
-        return [(self.first + BAY * a, b - a) for a, b in zip(ends[::2], ends[1::2], strict=True) if b > a]
+        """Stretches of panels between the doors: metres from the wall's left end, and number of
+        bays."""
+        ends = [
+            0,
+            *(bay for door in self.doors for bay in (door, door + _DOOR_BAYS)),
+            self.num_bays,
+        ]
+        return [
+            (self.first + BAY * a, b - a)
+            for a, b in zip(ends[::2], ends[1::2], strict=True)
+            if b > a
+        ]
 
     def door_bays(self) -> list[tuple[float, float]]:
         """From and to, metres from the wall's left end."""
-        return [(self.first + BAY * door, self.first + BAY * (door + _DOOR_BAYS)) for door in self.doors]
+        return [
+            (self.first + BAY * door, self.first + BAY * (door + _DOOR_BAYS)) for door in self.doors
+        ]
 
 
 _WALLS = (
@@ -76,7 +88,9 @@ def walls_of(seed: int) -> dict[str, PanelledWall]:
     for wall in _WALLS:
         num_bays = _SHORT if wall.name.startswith(("east", "west")) else _LONG
         first = WING if wall.name.endswith("outer") else 0.0
-        walls[wall.name] = PanelledWall(wall, first, num_bays, _doors(rng_of(seed, f"hospital/doors/{wall.name}"), num_bays))
+        walls[wall.name] = PanelledWall(
+            wall, first, num_bays, _doors(rng_of(seed, f"hospital/doors/{wall.name}"), num_bays)
+        )
     return walls
 
 
@@ -90,7 +104,8 @@ def _doors(rng: np.random.Generator, num_bays: int) -> tuple[int, ...]:
 
 
 def lamp_sites() -> list[tuple[float, float, bool]]:
-    """Places (x, y) of the ceiling lamps, one a bay and one in each square, and whether they lie along x."""
+    """Places (x, y) of the ceiling lamps, one a bay and one in each square, and whether they lie
+    along x."""
     (x0, y0), (x1, _), (_, y1), _ = LOOP
     along_x, along_y = (WING + BAY * (np.arange(number) + 0.5) for number in (_LONG, _SHORT))
     sites = [(float(x), y, True) for y in (y0, y1) for x in along_x]

@@ -1,7 +1,9 @@
-"""What rays meet first: the surface's own colour, its own light, how far it is. No noise in any of it.
+"""What rays meet first: the surface's own colour, its own light, how far it is. No noise in any of
+it.
 
-A picture is `albedo * light + emission` at every pixel, and what `sheen` mirrors. Albedo and emission carry all textures, edges
-and screens, and cost one ray a sample; the light on the surfaces may be traced beforehand, or filtered, without blurring these.
+A picture is `albedo * light + emission` at every pixel, and what `sheen` mirrors. Albedo and
+emission carry all textures, edges and screens, and cost one ray a sample; the light on the surfaces
+may be traced beforehand, or filtered, without blurring these.
 """
 
 from __future__ import annotations
@@ -15,28 +17,40 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from topoloc_worlds.rendering.first_hits_kernels import NUM_COLUMNS, NUM_NUMBERS, NUM_VECTORS, flat, follow, let_through
+from topoloc_worlds.rendering.first_hits_kernels import (
+    NUM_COLUMNS,
+    NUM_NUMBERS,
+    NUM_VECTORS,
+    flat,
+    follow,
+    let_through,
+)
 
 _SKY_HEIGHT = 0.3
-"""Air gets clear at this height, as a share of the range of sight: sky seen upwards keeps its clouds in haze."""
+"""Air gets clear at this height, as a share of the range of sight: sky seen upwards keeps its
+clouds in haze."""
 
 
 @dataclass(frozen=True, eq=False)
 class FirstHits:
-    """One entry a ray. Where a ray goes through glass or a gap between leaves, it is what lies behind, weighted by what gets through."""
+    """One entry a ray. Where a ray goes through glass or a gap between leaves, it is what lies
+    behind, weighted by what gets through."""
 
     albedo: Float32[np.ndarray, "n 3"]
-    """Share of light sent back to all sides: the colour of matt surfaces, and of what mirrors too roughly to show a picture."""
+    """Share of light sent back to all sides: the colour of matt surfaces, and of what mirrors too
+    roughly to show a picture."""
     emission: Float32[np.ndarray, "n 3"]
     """Light of lamps, screens and the sky."""
     normal: Float32[np.ndarray, "n 3"]
-    """Unit normal of the first surface that is not glass (of the pane, where only sky is behind it); 0 in the sky."""
+    """Unit normal of the first surface that is not glass (of the pane, where only sky is behind
+    it); 0 in the sky."""
     position: Float32[np.ndarray, "n 3"]
     """Where that surface is met, relative to the camera, in world axes."""
     distance: Float32[np.ndarray, " n"]
     """Metres to the first surface, glass included; infinite in the sky."""
     sheen: Float32[np.ndarray, "n 3"]
-    """Share of light reflected as by a mirror: by metal, by a coat of varnish or water, by a pane of glass."""
+    """Share of light reflected as by a mirror: by metal, by a coat of varnish or water, by a pane
+    of glass."""
     sheen_normal: Float32[np.ndarray, "n 3"]
     """Unit normal of the first surface with a sheen; 0 where there is none."""
     sheen_distance: Float32[np.ndarray, " n"]
@@ -52,9 +66,13 @@ class FirstHits:
 
 
 def find_first_hits(
-    scene: Any, origin: Float64[np.ndarray, "*n 3"], directions_world: Float64[np.ndarray, "n 3"], haze_range: float = inf
+    scene: Any,
+    origin: Float64[np.ndarray, "*n 3"],
+    directions_world: Float64[np.ndarray, "n 3"],
+    haze_range: float = inf,
 ) -> FirstHits:
-    """Follow one ray a row of `directions_world` (unit vectors) from `origin`, one for all or one for each."""
+    """Follow one ray a row of `directions_world` (unit vectors) from `origin`, one for all or one
+    for each."""
     import drjit as dr
     import mitsuba as mi
 
@@ -62,13 +80,23 @@ def find_first_hits(
     rays = np.ascontiguousarray(directions_world, np.float32)
     if not dr.is_jit_v(mi.Float):
         starts = np.broadcast_to(start, rays.shape)
-        each = [flat(follow(scene, mi.Point3f(o), mi.Vector3f(d))) for o, d in zip(starts, rays, strict=True)]
+        each = [
+            flat(follow(scene, mi.Point3f(o), mi.Vector3f(d)))
+            for o, d in zip(starts, rays, strict=True)
+        ]
         rows = np.array(each, np.float32).reshape(-1, NUM_COLUMNS)
-        columns = [*np.split(rows[:, :-NUM_NUMBERS], NUM_VECTORS, axis=1), *rows[:, -NUM_NUMBERS:].T]
+        columns = [
+            *np.split(rows[:, :-NUM_NUMBERS], NUM_VECTORS, axis=1),
+            *rows[:, -NUM_NUMBERS:].T,
+        ]
     else:
         origins = mi.Point3f(np.ascontiguousarray(start.T))
-        dr.make_opaque(origins)  # a value that the code would contain costs a compilation for every picture
-        found = _recorded_in(scene, follow)(scene, origins, mi.Vector3f(np.ascontiguousarray(rays.T)))
+        dr.make_opaque(
+            origins
+        )  # a value that the code would contain costs a compilation for every picture
+        found = _recorded_in(scene, follow)(
+            scene, origins, mi.Vector3f(np.ascontiguousarray(rays.T))
+        )
         dr.eval(*found)  # all in one kernel
         columns = [_array(part, len(rays)) for part in found]
     return _first_hits(columns, rays, haze_range)
@@ -82,8 +110,11 @@ def _array(part: Any, count: int) -> Float32[np.ndarray, "n *width"]:
     return np.ascontiguousarray(array.T)
 
 
-def open_towards(scene: Any, points: Float64[np.ndarray, "n 3"], direction_world: Float64[np.ndarray, "3"]) -> Float32[np.ndarray, " n"]:
-    """Share of the light from infinitely far away that reaches each point, through panes and between leaves. Vectorised variants only."""
+def open_towards(
+    scene: Any, points: Float64[np.ndarray, "n 3"], direction_world: Float64[np.ndarray, "3"]
+) -> Float32[np.ndarray, " n"]:
+    """Share of the light from infinitely far away that reaches each point, through panes and
+    between leaves. Vectorised variants only."""
     import mitsuba as mi
 
     starts = mi.Point3f(np.ascontiguousarray(points.T, np.float32))
@@ -92,28 +123,50 @@ def open_towards(scene: Any, points: Float64[np.ndarray, "n 3"], direction_world
 
 
 def forget_recordings() -> None:
-    """To be called before a scene is loaded: it may come to lie where another one was, and be taken for that by its recording."""
+    """To be called before a scene is loaded: it may come to lie where another one was, and be taken
+    for that by its recording."""
     _recorded.cache_clear()
 
 
 def _recorded_in(scene: Any, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Recorded, but for an empty scene: there Dr.Jit misses the surfaces of any other scene that is still alive, and refuses."""
+    """Recorded, but for an empty scene: there Dr.Jit misses the surfaces of any other scene that is
+    still alive, and refuses."""
     return _recorded(function) if len(scene.shapes()) else function
 
 
 @cache
 def _recorded(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The same, but Python runs it only once for a scene: its kernels are recorded and launched again, which saves half of the time."""
+    """The same, but Python runs it only once for a scene: its kernels are recorded and launched
+    again, which saves half of the time."""
     import drjit as dr
 
-    # Where lamps are weighed anew for each picture (light that is not known beforehand), a recording serves but one picture.
+    # Where lamps are weighed anew for each picture (light that is not known beforehand), a
+    # recording serves but one picture.
     return dr.freeze(function, limit=8, warn_after=1_000_000_000)
 
 
-def _first_hits(columns: list[np.ndarray], rays: Float32[np.ndarray, "n 3"], haze_range: float) -> FirstHits:
-    albedo, emission, normal, position, sheen, sheen_normal, distance, mirror, sheen_distance, roughness, sky = columns
+def _first_hits(
+    columns: list[np.ndarray], rays: Float32[np.ndarray, "n 3"], haze_range: float
+) -> FirstHits:
+    (
+        albedo,
+        emission,
+        normal,
+        position,
+        sheen,
+        sheen_normal,
+        distance,
+        mirror,
+        sheen_distance,
+        roughness,
+        sky,
+    ) = columns
     distance = np.where(distance > 0.0, distance, np.float32(inf))
-    through = np.minimum(distance, _SKY_HEIGHT * haze_range / np.maximum(rays[:, 2], 1e-3)) if haze_range < inf else distance
+    through = (
+        np.minimum(distance, _SKY_HEIGHT * haze_range / np.maximum(rays[:, 2], 1e-3))
+        if haze_range < inf
+        else distance
+    )
     clear = np.exp(-through / haze_range) if haze_range < inf else np.ones_like(distance)
     return FirstHits(
         albedo=albedo,
@@ -131,7 +184,9 @@ def _first_hits(columns: list[np.ndarray], rays: Float32[np.ndarray, "n 3"], haz
     )
 
 
-def _towards_eye(normal: Float32[np.ndarray, "n 3"], rays: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
+def _towards_eye(
+    normal: Float32[np.ndarray, "n 3"], rays: Float32[np.ndarray, "n 3"]
+) -> Float32[np.ndarray, "n 3"]:
     away = np.einsum("ni,ni->n", normal, rays) > 0.0
     normal[away] *= -1.0
     return normal

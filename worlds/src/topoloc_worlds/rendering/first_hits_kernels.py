@@ -1,10 +1,19 @@
-"""The loop along a ray, in Mitsuba's own arrays or numbers: the part of `first_hits` that runs once a ray where nothing is vectorised."""
+"""The loop along a ray, in Mitsuba's own arrays or numbers: the part of `first_hits` that runs once
+a ray where nothing is vectorised."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from topoloc_worlds.rendering.mitsuba_scene import GLASS, KIND, LIGHT, METAL, POLISHED, ROUGHNESS, TINT
+from topoloc_worlds.rendering.mitsuba_scene import (
+    GLASS,
+    KIND,
+    LIGHT,
+    METAL,
+    POLISHED,
+    ROUGHNESS,
+    TINT,
+)
 
 NUM_VECTORS, NUM_NUMBERS = 6, 5
 NUM_COLUMNS = 3 * NUM_VECTORS + NUM_NUMBERS
@@ -16,7 +25,8 @@ _FACE_ON = 0.04
 
 
 def follow(scene: Any, origin: Any, direction: Any) -> tuple[Any, ...]:
-    """The loop along a ray, or along an array of rays, as the variant has it. Returns `NUM_COLUMNS` numbers a ray."""
+    """The loop along a ray, or along an array of rays, as the variant has it. Returns `NUM_COLUMNS`
+    numbers a ray."""
     import drjit as dr
     import mitsuba as mi
 
@@ -24,9 +34,22 @@ def follow(scene: Any, origin: Any, direction: Any) -> tuple[Any, ...]:
     nothing, black = dr.zeros(mi.Float, width), dr.zeros(mi.Color3f, width)
     vector = dr.zeros(mi.Vector3f, width)
     ray = mi.Ray3f(mi.Point3f(origin + vector), mi.Vector3f(direction))
-    colours = (black, mi.Color3f(black), vector, mi.Vector3f(vector), mi.Color3f(black), mi.Vector3f(vector))
+    colours = (
+        black,
+        mi.Color3f(black),
+        vector,
+        mi.Vector3f(vector),
+        mi.Color3f(black),
+        mi.Vector3f(vector),
+    )
     found = (*colours, *(mi.Float(nothing) for _ in range(5)))
-    state = (nothing == 0.0, mi.UInt32(dr.zeros(mi.UInt32, width)), ray, mi.Float(nothing + 1.0), *found)
+    state = (
+        nothing == 0.0,
+        mi.UInt32(dr.zeros(mi.UInt32, width)),
+        ray,
+        mi.Float(nothing + 1.0),
+        *found,
+    )
 
     def go_on(active: Any, layer: Any, ray: Any, through: Any, *found: Any) -> tuple[Any, ...]:
         si = scene.ray_intersect(ray, active)
@@ -67,7 +90,8 @@ def _add_surface(
     sheen_distance: Any,
     roughness: Any,
 ) -> tuple[Any, tuple[Any, ...]]:
-    """What one surface adds to what was found along a ray so far; also the share of light that passes it."""
+    """What one surface adds to what was found along a ray so far; also the share of light that
+    passes it."""
     import drjit as dr
     import mitsuba as mi
 
@@ -77,7 +101,8 @@ def _add_surface(
     share = dr.select(hit, through * (1.0 - gap), 0.0)
     cosine = dr.dot(si.n, ray.d)
     own, mirrored, rough = _answers(si, hit, bsdf, kind, cosine)
-    # One mirror a ray shows its picture: the first that is smooth enough. All others only send light back.
+    # One mirror a ray shows its picture: the first that is smooth enough. All others only send
+    # light back.
     shown = hit & (rough < _TOO_ROUGH) & (sheen_distance == 0.0) & (dr.max(share * mirrored) > 0.0)
     albedo += share * dr.select(shown, own, own + mirrored)
     sheen = dr.select(shown, share * mirrored, sheen)
@@ -94,11 +119,23 @@ def _add_surface(
     normal = dr.select(guide, mi.Vector3f(si.n), normal)
     position = dr.select(guide, path, position)
     mirror = dr.select(solid & ((kind == GLASS) | (kind == METAL)), 1.0, mirror)
-    return gap, (albedo, emission, normal, position, sheen, sheen_normal, distance, mirror, sheen_distance, roughness)
+    return gap, (
+        albedo,
+        emission,
+        normal,
+        position,
+        sheen,
+        sheen_normal,
+        distance,
+        mirror,
+        sheen_distance,
+        roughness,
+    )
 
 
 def _answers(si: Any, hit: Any, bsdf: Any, kind: Any, cosine: Any) -> tuple[Any, Any, Any]:
-    """Shares of light that a surface sends back to all sides, and that it mirrors; and how rough a mirror it is."""
+    """Shares of light that a surface sends back to all sides, and that it mirrors; and how rough a
+    mirror it is."""
     import drjit as dr
     import mitsuba as mi
 
@@ -108,13 +145,16 @@ def _answers(si: Any, hit: Any, bsdf: Any, kind: Any, cosine: Any) -> tuple[Any,
     own = dr.select(kind == POLISHED, own * (1.0 - coat), own)
     own = dr.select((kind == METAL) | (kind == GLASS) | (kind == LIGHT), black, own)
     mirrored = dr.select(kind == POLISHED, mi.Color3f(coat), black)
-    mirrored = dr.select(kind == METAL, mi.Color3f(si.shape.eval_attribute_3(TINT, si, hit)), mirrored)
+    mirrored = dr.select(
+        kind == METAL, mi.Color3f(si.shape.eval_attribute_3(TINT, si, hit)), mirrored
+    )
     mirrored = dr.select(kind == GLASS, mi.Color3f(1.0), mirrored)
     return own, mirrored, si.shape.eval_attribute_1(ROUGHNESS, si, hit)
 
 
 def let_through(scene: Any, ray: Any) -> Any:
-    """Share of light that comes through along each ray of an array: 0 where something solid is in the way."""
+    """Share of light that comes through along each ray of an array: 0 where something solid is in
+    the way."""
     import drjit as dr
     import mitsuba as mi
 
@@ -127,10 +167,19 @@ def let_through(scene: Any, ray: Any) -> Any:
         return met & (gap > 0.01) & (layer < _MAX_LAYERS), layer + 1, behind, left * gap
 
     width = dr.width(ray)
-    state = (dr.full(mi.Bool, True, width), dr.zeros(mi.UInt32, width), ray, dr.ones(mi.Float, width))
+    state = (
+        dr.full(mi.Bool, True, width),
+        dr.zeros(mi.UInt32, width),
+        ray,
+        dr.ones(mi.Float, width),
+    )
     return dr.while_loop(state, lambda active, *_: active, go_on)[3]
 
 
 def flat(parts: tuple[Any, ...]) -> list[float]:
     """All numbers of what `follow` found along one ray."""
-    return [float(component) for part in parts for component in (part if hasattr(part, "x") else (part,))]
+    return [
+        float(component)
+        for part in parts
+        for component in (part if hasattr(part, "x") else (part,))
+    ]

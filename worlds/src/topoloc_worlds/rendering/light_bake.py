@@ -22,7 +22,8 @@ class LightBakeConfig:
     Attributes:
         finest: metres, the smallest cells.
         angle: size of cells over their distance.
-        rays: rays from each viewpoint into all directions; what they meet is where light is traced to.
+        rays: rays from each viewpoint into all directions; what they meet is where light is traced
+            to.
         paths: light paths to each such point.
         bounces: reflections on the way from a lamp to that point.
     """
@@ -46,21 +47,31 @@ def bake_light(
 
     Args:
         light_scene: from `light_scene.load_light_scene`.
-        weigh_lights: how often each light is to be asked for what is seen from a viewpoint, by the name of Mitsuba's parameter.
+        weigh_lights: how often each light is to be asked for what is seen from a viewpoint, by the
+            name of Mitsuba's parameter.
         progress: called with ("light", done, total).
     """
     import mitsuba as mi
 
     parameters = mi.traverse(light_scene)
     gatherer = LightGatherer(grid)
-    integrator = mi.load_dict({"type": "path", "max_depth": config.bounces, "rr_depth": 100, "hide_emitters": True})
+    integrator = mi.load_dict(
+        {"type": "path", "max_depth": config.bounces, "rr_depth": 100, "hide_emitters": True}
+    )
     sampler = mi.load_dict({"type": "independent"})
     for number, viewpoint in enumerate(viewpoints):
         for name, weight in weigh_lights(viewpoint).items():
             parameters[name] = weight
         parameters.update()
         sampler.seed(number, config.rays * config.paths)
-        points, normals, found = _light_seen(light_scene, integrator, sampler, viewpoint, _directions(number, config.rays), config.paths)
+        points, normals, found = _light_seen(
+            light_scene,
+            integrator,
+            sampler,
+            viewpoint,
+            _directions(number, config.rays),
+            config.paths,
+        )
         gatherer.add(points, normals, found)
         progress("light", number + 1, len(viewpoints))
     return gatherer.cells()
@@ -76,9 +87,15 @@ def _directions(number: int, count: int) -> Float64[np.ndarray, "n 3"]:
 
 
 def _light_seen(
-    scene: Any, integrator: Any, sampler: Any, viewpoint: Float64[np.ndarray, "3"], directions: Float64[np.ndarray, "n 3"], paths: int
+    scene: Any,
+    integrator: Any,
+    sampler: Any,
+    viewpoint: Float64[np.ndarray, "3"],
+    directions: Float64[np.ndarray, "n 3"],
+    paths: int,
 ) -> tuple[Float64[np.ndarray, "m 3"], Float32[np.ndarray, "m 3"], FoundLight]:
-    """Points that rays meet, their normals, and the light there: irradiance over pi, the sun's own left out."""
+    """Points that rays meet, their normals, and the light there: irradiance over pi, the sun's own
+    left out."""
     import drjit as dr
     import mitsuba as mi
 

@@ -1,4 +1,5 @@
-"""Light found once for a world and a condition serves all recordings there: it is kept among the user's cache files."""
+"""Light found once for a world and a condition serves all recordings there: it is kept among the
+user's cache files."""
 
 from __future__ import annotations
 
@@ -24,9 +25,14 @@ _MAX_FILES = 24
 
 
 def cached_light(
-    scene: Scene, viewpoints: Float64[np.ndarray, "n 3"], config: LightBakeConfig, grid: CellGrid, bake: Callable[[], LightCells]
+    scene: Scene,
+    viewpoints: Float64[np.ndarray, "n 3"],
+    config: LightBakeConfig,
+    grid: CellGrid,
+    bake: Callable[[], LightCells],
 ) -> LightCells:
-    """The light of a scene from the cache, else from `bake`, then kept. Without a writable cache it is traced every time."""
+    """The light of a scene from the cache, else from `bake`, then kept. Without a writable cache it
+    is traced every time."""
     try:
         file = cache_folder() / "light" / f"{_digest(scene, viewpoints, config)}.npz"
     except RuntimeError:  # the user has no home
@@ -48,7 +54,9 @@ def _keep(file: Path, cells: LightCells) -> None:
         with part.open("wb") as stream:
             np.savez(stream, keys=cells.keys, light=cells.light)
         os.replace(part, file)
-        for old in sorted(file.parent.glob("*.npz"), key=lambda path: path.stat().st_mtime)[:-_MAX_FILES]:
+        for old in sorted(file.parent.glob("*.npz"), key=lambda path: path.stat().st_mtime)[
+            :-_MAX_FILES
+        ]:
             old.unlink()
     except OSError:  # it is only a shortcut
         with suppress(OSError):
@@ -57,7 +65,9 @@ def _keep(file: Path, cells: LightCells) -> None:
 
 def _digest(scene: Scene, viewpoints: Float64[np.ndarray, "n 3"], config: LightBakeConfig) -> str:
     """Of all that the light depends on."""
-    digest = hashlib.sha256(repr((_FORMAT, version("mitsuba"), asdict(config), viewpoints.shape)).encode())
+    digest = hashlib.sha256(
+        repr((_FORMAT, version("mitsuba"), asdict(config), viewpoints.shape)).encode()
+    )
     digest.update(np.ascontiguousarray(viewpoints).tobytes())
     if scene.sky is not None:
         digest.update(np.ascontiguousarray(scene.sky.radiance).tobytes())
@@ -71,7 +81,9 @@ def _digest(scene: Scene, viewpoints: Float64[np.ndarray, "n 3"], config: LightB
         for picture in (material.color, material.opacity):
             if isinstance(picture, np.ndarray):
                 if id(picture) not in pictures:
-                    pictures[id(picture)] = hashlib.sha256(np.ascontiguousarray(picture).tobytes()).hexdigest()
+                    pictures[id(picture)] = hashlib.sha256(
+                        np.ascontiguousarray(picture).tobytes()
+                    ).hexdigest()
                 digest.update(pictures[id(picture)].encode())
             else:
                 digest.update(repr(picture).encode())

@@ -1,8 +1,10 @@
-"""The light that falls on the surfaces of a world, kept in small cells of space: found once, used by every picture.
+"""The light that falls on the surfaces of a world, kept in small cells of space: found once, used
+by every picture.
 
-What lamps, sky and walls send to a matt surface is the same from wherever it is seen. So it is traced once for each cell that
-can be seen from where cameras will be (after Ward et al., *A ray tracing solution for diffuse interreflection*, 1988), with as
-many paths as it takes, and pictures have no noise of their own. Direct sunlight, whose shadows are sharp, is not in the cells.
+What lamps, sky and walls send to a matt surface is the same from wherever it is seen. So it is
+traced once for each cell that can be seen from where cameras will be (after Ward et al., *A ray
+tracing solution for diffuse interreflection*, 1988), with as many paths as it takes, and pictures
+have no noise of their own. Direct sunlight, whose shadows are sharp, is not in the cells.
 """
 
 from __future__ import annotations
@@ -23,10 +25,12 @@ _ENOUGH_SHARP, _ENOUGH_SOFT = 10.0, 400.0
 
 @dataclass(frozen=True, eq=False)
 class CellGrid:
-    """How space is divided: cells of `finest` metres near `viewpoints`, growing with the distance so that they appear equally large.
+    """How space is divided: cells of `finest` metres near `viewpoints`, growing with the distance
+    so that they appear equally large.
 
     Attributes:
-        frame: x and y of the corner of `distances`, height of the cameras, metres a pixel of `distances`.
+        frame: x and y of the corner of `distances`, height of the cameras, metres a pixel of
+            `distances`.
         distances: from a place (row y, column x) to the nearest viewpoint, metres.
         finest: size of the smallest cells, metres.
         angle: size of a cell over its distance.
@@ -40,7 +44,8 @@ class CellGrid:
 
 @dataclass(frozen=True, eq=False)
 class LightCells:
-    """Mean light in each cell that was seen: irradiance over pi, so that a matt surface sends back albedo times light."""
+    """Mean light in each cell that was seen: irradiance over pi, so that a matt surface sends back
+    albedo times light."""
 
     grid: CellGrid
     keys: Int64[np.ndarray, " n"]
@@ -61,8 +66,9 @@ def divide_space(viewpoints: Float64[np.ndarray, "n 3"], finest: float, angle: f
 
 @dataclass(frozen=True, eq=False)
 class FoundLight:
-    """Irradiance over pi at each of n points. `sharp` is that of lamps, with shadows and little noise; `soft` that of the sky and of
-    all surfaces, which is noisy and changes slowly from place to place."""
+    """Irradiance over pi at each of n points. `sharp` is that of lamps, with shadows and little
+    noise; `soft` that of the sky and of all surfaces, which is noisy and changes slowly from place
+    to place."""
 
     sharp: Float32[np.ndarray, "n 3"]
     soft: Float32[np.ndarray, "n 3"]
@@ -76,7 +82,12 @@ class LightGatherer:
         self._keys = np.empty(0, np.int64)
         self._sums = np.empty((0, 7))
 
-    def add(self, points: Float64[np.ndarray, "n 3"], normals: Float32[np.ndarray, "n 3"], found: FoundLight) -> None:
+    def add(
+        self,
+        points: Float64[np.ndarray, "n 3"],
+        normals: Float32[np.ndarray, "n 3"],
+        found: FoundLight,
+    ) -> None:
         """Light found at points on surfaces."""
         g = self._grid
         keys = kernels.keys_of(points, normals, g.frame, g.distances, g.finest, g.angle)
@@ -85,10 +96,13 @@ class LightGatherer:
         self._sums = _sum_rows(np.concatenate([self._sums, rows]), where.ravel(), len(self._keys))
 
     def cells(self) -> LightCells:
-        """All that was collected, smoothed where it was little; coarser cells are the means of the finer ones."""
+        """All that was collected, smoothed where it was little; coarser cells are the means of the
+        finer ones."""
         keys, table = self._keys, kernels.hash_table(self._keys)
         counts = self._sums[:, 6].astype(np.float32)
-        sharp, soft = ((self._sums[:, k : k + 3] / self._sums[:, 6:]).astype(np.float32) for k in (0, 3))
+        sharp, soft = (
+            (self._sums[:, k : k + 3] / self._sums[:, 6:]).astype(np.float32) for k in (0, 3)
+        )
         sharp, _ = kernels.smooth(keys, sharp, counts, table, _ENOUGH_SHARP, 1)
         trusted = counts
         for step in (1, 2, 4):
@@ -97,26 +111,47 @@ class LightGatherer:
         return light_cells(self._grid, keys, light)
 
 
-def light_cells(grid: CellGrid, keys: Int64[np.ndarray, " n"], light: Float32[np.ndarray, "n 3"]) -> LightCells:
+def light_cells(
+    grid: CellGrid, keys: Int64[np.ndarray, " n"], light: Float32[np.ndarray, "n 3"]
+) -> LightCells:
     """Cells ready to be looked up."""
     return LightCells(grid, keys, light, kernels.hash_table(keys))
 
 
-def light_at(cells: LightCells, points: Float64[np.ndarray, "n 3"], normals: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
-    """Light that falls on surfaces at `points` (world) with unit `normals` towards the side that is seen."""
+def light_at(
+    cells: LightCells, points: Float64[np.ndarray, "n 3"], normals: Float32[np.ndarray, "n 3"]
+) -> Float32[np.ndarray, "n 3"]:
+    """Light that falls on surfaces at `points` (world) with unit `normals` towards the side that is
+    seen."""
     g = cells.grid
     ambient = cells.light.mean(axis=0) if len(cells.light) else np.zeros(3, np.float32)
-    return kernels.look_up(points, normals, cells.keys, cells.light, cells.table, g.frame, g.distances, g.finest, g.angle, ambient)
+    return kernels.look_up(
+        points,
+        normals,
+        cells.keys,
+        cells.light,
+        cells.table,
+        g.frame,
+        g.distances,
+        g.finest,
+        g.angle,
+        ambient,
+    )
 
 
-def _sum_rows(rows: Float64[np.ndarray, "n columns"], where: Int64[np.ndarray, " n"], count: int) -> Float64[np.ndarray, "k columns"]:
+def _sum_rows(
+    rows: Float64[np.ndarray, "n columns"], where: Int64[np.ndarray, " n"], count: int
+) -> Float64[np.ndarray, "k columns"]:
     return np.column_stack([np.bincount(where, column, count) for column in rows.T])
 
 
 def _with_coarser(
-    keys: Int64[np.ndarray, " n"], light: Float32[np.ndarray, "n 3"], counts: Float32[np.ndarray, " n"]
+    keys: Int64[np.ndarray, " n"],
+    light: Float32[np.ndarray, "n 3"],
+    counts: Float32[np.ndarray, " n"],
 ) -> tuple[Int64[np.ndarray, " m"], Float32[np.ndarray, "m 3"]]:
-    """With a pyramid above: whoever looks at a spot that no sample met finds the light around it."""
+    """With a pyramid above: whoever looks at a spot that no sample met finds the light around
+    it."""
     all_keys, all_light = [keys], [light]
     sums = np.column_stack([light * counts[:, None], counts]).astype(np.float64)
     for level in range(kernels.COARSEST + 2):

@@ -1,4 +1,5 @@
-"""Compiled loops of `light_cells`: from a point on a surface to its cell, and the light between cells."""
+"""Compiled loops of `light_cells`: from a point on a surface to its cell, and the light between
+cells."""
 
 from __future__ import annotations
 
@@ -22,7 +23,10 @@ def _side(normal):
 
 @njit(cache=True, inline="always")
 def _key(level, ix, iy, iz, side):
-    return (((level << 17 | ((ix + _BIAS) & _MASK)) << 17 | ((iy + _BIAS) & _MASK)) << 17 | ((iz + _BIAS) & _MASK)) << 5 | side
+    return (
+        ((level << 17 | ((ix + _BIAS) & _MASK)) << 17 | ((iy + _BIAS) & _MASK)) << 17
+        | ((iz + _BIAS) & _MASK)
+    ) << 5 | side
 
 
 @njit(cache=True, inline="always")
@@ -54,7 +58,11 @@ def keys_of(points, normals, frame, distances, finest, angle):
     for i in prange(len(points)):
         level = _level(points[i], frame, distances, finest, angle)
         size = finest * (1 << level)
-        ix, iy, iz = int(np.floor(points[i, 0] / size)), int(np.floor(points[i, 1] / size)), int(np.floor(points[i, 2] / size))
+        ix, iy, iz = (
+            int(np.floor(points[i, 0] / size)),
+            int(np.floor(points[i, 1] / size)),
+            int(np.floor(points[i, 2] / size)),
+        )
         keys[i] = _key(level, ix, iy, iz, _side(normals[i]))
     return keys
 
@@ -76,7 +84,8 @@ def hash_table(keys):
 
 @njit(cache=True, parallel=True)
 def look_up(points, normals, keys, light, table, frame, distances, finest, angle, ambient):
-    """Light at points on surfaces, between the middles of the cells around; from coarser cells where there is none. (n, 3)."""
+    """Light at points on surfaces, between the middles of the cells around; from coarser cells
+    where there is none. (n, 3)."""
     found = np.empty((len(points), 3), np.float32)
     for i in prange(len(points)):
         side = _side(normals[i])
@@ -84,7 +93,11 @@ def look_up(points, normals, keys, light, table, frame, distances, finest, angle
         total, r, g, b = 0.0, 0.0, 0.0, 0.0
         while level <= COARSEST + 2 and total < 1e-3:
             size = finest * (1 << level)
-            x, y, z = points[i, 0] / size - 0.5, points[i, 1] / size - 0.5, points[i, 2] / size - 0.5
+            x, y, z = (
+                points[i, 0] / size - 0.5,
+                points[i, 1] / size - 0.5,
+                points[i, 2] / size - 0.5,
+            )
             ix, iy, iz = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
             total, r, g, b = 0.0, 0.0, 0.0, 0.0
             for corner in range(8):
@@ -106,13 +119,18 @@ def look_up(points, normals, keys, light, table, frame, distances, finest, angle
 
 @njit(cache=True, parallel=True)
 def smooth(keys, light, counts, table, enough, step):
-    """Cells with few samples take from those `step` cells away, of the same side and size. Returns light (n, 3) and counts (n,)."""
+    """Cells with few samples take from those `step` cells away, of the same side and size. Returns
+    light (n, 3) and counts (n,)."""
     result = np.empty_like(light)
     trusted = np.empty_like(counts)
     for row in prange(len(keys)):
         key = keys[row]
         side, level = key & 31, key >> 56
-        iz, iy, ix = (key >> 5 & _MASK) - _BIAS, (key >> 22 & _MASK) - _BIAS, (key >> 39 & _MASK) - _BIAS
+        iz, iy, ix = (
+            (key >> 5 & _MASK) - _BIAS,
+            (key >> 22 & _MASK) - _BIAS,
+            (key >> 39 & _MASK) - _BIAS,
+        )
         share = enough / (enough + counts[row])
         total = counts[row]
         r, g, b = light[row, 0] * total, light[row, 1] * total, light[row, 2] * total
@@ -122,7 +140,11 @@ def smooth(keys, light, counts, table, enough, step):
                     steps = abs(dx) + abs(dy) + abs(dz)
                     if steps == 0:
                         continue
-                    other = _find(table, keys, _key(level, ix + step * dx, iy + step * dy, iz + step * dz, side))
+                    other = _find(
+                        table,
+                        keys,
+                        _key(level, ix + step * dx, iy + step * dy, iz + step * dz, side),
+                    )
                     if other == _EMPTY:
                         continue
                     weight = counts[other] * share * 0.5 ** (steps - 1)
@@ -142,6 +164,10 @@ def parents_of(keys):
     for row in range(len(keys)):
         key = keys[row]
         side, level = key & 31, key >> 56
-        iz, iy, ix = (key >> 5 & _MASK) - _BIAS, (key >> 22 & _MASK) - _BIAS, (key >> 39 & _MASK) - _BIAS
+        iz, iy, ix = (
+            (key >> 5 & _MASK) - _BIAS,
+            (key >> 22 & _MASK) - _BIAS,
+            (key >> 39 & _MASK) - _BIAS,
+        )
         parents[row] = _key(level + 1, ix >> 1, iy >> 1, iz >> 1, side)
     return parents

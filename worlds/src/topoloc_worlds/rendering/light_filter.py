@@ -1,8 +1,10 @@
-"""Noise out of the light that falls on surfaces: averaged along each surface, across no edge and no shadow's border.
+"""Noise out of the light that falls on surfaces: averaged along each surface, across no edge and no
+shadow's border.
 
-An edge-avoiding a-trous wavelet filter (Dammertz et al., HPG 2010) guided by normals and planes, with the brightness' own
-variance as the measure of what is a shadow and what is noise (Schied et al., *Spatiotemporal variance-guided filtering*, 2017).
-The variance comes from two pictures of the same view with independent noise.
+An edge-avoiding a-trous wavelet filter (Dammertz et al., HPG 2010) guided by normals and planes,
+with the brightness' own variance as the measure of what is a shadow and what is noise (Schied et
+al., *Spatiotemporal variance-guided filtering*, 2017). The variance comes from two pictures of the
+same view with independent noise.
 """
 
 from __future__ import annotations
@@ -21,7 +23,9 @@ _DARKEST = 2e-3
 
 _COARSE_LEVELS = 2
 _ANY_CONTRAST = 1e12
-Guides = tuple[Float32[np.ndarray, "3 h w"], Float32[np.ndarray, "3 h w"], Float32[np.ndarray, "h w"]]
+Guides = tuple[
+    Float32[np.ndarray, "3 h w"], Float32[np.ndarray, "3 h w"], Float32[np.ndarray, "h w"]
+]
 """Normals, positions, and how far off its plane a pixel's surface reaches."""
 State = tuple[Float32[np.ndarray, "3 h w"], Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]
 """Light, how much it can be trusted, and the variance of its brightness."""
@@ -33,10 +37,13 @@ class LightFilterConfig:
 
     Attributes:
         levels: passes; each doubles the reach, which starts at one pixel.
-        mirror_levels: passes where a mirror or a pane shows what lies elsewhere, which normals and planes know nothing of.
+        mirror_levels: passes where a mirror or a pane shows what lies elsewhere, which normals and
+            planes know nothing of.
         contrast: brightness that is still noise, in standard deviations of the noise.
-        flatness: how far from a pixel's plane a point may lie, as a share of its distance to the camera.
-        firefly: light above this many times the mean around it, and above this many times the other picture's, is cut off.
+        flatness: how far from a pixel's plane a point may lie, as a share of its distance to the
+            camera.
+        firefly: light above this many times the mean around it, and above this many times the other
+            picture's, is cut off.
     """
 
     levels: int = 5
@@ -63,43 +70,88 @@ def filter_light(
         mirror: pixels where only the first `mirror_levels` passes apply.
     """
     reflecting = np.maximum(albedo, _DARKEST)
-    first, second = (_without_fireflies(picture / reflecting, other / reflecting, config) for picture, other in (radiance, radiance[::-1]))
+    first, second = (
+        _without_fireflies(picture / reflecting, other / reflecting, config)
+        for picture, other in (radiance, radiance[::-1])
+    )
     light = np.ascontiguousarray((0.5 * (first + second)).transpose(2, 0, 1))
     difference = 0.5 * (first - second).sum(axis=2)
     weight = albedo.mean(axis=2) + np.float32(_DARKEST)
     squared = difference * difference
     variance = np.maximum(cv2.blur(squared * weight, (7, 7)) / cv2.blur(weight, (7, 7)), squared)
-    normals, positions = (np.ascontiguousarray(picture.transpose(2, 0, 1)) for picture in (normal, position))
-    reach = np.maximum(np.float32(config.flatness) * np.linalg.norm(position, axis=2), 1e-4).astype(np.float32)
+    normals, positions = (
+        np.ascontiguousarray(picture.transpose(2, 0, 1)) for picture in (normal, position)
+    )
+    reach = np.maximum(np.float32(config.flatness) * np.linalg.norm(position, axis=2), 1e-4).astype(
+        np.float32
+    )
     state = (light, weight, variance)
     guides = (normals, positions, reach)
     still = np.zeros_like(weight)
     coarse = state
-    for level in range(_COARSE_LEVELS):  # what to compare at first: single pixels are too noisy for that
+    for level in range(
+        _COARSE_LEVELS
+    ):  # what to compare at first: single pixels are too noisy for that
         coarse = _spread(coarse, coarse, guides, still, 2**level, _ANY_CONTRAST)
     for level in range(config.levels):
         if level == config.mirror_levels:
             still = mirror.astype(np.float32)
-        state = _spread(state, coarse if level < _COARSE_LEVELS else state, guides, still, 2**level, config.contrast)
+        state = _spread(
+            state,
+            coarse if level < _COARSE_LEVELS else state,
+            guides,
+            still,
+            2**level,
+            config.contrast,
+        )
     return np.ascontiguousarray(state[0].transpose(1, 2, 0))
 
 
-def _spread(state: State, compared: State, guides: Guides, still: Float32[np.ndarray, "h w"], step: int, contrast: float) -> State:
+def _spread(
+    state: State,
+    compared: State,
+    guides: Guides,
+    still: Float32[np.ndarray, "h w"],
+    step: int,
+    contrast: float,
+) -> State:
     light, weight, variance = state
-    brightness, doubt = compared[0].sum(axis=0), np.maximum(cv2.GaussianBlur(compared[2], (3, 3), 0), compared[2])
+    brightness, doubt = (
+        compared[0].sum(axis=0),
+        np.maximum(cv2.GaussianBlur(compared[2], (3, 3), 0), compared[2]),
+    )
     normal, position, reach = guides
     out = (np.empty_like(light), np.empty_like(weight), np.empty_like(variance))
     spread_light(
-        light, brightness, weight, variance, doubt, normal, position, reach, still, step, np.float32(contrast**2), out[0], out[1], out[2]
+        light,
+        brightness,
+        weight,
+        variance,
+        doubt,
+        normal,
+        position,
+        reach,
+        still,
+        step,
+        np.float32(contrast**2),
+        out[0],
+        out[1],
+        out[2],
     )
     return out
 
 
 def _without_fireflies(
-    light: Float32[np.ndarray, "h w 3"], other: Float32[np.ndarray, "h w 3"], config: LightFilterConfig
+    light: Float32[np.ndarray, "h w 3"],
+    other: Float32[np.ndarray, "h w 3"],
+    config: LightFilterConfig,
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Rare paths that found a lamp by luck, seen in one of two pictures only, cut down to the brightness around them."""
+    """Rare paths that found a lamp by luck, seen in one of two pictures only, cut down to the
+    brightness around them."""
     brightness, brightness_other = light.sum(axis=2), other.sum(axis=2)
     around = cv2.blur(np.minimum(brightness, brightness_other), (7, 7))
     limit = np.float32(config.firefly) * np.maximum(around, brightness_other) + np.float32(1e-6)
-    return light * np.minimum(1.0, limit / np.maximum(brightness, 1e-12)).astype(np.float32)[:, :, None]
+    return (
+        light
+        * np.minimum(1.0, limit / np.maximum(brightness, 1e-12)).astype(np.float32)[:, :, None]
+    )

@@ -1,4 +1,5 @@
-"""One pass of the light filter, compiled. Pictures lie plane by plane, so that the inner loops run along a row with SIMD."""
+"""One pass of the light filter, compiled. Pictures lie plane by plane, so that the inner loops run
+along a row with SIMD."""
 
 from __future__ import annotations
 
@@ -8,10 +9,12 @@ import numpy as np
 
 @nb.njit(cache=True, fastmath=True, nogil=True)
 def _add_neighbours(planes, sigma, kernel, y, v, shift, sums):
-    """Add to each pixel's sums in row y what it takes of the pixel of row v that is `shift` to the right.
+    """Add to each pixel's sums in row y what it takes of the pixel of row v that is `shift` to the
+    right.
 
-    planes: light to mirror, as `spread_light` takes them. sums, (w,) each: of the shares, of the shares times weight, of the
-    variance with the square of that, and of red, green and blue with it.
+    planes: light to mirror, as `spread_light` takes them. sums, (w,) each: of the shares, of the
+    shares times weight, of the variance with the square of that, and of red, green and blue with
+    it.
     """
     light, brightness, weight, variance, doubt, normal, position, reach, mirror = planes
     share, total, total_variance, red, green, blue = sums
@@ -19,7 +22,9 @@ def _add_neighbours(planes, sigma, kernel, y, v, shift, sums):
     for x in range(max(0, -shift), min(width, width - shift)):
         u = x + shift
         nx, ny, nz = normal[0, y, x], normal[1, y, x], normal[2, y, x]
-        alike = max(np.float32(0.0), nx * normal[0, v, u] + ny * normal[1, v, u] + nz * normal[2, v, u])
+        alike = max(
+            np.float32(0.0), nx * normal[0, v, u] + ny * normal[1, v, u] + nz * normal[2, v, u]
+        )
         alike *= alike
         alike *= alike
         alike *= alike
@@ -31,7 +36,9 @@ def _add_neighbours(planes, sigma, kernel, y, v, shift, sums):
         flat = max(np.float32(0.0), np.float32(1.0) - off * off)
         brighter = brightness[v, u] - brightness[y, x]
         spread = sigma * doubt[y, x] + np.float32(1e-12)
-        near = max(np.float32(0.0), np.float32(1.0) - np.float32(0.125) * brighter * brighter / spread)
+        near = max(
+            np.float32(0.0), np.float32(1.0) - np.float32(0.125) * brighter * brighter / spread
+        )
         near *= near
         near *= near
         near *= near
@@ -47,18 +54,41 @@ def _add_neighbours(planes, sigma, kernel, y, v, shift, sums):
 
 @nb.njit(cache=True, fastmath=True, nogil=True)
 def spread_light(
-    light, brightness, weight, variance, doubt, normal, position, reach, mirror, step, sigma, light_out, weight_out, variance_out
+    light,
+    brightness,
+    weight,
+    variance,
+    doubt,
+    normal,
+    position,
+    reach,
+    mirror,
+    step,
+    sigma,
+    light_out,
+    weight_out,
+    variance_out,
 ):
-    """Average every pixel with its eight neighbours `step` pixels away that are on the same plane and about as bright.
+    """Average every pixel with its eight neighbours `step` pixels away that are on the same plane
+    and about as bright.
 
-    light, normal, position: (3, h, w). All others (h, w): brightness to compare, weight (how much a pixel's light can be
-    trusted), variance (of its light), doubt (variance of the brightness, for the comparison), reach (metres off its plane that
-    still belong to it), mirror (1 where nothing is to be averaged).
+    light, normal, position: (3, h, w). All others (h, w): brightness to compare, weight (how much a
+    pixel's light can be trusted), variance (of its light), doubt (variance of the brightness, for
+    the comparison), reach (metres off its plane that still belong to it), mirror (1 where nothing
+    is to be averaged).
     """
     height, width = weight.shape
     planes = (light, brightness, weight, variance, doubt, normal, position, reach, mirror)
-    share, total, total_variance = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
-    red, green, blue = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
+    share, total, total_variance = (
+        np.empty(width, np.float32),
+        np.empty(width, np.float32),
+        np.empty(width, np.float32),
+    )
+    red, green, blue = (
+        np.empty(width, np.float32),
+        np.empty(width, np.float32),
+        np.empty(width, np.float32),
+    )
     sums = (share, total, total_variance, red, green, blue)
     for y in range(height):
         for x in range(width):

@@ -15,7 +15,8 @@ from topoloc_worlds.scene import Color, Material, Mesh, Picture, Scene, Sky
 from topoloc_worlds.shapes import join
 
 KIND, TINT, ROUGHNESS = "face_kind", "face_tint", "face_roughness"
-"""Attributes of every mesh, for `first_hits`: the kind of its material, a metal's mean colour, how rough it is."""
+"""Attributes of every mesh, for `first_hits`: the kind of its material, a metal's mean colour, how
+rough it is."""
 MATT, POLISHED, METAL, GLASS, LIGHT = range(5)
 _KINDS = {"matt": MATT, "polished": POLISHED, "metal": METAL, "glass": GLASS, "light": LIGHT}
 _LAMP_PIECE = 4.0
@@ -23,10 +24,12 @@ _SMOOTHEST = 0.02  # below it a rough surface is as good as a mirror, and slower
 
 
 def load_scene(scene: Scene, lamps: list[tuple[Material, Mesh]]) -> Any:
-    """The scene with its surfaces and lights, without camera and integrator, in Mitsuba's current variant.
+    """The scene with its surfaces and lights, without camera and integrator, in Mitsuba's current
+    variant.
 
     Args:
-        lamps: what gives light, in pieces as from `lamp_pieces`; `lamp_name` says what Mitsuba calls each.
+        lamps: what gives light, in pieces as from `lamp_pieces`; `lamp_name` says what Mitsuba
+            calls each.
     """
     import mitsuba as mi
 
@@ -41,7 +44,10 @@ def load_scene(scene: Scene, lamps: list[tuple[Material, Mesh]]) -> Any:
 
 def lamp_meshes(lamps: list[tuple[Material, Mesh]]) -> dict[str, Any]:
     """Lamps by the names that `lamp_name` gives them."""
-    return {lamp_name(index): _mitsuba_mesh(lamp_name(index), mesh, material) for index, (material, mesh) in enumerate(lamps)}
+    return {
+        lamp_name(index): _mitsuba_mesh(lamp_name(index), mesh, material)
+        for index, (material, mesh) in enumerate(lamps)
+    }
 
 
 def meshes_by_material(scene: Scene) -> list[tuple[Material, Mesh]]:
@@ -53,20 +59,24 @@ def meshes_by_material(scene: Scene) -> list[tuple[Material, Mesh]]:
 
 
 def lamp_pieces(scene: Scene) -> list[tuple[Material, Mesh]]:
-    """All lamps, cut up into pieces of a few metres: one mesh for all lamps of a street would be asked for its light as one."""
+    """All lamps, cut up into pieces of a few metres: one mesh for all lamps of a street would be
+    asked for its light as one."""
     lamps = [entry for entry in meshes_by_material(scene) if _shines(entry[0])]
     return [(material, piece) for material, mesh in lamps for piece in pieces(mesh, _LAMP_PIECE)]
 
 
 def pieces(mesh: Mesh, size: float) -> list[Mesh]:
-    """The mesh cut up by a grid of cells of `size` metres in which the middles of its faces lie; no face is cut."""
+    """The mesh cut up by a grid of cells of `size` metres in which the middles of its faces lie; no
+    face is cut."""
     cells = np.floor(mesh.vertices[mesh.faces].mean(axis=1) / size).astype(np.int64)
     _, group = np.unique(cells, axis=0, return_inverse=True)
     parts = []
     for index in range(int(group.max()) + 1):
         faces = mesh.faces[group.ravel() == index]
         used, renumbered = np.unique(faces, return_inverse=True)
-        parts.append(Mesh(mesh.vertices[used], renumbered.reshape(-1, 3).astype(np.int32), mesh.uv[used]))
+        parts.append(
+            Mesh(mesh.vertices[used], renumbered.reshape(-1, 3).astype(np.int32), mesh.uv[used])
+        )
     return parts
 
 
@@ -88,7 +98,9 @@ def _mitsuba_mesh(name: str, mesh: Mesh, material: Material) -> Any:
     properties["bsdf"] = mi.load_dict(_bsdf(material))
     if _shines(material):
         properties["emitter"] = mi.load_dict(_emitter(material))
-    result: Any = mi.Mesh(name, len(mesh.vertices), len(mesh.faces), has_vertex_texcoords=True, props=properties)
+    result: Any = mi.Mesh(
+        name, len(mesh.vertices), len(mesh.faces), has_vertex_texcoords=True, props=properties
+    )
     parameters = mi.traverse(result)
     parameters["vertex_positions"] = np.ascontiguousarray(mesh.vertices, np.float32).ravel()
     parameters["faces"] = np.ascontiguousarray(mesh.faces, np.uint32).ravel()
@@ -122,7 +134,11 @@ def _bsdf(material: Material) -> dict[str, Any]:
     both = plain if material.kind == "glass" else {"type": "twosided", "bsdf": plain}
     if material.opacity is None:
         return both
-    return {"type": "mask", "opacity": _bitmap(material.opacity[:, :, None].astype(np.float32) / 255.0), "bsdf": both}
+    return {
+        "type": "mask",
+        "opacity": _bitmap(material.opacity[:, :, None].astype(np.float32) / 255.0),
+        "bsdf": both,
+    }
 
 
 def _emitter(material: Material) -> dict[str, Any]:
@@ -139,8 +155,18 @@ def sky_and_sun(sky: Sky) -> dict[str, Any]:
     """The lights of the sky, named "sky" and "sun"."""
     import mitsuba as mi
 
-    # Mitsuba's own picture of the sky has y up and starts elsewhere; this turns it so that column 0 looks along +x.
-    to_world = mi.ScalarTransform4f(np.array([[0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]))
+    # Mitsuba's own picture of the sky has y up and starts elsewhere; this turns it so that column 0
+    # looks along +x.
+    to_world = mi.ScalarTransform4f(
+        np.array(
+            [
+                [0.0, 0.0, -1.0, 0.0],
+                [1.0, 0.0, 0.0, 0.0],
+                [0.0, 1.0, 0.0, 0.0],
+                [0.0, 0.0, 0.0, 1.0],
+            ]
+        )
+    )
     picture = mi.Bitmap(np.ascontiguousarray(sky.radiance, np.float32))
     parts: dict[str, Any] = {"sky": {"type": "envmap", "bitmap": picture, "to_world": to_world}}
     if sky.sun_direction is not None:
@@ -158,7 +184,12 @@ def _texture(color: Picture | Color) -> dict[str, Any]:
 def _bitmap(picture: Float32[np.ndarray, "h w c"]) -> dict[str, Any]:
     import mitsuba as mi
 
-    return {"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(picture)), "raw": True, "wrap_mode": "repeat"}
+    return {
+        "type": "bitmap",
+        "bitmap": mi.Bitmap(np.ascontiguousarray(picture)),
+        "raw": True,
+        "wrap_mode": "repeat",
+    }
 
 
 def linear_from_srgb(color: Picture | Sequence[float]) -> Float32[np.ndarray, "*shape 3"]:

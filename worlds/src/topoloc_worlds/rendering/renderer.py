@@ -31,9 +31,10 @@ class RenderConfig:
 
     Attributes:
         albedo_samples: rays a pixel for colours, edges, screens, sky, sunlight and reflections.
-        samples: light paths a pixel where light is not known beforehand; half of them go into each of two pictures, from whose
-            difference the noise is known.
-        bounces: how often light is reflected on its way from a lamp to the camera, in such pictures.
+        samples: light paths a pixel where light is not known beforehand; half of them go into each
+            of two pictures, from whose difference the noise is known.
+        bounces: how often light is reflected on its way from a lamp to the camera, in such
+            pictures.
         bake: how the light of a world is traced beforehand.
     """
 
@@ -46,7 +47,12 @@ class RenderConfig:
     @staticmethod
     def draft() -> RenderConfig:
         """Several times faster, with rougher edges and some blotches in the light."""
-        return RenderConfig(albedo_samples=1, samples=2, bounces=2, bake=LightBakeConfig(finest=0.06, angle=0.02, rays=8_000, paths=16))
+        return RenderConfig(
+            albedo_samples=1,
+            samples=2,
+            bounces=2,
+            bake=LightBakeConfig(finest=0.06, angle=0.02, rays=8_000, paths=16),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,15 +62,18 @@ class Rendering:
     radiance: Float32[np.ndarray, "h w 3"]
     """Linear light: red, green, blue."""
     depth: Float32[np.ndarray, "h w"]
-    """Metres along the camera's z axis at the pixel centres; NaN in the sky. Through glass it is that of the pane."""
+    """Metres along the camera's z axis at the pixel centres; NaN in the sky. Through glass it is
+    that of the pane."""
 
 
 class Renderer:
     """A world loaded once, for many pictures.
 
-    The same seed gives the same bytes, in every process with the same variant of Mitsuba. With `viewpoints` (n, 3), places all over
-    where cameras will be, the light on all that is seen from there is traced beforehand, or taken from the cache; pictures are then
-    quick and without noise. Without them, and without LLVM, each picture traces its own few light paths and filters their noise.
+    The same seed gives the same bytes, in every process with the same variant of Mitsuba. With
+    `viewpoints` (n, 3), places all over where cameras will be, the light on all that is seen from
+    there is traced beforehand, or taken from the cache; pictures are then quick and without noise.
+    Without them, and without LLVM, each picture traces its own few light paths and filters their
+    noise.
 
     Raises:
         MissingExtraError: Mitsuba is not installed.
@@ -89,7 +98,9 @@ class Renderer:
         self._integrator = _integrator(scene, self._config)
         self._shader: Shader | None = None
         if vectorised and viewpoints is not None:
-            self._shader = Shader(self._scene, self._known_light(scene, viewpoints, progress), scene.sky)
+            self._shader = Shader(
+                self._scene, self._known_light(scene, viewpoints, progress), scene.sky
+            )
 
     def render(self, camera: Camera, world_from_cam: Rigid3, seed: int) -> Rendering:
         """What `camera` sees from a pose.
@@ -99,7 +110,8 @@ class Renderer:
         """
         if camera.is_distorted or abs(camera.fx / camera.fy - 1.0) > 1e-6:
             raise CalibrationError(
-                f"only cameras without distortion and with square pixels are rendered, not {camera.model} {camera.params}"
+                "only cameras without distortion and with square pixels are rendered, not"
+                f" {camera.model} {camera.params}"
             )
         centres = self._first_hits(camera, world_from_cam, (0.0, 0.0))
         if self._shader is None:
@@ -107,10 +119,14 @@ class Renderer:
         else:
             picture = self._shaded(self._shader, camera, world_from_cam, centres, seed)
         along = _directions_cam(camera, (0.0, 0.0))[:, 2]
-        depth = np.where(np.isfinite(centres.distance), centres.distance * along, np.nan).astype(np.float32)
+        depth = np.where(np.isfinite(centres.distance), centres.distance * along, np.nan).astype(
+            np.float32
+        )
         return Rendering(picture, depth.reshape(camera.height, camera.width))
 
-    def _known_light(self, scene: Scene, viewpoints: Float64[np.ndarray, "n 3"], progress: Progress) -> LightCells:
+    def _known_light(
+        self, scene: Scene, viewpoints: Float64[np.ndarray, "n 3"], progress: Progress
+    ) -> LightCells:
         bake = self._config.bake
         grid = divide_space(viewpoints, bake.finest, bake.angle)
 
@@ -124,7 +140,9 @@ class Renderer:
         """How often to ask each light for what is seen from a place, whatever the direction."""
         directions = np.random.default_rng(0).standard_normal((_NUM_AROUND, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        return self._lights.weights(self._scene, origin, find_first_hits(self._scene, origin, directions))
+        return self._lights.weights(
+            self._scene, origin, find_first_hits(self._scene, origin, directions)
+        )
 
     def _weigh_lights(self, origin: Float64[np.ndarray, "3"], seen: FirstHits) -> None:
         """Let paths ask the lights that matter for what is seen from there."""
@@ -141,44 +159,77 @@ class Renderer:
         total = np.zeros((camera.height * camera.width, 3), np.float32)
         for k, offset_px in enumerate(_offsets(self._config.albedo_samples)):
             directions_world = _directions_cam(camera, offset_px) @ world_from_cam.rotation.T
-            hits = self._first_hits(camera, world_from_cam, offset_px) if offset_px != (0.0, 0.0) else centres
-            seen = shader.shade(origin, directions_world, hits, middle, np.random.default_rng([seed, k]))
+            hits = (
+                self._first_hits(camera, world_from_cam, offset_px)
+                if offset_px != (0.0, 0.0)
+                else centres
+            )
+            seen = shader.shade(
+                origin, directions_world, hits, middle, np.random.default_rng([seed, k])
+            )
             total += self._through_air(seen, hits.clear)
         return (total / self._config.albedo_samples).reshape(*shape, 3)
 
-    def _traced(self, camera: Camera, world_from_cam: Rigid3, centres: FirstHits, seed: int) -> Float32[np.ndarray, "h w 3"]:
+    def _traced(
+        self, camera: Camera, world_from_cam: Rigid3, centres: FirstHits, seed: int
+    ) -> Float32[np.ndarray, "h w 3"]:
         """The picture from light paths of its own, their noise filtered."""
         shape = (camera.height, camera.width)
         albedo, emission, clear = self._colours(camera, world_from_cam)
         self._weigh_lights(world_from_cam.translation, centres)
         radiance = self._trace(camera, world_from_cam, seed)
         normal, position = centres.normal.reshape(*shape, 3), centres.position.reshape(*shape, 3)
-        light = filter_light(radiance, albedo, normal, position, centres.mirror.reshape(shape), self._config.light_filter)
+        light = filter_light(
+            radiance,
+            albedo,
+            normal,
+            position,
+            centres.mirror.reshape(shape),
+            self._config.light_filter,
+        )
         return self._through_air(albedo * light + emission, clear)
 
-    def _through_air(self, seen: Float32[np.ndarray, "*n 3"], clear: Float32[np.ndarray, "*n"]) -> Float32[np.ndarray, "*n 3"]:
+    def _through_air(
+        self, seen: Float32[np.ndarray, "*n 3"], clear: Float32[np.ndarray, "*n"]
+    ) -> Float32[np.ndarray, "*n 3"]:
         if self._haze is None:
             return seen
-        return clear[..., None] * seen + (1.0 - clear[..., None]) * np.array(self._haze.radiance, np.float32)
+        return clear[..., None] * seen + (1.0 - clear[..., None]) * np.array(
+            self._haze.radiance, np.float32
+        )
 
-    def _first_hits(self, camera: Camera, world_from_cam: Rigid3, offset_px: tuple[float, float]) -> FirstHits:
+    def _first_hits(
+        self, camera: Camera, world_from_cam: Rigid3, offset_px: tuple[float, float]
+    ) -> FirstHits:
         directions_world = _directions_cam(camera, offset_px) @ world_from_cam.rotation.T
         haze_range = self._haze.range if self._haze is not None else np.inf
-        return find_first_hits(self._scene, world_from_cam.translation, directions_world, haze_range)
+        return find_first_hits(
+            self._scene, world_from_cam.translation, directions_world, haze_range
+        )
 
     def _colours(
         self, camera: Camera, world_from_cam: Rigid3
-    ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
+    ) -> tuple[
+        Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]
+    ]:
         """Albedo, emission and clearness of the air, averaged over each pixel."""
         num, pixels = self._config.albedo_samples, camera.width * camera.height
-        albedo, emission, clear = np.zeros((pixels, 3), np.float32), np.zeros((pixels, 3), np.float32), np.zeros(pixels, np.float32)
+        albedo, emission, clear = (
+            np.zeros((pixels, 3), np.float32),
+            np.zeros((pixels, 3), np.float32),
+            np.zeros(pixels, np.float32),
+        )
         for offset_px in _offsets(num):
             hits = self._first_hits(camera, world_from_cam, offset_px)
             albedo += hits.albedo + hits.sheen
             emission += hits.emission
             clear += hits.clear
         shape = (camera.height, camera.width)
-        return (albedo / num).reshape(*shape, 3), (emission / num).reshape(*shape, 3), (clear / num).reshape(shape)
+        return (
+            (albedo / num).reshape(*shape, 3),
+            (emission / num).reshape(*shape, 3),
+            (clear / num).reshape(shape),
+        )
 
     def _trace(
         self, camera: Camera, world_from_cam: Rigid3, seed: int
@@ -191,25 +242,35 @@ class Renderer:
         seeds = ((seed * _SEED_STEP + k * _HALF_STEP) % 2**32 for k in (0, 1))
         render: Any = mi.render  # its stub knows only the seeds of vectorised code
         first, second = (
-            np.array(render(self._scene, sensor=sensor, integrator=self._integrator, spp=half, seed=each), np.float32) for each in seeds
+            np.array(
+                render(
+                    self._scene, sensor=sensor, integrator=self._integrator, spp=half, seed=each
+                ),
+                np.float32,
+            )
+            for each in seeds
         )
         return first[:, :, :3], second[:, :, :3]
 
 
 _SEED_STEP, _HALF_STEP = 0x9E3779B1, 0x85EBCA6B
-"""Mitsuba gives a pixel the noise of the one before it at the next seed: seeds must lie far apart, those of the two halves too."""
+"""Mitsuba gives a pixel the noise of the one before it at the next seed: seeds must lie far apart,
+those of the two halves too."""
 _NUM_AROUND = 400
 _GOLDEN = 0.6180339887498949
 
 
 def _directions_cam(camera: Camera, offset_px: tuple[float, float]) -> Float64[np.ndarray, "n 3"]:
     """Unit directions through all pixels, row by row, each at the same offset from its centre."""
-    x, y = np.meshgrid(np.arange(camera.width) + offset_px[0], np.arange(camera.height) + offset_px[1])
+    x, y = np.meshgrid(
+        np.arange(camera.width) + offset_px[0], np.arange(camera.height) + offset_px[1]
+    )
     return camera.rays_from_img(np.column_stack([x.ravel(), y.ravel()]))
 
 
 def _offsets(num: int) -> list[tuple[float, float]]:
-    """Where in a pixel its rays go. The golden ratio's lattice: for any number both coordinates fill their range evenly."""
+    """Where in a pixel its rays go. The golden ratio's lattice: for any number both coordinates
+    fill their range evenly."""
     return [((k + 0.5) / num - 0.5, (0.5 + k * _GOLDEN) % 1.0 - 0.5) for k in range(num)]
 
 
@@ -222,21 +283,34 @@ def _whole_grid(samples: int) -> int:
 def _integrator(scene: Scene, config: RenderConfig) -> Any:
     import mitsuba as mi
 
-    # Only this one lets light through panes and between leaves on its way from a lamp, but it takes half as long again.
-    see_through = any(surface.material.kind == "glass" or surface.material.opacity is not None for surface in scene.surfaces)
+    # Only this one lets light through panes and between leaves on its way from a lamp, but it takes
+    # half as long again.
+    see_through = any(
+        surface.material.kind == "glass" or surface.material.opacity is not None
+        for surface in scene.surfaces
+    )
     kind = "volpath" if see_through else "path"
-    return mi.load_dict({"type": kind, "max_depth": config.bounces + 1, "rr_depth": 100, "hide_emitters": True})
+    return mi.load_dict(
+        {"type": kind, "max_depth": config.bounces + 1, "rr_depth": 100, "hide_emitters": True}
+    )
 
 
 def _sensor(camera: Camera, world_from_cam: Rigid3, samples: int) -> Any:
     import mitsuba as mi
 
-    film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "pixel_format": "rgb", "rfilter": {"type": "box"}}
+    film = {
+        "type": "hdrfilm",
+        "width": camera.width,
+        "height": camera.height,
+        "pixel_format": "rgb",
+        "rfilter": {"type": "box"},
+    }
     sensor = {
         "type": "perspective",
         "fov_axis": "x",
         "fov": float(np.degrees(2.0 * np.arctan(camera.width / (2.0 * camera.fx)))),
-        # Mitsuba counts from the image's border, in image sizes, and moves the picture where we move its centre.
+        # Mitsuba counts from the image's border, in image sizes, and moves the picture where we
+        # move its centre.
         "principal_point_offset_x": 0.5 - (camera.cx + 0.5) / camera.width,
         "principal_point_offset_y": 0.5 - (camera.cy + 0.5) / camera.height,
         "near_clip": 0.01,

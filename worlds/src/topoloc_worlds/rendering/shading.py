@@ -1,4 +1,5 @@
-"""What a ray sees where the light on all surfaces is known: colours, light, direct sun, and one reflection."""
+"""What a ray sees where the light on all surfaces is known: colours, light, direct sun, and one
+reflection."""
 
 from __future__ import annotations
 
@@ -37,9 +38,13 @@ class Shader:
     def __init__(self, loaded: Any, cells: LightCells, sky: Sky | None) -> None:
         self._loaded, self._cells = loaded, cells
         self._sun_direction = sky.sun_direction if sky is not None else None
-        self._sun = np.array(sky.sun_irradiance if sky is not None else (0.0, 0.0, 0.0), np.float32) / np.float32(np.pi)
+        self._sun = np.array(
+            sky.sun_irradiance if sky is not None else (0.0, 0.0, 0.0), np.float32
+        ) / np.float32(np.pi)
 
-    def surface_light(self, origin: Float64[np.ndarray, "3"], hits: FirstHits, shape: tuple[int, int]) -> SurfaceLight:
+    def surface_light(
+        self, origin: Float64[np.ndarray, "3"], hits: FirstHits, shape: tuple[int, int]
+    ) -> SurfaceLight:
         """Light at the middles of all pixels of a picture of `shape`, for `shade` to start from."""
         points = origin + hits.position.astype(np.float64)
         everywhere = np.ones(len(points), bool)
@@ -60,7 +65,8 @@ class Shader:
         """Radiance along rays from `origin`, one a pixel, whose first hits are known.
 
         Args:
-            middle: of the same pixels: where a ray meets the surface that the pixel's middle shows, so does the light.
+            middle: of the same pixels: where a ray meets the surface that the pixel's middle shows,
+                so does the light.
             rng: spreads what rough mirrors show.
         """
         elsewhere = _on_other_surface(hits, middle.hits)
@@ -73,7 +79,9 @@ class Shader:
         seen = hits.emission + hits.albedo * self._together(light, sun, hits.normal)
         shiny = np.flatnonzero(hits.sheen.max(axis=1) > _FAINTEST_SHEEN)
         if len(shiny):
-            seen[shiny] += hits.sheen[shiny] * self._mirrored(origin, directions_world[shiny], hits, shiny, rng)
+            seen[shiny] += hits.sheen[shiny] * self._mirrored(
+                origin, directions_world[shiny], hits, shiny, rng
+            )
         return seen
 
     def _mirrored(
@@ -84,18 +92,26 @@ class Shader:
         shiny: Int64[np.ndarray, " m"],
         rng: np.random.Generator,
     ) -> Float32[np.ndarray, "m 3"]:
-        """What the mirrors show. Mirrors seen in mirrors are dim: these send back what light falls on them."""
+        """What the mirrors show. Mirrors seen in mirrors are dim: these send back what light falls
+        on them."""
         normals = hits.sheen_normal[shiny].astype(np.float64)
         points = origin + towards * hits.sheen_distance[shiny, None] + _LIFT * normals
         away = towards - 2.0 * np.einsum("ni,ni->n", towards, normals)[:, None] * normals
-        there = find_first_hits(self._loaded, points, _spread(away, normals, hits.roughness[shiny], rng))
+        there = find_first_hits(
+            self._loaded, points, _spread(away, normals, hits.roughness[shiny], rng)
+        )
         points_there = points + there.position
         light = light_at(self._cells, points_there, there.normal)
         sun = self._sun_on(points_there, there.normal, np.ones(len(light), bool))
-        return there.emission + (there.albedo + there.sheen) * self._together(light, sun, there.normal)
+        return there.emission + (there.albedo + there.sheen) * self._together(
+            light, sun, there.normal
+        )
 
     def _together(
-        self, light: Float32[np.ndarray, "n 3"], sun: Float32[np.ndarray, " n"], normals: Float32[np.ndarray, "n 3"]
+        self,
+        light: Float32[np.ndarray, "n 3"],
+        sun: Float32[np.ndarray, " n"],
+        normals: Float32[np.ndarray, "n 3"],
     ) -> Float32[np.ndarray, "n 3"]:
         if self._sun_direction is None:
             return light
@@ -103,14 +119,19 @@ class Shader:
         return light + (facing * sun)[:, None] * self._sun
 
     def _sun_on(
-        self, points: Float64[np.ndarray, "n 3"], normals: Float32[np.ndarray, "n 3"], wanted: Bool[np.ndarray, " n"]
+        self,
+        points: Float64[np.ndarray, "n 3"],
+        normals: Float32[np.ndarray, "n 3"],
+        wanted: Bool[np.ndarray, " n"],
     ) -> Float32[np.ndarray, " m"]:
         """Share of the sun at the wanted points, 0 where the surface is turned away."""
         sun = np.zeros(len(points), np.float32)
         if self._sun_direction is not None:
             lit = np.flatnonzero(wanted & (normals @ self._sun_direction.astype(np.float32) > 0.0))
             if len(lit):
-                sun[lit] = open_towards(self._loaded, points[lit] + _LIFT * normals[lit], self._sun_direction)
+                sun[lit] = open_towards(
+                    self._loaded, points[lit] + _LIFT * normals[lit], self._sun_direction
+                )
         return sun[wanted]
 
 
@@ -127,7 +148,8 @@ def _spread(
     roughness: Float32[np.ndarray, " n"],
     rng: np.random.Generator,
 ) -> Float64[np.ndarray, "n 3"]:
-    """Directions tilted at random, twice as far as the facets of a rough surface are, and none into the surface."""
+    """Directions tilted at random, twice as far as the facets of a rough surface are, and none into
+    the surface."""
     tilted = directions + np.sqrt(2.0) * roughness[:, None] * rng.standard_normal(directions.shape)
     below = np.einsum("ni,ni->n", tilted, normals) < 1e-3
     tilted[below] = directions[below]

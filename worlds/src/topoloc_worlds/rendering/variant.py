@@ -1,7 +1,9 @@
-"""Which build of Mitsuba renders: vectorised by LLVM where a usable libLLVM is found, else one ray at a time.
+"""Which build of Mitsuba renders: vectorised by LLVM where a usable libLLVM is found, else one ray
+at a time.
 
-Mitsuba compiles its kernels with whatever libLLVM it finds, and one that does not suit it (LLVM 15, for one) aborts the whole
-process in code generation. So every library is tried out in a child process first, and the verdict is remembered.
+Mitsuba compiles its kernels with whatever libLLVM it finds, and one that does not suit it (LLVM 15,
+for one) aborts the whole process in code generation. So every library is tried out in a child
+process first, and the verdict is remembered.
 """
 
 from __future__ import annotations
@@ -42,14 +44,15 @@ scene = mi.load_dict({
                'film': {'type': 'hdrfilm', 'width': 8, 'height': 8}},
 })
 raise SystemExit(0 if np.asarray(mi.render(scene, spp=4)).max() > 0 else 1)
-"""
+"""  # noqa: E501
 
 
 def use_best_variant(force: str | None = None) -> str:
     """Make Mitsuba's fastest usable variant current, and return its name.
 
     Args:
-        force: a variant's name to use whatever is found; the environment variable TOPOLOC_MITSUBA_VARIANT does the same.
+        force: a variant's name to use whatever is found; the environment variable
+            TOPOLOC_MITSUBA_VARIANT does the same.
 
     Raises:
         MissingExtraError: Mitsuba is not installed.
@@ -70,7 +73,10 @@ def use_best_variant(force: str | None = None) -> str:
         if library is not None:
             os.environ[_LIBRARY] = library
         elif wanted is not None:
-            raise TopolocError(f"{wanted} needs a libLLVM of version {_OLDEST} or later, and none was found that works (set {_LIBRARY})")
+            raise TopolocError(
+                f"{wanted} needs a libLLVM of version {_OLDEST} or later, and none was found that"
+                f" works (set {_LIBRARY})"
+            )
         wanted = wanted or (LLVM if library is not None else SCALAR)
     if wanted != current:
         mitsuba.set_variant(wanted)
@@ -78,7 +84,8 @@ def use_best_variant(force: str | None = None) -> str:
 
 
 def find_llvm() -> str | None:
-    """Path of the first libLLVM that renders: the one of DRJIT_LIBLLVM_PATH alone if that is set, else the newest installed."""
+    """Path of the first libLLVM that renders: the one of DRJIT_LIBLLVM_PATH alone if that is set,
+    else the newest installed."""
     named = os.environ.get(_LIBRARY)
     verdicts = _read_cache()
     for library in [named] if named else installed_llvms():
@@ -94,23 +101,35 @@ def find_llvm() -> str | None:
 
 
 def installed_llvms() -> list[str]:
-    """LLVM libraries in the usual places of Linux and macOS, newest first; none older than version 16, none twice."""
+    """LLVM libraries in the usual places of Linux and macOS, newest first; none older than version
+    16, none twice."""
     found: dict[str, tuple[int, str]] = {}
     for pattern in _PLACES:
         for path in sorted(glob.glob(pattern)):
             match = re.search(r"libLLVM(?:-|\.so\.|-C\.so\.)?(\d*)[^/]*\.?(?:so|dylib)?", path)
             of_folder = re.search(r"llvm[-@](\d+)", path)
             number = (match and match[1]) or (of_folder and of_folder[1])
-            if number and int(number) >= _OLDEST and re.search(r"libLLVM[-.\d]*(?:\.so[.\d]*|\.dylib)$", path):
+            if (
+                number
+                and int(number) >= _OLDEST
+                and re.search(r"libLLVM[-.\d]*(?:\.so[.\d]*|\.dylib)$", path)
+            ):
                 found.setdefault(os.path.realpath(path), (int(number), path))
     return [path for _, path in sorted(found.values(), key=lambda entry: -entry[0])]
 
 
 def _renders(library: str) -> bool:
-    """Whether Mitsuba can render with this library, tried in a process of its own, whose last words nobody needs to hear."""
+    """Whether Mitsuba can render with this library, tried in a process of its own, whose last words
+    nobody needs to hear."""
     environment = {**os.environ, _LIBRARY: library}
     try:
-        child = subprocess.run([sys.executable, "-c", _PROBE], env=environment, capture_output=True, timeout=120, check=False)
+        child = subprocess.run(
+            [sys.executable, "-c", _PROBE],
+            env=environment,
+            capture_output=True,
+            timeout=120,
+            check=False,
+        )
     except (OSError, subprocess.TimeoutExpired):
         return False
     return child.returncode == 0
@@ -125,7 +144,8 @@ def _key(library: str) -> str | None:
 
 
 def cache_folder() -> Path:
-    """Where things are kept that can be made again. Raises RuntimeError where the user has no home."""
+    """Where things are kept that can be made again. Raises RuntimeError where the user has no
+    home."""
     folder = os.environ.get("XDG_CACHE_HOME")
     return Path(folder or Path.home() / ".cache") / "topoloc"
 

@@ -1,6 +1,8 @@
-"""Pieces of a house front: a wall with a grid of openings, reveals, frames, panes, sills, balconies, roofs.
+"""Pieces of a house front: a wall with a grid of openings, reveals, frames, panes, sills,
+balconies, roofs.
 
-In a front's own frame x runs to the right and z up, seen from the street, and y into the house; the wall is at y = 0.
+In a front's own frame x runs to the right and z up, seen from the street, and y into the house; the
+wall is at y = 0.
 """
 
 from __future__ import annotations
@@ -36,20 +38,38 @@ def upright(spans: Openings, y: float) -> Float64[np.ndarray, "n 4 3"]:
 
 
 def wall_uv(corners: Float64[np.ndarray, "n 4 3"], shift: float) -> Float64[np.ndarray, "n 4 2"]:
-    """Where a picture of a wall of WALL_METRES lies on a front: its foot at z = 0, moved sideways by `shift` metres."""
+    """Where a picture of a wall of WALL_METRES lies on a front: its foot at z = 0, moved sideways
+    by `shift` metres."""
     height, width = WALL_METRES
-    return np.stack([(corners[..., 0] + shift + 0.37 * corners[..., 1]) / width, 1.0 - corners[..., 2] / height], axis=-1)
+    return np.stack(
+        [
+            (corners[..., 0] + shift + 0.37 * corners[..., 1]) / width,
+            1.0 - corners[..., 2] / height,
+        ],
+        axis=-1,
+    )
 
 
 def wall(
-    width: float, z: Span, columns: Sequence[Span], rows: Sequence[Span], blind: Bool[np.ndarray, "r c"], shift: float
+    width: float,
+    z: Span,
+    columns: Sequence[Span],
+    rows: Sequence[Span],
+    blind: Bool[np.ndarray, "r c"],
+    shift: float,
 ) -> tuple[Mesh, Openings]:
-    """A wall from z[0] to z[1] with openings where columns and rows cross, except the blind ones; and these openings."""
+    """A wall from z[0] to z[1] with openings where columns and rows cross, except the blind ones;
+    and these openings."""
     xs = np.unique(np.concatenate([[0.0, width], np.ravel(columns)]))
     zs = np.unique(np.concatenate([z, np.ravel(rows)]))
-    holes = np.array([[c[0], c[1], r[0], r[1]] for i, r in enumerate(rows) for j, c in enumerate(columns) if not blind[i, j]]).reshape(
-        -1, 4
-    )
+    holes = np.array(
+        [
+            [c[0], c[1], r[0], r[1]]
+            for i, r in enumerate(rows)
+            for j, c in enumerate(columns)
+            if not blind[i, j]
+        ]
+    ).reshape(-1, 4)
     pieces = []
     for x0, x1 in pairwise(xs.tolist()):
         free = [z[0]]
@@ -72,21 +92,33 @@ def reveals(openings: Openings, depth: float, shift: float) -> Mesh:
         [(x0, near, z1), (x0, far, z1), (x1, far, z1), (x1, near, z1)],
         [(x0, far, z0), (x0, near, z0), (x1, near, z0), (x1, far, z0)],
     ]
-    corners = np.concatenate([np.stack([np.column_stack(row) for row in side], axis=1) for side in sides])
+    corners = np.concatenate(
+        [np.stack([np.column_stack(row) for row in side], axis=1) for side in sides]
+    )
     return quads(corners, wall_uv(corners, shift))
 
 
 def panes(openings: Openings, depth: float, parts: Float64[np.ndarray, "n 2 2"]) -> Mesh:
     """A pane in each opening that shows a part of a picture: its corner (u, v) and its size."""
-    uv = parts[:, None, 0] + np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 1.0], [1.0, 0.0]])[None] * parts[:, None, 1]
+    uv = (
+        parts[:, None, 0]
+        + np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 1.0], [1.0, 0.0]])[None] * parts[:, None, 1]
+    )
     return quads(upright(openings, depth), uv)
 
 
-def frames(openings: Openings, depth: float, bars: tuple[int, int], thickness: float = 0.06) -> Mesh:
+def frames(
+    openings: Openings, depth: float, bars: tuple[int, int], thickness: float = 0.06
+) -> Mesh:
     """Window frames just before the panes: a border, and `bars` bars standing and lying."""
     t, pieces = thickness, []
     for x0, x1, z0, z1 in openings.tolist():
-        pieces += [(x0, x0 + t, z0, z1), (x1 - t, x1, z0, z1), (x0 + t, x1 - t, z0, z0 + t), (x0 + t, x1 - t, z1 - t, z1)]
+        pieces += [
+            (x0, x0 + t, z0, z1),
+            (x1 - t, x1, z0, z1),
+            (x0 + t, x1 - t, z0, z0 + t),
+            (x0 + t, x1 - t, z1 - t, z1),
+        ]
         for k in range(bars[0]):
             x = x0 + (x1 - x0) * (k + 1) / (bars[0] + 1)
             pieces.append((x - t * 0.6, x + t * 0.6, z0 + t, z1 - t))
@@ -99,7 +131,9 @@ def frames(openings: Openings, depth: float, bars: tuple[int, int], thickness: f
 
 def bands(spans: Openings, out: float, back: float = 0.0) -> Mesh:
     """Boxes lying on the wall, `out` before it: sills, lintels, cornices, surrounds, boards."""
-    return join([box((x0, -out, z0), (x1, back, z1), faces="sewtb") for x0, x1, z0, z1 in spans.tolist()])
+    return join(
+        [box((x0, -out, z0), (x1, back, z1), faces="sewtb") for x0, x1, z0, z1 in spans.tolist()]
+    )
 
 
 def surrounds(openings: Openings, thickness: float) -> Float64[np.ndarray, "m 4"]:
@@ -126,17 +160,28 @@ def balcony(span: Span, z: float, out: float) -> tuple[Mesh, Mesh]:
     x0, x1 = span
     slab = box((x0, -out, z - 0.16), (x1, 0.0, z))
     top = z + 1.0
-    bars = [box((x0, -out, top - 0.04), (x1, -out + 0.05, top)), box((x0, -out, z + 0.1), (x1, -out + 0.03, z + 0.14))]
+    bars = [
+        box((x0, -out, top - 0.04), (x1, -out + 0.05, top)),
+        box((x0, -out, z + 0.1), (x1, -out + 0.03, z + 0.14)),
+    ]
     for x in (x0, x1 - 0.05):
         bars.append(box((x, -out, top - 0.04), (x + 0.05, 0.0, top)))
         bars.append(box((x, -out, z), (x + 0.05, -out + 0.05, top)))
     stands = np.arange(x0 + 0.14, x1 - 0.06, 0.14)
-    rows = upright(np.column_stack([stands, stands + 0.025, np.full(len(stands), z), np.full(len(stands), top)]), -out + 0.02)
+    rows = upright(
+        np.column_stack(
+            [stands, stands + 0.025, np.full(len(stands), z), np.full(len(stands), top)]
+        ),
+        -out + 0.02,
+    )
     return slab, join([*bars, quads(rows, np.zeros((len(rows), 4, 2)))])
 
 
-def gable_roof(width: float, depth: float, eaves: float, rise: float, overhang: float = 0.45) -> tuple[Mesh, Mesh]:
-    """Two slopes with the ridge along the street, and the two triangles of wall below them. Tiles are 2.56 m a picture."""
+def gable_roof(
+    width: float, depth: float, eaves: float, rise: float, overhang: float = 0.45
+) -> tuple[Mesh, Mesh]:
+    """Two slopes with the ridge along the street, and the two triangles of wall below them. Tiles
+    are 2.56 m a picture."""
     slope = np.hypot(depth / 2 + overhang, rise * (1 + 2 * overhang / depth))
     low, top = eaves - rise * 2 * overhang / depth, eaves + rise
     repeat = (width / 2.56, slope / 2.56)
@@ -158,7 +203,12 @@ def side_walls(width: float, depth: float, height: float, which: str) -> list[Me
     made = {
         "l": panel((0.0, depth, height), (0, -depth, 0), (0, 0, -height), (uv_width, uv_height)),
         "r": panel((width, 0.0, height), (0, depth, 0), (0, 0, -height), (uv_width, uv_height)),
-        "b": panel((width, depth, height), (-width, 0, 0), (0, 0, -height), (width / WALL_METRES[1], uv_height)),
+        "b": panel(
+            (width, depth, height),
+            (-width, 0, 0),
+            (0, 0, -height),
+            (width / WALL_METRES[1], uv_height),
+        ),
     }
     result = []
     for side in which:

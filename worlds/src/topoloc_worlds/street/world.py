@@ -1,6 +1,8 @@
-"""World "street": a circuit of town streets about 800 m round, within the paper's 333 by 81 m (section IV-D, there made by CARLA).
+"""World "street": a circuit of town streets about 800 m round, within the paper's 333 by 81 m
+(section IV-D, there made by CARLA).
 
-Traffic keeps to the right and the loop is driven counter-clockwise, seen from above; its lane is the outer one of two.
+Traffic keeps to the right and the loop is driven counter-clockwise, seen from above; its lane is
+the outer one of two.
 """
 
 from __future__ import annotations
@@ -91,15 +93,19 @@ def _horizon(sky: Sky) -> tuple[float, float, float]:
     return r, g, b
 
 
-def _beside(surfaces: list[Surface], station: float, offset: float, height: float = KERB) -> list[Surface]:
-    """Things made for the right-hand side, set there or, turned round, to the left of the street."""
+def _beside(
+    surfaces: list[Surface], station: float, offset: float, height: float = KERB
+) -> list[Surface]:
+    """Things made for the right-hand side, set there or, turned round, to the left of the
+    street."""
     x, y, yaw = position(station, offset)
     return set_at(surfaces, (x, y, height), yaw if offset > 0 else yaw + np.pi)
 
 
 @dataclass(frozen=True)
 class _KeptFree:
-    """Where no car may stand: stations of zebra crossings, from and to; stations and sides (+1 is right) of bus stops."""
+    """Where no car may stand: stations of zebra crossings, from and to; stations and sides (+1 is
+    right) of bus stops."""
 
     zebras: tuple[tuple[float, float], ...]
     bus_stops: tuple[tuple[float, float], ...]
@@ -107,18 +113,27 @@ class _KeptFree:
     def allows(self, station: float, side: float, margin: float) -> bool:
         """Whether a thing within `margin` metres of a station disturbs neither."""
         at_zebra = any(start - margin < station < end + margin for start, end in self.zebras)
-        return not at_zebra and not any(side == way and abs(station - stop) < 7.0 + margin for stop, way in self.bus_stops)
+        return not at_zebra and not any(
+            side == way and abs(station - stop) < 7.0 + margin for stop, way in self.bus_stops
+        )
 
 
 def _kept_free(seed: int) -> _KeptFree:
     rng = rng_of(seed, "bus stops")
-    stops = [(start + (end - start) * float(rng.uniform(0.2, 0.8)), side) for start, end in (SIDES[0], SIDES[2]) for side in (1.0, -1.0)]
+    stops = [
+        (start + (end - start) * float(rng.uniform(0.2, 0.8)), side)
+        for start, end in (SIDES[0], SIDES[2])
+        for side in (1.0, -1.0)
+    ]
     made = tiles()
     return _KeptFree(tuple(made[i] for i in crossings(seed)), tuple(stops))
 
 
-def _pavements(seed: int, kept: _KeptFree, kit: StreetMaterials, things: FurnitureMaterials) -> list[Surface]:
-    """Lamps, trees, signs and the rest along the kerbs, shelters, traffic lights at crossings, wires overhead."""
+def _pavements(
+    seed: int, kept: _KeptFree, kit: StreetMaterials, things: FurnitureMaterials
+) -> list[Surface]:
+    """Lamps, trees, signs and the rest along the kerbs, shelters, traffic lights at crossings,
+    wires overhead."""
     rng = rng_of(seed, "pavements")
     edge = PAVEMENT[0] + 0.45
     result: list[Surface] = []
@@ -133,12 +148,16 @@ def _pavements(seed: int, kept: _KeptFree, kit: StreetMaterials, things: Furnitu
                 own = rng_of(seed, f"kerb/{count}")
                 count += 1
                 if k % 6 == (0 if side > 0 else 3):
-                    result += _beside(lamp_post(bool(lamp_luck < kit.lit), kit), station, side * edge)
+                    result += _beside(
+                        lamp_post(bool(lamp_luck < kit.lit), kit), station, side * edge
+                    )
                 elif not kept.allows(station, side, -2.0):
                     continue
                 elif leafy and k % 2:
                     result += _beside(
-                        tree(own, kit, float(own.uniform(5.5, 8.5)), float(own.uniform(1.7, 2.4))), station, side * (edge + 0.3)
+                        tree(own, kit, float(own.uniform(5.5, 8.5)), float(own.uniform(1.7, 2.4))),
+                        station,
+                        side * (edge + 0.3),
                     )
                 elif luck < 0.17:
                     result += _beside(traffic_sign(own, kit, things), station, side * edge)
@@ -148,7 +167,9 @@ def _pavements(seed: int, kept: _KeptFree, kit: StreetMaterials, things: Furnitu
         result += _beside(bus_stop(rng, kit, things), station, side * 7.5)
     for start, end in kept.zebras:
         middle = (start + end) / 2
-        result += _beside(traffic_light(kit, things), middle + 3.2, edge) + _beside(traffic_light(kit, things), middle - 3.2, -edge)
+        result += _beside(traffic_light(kit, things), middle + 3.2, edge) + _beside(
+            traffic_light(kit, things), middle - 3.2, -edge
+        )
     return result + _wires(rng, kit)
 
 
@@ -161,7 +182,9 @@ def _wires(rng: np.random.Generator, kit: StreetMaterials) -> list[Surface]:
     return result
 
 
-def _corners(seed: int, kit: StreetMaterials, things: FurnitureMaterials, made: list[Surface]) -> list[Surface]:
+def _corners(
+    seed: int, kit: StreetMaterials, things: FurnitureMaterials, made: list[Surface]
+) -> list[Surface]:
     """The open ground outside each bend: paving, a pillar, trees."""
     rng = rng_of(seed, "corners")
     paving = next(surface.material for surface in made if surface.name == "pavement")
@@ -176,12 +199,15 @@ def _corners(seed: int, kit: StreetMaterials, things: FurnitureMaterials, made: 
         result.append(Surface("pavement", Mesh(vertices, faces, outline / [8.0, 2.85]), paving))
         middle = end + RADIUS * np.pi / 4
         result += _beside(advertising_pillar(rng, kit, things), middle, 10.3)
-        result += _beside(tree(rng, kit, 7.0, 2.2), middle - 4.0, 7.2) + _beside(tree(rng, kit, 6.5, 2.0), middle + 4.0, 7.2)
+        result += _beside(tree(rng, kit, 7.0, 2.2), middle - 4.0, 7.2) + _beside(
+            tree(rng, kit, 6.5, 2.0), middle + 4.0, 7.2
+        )
     return result
 
 
 def _cars(seed: int, kept: _KeptFree, arrangement: int) -> list[Surface]:
-    """Both edges of the street full of parked cars, with gaps; each heads the way its side drives."""
+    """Both edges of the street full of parked cars, with gaps; each heads the way its side
+    drives."""
     kit = car_materials(rng_of(seed, "car materials"))
     rng = rng_of(seed, f"cars/{arrangement}")
     result = []
@@ -192,15 +218,24 @@ def _cars(seed: int, kept: _KeptFree, arrangement: int) -> list[Surface]:
                 shape = SHAPES[int(rng.choice(len(SHAPES), p=[0.3, 0.22, 0.2, 0.18, 0.1]))]
                 paint, plate = int(rng.integers(0, len(PAINTS))), int(rng.integers(0, 24))
                 crowd = float(np.clip(crowd + rng.normal(0.0, 0.2), 0.25, 0.85))
-                offset, askew = side * (4.68 + float(rng.uniform(-0.06, 0.08))), float(rng.normal(0.0, 0.015))
+                offset, askew = (
+                    side * (4.68 + float(rng.uniform(-0.06, 0.08))),
+                    float(rng.normal(0.0, 0.015)),
+                )
                 if rng.uniform() < crowd and kept.allows(station, side, 0.0):
                     x, y, yaw = position(station, offset)
-                    result += parked(car(shape, paint, plate, kit), (x, y, -0.015), yaw + askew + (0.0 if side > 0 else np.pi))
+                    result += parked(
+                        car(shape, paint, plate, kit),
+                        (x, y, -0.015),
+                        yaw + askew + (0.0 if side > 0 else np.pi),
+                    )
                 station += 5.4 + float(rng.exponential(0.5))
     return result
 
 
-def _bins(seed: int, kept: _KeptFree, arrangement: int, kit: StreetMaterials, things: FurnitureMaterials) -> list[Surface]:
+def _bins(
+    seed: int, kept: _KeptFree, arrangement: int, kit: StreetMaterials, things: FurnitureMaterials
+) -> list[Surface]:
     rng = rng_of(seed, f"bins/{arrangement}")
     result = []
     for _ in range(45):
