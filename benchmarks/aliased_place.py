@@ -28,9 +28,9 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.building import build_map
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.sequences.frame import StereoFrame
-from topoloc.sequences.open import open_sequence
-from topoloc.sequences.recording import single_pictures
+from topoloc.recordings.frame import StereoFrame
+from topoloc.recordings.open import open_sequence
+from topoloc.recordings.recording import single_pictures
 from topoloc.tracking.tracker import Tracker
 from topoloc_worlds.hospital.plan import BAY, walls_of
 

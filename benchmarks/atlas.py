@@ -30,11 +30,11 @@ from topoloc.geometry.alignment import translation_error
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.query import Picture
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.map.memory import set_node_memory
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.sequences.frame import StereoFrame
-from topoloc.sequences.open import open_sequence
-from topoloc.sequences.recording import single_pictures
+from topoloc.mapping.memory import set_node_memory
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.frame import StereoFrame
+from topoloc.recordings.open import open_sequence
+from topoloc.recordings.recording import single_pictures
 from topoloc.tracking.warm_up import warm_up
 
 RIGHT_METRES = 0.5

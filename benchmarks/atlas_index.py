@@ -31,8 +31,8 @@ from topoloc.atlas.index_files import open_index
 from topoloc.atlas.manifest import StoredFile, Tile
 from topoloc.atlas.place_shard import PlaceShard
 from topoloc.atlas.place_vectors import PlaceVectors, read_vectors
-from topoloc.places.place_kernels import multiply_rows
-from topoloc.places.shared_vocabulary import shared_vocabulary
+from topoloc.retrieval.place_kernels import multiply_rows
+from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
 NUM_NEIGHBOURS, PLACES_A_TILE, CHUNK = 20, 250, 100_000
 

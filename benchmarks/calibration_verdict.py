@@ -13,9 +13,9 @@ from topoloc.geometry.calibration_check import SeenCamera
 from topoloc.geometry.calibration_verdict import verdict_of_pictures
 from topoloc.geometry.camera import MODELS, Camera
 from topoloc.localization.localizer import Localizer
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.sequences.frame import StereoSequence
-from topoloc.sequences.open import open_sequence
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.open import open_sequence
 
 RIGHT = (1.0, 0.0, 0.0)
 WRONG = (

@@ -27,13 +27,13 @@ import numpy as np
 
 from topoloc.evaluation.experiments import neighbours_of
 from topoloc.features.extraction import extract_features
-from topoloc.map.nodes import NodePoses, node_distances
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.coarse import CoarseLocalizer, open_coarse
-from topoloc.places.network_config import PictureConfig
-from topoloc.sequences.frame import StereoSequence
-from topoloc.sequences.open import open_sequence
-from topoloc.sequences.pictures import grey_image
+from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.open import open_sequence
+from topoloc.recordings.pictures import grey_image
+from topoloc.retrieval.coarse import CoarseLocalizer, open_coarse
+from topoloc.retrieval.network_config import PictureConfig
 from topoloc_training.classifier_config import CnnFcConfig
 from topoloc_training.coarse_training import CoarseTrainingConfig, train_coarse
 

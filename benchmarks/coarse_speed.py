@@ -18,16 +18,16 @@ import torch
 
 from topoloc.compiled import set_num_threads
 from topoloc.features.features import Features
-from topoloc.places.backbones import Backbone
-from topoloc.places.cnn_fc import CnnFc, NodeClassifier
-from topoloc.places.cnn_nn import DEPTHS as CNN_DEPTHS
-from topoloc.places.cnn_nn import PooledFeatures
-from topoloc.places.coarse import CoarseLocalizer, CoarseModel
-from topoloc.places.inference import has_bfloat16
-from topoloc.places.network_config import BackboneName, PictureConfig
-from topoloc.places.vector_search import VectorSearch
-from topoloc.places.vlad_nn import DEPTHS as VLAD_DEPTHS
-from topoloc.places.vlad_nn import VladNetwork
+from topoloc.retrieval.backbones import Backbone
+from topoloc.retrieval.cnn_fc import CnnFc, NodeClassifier
+from topoloc.retrieval.cnn_nn import DEPTHS as CNN_DEPTHS
+from topoloc.retrieval.cnn_nn import PooledFeatures
+from topoloc.retrieval.coarse import CoarseLocalizer, CoarseModel
+from topoloc.retrieval.inference import has_bfloat16
+from topoloc.retrieval.network_config import BackboneName, PictureConfig
+from topoloc.retrieval.vector_search import VectorSearch
+from topoloc.retrieval.vlad_nn import DEPTHS as VLAD_DEPTHS
+from topoloc.retrieval.vlad_nn import VladNetwork
 from topoloc_training.classifier_config import CnnNnConfig, VladNnConfig
 from topoloc_training.stored_weights import to_arrays
 

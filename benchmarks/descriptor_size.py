@@ -37,9 +37,9 @@ from topoloc.features.kinds import find_kind
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.lifelong.prune import PruneConfig, _with_fewer
 from topoloc.localization.result import Localization
-from topoloc.map.points import array_packed, unit_descriptors
-from topoloc.map.topomap import TopoNode
-from topoloc.map.writing import write_map
+from topoloc.mapping.points import array_packed, unit_descriptors
+from topoloc.mapping.topomap import TopoNode
+from topoloc.mapping.writing import write_map
 
 _WRONG_M, _WRONG_DEG, _WORDS, _LEARNED_FROM = 0.5, 5.0, 256, 40_000
 

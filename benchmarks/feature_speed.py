@@ -19,8 +19,8 @@ import tyro
 from topoloc.features.extraction import FeatureConfig, extract_normalized, normalize_image
 from topoloc.features.matching import MatchingConfig, match_features, match_pooled
 from topoloc.features.patch_normalization import PatchNormalizationConfig, patch_normalize
-from topoloc.sequences.open import open_sequence
-from topoloc.sequences.pictures import grey_image
+from topoloc.recordings.open import open_sequence
+from topoloc.recordings.pictures import grey_image
 
 RECORDINGS = {
     "kitchen": "seven_scenes/kitchen/seq-01",

@@ -286,7 +286,7 @@ def _numbers(data: bytes) -> Iterator[tuple[int, int]]:
 
 
 def _read_picture(path: Path) -> str:
-    from topoloc.sequences.pictures import exif_focal_length, image_size, read_depth, read_image
+    from topoloc.recordings.pictures import exif_focal_length, image_size, read_depth, read_image
 
     width, height = image_size(path)
     exif_focal_length(path, width, height)
@@ -295,7 +295,7 @@ def _read_picture(path: Path) -> str:
 
 
 def _read_recording(path: Path) -> str:
-    from topoloc.sequences.open import open_sequence
+    from topoloc.recordings.open import open_sequence
 
     sequence = open_sequence(path)
     for k in range(min(len(sequence), 5)):

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 
 from real_recordings import PLACES, Place
-from topoloc.cli.features_option import localizer_of
+from topoloc.apps.cli.features_option import localizer_of
 from topoloc.demo.recordings import SHIPPED
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
@@ -31,9 +31,9 @@ from topoloc.localization.evidence import EvidenceConfig, tolerated_translation
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.building import build_map
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.map.build import BuildConfig
-from topoloc.map.nodes import NodeConfig
-from topoloc.sequences.open import open_sequence
+from topoloc.mapping.build import BuildConfig
+from topoloc.mapping.nodes import NodeConfig
+from topoloc.recordings.open import open_sequence
 from topoloc_paper.fit.corpus import read_rigid
 from topoloc_paper.fit.pictures import darkened, drawn_pictures
 

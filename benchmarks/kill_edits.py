@@ -31,8 +31,8 @@ from pathlib import Path
 
 import numpy as np
 
-from topoloc.map.checking import damages
-from topoloc.map.edit import editing, undo_edit, undoable_edits
+from topoloc.mapping.checking import damages
+from topoloc.mapping.edit import editing, undo_edit, undoable_edits
 
 
 def edit_without_end(path: Path) -> None:

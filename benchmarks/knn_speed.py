@@ -19,7 +19,7 @@ from pathlib import Path
 import faiss
 import numpy as np
 
-from topoloc.places.neighbours import PlaceIndex
+from topoloc.retrieval.neighbours import PlaceIndex
 
 NUM_QUERIES = 200
 

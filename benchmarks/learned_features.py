@@ -25,9 +25,9 @@ import tyro
 from topoloc.features.features import Features
 from topoloc.features.learned import LearnedConfig, extract_learned
 from topoloc.features.surf import SurfConfig, extract_surf
-from topoloc.sequences.frame import StereoFrame
-from topoloc.sequences.open import open_sequence
-from topoloc.sequences.pictures import grey_image, read_image
+from topoloc.recordings.frame import StereoFrame
+from topoloc.recordings.open import open_sequence
+from topoloc.recordings.pictures import grey_image, read_image
 
 _TURN = np.cos(np.deg2rad(25))
 _SOLVED = (0.10, 1.0)  # metres, degrees

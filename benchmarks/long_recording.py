@@ -31,8 +31,8 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.map_facts.building import build_map
-from topoloc.map.build import BuildConfig
-from topoloc.sequences.frame import StereoFrame
+from topoloc.mapping.build import BuildConfig
+from topoloc.recordings.frame import StereoFrame
 from topoloc.slam.slam import run_slam
 
 CAMERA, BASELINE = Camera.pinhole(640, 400, 320.0, 320.0, 319.5, 199.5), 0.12

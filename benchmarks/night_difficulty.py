@@ -24,8 +24,8 @@ from topoloc.localization.evidence import EvidenceConfig
 from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.building import build_map
-from topoloc.map.build import BuildConfig
-from topoloc.sequences.open import open_sequence
+from topoloc.mapping.build import BuildConfig
+from topoloc.recordings.open import open_sequence
 
 BOUNDS = ("0.05m_5deg", "0.25m_2deg")
 UNGUIDED = GuidedConfig(num_nodes=0)

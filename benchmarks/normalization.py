@@ -30,9 +30,9 @@ from topoloc.features.surf import SurfConfig, extract_surf
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.rigid import Rigid3
-from topoloc.sequences.frame_view import FrameView, frame_view
-from topoloc.sequences.open import open_sequence
-from topoloc.slam.metric_points import MetricPointsConfig, locate_points
+from topoloc.points.metric_points import MetricPointsConfig, locate_points
+from topoloc.recordings.frame_view import FrameView, frame_view
+from topoloc.recordings.open import open_sequence
 
 KITCHEN, ZED = "seven_scenes/kitchen/seq-01", "zed_lab/session{}"
 # recording and frame of the map picture, of the query

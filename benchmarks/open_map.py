@@ -23,9 +23,9 @@ from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
-from topoloc.map.build import BuildConfig
-from topoloc.map.topomap import Edge, NodeSummary, PlaceImage, TopoMetricMap, TopoNode
-from topoloc.places.vlad import SurfVlad, VladConfig
+from topoloc.mapping.build import BuildConfig
+from topoloc.mapping.topomap import Edge, NodeSummary, PlaceImage, TopoMetricMap, TopoNode
+from topoloc.retrieval.vlad import SurfVlad, VladConfig
 
 NUM_POINTS = 800
 IMAGES_A_NODE = 3

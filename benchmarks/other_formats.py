@@ -21,10 +21,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from topoloc.sequences.frame import StereoFrame, StereoSequence
-from topoloc.sequences.frame_view import frame_view
-from topoloc.sequences.open import open_sequence
-from topoloc.sequences.pictures import jpeg_of
+from topoloc.recordings.frame import StereoFrame, StereoSequence
+from topoloc.recordings.frame_view import frame_view
+from topoloc.recordings.open import open_sequence
+from topoloc.recordings.pictures import jpeg_of
 
 COLMAP_UNIT = 2.5  # metres
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -29,8 +29,8 @@ from topoloc.localization.config import WallsConfig
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.building import build_map
 from topoloc.localization.result import Localization
-from topoloc.sequences.frame import StereoFrame
-from topoloc.sequences.open import open_sequence
+from topoloc.recordings.frame import StereoFrame
+from topoloc.recordings.open import open_sequence
 
 CHI_SQUARE_6_AT_95 = 12.592
 MIN_POINTS, MAX_METRES = 50, 60.0

@@ -27,10 +27,10 @@ import tyro
 from topoloc.features.extraction import extract_features
 from topoloc.features.features import Features
 from topoloc.features.kinds import FeatureConfig
-from topoloc.map.config import MapConfig
-from topoloc.places.vlad import SurfVlad, learn_words, placed, vlad
-from topoloc.sequences.open import open_sequence
-from topoloc.sequences.pictures import grey_image, read_image
+from topoloc.mapping.config import MapConfig
+from topoloc.recordings.open import open_sequence
+from topoloc.recordings.pictures import grey_image, read_image
+from topoloc.retrieval.vlad import SurfVlad, learn_words, placed, vlad
 
 _TURN_DEG = 20.0
 _NUM_FRAMES = 100

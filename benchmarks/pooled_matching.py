@@ -22,9 +22,9 @@ import tyro
 from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.matching import MatchingConfig, match_features, match_pooled
 from topoloc.geometry.absolute_pose import estimate_absolute_pose
-from topoloc.sequences.frame_view import frame_view
-from topoloc.sequences.open import open_sequence
-from topoloc.slam.metric_points import MetricPointsConfig, locate_points
+from topoloc.points.metric_points import MetricPointsConfig, locate_points
+from topoloc.recordings.frame_view import frame_view
+from topoloc.recordings.open import open_sequence
 
 Rule = Callable[[np.ndarray, "Pool", float], tuple[np.ndarray, np.ndarray]]
 

@@ -22,9 +22,9 @@ from topoloc.evaluation.experiments import answer_queries
 from topoloc.evaluation.metrics import summarize
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.network_config import PictureConfig
-from topoloc.sequences.open import open_sequence
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.open import open_sequence
+from topoloc.retrieval.network_config import PictureConfig
 from topoloc_paper.posenet import PoseNet, PoseNetConfig, train_posenet
 from topoloc_training.classifier_config import TrainingConfig
 from topoloc_training.weights import find_weights

@@ -22,9 +22,9 @@ from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.building import build_map
-from topoloc.map.build import BuildConfig
-from topoloc.map.nodes import NodeConfig
-from topoloc.sequences.open import open_sequence
+from topoloc.mapping.build import BuildConfig
+from topoloc.mapping.nodes import NodeConfig
+from topoloc.recordings.open import open_sequence
 
 PEER = "the paper's scheme on OpenCV"
 AS_WRITTEN = LocalizerConfig(

@@ -24,11 +24,11 @@ from pathlib import Path
 
 from ray.cluster_utils import Cluster
 
+from topoloc.apps.cli.recording_maps import MapMaking, PosesAsked
+from topoloc.apps.cluster.building import AtlasBuild, build_on_ray
+from topoloc.apps.cluster.tiles import Outcome, TileJob, tile_ids
 from topoloc.atlas.atlas import Atlas
-from topoloc.cli.recording_maps import MapMaking, PosesAsked
-from topoloc.cluster.building import AtlasBuild, build_on_ray
-from topoloc.cluster.tiles import Outcome, TileJob, tile_ids
-from topoloc.map.build import BuildConfig
+from topoloc.mapping.build import BuildConfig
 from topoloc.slam.slam import SlamConfig
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")

@@ -26,11 +26,11 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.building import build_map
-from topoloc.map.build import BuildConfig
-from topoloc.map.nodes import NodeConfig
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.sequences.frame import StereoFrame
-from topoloc.sequences.open import open_sequence
+from topoloc.mapping.build import BuildConfig
+from topoloc.mapping.nodes import NodeConfig
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.frame import StereoFrame
+from topoloc.recordings.open import open_sequence
 from topoloc_paper.fit.corpus import read_rigid
 from topoloc_paper.fit.pictures import darkened, drawn_pictures
 

@@ -1,5 +1,6 @@
-"""Seconds a picture of every world, and seconds until its light is known: python
-benchmarks/render_speed.py [--worlds lab] [--fresh]
+"""Seconds a picture of every world, and seconds until its light is known:
+
+    python benchmarks/render_speed.py [--worlds lab] [--fresh]
 
 Light is traced once for a world, a condition and a quality, and kept in the cache; with --fresh it
 is traced here, into a cache of its own. Without LLVM nothing is known beforehand, and each picture

@@ -36,7 +36,7 @@ import numpy as np
 
 from topoloc import Localizer, TopoMetricMap, open_sequence, set_num_threads
 from topoloc.geometry.camera import Camera
-from topoloc.sequences.pictures import PictureBytes, jpeg_of, read_image
+from topoloc.recordings.pictures import PictureBytes, jpeg_of, read_image
 
 
 @dataclass

@@ -27,12 +27,12 @@ from topoloc.features.extraction import extract_features
 from topoloc.features.features import Features
 from topoloc.features.kinds import FeatureConfig
 from topoloc.geometry.rigid import Rigid3
-from topoloc.map.config import MapConfig
-from topoloc.map.session_light import light_distance, light_groups
-from topoloc.map.sessions import Light, Session, light_of, mean_light
-from topoloc.places.vlad import SurfVlad, learn_words, placed, vlad
-from topoloc.sequences.open import open_sequence
-from topoloc.sequences.pictures import grey_image, read_image
+from topoloc.mapping.config import MapConfig
+from topoloc.mapping.session_light import light_distance, light_groups
+from topoloc.mapping.sessions import Light, Session, light_of, mean_light
+from topoloc.recordings.open import open_sequence
+from topoloc.recordings.pictures import grey_image, read_image
+from topoloc.retrieval.vlad import SurfVlad, learn_words, placed, vlad
 
 SHARED = Path(os.environ.get("TOPOLOC_SHARED", Path(__file__).parents[2] / "shared"))
 LAB = Path(__file__).parents[1] / "src/topoloc/demo/lab"

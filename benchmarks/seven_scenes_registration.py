@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.sequences.frame import StereoFrame
-from topoloc.sequences.open import open_sequence
-from topoloc.sequences.pictures import grey_image
-from topoloc.sequences.seven_scenes import COLOUR_CAMERA, COLOUR_FROM_DEPTH, DEPTH_CAMERA
+from topoloc.recordings.frame import StereoFrame
+from topoloc.recordings.open import open_sequence
+from topoloc.recordings.pictures import grey_image
+from topoloc.recordings.seven_scenes import COLOUR_CAMERA, COLOUR_FROM_DEPTH, DEPTH_CAMERA
 
 EVERY = 7
 BORDER_PX = 4

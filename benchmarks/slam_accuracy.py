@@ -30,7 +30,7 @@ from topoloc.geometry.alignment import (
     relative_drift,
 )
 from topoloc.geometry.rigid import Rigid3
-from topoloc.sequences.open import open_sequence
+from topoloc.recordings.open import open_sequence
 from topoloc.slam.slam import run_slam
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import topoloc
 from topoloc.demo.recordings import SHIPPED
 from topoloc.errors import UnreadableImageError
-from topoloc.sequences.trajectory import Trajectory, write_tum
+from topoloc.recordings.trajectory import Trajectory, write_tum
 
 
 def main(map_file: Path | None, folder: str, out: Path) -> None:

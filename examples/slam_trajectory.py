@@ -15,7 +15,7 @@ import numpy as np
 import topoloc
 from topoloc.demo.recordings import SHIPPED
 from topoloc.geometry.alignment import absolute_trajectory_errors
-from topoloc.sequences.trajectory import Trajectory, with_trajectory, write_tum
+from topoloc.recordings.trajectory import Trajectory, with_trajectory, write_tum
 from topoloc.slam.slam import run_slam
 
 

@@ -15,8 +15,8 @@ import topoloc
 from topoloc.demo.recordings import SHIPPED
 from topoloc.evaluation.experiments import answer_queries
 from topoloc.evaluation.metrics import summarize
-from topoloc.map.nodes import NodeConfig
-from topoloc.places.network_config import PictureConfig
+from topoloc.mapping.nodes import NodeConfig
+from topoloc.retrieval.network_config import PictureConfig
 from topoloc_training.classifier_config import CnnFcConfig, TrainingConfig
 from topoloc_training.coarse_storing import store_coarse
 from topoloc_training.coarse_training import CoarseTrainingConfig, train_coarse

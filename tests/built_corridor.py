@@ -20,9 +20,9 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.map_facts.building import build_map
-from topoloc.map.build import BuildConfig
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.sequences.frame import StereoFrame
+from topoloc.mapping.build import BuildConfig
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.frame import StereoFrame
 
 WIDE = Camera.pinhole(480, 320, 240.0, 240.0, 239.5, 159.5)
 """45 degrees to either side, as a phone or a stereo camera of a robot sees them."""

@@ -14,9 +14,9 @@ from made_once import once_a_run
 from tiny_world import CAMERA, path_pose, render, room, tum_line, write_stereo_recording
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.map_facts.building import build_map
-from topoloc.map.build import BuildConfig
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.sequences.open import open_sequence
+from topoloc.mapping.build import BuildConfig
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.open import open_sequence
 
 
 @once_a_run

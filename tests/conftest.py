@@ -104,7 +104,7 @@ def queries(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def complaint(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., str]:
     """Runs a command that must fail: its one line on stderr. No file may appear, change size or
     go."""
-    from topoloc.cli import main  # after the hook above
+    from topoloc.apps.cli import main  # after the hook above
 
     def run(*args: object, status: int = 1) -> str:
         before = {path: path.stat().st_size for path in tmp_path.rglob("*")}

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.map.topomap import TopoMetricMap, TopoNode
-from topoloc.places.vlad import SurfVlad
+from topoloc.mapping.topomap import TopoMetricMap, TopoNode
+from topoloc.retrieval.vlad import SurfVlad
 
 ELSEWHERE = Rigid3(exp_so3(np.array([0.0, 0.0, 1.0])), np.array([40.0, -15.0, 0.0]))
 """Where the second room stands, in the world of the first."""

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 import topoloc
 from built_room import built_room
+from topoloc.apps.cli.settings_file import all_tables, config_class, meanings_of
 from topoloc.bounds import (
     Above,
     AtLeast,
@@ -26,9 +27,8 @@ from topoloc.bounds import (
     complaint,
     settings_from,
 )
-from topoloc.cli.settings_file import all_tables, config_class, meanings_of
 from topoloc.errors import ConfigError
-from topoloc.map.nodes import NodeConfig
+from topoloc.mapping.nodes import NodeConfig
 from topoloc.slam.odometry import OdometryConfig
 from topoloc.slam.slam import SlamConfig, run_slam
 from topoloc.tracking.pose_hypotheses import HypothesesConfig

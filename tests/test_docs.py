@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 import topoloc
-from topoloc.cli import all_commands, main
+from topoloc.apps.cli import all_commands, main
 from topoloc.evaluation.metrics import Answer, summarize
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.map import schema
-from topoloc.places.coarse import NodeScore
+from topoloc.mapping import schema
+from topoloc.retrieval.coarse import NodeScore
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -18,9 +18,9 @@ import pytest
 
 import topoloc
 from topoloc.demo.recordings import SHIPPED
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.sequences.frame import StereoSequence
-from topoloc.sequences.trajectory import read_trajectory
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.trajectory import read_trajectory
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 MAX_LINES = 60

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 import topoloc
-from topoloc.cli import BROUGHT, COMMANDS, all_commands, main
+from topoloc.apps.cli import BROUGHT, COMMANDS, all_commands, main
 
 ROOT = Path(__file__).parents[1]
 HEAVY = ("cv2", "faiss", "matplotlib", "numba", "numpy", "poselib", "torch", "tyro")
@@ -180,7 +180,7 @@ def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.parametrize(
-    "statement", ["import topoloc", "from topoloc.cli import main; main(['--help'])"]
+    "statement", ["import topoloc", "from topoloc.apps.cli import main; main(['--help'])"]
 )
 def test_nothing_heavy_is_loaded_before_it_is_needed(statement: str):
     code = f"import sys; {statement}; print([name for name in {HEAVY} if name in sys.modules])"
@@ -198,21 +198,22 @@ def test_every_module_loads_without_extras_but_learned_classifiers_and_figures()
     assert answer.returncode == 0, answer.stderr
     modules, learning, asked = json.loads(answer.stdout)
     assert "topoloc.localization.localizer" in modules
-    assert "topoloc.places.cnn_fc" in learning
-    assert "topoloc.places.network_config" not in learning
+    assert "topoloc.retrieval.cnn_fc" in learning
+    assert "topoloc.retrieval.network_config" not in learning
     drawing = {
-        f"topoloc.evaluation.{name}"
+        f"topoloc.apps.report.{name}"
         for name in ("figures", "map_figure", "report", "weak_parts_figure", "weak_parts_page")
     }
     others = [
         name
         for name in learning
-        if not name.startswith(("topoloc.places.", "topoloc.service.")) and name not in drawing
+        if not name.startswith(("topoloc.retrieval.", "topoloc.apps.service."))
+        and name not in drawing
     ]
-    assert others == ["topoloc.export.ros_messages", "topoloc.sequences.bags.mcap_file"]
+    assert others == ["topoloc.apps.formats.bags.mcap_file", "topoloc.apps.robots.ros_messages"]
     assert not {
-        "topoloc.service.client",
-        "topoloc.service.config",
+        "topoloc.apps.service.client",
+        "topoloc.apps.service.config",
         "topoloc.atlas.open_maps",
     } & set(learning), "commands and clients need these"
     assert "torchvision" not in asked

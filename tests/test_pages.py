@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 
 import topoloc
-from topoloc.cli import all_commands
-from topoloc.cli.settings_file import all_tables, config_class, read_settings
+from topoloc.apps.cli import all_commands
+from topoloc.apps.cli.settings_file import all_tables, config_class, read_settings
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -94,7 +94,7 @@ def test_every_public_name_is_in_the_reference(name: str):
 
 def test_settings_that_the_pipeline_names_are_there(capsys: pytest.CaptureFixture[str]):
     """The table of the paper's own settings."""
-    from topoloc.cli import main
+    from topoloc.apps.cli import main
 
     helps = ""
     for command in ("build", "train", "localize"):

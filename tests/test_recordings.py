@@ -13,10 +13,10 @@ from topoloc.evaluation.experiments import answer_elsewhere, answer_queries
 from topoloc.evaluation.metrics import summarize
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
-from topoloc.map.build import BuildConfig, build_map
-from topoloc.map.nodes import NodeConfig
-from topoloc.sequences.open import open_sequence
-from topoloc.sequences.recording import sequence_subset
+from topoloc.mapping.build import BuildConfig, build_map
+from topoloc.mapping.nodes import NodeConfig
+from topoloc.recordings.open import open_sequence
+from topoloc.recordings.recording import sequence_subset
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ class CommandHelp(SphinxDirective):
     """What every command prints for `--help`, a section each: the reference that no hand writes."""
 
     def run(self) -> list[nodes.Node]:
-        from topoloc.cli import all_commands
+        from topoloc.apps.cli import all_commands
 
         os.environ["COLUMNS"] = "82"  # as wide as a page
         sections: list[nodes.Node] = []
@@ -30,7 +30,7 @@ class CommandHelp(SphinxDirective):
 
 
 def _printed(args: list[str]) -> str:
-    from topoloc.cli import main
+    from topoloc.apps.cli import main
 
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):

@@ -11,6 +11,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from topoloc.apps.service.client import AsyncClient, Client
     from topoloc.compiled import set_num_threads
     from topoloc.errors import TopolocError
     from topoloc.geometry.camera import Camera
@@ -22,12 +23,11 @@ if TYPE_CHECKING:
     from topoloc.localization.provenance import Provenance
     from topoloc.localization.result import Alternative, Localization, NotLocalized
     from topoloc.localization.search import Trace
-    from topoloc.map.build import BuildConfig
-    from topoloc.map.topomap import TopoMetricMap
-    from topoloc.sequences.frame import DepthImage, StereoFrame
-    from topoloc.sequences.memory_sequence import MemorySequence
-    from topoloc.sequences.open import open_sequence
-    from topoloc.service.client import AsyncClient, Client
+    from topoloc.mapping.build import BuildConfig
+    from topoloc.mapping.topomap import TopoMetricMap
+    from topoloc.recordings.frame import DepthImage, StereoFrame
+    from topoloc.recordings.memory_sequence import MemorySequence
+    from topoloc.recordings.open import open_sequence
     from topoloc.tracking.stream_result import StreamedPose
     from topoloc.tracking.tracker import Tracker, TrackerConfig
     from topoloc.tracking.warm_up import warm_up
@@ -66,29 +66,29 @@ __all__ = [
 
 _MODULES = {
     "Alternative": "topoloc.localization.result",
-    "AsyncClient": "topoloc.service.client",
-    "BuildConfig": "topoloc.map.build",
+    "AsyncClient": "topoloc.apps.service.client",
+    "BuildConfig": "topoloc.mapping.build",
     "Camera": "topoloc.geometry.camera",
-    "Client": "topoloc.service.client",
-    "DepthImage": "topoloc.sequences.frame",
+    "Client": "topoloc.apps.service.client",
+    "DepthImage": "topoloc.recordings.frame",
     "GeoPose": "topoloc.geometry.geodesy",
     "Localization": "topoloc.localization.result",
     "Localizer": "topoloc.localization.localizer",
     "LocalizerConfig": "topoloc.localization.localizer",
-    "MemorySequence": "topoloc.sequences.memory_sequence",
+    "MemorySequence": "topoloc.recordings.memory_sequence",
     "NotLocalized": "topoloc.localization.result",
     "Provenance": "topoloc.localization.provenance",
     "Rigid3": "topoloc.geometry.rigid",
-    "StereoFrame": "topoloc.sequences.frame",
+    "StereoFrame": "topoloc.recordings.frame",
     "StereoRig": "topoloc.geometry.rig",
     "StreamedPose": "topoloc.tracking.stream_result",
-    "TopoMetricMap": "topoloc.map.topomap",
+    "TopoMetricMap": "topoloc.mapping.topomap",
     "TopolocError": "topoloc.errors",
     "Trace": "topoloc.localization.search",
     "Tracker": "topoloc.tracking.tracker",
     "TrackerConfig": "topoloc.tracking.tracker",
     "build_map": "topoloc.localization.map_facts.building",
-    "open_sequence": "topoloc.sequences.open",
+    "open_sequence": "topoloc.recordings.open",
     "set_num_threads": "topoloc.compiled",
     "warm_up": "topoloc.tracking.warm_up",
 }

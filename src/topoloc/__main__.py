@@ -2,7 +2,7 @@
 
 import sys
 
-from topoloc.cli import main
+from topoloc.apps.cli import main
 
 if __name__ == "__main__":
     sys.exit(main())

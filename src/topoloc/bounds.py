@@ -122,9 +122,9 @@ def settings_from(
             raise ConfigError(f"{its_key}: no such setting{did_you_mean(its_key, known)}")
     required = (
         field.name
-        for field in fields(of)
+        for field in fields(of)  # pyright: ignore[reportArgumentType]
         if field.default is MISSING and field.default_factory is MISSING
-    )  # pyright: ignore[reportArgumentType]
+    )
     if missing := [name for name in required if name not in values]:
         raise ConfigError(f"{key}.{missing[0]}: is missing")
     try:

@@ -11,8 +11,8 @@ import pytest
 
 from topoloc.atlas.editing import create_atlas, new_tiles
 from topoloc.localization.map_facts.building import build_map
-from topoloc.map.build import BuildConfig
-from topoloc.sequences.open import open_sequence
+from topoloc.mapping.build import BuildConfig
+from topoloc.recordings.open import open_sequence
 
 
 @pytest.fixture(scope="session")

@@ -12,9 +12,9 @@ import pytest
 
 from built_room import unseen_views, write_pictures
 from schemas import check_result
+from topoloc.apps.cli import main
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.manifest import Tile
-from topoloc.cli import main
 from topoloc.errors import StoreError
 
 Complaint = Callable[..., str]

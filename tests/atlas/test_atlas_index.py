@@ -12,7 +12,7 @@ from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.index import AtlasIndex
 from topoloc.atlas.place_vectors import place_vectors, read_vectors, write_vectors
 from topoloc.errors import AtlasError
-from topoloc.map.topomap import TopoMetricMap
+from topoloc.mapping.topomap import TopoMetricMap
 
 
 def _units(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -59,7 +59,7 @@ def test_vectors_of_a_map_are_kept_and_those_of_another_vocabulary_are_not_compa
         assert len(vectors["surf"]) == len(topomap.summaries)
     assert np.allclose(np.linalg.norm(vectors["surf"], axis=1), 1.0, atol=1e-5)
     write_vectors(tmp_path / "places", vectors)
-    from topoloc.places.shared_vocabulary import shared_vocabulary
+    from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
     vocabulary = shared_vocabulary("surf")
     assert vocabulary is not None
@@ -84,7 +84,7 @@ def test_pictures_look_like_their_own_tile(atlas: Path):
     from tiny_world import CAMERA
     from topoloc.features.extraction import extract_features
     from topoloc.features.kinds import FeatureConfig
-    from topoloc.places.shared_vocabulary import shared_vocabulary
+    from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
     index, vocabulary = Atlas.open(str(atlas)).index, shared_vocabulary("surf")
     assert vocabulary is not None

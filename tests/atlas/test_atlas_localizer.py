@@ -23,7 +23,7 @@ from topoloc.localization import query
 from topoloc.localization.asking import Asking
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized, result_from_json
-from topoloc.map.topomap import TopoMetricMap
+from topoloc.mapping.topomap import TopoMetricMap
 
 BUDGET = 100_000_000
 

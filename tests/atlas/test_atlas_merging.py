@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from topoloc.apps.cli import main
 from topoloc.atlas.atlas import Atlas, tile_problem
 from topoloc.atlas.editing import add_joins, create_atlas, new_tiles
 from topoloc.atlas.joins import Join
 from topoloc.atlas.merging import merge_atlases
-from topoloc.cli import main
 from topoloc.errors import AtlasError
 from topoloc.geometry.rigid import Rigid3
 

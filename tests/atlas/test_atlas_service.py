@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
+from topoloc.apps.service.application import Access, make_application
+from topoloc.apps.service.config import ServiceConfig
 from topoloc.atlas.editing import add_tiles, new_tiles, remove_tiles
 from topoloc.atlas.open_maps import Maps
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.service.application import Access, make_application
-from topoloc.service.config import ServiceConfig
+from topoloc.mapping.topomap import TopoMetricMap
 
 
 @pytest.fixture

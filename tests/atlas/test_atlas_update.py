@@ -14,19 +14,19 @@ import numpy as np
 import pytest
 
 from tiny_world import write_stereo_recording
+from topoloc.apps.cli import main
 from topoloc.atlas.atlas import Atlas, tile_problem
 from topoloc.atlas.editing import NewTile, add_joins, add_tiles, create_atlas, new_tiles
 from topoloc.atlas.joins import Join
 from topoloc.atlas.manifest import Tile
-from topoloc.cli import main
 from topoloc.errors import AtlasError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.lifelong.tile_choice import TileChoiceConfig, chosen_tile
 from topoloc.lifelong.tile_update import edited_tile
 from topoloc.localization.provenance import Provenance
 from topoloc.localization.result import Localization
-from topoloc.map.edit import editing
-from topoloc.map.topomap import TopoMetricMap
+from topoloc.mapping.edit import editing
+from topoloc.mapping.topomap import TopoMetricMap
 
 Complaint = Callable[..., str]
 

@@ -14,7 +14,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.evidence import Evidence
 from topoloc.localization.provenance import Provenance
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.places.coarse import NodeScore
+from topoloc.retrieval.coarse import NodeScore
 
 STRONG = Evidence(200, 150, 400, 500, 20, 0.9, 0.05, 0.7)
 FAIR = Evidence(100, 30, 80, 400, 20, 0.5, 0.15, 0.15)

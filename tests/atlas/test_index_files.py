@@ -17,7 +17,7 @@ from topoloc.atlas.manifest import StoredFile, Tile
 from topoloc.atlas.place_shard import PlaceShard
 from topoloc.atlas.place_vectors import PlaceVectors
 from topoloc.errors import AtlasError
-from topoloc.places.shared_vocabulary import shared_vocabulary
+from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
 PLACES_A_TILE = 60
 

@@ -15,17 +15,17 @@ from uuid import uuid4
 import pytest
 from fastapi.testclient import TestClient
 
+from topoloc.apps.service import served_atlases
+from topoloc.apps.service.application import Access, make_application
+from topoloc.apps.service.config import ServiceConfig
+from topoloc.apps.stores.object_store import ObjectStore
 from topoloc.atlas import tile_fetches
 from topoloc.atlas.atlas import Atlas, store_at
 from topoloc.atlas.editing import add_tiles, create_atlas, new_tiles, remove_tiles
-from topoloc.atlas.object_store import ObjectStore
 from topoloc.atlas.open_maps import Maps
 from topoloc.atlas.tile_fetches import TileAwaited, TileFetches
 from topoloc.errors import AtlasError, MapError, StoreError
 from topoloc.localization.localizer import Localizer
-from topoloc.service import served_atlases
-from topoloc.service.application import Access, make_application
-from topoloc.service.config import ServiceConfig
 
 
 @pytest.fixture(params=["memory", "s3"])
@@ -246,7 +246,10 @@ def test_what_was_opened_answers_while_the_store_is_gone(
 
     with _served(in_memory) as (client, _):
         assert _asked(client, "/v1/maps/room/localize", queries)["localized"]
-        with monkeypatch.context() as patched, caplog.at_level(logging.WARNING, "topoloc.service"):
+        with (
+            monkeypatch.context() as patched,
+            caplog.at_level(logging.WARNING, "topoloc.apps.service"),
+        ):
             for name in ("ls", "get_file", "cat_file"):
                 patched.setattr(type(ObjectStore(in_memory)._files), name, gone)
             _until(lambda: bool(caplog.records))
@@ -272,7 +275,10 @@ def test_a_missing_or_rotten_tile_is_named_and_the_others_answer(
     files, name = ObjectStore(in_memory)._files, _file_of(in_memory, "other")
     path = f"{in_memory.removeprefix('memory:/')}/{name}"
     files.pipe_file(path, b"rotten") if is_there else files.rm_file(path)
-    with _served(in_memory) as (client, _), caplog.at_level(logging.WARNING, "topoloc.service"):
+    with (
+        _served(in_memory) as (client, _),
+        caplog.at_level(logging.WARNING, "topoloc.apps.service"),
+    ):
         for _ in range(2):
             answer = _posted(client, "/v1/maps/other/localize", queries)
             assert answer.status_code == 503

@@ -12,12 +12,12 @@ from uuid import uuid4
 
 import pytest
 
+from topoloc.apps.cli import main
 from topoloc.atlas.atlas import Atlas, tile_problem
 from topoloc.atlas.editing import create_atlas, new_tiles
 from topoloc.atlas.manifest import Manifest
-from topoloc.cli import main
 from topoloc.lifelong.tile_update import edited_tile
-from topoloc.map.edit import editing, undo_edit
+from topoloc.mapping.edit import editing, undo_edit
 
 Complaint = Callable[..., str]
 ORIGIN = "51.5,-0.17,30,90"

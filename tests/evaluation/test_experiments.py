@@ -12,7 +12,7 @@ from topoloc.errors import CalibrationError, TrajectoryError
 from topoloc.evaluation.experiments import answer_elsewhere, answer_queries
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
-from topoloc.sequences.open import open_sequence
+from topoloc.recordings.open import open_sequence
 
 
 @pytest.fixture(scope="module")

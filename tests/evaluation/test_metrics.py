@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from hand_made import answer, elsewhere, lost
 
+from topoloc.apps.viewer.result_files import read_results
 from topoloc.evaluation.metrics import summarize
-from topoloc.viewer.result_files import read_results
 
 ANSWERS = [
     answer("a", 0.0, error_m=0.01, error_deg=0.1),

@@ -11,7 +11,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.lifelong.adjusted_walk import adjusted_walk
 from topoloc.lifelong.session_poses import SessionPosesConfig
 from topoloc.localization.result import Localization
-from topoloc.sequences.frame import StereoFrame
+from topoloc.recordings.frame import StereoFrame
 from topoloc.slam.single_camera import SingleCameraOdometry, Stretch
 from topoloc.slam.single_camera_config import SingleCameraConfig
 

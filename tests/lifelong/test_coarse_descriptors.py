@@ -12,12 +12,12 @@ import pytest
 from built_room import unseen_views
 from tiny_world import CAMERA
 from topoloc import Localizer, TopoMetricMap
-from topoloc.cli import main
+from topoloc.apps.cli import main
 from topoloc.geometry.alignment import translation_error
 from topoloc.lifelong.coarse_descriptors import coarser
 from topoloc.localization.result import Localization
-from topoloc.map.checking import damages
-from topoloc.map.points import array_packed
+from topoloc.mapping.checking import damages
+from topoloc.mapping.points import array_packed
 
 STEP = 0.64
 

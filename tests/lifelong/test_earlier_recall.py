@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from topoloc import TopoMetricMap
-from topoloc.cli import main
+from topoloc.apps.cli import main
 from topoloc.lifelong.earlier_recall import described, earlier_recall
 from topoloc.lifelong.prune import with_points
 

@@ -14,11 +14,11 @@ import pytest
 from built_room import unseen_views
 from tiny_world import CAMERA
 from topoloc import Localizer, TopoMetricMap
-from topoloc.cli import main
+from topoloc.apps.cli import main
 from topoloc.geometry.alignment import translation_error
 from topoloc.lifelong.fewer_nodes import Holds, dropped_one_by_one, holds_of, without_nodes
 from topoloc.localization.result import Localization
-from topoloc.map.checking import damages
+from topoloc.mapping.checking import damages
 
 
 def _holds(landmarks: list[list[int]], pictures: list[int]) -> Holds:

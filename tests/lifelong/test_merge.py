@@ -14,15 +14,15 @@ import pytest
 
 from tiny_world import CAMERA, path_pose, render, room, write_stereo_recording
 from topoloc import Localizer, TopoMetricMap, open_sequence
-from topoloc.cli import main
+from topoloc.apps.cli import main
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.map_facts.building import build_map
 from topoloc.localization.query import Picture
 from topoloc.localization.result import Localization
-from topoloc.map.build import BuildConfig
-from topoloc.map.checking import damages
-from topoloc.sequences.recording import SequenceView
+from topoloc.mapping.build import BuildConfig
+from topoloc.mapping.checking import damages
+from topoloc.recordings.recording import SequenceView
 
 OTHER_WORLD = Rigid3(exp_so3(np.array([0.1, 0.4, -0.8])), np.array([-4.0, 7.0, 1.0]))
 SECOND = np.arange(4.0, 17.0)

@@ -15,13 +15,13 @@ import pytest
 from built_room import unseen_views
 from tiny_world import CAMERA
 from topoloc import Localizer, TopoMetricMap
-from topoloc.cli import main
+from topoloc.apps.cli import main
 from topoloc.geometry.alignment import translation_error
 from topoloc.lifelong.prune import with_points
 from topoloc.localization.result import Localization
-from topoloc.map.checking import damages
-from topoloc.map.edit import editing
-from topoloc.map.sums import LandmarkSums
+from topoloc.mapping.checking import damages
+from topoloc.mapping.edit import editing
+from topoloc.mapping.sums import LandmarkSums
 
 
 def _counts(num_points: int, expected: int, seen: np.ndarray) -> LandmarkSums:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from tiny_world import CAMERA, Panel, path_pose, render, room, write_stereo_recording
+from topoloc.apps.cli import main
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.atlas_localizer import AtlasLocalizer
 from topoloc.atlas.editing import add_joins, add_tiles, create_atlas, new_tiles, remove_tiles
@@ -20,7 +21,6 @@ from topoloc.atlas.joins import sigmas_at
 from topoloc.atlas.manifest import Manifest
 from topoloc.atlas.near import NearPose, tiles_in_reach
 from topoloc.atlas.open_maps import Maps
-from topoloc.cli import main
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3, exp_so3
@@ -30,10 +30,10 @@ from topoloc.lifelong.tile_joins import NotJoined, TileJoinConfig
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.building import Trust, build_map
 from topoloc.localization.result import Localization
-from topoloc.map.build import BuildConfig
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.sequences.open import open_sequence
-from topoloc.sequences.recording import SequenceView
+from topoloc.mapping.build import BuildConfig
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.open import open_sequence
+from topoloc.recordings.recording import SequenceView
 
 # each part of the walk in a world of its own: own_from_room
 WORLDS = {

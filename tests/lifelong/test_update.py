@@ -25,17 +25,17 @@ from tiny_world import (
     write_stereo_recording,
 )
 from topoloc import Localizer, TopoMetricMap, open_sequence
-from topoloc.cli import main
+from topoloc.apps.cli import main
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.lifelong.update import UpdateConfig, update_map
 from topoloc.localization.map_facts.building import build_map
 from topoloc.localization.result import Localization
-from topoloc.map.build import BuildConfig
-from topoloc.map.checking import damages
-from topoloc.map.edit import editing
-from topoloc.sequences.recording import SequenceView
+from topoloc.mapping.build import BuildConfig
+from topoloc.mapping.checking import damages
+from topoloc.mapping.edit import editing
+from topoloc.recordings.recording import SequenceView
 
 ON = np.arange(3.0, 24.0, 0.75)
 ELSEWHERE = Rigid3(exp_so3(np.array([0.3, -0.2, 1.1])), np.array([5.0, -3.0, 2.0]))

@@ -15,7 +15,7 @@ import pytest
 
 from tiny_world import write_stereo_recording
 from topoloc import Localizer, TopoMetricMap, open_sequence
-from topoloc.cli import main
+from topoloc.apps.cli import main
 from topoloc.geometry.rigid import Rigid3
 from topoloc.lifelong.left_out import evenly
 from topoloc.lifelong.prune import with_points
@@ -23,10 +23,10 @@ from topoloc.lifelong.weak_parts import WeakPartsConfig, weak_parts
 from topoloc.localization.map_facts.building import build_map
 from topoloc.localization.query import Picture
 from topoloc.localization.result import Localization
-from topoloc.map.build import BuildConfig
-from topoloc.map.sums import LandmarkSums
-from topoloc.map.topomap import TopoNode
-from topoloc.sequences.recording import SequenceView
+from topoloc.mapping.build import BuildConfig
+from topoloc.mapping.sums import LandmarkSums
+from topoloc.mapping.topomap import TopoNode
+from topoloc.recordings.recording import SequenceView
 
 TURNED = Rigid3(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))
 

@@ -18,7 +18,7 @@ from topoloc.localization.open_map import OpenMap
 from topoloc.localization.pose_fit import PoseFit
 from topoloc.localization.query import Query
 from topoloc.localization.search import Search
-from topoloc.places.coarse import NodeScore
+from topoloc.retrieval.coarse import NodeScore
 
 WEIGHTS = weights_of("surf")
 CANDIDATES = [NodeScore(3, 0.5)]

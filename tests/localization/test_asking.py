@@ -16,7 +16,7 @@ from topoloc.localization.evidence import log_odds_of
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.query import Picture
 from topoloc.localization.result import Localization
-from topoloc.map.topomap import TopoMetricMap
+from topoloc.mapping.topomap import TopoMetricMap
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,8 @@ from topoloc.localization import calibration_doubt
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import PoseFit
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.sequences.open import open_sequence
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.open import open_sequence
 
 
 def with_focal(camera: Camera, scale: float) -> Camera:

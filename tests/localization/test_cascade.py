@@ -32,9 +32,9 @@ from topoloc.localization.query import Query
 from topoloc.localization.refine import say_on
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Search, Trace
-from topoloc.map.build import BuildConfig
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.sequences.open import open_sequence
+from topoloc.mapping.build import BuildConfig
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.open import open_sequence
 from topoloc.tracking.tracker import Tracker
 
 PICTURE, TRUTH = unseen_views()[2]

@@ -19,7 +19,7 @@ from topoloc.localization.guided import (
     visible_points,
 )
 from topoloc.localization.local_map import LocalMap
-from topoloc.map.topomap import NodeSummary, TopoNode
+from topoloc.mapping.topomap import NodeSummary, TopoNode
 
 GUIDED = GuidedConfig().resolved(SURF)
 

@@ -18,8 +18,8 @@ from topoloc.localization.belief import Belief
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Trace
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.coarse import NodeScore
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.retrieval.coarse import NodeScore
 
 PICTURE, TRUTH = unseen_views()[2]
 

@@ -14,7 +14,7 @@ import pytest
 import topoloc
 from built_room import unseen_views
 from topoloc.errors import RecordingError
-from topoloc.sequences.open import open_sequence
+from topoloc.recordings.open import open_sequence
 
 SURF_ALONE = topoloc.BuildConfig(other_kinds=())
 

@@ -7,7 +7,7 @@ import pytest
 
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.open_map import viewing_distances
-from topoloc.map.nodes import NodePoses, node_distances
+from topoloc.mapping.nodes import NodePoses, node_distances
 
 NODES = NodePoses.of(
     [Rigid3.identity(), Rigid3(exp_so3(np.array([0.0, 0.5, 0.0])), np.array([1.0, 0.0, 0.0]))]

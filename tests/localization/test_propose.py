@@ -22,7 +22,7 @@ from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import PoseFit
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Proposal, Search, Trace
-from topoloc.map.topomap import TopoMetricMap
+from topoloc.mapping.topomap import TopoMetricMap
 
 LIGHTS = (0.055, 0.05, 0.045)
 ONLY_RETRIEVAL = LocalizerConfig(

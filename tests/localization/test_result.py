@@ -8,7 +8,7 @@ import numpy as np
 
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.result import Alternative, Localization, NotLocalized
-from topoloc.places.coarse import NodeScore
+from topoloc.retrieval.coarse import NodeScore
 
 POSE = Rigid3(exp_so3(np.array([0.1, -0.2, 0.3])), np.array([1.0, -2.0, 0.5]))
 CANDIDATES = [NodeScore(17, 0.812345), NodeScore(3, 0.4)]

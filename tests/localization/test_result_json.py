@@ -25,7 +25,7 @@ from topoloc.localization.evidence import Evidence
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.provenance import Provenance
 from topoloc.localization.result import Alternative, Localization, NotLocalized, result_from_json
-from topoloc.places.coarse import NodeScore
+from topoloc.retrieval.coarse import NodeScore
 from topoloc.tracking.tracker import Tracker
 
 POSE = Rigid3(exp_so3(np.array([0.1, -0.2, 0.3])), np.array([1.0, -2.0, 0.5]))

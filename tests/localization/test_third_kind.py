@@ -20,9 +20,9 @@ from topoloc.localization.fitted_weights import weights_of
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.building import build_map
 from topoloc.localization.result import Localization
-from topoloc.map.build import BuildConfig
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.sequences.open import open_sequence
+from topoloc.mapping.build import BuildConfig
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.open import open_sequence
 
 
 @pytest.fixture(scope="module")

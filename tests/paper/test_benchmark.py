@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from built_room import unseen_views, write_pictures
-from topoloc.cli import main
+from topoloc.apps.cli import main
 from topoloc_paper import benchmark
 from topoloc_paper.datasets import Dataset
 from topoloc_paper.settings import PaperConfig, WeightFiles

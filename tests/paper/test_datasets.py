@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import tyro
 
-from topoloc.sequences.trajectory import Trajectory
+from topoloc.recordings.trajectory import Trajectory
 from topoloc_paper import datasets
 from topoloc_paper.datasets import (
     RENDERED,

@@ -11,8 +11,8 @@ import pytest
 from built_room import built_room, unseen_views
 from tiny_world import CAMERA
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.sequences.frame import StereoFrame
-from topoloc.sequences.open import open_sequence
+from topoloc.recordings.frame import StereoFrame
+from topoloc.recordings.open import open_sequence
 from topoloc_paper.installed_size import installed_bytes
 from topoloc_paper.peer_answers import PeerAnswer, rows_of, summarize_peer
 from topoloc_paper.peer_colmap import Colmap

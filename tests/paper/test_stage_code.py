@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from topoloc.places.coarse import _MODULES, COARSE_NAMES
+from topoloc.retrieval.coarse import _MODULES, COARSE_NAMES
 from topoloc_paper import stage_code
 from topoloc_paper.peers import _CODE
 from topoloc_paper.posenet_baseline import _CODE as POSENET
@@ -93,13 +93,13 @@ def _done_again(change: Callable[[], object]) -> set[str]:
         ("topoloc/evaluation/metrics.py", set()),
         ("topoloc_paper/tables.py", set()),
         ("topoloc/errors.py", set()),
-        ("topoloc/places/vlad.py", {"mapping", *ASKING, *PEERS}),
-        ("topoloc/places/cnn_nn.py", {"asking cnn-nn", "learning cnn-nn"}),
+        ("topoloc/retrieval/vlad.py", {"mapping", *ASKING, *PEERS}),
+        ("topoloc/retrieval/cnn_nn.py", {"asking cnn-nn", "learning cnn-nn"}),
         ("topoloc_training/cnn_nn.py", {"learning cnn-nn"}),
         ("topoloc_training/training.py", {"learning cnn-fc", "learning PoseNet"}),
         ("topoloc_training/coarse_training.py", {*LEARNING, "learning PoseNet"}),
-        ("topoloc/map/landmarks.py", {"mapping", *ASKING, *PEERS}),
-        ("topoloc/map/reading.py", {"mapping", *ASKING, *PEERS}),
+        ("topoloc/mapping/landmarks.py", {"mapping", *ASKING, *PEERS}),
+        ("topoloc/mapping/reading.py", {"mapping", *ASKING, *PEERS}),
         ("topoloc/features/surf_detector_kernels.py", {"mapping", *ASKING, *PEERS}),
         ("topoloc_paper/colmap_worker.py", {"pycolmap, SIFT"}),
         ("topoloc_paper/pose_losses.py", {"learning PoseNet"}),
@@ -124,7 +124,7 @@ def test_comments_and_docstrings_are_no_change(code: Path):
 
 
 def test_what_a_stage_comes_to_import_counts(code: Path):
-    path = code / "topoloc/places/vlad.py"
+    path = code / "topoloc/retrieval/vlad.py"
     before = MAPPING.files()
     path.write_text(
         path.read_text().replace(
@@ -136,7 +136,7 @@ def test_what_a_stage_comes_to_import_counts(code: Path):
 
 
 def test_an_import_for_the_type_checker_alone_does_not_count(code: Path):
-    path = code / "topoloc/places/vlad.py"
+    path = code / "topoloc/retrieval/vlad.py"
     before = MAPPING.files()
     guarded = (
         "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from topoloc.slam import"
@@ -150,7 +150,7 @@ def test_an_import_for_the_type_checker_alone_does_not_count(code: Path):
 
 
 def test_every_module_named_is_there():
-    assert {f"topoloc/places/{module}.py" for module in _MODULES.values()} == set(
+    assert {f"topoloc/retrieval/{module}.py" for module in _MODULES.values()} == set(
         COARSE_MODULES.values()
     )
     assert COARSE_MODULES.keys() == set(COARSE_NAMES)

@@ -14,7 +14,7 @@ from topoloc.evaluation.metrics import Answer, summarize
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Alternative, Localization, NotLocalized
-from topoloc.sequences.open import open_sequence
+from topoloc.recordings.open import open_sequence
 from topoloc_paper.stored_answers import answers_of, rows_of
 
 

@@ -18,7 +18,7 @@ from tiny_world import BASELINE, LEVEL_FROM_CAM, Panel, render, right_pose, smoo
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.sequences.frame import StereoFrame
+from topoloc.recordings.frame import StereoFrame
 
 PERIOD, STEP = 1.0, 0.12
 CAMERA = Camera.pinhole(320, 200, 200.0, 200.0, 159.5, 99.5)

@@ -7,8 +7,9 @@ import pytest
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.points.disparity import StereoCamera
 from topoloc.slam.bundle import Anchor, BundleConfig, adjust_bundle
-from topoloc.slam.keyframes import DisparityBias, KeyFrame, Landmarks, Observations, StereoCamera
+from topoloc.slam.keyframes import DisparityBias, KeyFrame, Landmarks, Observations
 
 STEREO = StereoCamera(Camera.pinhole(640, 400, 380.0, 380.0, 319.5, 199.5), 45.0)
 NOISE_PX = 0.2

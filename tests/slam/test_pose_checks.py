@@ -10,9 +10,9 @@ import pytest
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.pose_conventions import PoseReading
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.sequences.frame import StereoFrame
-from topoloc.sequences.open import open_sequence
-from topoloc.sequences.recording import SequenceView
+from topoloc.recordings.frame import StereoFrame
+from topoloc.recordings.open import open_sequence
+from topoloc.recordings.recording import SequenceView
 from topoloc.slam.measured_steps import MeasuredStep, MeasuredStepsConfig, measure_steps
 from topoloc.slam.pose_checks import check_gaps, check_poses, judge_poses
 

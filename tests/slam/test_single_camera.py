@@ -7,7 +7,7 @@ import numpy as np
 
 from tiny_world import CAMERA, path_pose, render, room
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.sequences.frame import StereoFrame
+from topoloc.recordings.frame import StereoFrame
 from topoloc.slam.single_camera import SingleCameraOdometry, Stretch
 from topoloc.slam.single_camera_config import SingleCameraConfig
 

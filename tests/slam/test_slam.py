@@ -16,7 +16,7 @@ from topoloc.errors import CalibrationError, RecordingError
 from topoloc.geometry.alignment import absolute_trajectory_errors
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
-from topoloc.sequences.frame import StereoSequence
+from topoloc.recordings.frame import StereoSequence
 from topoloc.slam.slam import SlamResult, run_slam
 
 PLACES = np.arange(0.0, 9.0, 0.4)

@@ -13,9 +13,9 @@ from room_frames import RIG, FrameList, walk
 import tiny_world
 from topoloc.geometry.alignment import absolute_trajectory_errors
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.sequences.frame import StereoFrame, StereoSequence
-from topoloc.sequences.frame_view import frame_view
-from topoloc.slam.disparity import measured_view
+from topoloc.points.disparity import measured_view
+from topoloc.recordings.frame import StereoFrame, StereoSequence
+from topoloc.recordings.frame_view import frame_view
 from topoloc.slam.input_checks import InputCheckConfig, InputChecks
 from topoloc.slam.keyframes import FramePose, KeyFrame, Landmarks, PlaceView
 from topoloc.slam.loop_closure import LoopConfig, find_links

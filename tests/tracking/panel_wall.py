@@ -13,7 +13,7 @@ from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import SeenPoints
 from topoloc.localization.result import Alternative, Localization, NotLocalized
 from topoloc.localization.search import Trace
-from topoloc.map.topomap import TopoMetricMap
+from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.tracking.stream_result import StreamedPose
 from topoloc.tracking.tracker import Tracker
 

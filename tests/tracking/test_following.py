@@ -10,7 +10,7 @@ import tiny_world
 from room_stream import room_stream
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.localization.pose_fit import SeenPoints
-from topoloc.slam.tracking import TrackingConfig, find_corners
+from topoloc.points.tracking import TrackingConfig, find_corners
 from topoloc.tracking.following import FollowingConfig, PointFollower
 
 CAMERA = tiny_world.CAMERA

@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 
 from tiny_world import write_stereo_recording
+from topoloc.apps.cli import main
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.atlas_localizer import AtlasLocalizer
 from topoloc.atlas.editing import create_atlas, new_tiles
 from topoloc.atlas.open_maps import Maps
-from topoloc.cli import main
 from topoloc.errors import QueryError
 from topoloc.geometry.alignment import translation_error
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.building import build_map
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.map.build import BuildConfig
-from topoloc.sequences.frame import StereoFrame
-from topoloc.sequences.open import open_sequence
+from topoloc.mapping.build import BuildConfig
+from topoloc.recordings.frame import StereoFrame
+from topoloc.recordings.open import open_sequence
 from topoloc.tracking.tile_tracker import TileTracker
 
 STEP_NS = 100_000_000

@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from topoloc.places.backbones import normalize_pictures
+from topoloc.retrieval.backbones import normalize_pictures
 from topoloc_training.augmentation import augment
 from topoloc_training.classifier_config import AugmentationConfig
 

@@ -13,11 +13,11 @@ from test_place_vectors import NO_FEATURES, silent
 
 from built_room import unseen_views
 from topoloc.errors import MapError, TrainingError
-from topoloc.places.backbones import Backbone
-from topoloc.places.cnn_fc import CnnFc
-from topoloc.places.coarse import CoarseModel, open_coarse
-from topoloc.places.network_config import PictureConfig
-from topoloc.places.network_pictures import decode_picture
+from topoloc.retrieval.backbones import Backbone
+from topoloc.retrieval.cnn_fc import CnnFc
+from topoloc.retrieval.coarse import CoarseModel, open_coarse
+from topoloc.retrieval.network_config import PictureConfig
+from topoloc.retrieval.network_pictures import decode_picture
 from topoloc_training import cnn_fc, frozen_maps, training
 from topoloc_training.classifier_config import AugmentationConfig, CnnFcConfig, TrainingConfig
 from topoloc_training.cnn_fc import calibrated_temperature, soft_labels

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from topoloc.errors import WeightsError
-from topoloc.places.backbones import Backbone, normalize_pictures
-from topoloc.places.efficientnet import SameConv
+from topoloc.retrieval.backbones import Backbone, normalize_pictures
+from topoloc.retrieval.efficientnet import SameConv
 from topoloc_training import efficientnet_weights
 from topoloc_training.weights import find_weights, load_features, read_weights
 

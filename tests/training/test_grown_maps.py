@@ -12,13 +12,13 @@ import pytest
 from test_place_vectors import NO_FEATURES, silent
 
 from built_room import built_room
-from topoloc.cli import main
+from topoloc.apps.cli import main
 from topoloc.errors import TrainingError
 from topoloc.lifelong.coarse_models import taught_places
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.coarse import CoarseModel, open_coarse
-from topoloc.places.network_config import PictureConfig
-from topoloc.places.network_pictures import decode_picture
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.retrieval.coarse import CoarseModel, open_coarse
+from topoloc.retrieval.network_config import PictureConfig
+from topoloc.retrieval.network_pictures import decode_picture
 from topoloc_training import cnn_fc, cnn_nn
 from topoloc_training.classifier_config import (
     AugmentationConfig,

@@ -14,11 +14,11 @@ from test_weights import netvlad_tensors
 from built_room import unseen_views
 from topoloc.errors import MapError, TrainingError
 from topoloc.features.features import Features
-from topoloc.places.coarse import CoarseLocalizer, CoarseModel, open_coarse
-from topoloc.places.network_config import PictureConfig
-from topoloc.places.network_pictures import decode_picture
-from topoloc.places.vector_search import VectorSearch
-from topoloc.places.vlad_nn import VladNetwork
+from topoloc.retrieval.coarse import CoarseLocalizer, CoarseModel, open_coarse
+from topoloc.retrieval.network_config import PictureConfig
+from topoloc.retrieval.network_pictures import decode_picture
+from topoloc.retrieval.vector_search import VectorSearch
+from topoloc.retrieval.vlad_nn import VladNetwork
 from topoloc_training import cnn_nn, vlad_nn
 from topoloc_training.classifier_config import CnnNnConfig, TripletConfig, VladNnConfig
 from topoloc_training.training_set import TrainingSet

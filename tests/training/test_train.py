@@ -14,12 +14,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from topoloc.apps.cli import main
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import NewTile, create_atlas
-from topoloc.cli import main
-from topoloc.map.checking import list_coarse
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.backbones import Backbone
+from topoloc.mapping.checking import list_coarse
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.retrieval.backbones import Backbone
 
 SETTINGS = """
 [train]
@@ -168,7 +168,7 @@ class Barred:
 sys.meta_path.insert(0, Barred())
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import NewTile, create_atlas
-from topoloc.cli import main
+from topoloc.apps.cli import main
 sys.exit(main(sys.argv[1:]))
 """
 
@@ -204,7 +204,7 @@ def test_without_torch_the_extra_is_named(
 
 def test_mapping_and_asking_surf_vlad_loads_no_torch(copied_map: Path, queries: Path):
     code = (
-        "import sys; from topoloc.cli import main; main(sys.argv[1:]); print('torch' in"
+        "import sys; from topoloc.apps.cli import main; main(sys.argv[1:]); print('torch' in"
         " sys.modules)"
     )
     command = [sys.executable, "-c", code, "localize", str(copied_map), str(queries)]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from topoloc.places.vlad_nn import NetVlad
+from topoloc.retrieval.vlad_nn import NetVlad
 from topoloc_training.vlad_nn import SECOND_SHARE, learn_words
 
 

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from topoloc.errors import WeightsError
-from topoloc.places.backbones import Backbone, normalize_pictures
+from topoloc.retrieval.backbones import Backbone, normalize_pictures
 from topoloc_training import weights as weights_module
 from topoloc_training.weights import find_weights, load_features, read_weights
 

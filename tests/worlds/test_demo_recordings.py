@@ -12,7 +12,7 @@ import pytest
 from topoloc.demo.recordings import ROLES, SHIPPED, missing_recordings
 from topoloc.errors import TopolocError
 from topoloc.geometry.camera import Camera
-from topoloc.sequences.open import open_sequence
+from topoloc.recordings.open import open_sequence
 from topoloc_worlds import demo_recordings
 from topoloc_worlds.demo_recordings import RECORDINGS, draw_pictures_of_nothing, render_recordings
 from topoloc_worlds.rendering.renderer import RenderConfig

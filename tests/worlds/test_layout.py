@@ -9,9 +9,9 @@ import pytest
 from topoloc.errors import RecordingError, TopolocError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.sequences import atomic
-from topoloc.sequences.open import open_sequence
-from topoloc.sequences.trajectory import Trajectory
+from topoloc.recordings import atomic
+from topoloc.recordings.open import open_sequence
+from topoloc.recordings.trajectory import Trajectory
 from topoloc_worlds.layout import Layout, missing_frames, prepare, write_shot
 from topoloc_worlds.shots import Shot
 

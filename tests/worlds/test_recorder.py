@@ -12,8 +12,8 @@ from box_world import BOX_WORLD, RAINY_WORLD
 
 from topoloc.errors import CalibrationError, RecordingError, TopolocError
 from topoloc.geometry.camera import Camera
-from topoloc.map.build import build_map
-from topoloc.sequences.open import open_sequence
+from topoloc.mapping.build import build_map
+from topoloc.recordings.open import open_sequence
 from topoloc_worlds.conditions import CONDITIONS
 from topoloc_worlds.recorder import RecordConfig, record
 from topoloc_worlds.rendering.renderer import RenderConfig

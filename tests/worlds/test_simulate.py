@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from topoloc.cli import main
+from topoloc.apps.cli import main
 from topoloc.errors import MissingExtraError
-from topoloc.sequences.open import open_sequence
+from topoloc.recordings.open import open_sequence
 from topoloc_worlds import recorder, shots
 from topoloc_worlds.routes import RouteConfig
 from topoloc_worlds.shots import Shot

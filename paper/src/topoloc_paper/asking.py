@@ -10,9 +10,9 @@ from topoloc.demo.recordings import SHIPPED
 from topoloc.evaluation.experiments import answer_elsewhere, answer_queries
 from topoloc.evaluation.metrics import Answer, summarize
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.sequences.frame import StereoSequence
-from topoloc.sequences.open import open_sequence
-from topoloc.sequences.recording import sequence_subset
+from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.open import open_sequence
+from topoloc.recordings.recording import sequence_subset
 from topoloc_paper.datasets import Dataset
 from topoloc_paper.known_nodes import KnownNodes
 from topoloc_paper.maps import MapKind, opened

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from topoloc.cli.output import (
+from topoloc.apps.cli.output import (
     File,
     Flag,
     UsageError,
@@ -19,7 +19,7 @@ from topoloc.cli.output import (
     write_json,
 )
 from topoloc.errors import TopolocError
-from topoloc.sequences.atomic import write_text
+from topoloc.recordings.atomic import write_text
 from topoloc_paper.datasets import (
     RENDERED,
     at_hand,

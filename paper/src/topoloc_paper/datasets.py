@@ -17,8 +17,8 @@ import numpy as np
 from topoloc.demo.recordings import SHIPPED
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.sequences.frame import StereoSequence
-from topoloc.sequences.open import open_sequence
+from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.open import open_sequence
 from topoloc_worlds.conditions import find_condition
 from topoloc_worlds.layout import SETTINGS, Layout, missing_frames
 from topoloc_worlds.recorder import RecordConfig, record

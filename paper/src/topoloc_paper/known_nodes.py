@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.map.nodes import NodePoses, node_distances
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.coarse import NodeScore
+from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.retrieval.coarse import NodeScore
 
 
 class KnownNodes:

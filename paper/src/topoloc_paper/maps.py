@@ -14,12 +14,12 @@ import numpy as np
 from topoloc.errors import MissingExtraError
 from topoloc.features.extraction import FeatureConfig
 from topoloc.localization.map_facts.building import build_map
-from topoloc.map.build import BuildConfig
-from topoloc.map.nodes import NodeConfig
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.coarse import CoarseModel
-from topoloc.places.network_config import PictureConfig
-from topoloc.sequences.atomic import write_bytes
+from topoloc.mapping.build import BuildConfig
+from topoloc.mapping.nodes import NodeConfig
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.atomic import write_bytes
+from topoloc.retrieval.coarse import CoarseModel
+from topoloc.retrieval.network_config import PictureConfig
 from topoloc_paper.datasets import Dataset
 from topoloc_paper.settings import LEARNED, Bench, sequence_digest
 from topoloc_paper.stage_code import MAPPING, TEACHING_MODULES, learning

@@ -12,14 +12,14 @@ from typing import Any
 import matplotlib
 from matplotlib.figure import Figure
 
-from topoloc.evaluation.figure_style import STYLE, svg_text
-from topoloc.evaluation.figures import draw_error_curves
-from topoloc.evaluation.map_figure import draw_map
+from topoloc.apps.report.figure_style import STYLE, svg_text
+from topoloc.apps.report.figures import draw_error_curves
+from topoloc.apps.report.map_figure import draw_map
+from topoloc.apps.report.page_shell import page_style
+from topoloc.apps.report.query_gallery import gallery, typical_queries, worst_queries
 from topoloc.evaluation.metrics import Answer
-from topoloc.evaluation.page_shell import page_style
-from topoloc.evaluation.query_gallery import gallery, typical_queries, worst_queries
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.sequences.atomic import write_bytes, write_text
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.atomic import write_bytes, write_text
 from topoloc_paper import picture_figures
 from topoloc_paper.asking import Way, answers
 from topoloc_paper.datasets import Dataset

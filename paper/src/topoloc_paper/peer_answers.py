@@ -12,7 +12,7 @@ import numpy as np
 from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.rigid import Rigid3
-from topoloc.sequences.frame import StereoFrame
+from topoloc.recordings.frame import StereoFrame
 from topoloc_paper.stored_answers import pose_json, pose_of
 
 

@@ -27,9 +27,9 @@ import numpy as np
 from topoloc.errors import MissingExtraError, TopolocError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.map.nodes import NodePoses, node_distances
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.sequences.frame import Image, StereoFrame, StereoSequence
+from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.frame import Image, StereoFrame, StereoSequence
 from topoloc_paper.peer_answers import PeerAnswer
 from topoloc_paper.peer_retrieval import Retrieval
 from topoloc_paper.settings import evenly

@@ -23,11 +23,11 @@ from topoloc.features.features import Features
 from topoloc.features.patch_normalization import PatchNormalizationConfig, patch_normalize
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.sequences.frame import StereoFrame, StereoSequence
-from topoloc.sequences.frame_view import frame_view
-from topoloc.sequences.pictures import grey_image
-from topoloc.slam.metric_points import MetricPointsConfig, locate_points
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.points.metric_points import MetricPointsConfig, locate_points
+from topoloc.recordings.frame import StereoFrame, StereoSequence
+from topoloc.recordings.frame_view import frame_view
+from topoloc.recordings.pictures import grey_image
 from topoloc_paper.peer_answers import PeerAnswer
 from topoloc_paper.peer_retrieval import Retrieval
 

@@ -11,10 +11,10 @@ import time
 from collections.abc import Sequence
 
 from topoloc.features.extraction import extract_features
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.coarse import open_coarse
-from topoloc.sequences.frame import Image, StereoFrame
-from topoloc.sequences.pictures import grey_image
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.frame import Image, StereoFrame
+from topoloc.recordings.pictures import grey_image
+from topoloc.retrieval.coarse import open_coarse
 from topoloc_paper.peer_answers import PeerAnswer
 
 

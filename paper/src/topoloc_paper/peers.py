@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from topoloc.errors import MissingExtraError
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.sequences.frame import StereoFrame
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.frame import StereoFrame
 from topoloc_paper.asking import Way, elsewhere_of, false_accepts, queries_of, summary
 from topoloc_paper.datasets import Dataset
 from topoloc_paper.installed_size import installed_bytes

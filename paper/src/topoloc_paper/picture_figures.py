@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from topoloc.features.patch_normalization import PatchNormalizationConfig, patch_normalize
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization
-from topoloc.map.nodes import NodePoses, node_distances
-from topoloc.sequences.pictures import grey_image
+from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.recordings.pictures import grey_image
 from topoloc_paper import posenet_baseline
 from topoloc_paper.asking import Way, answers, queries_of
 from topoloc_paper.datasets import Dataset

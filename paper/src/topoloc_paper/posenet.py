@@ -20,12 +20,12 @@ from torch import Generator, Tensor, nn
 from topoloc.bounds import settings_from
 from topoloc.errors import WeightsError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.backbones import Backbone, normalize_pictures
-from topoloc.places.coarse import Image
-from topoloc.places.inference import BATCH_SIZE, in_channels_last
-from topoloc.places.network_config import BackboneName, PictureConfig
-from topoloc.places.network_pictures import PictureShape, network_pictures
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.retrieval.backbones import Backbone, normalize_pictures
+from topoloc.retrieval.coarse import Image
+from topoloc.retrieval.inference import BATCH_SIZE, in_channels_last
+from topoloc.retrieval.network_config import BackboneName, PictureConfig
+from topoloc.retrieval.network_pictures import PictureShape, network_pictures
 from topoloc_paper.pose_losses import beta_loss, learnt_loss, reprojection_loss
 from topoloc_training.augmentation import augment
 from topoloc_training.classifier_config import AugmentationConfig, TrainingConfig

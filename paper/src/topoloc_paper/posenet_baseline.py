@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from topoloc.geometry.alignment import rotation_error, translation_error
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.network_config import PictureConfig
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.retrieval.network_config import PictureConfig
 from topoloc_paper.asking import queries_of
 from topoloc_paper.datasets import Dataset
 from topoloc_paper.maps import MapKind, built, path_of

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from topoloc.errors import TopolocError
-from topoloc.sequences.atomic import write_text
+from topoloc.recordings.atomic import write_text
 from topoloc_paper.settings import LEARNED
 from topoloc_paper.text_tables import MISSING, Row, Table, about, error_words, paper_words
 

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from topoloc.places.network_config import BackboneName
-from topoloc.sequences.frame import StereoSequence
+from topoloc.recordings.frame import StereoSequence
+from topoloc.retrieval.network_config import BackboneName
 from topoloc_paper.datasets import Dataset
 from topoloc_paper.stages import StageStore, digest_of
 from topoloc_paper.stored_answers import pose_json

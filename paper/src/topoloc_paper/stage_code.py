@@ -25,17 +25,17 @@ _FILES = {
 # the folder that each package lies in
 ROOTS = {name: Path(path).parents[1] for name, path in _FILES.items() if path is not None}
 COARSE_MODULES = {
-    "surf-vlad": "topoloc/places/vlad.py",
-    "cnn-fc": "topoloc/places/cnn_fc.py",
-    "cnn-nn": "topoloc/places/cnn_nn.py",
-    "vlad-nn": "topoloc/places/vlad_nn.py",
+    "surf-vlad": "topoloc/retrieval/vlad.py",
+    "cnn-fc": "topoloc/retrieval/cnn_fc.py",
+    "cnn-nn": "topoloc/retrieval/cnn_nn.py",
+    "vlad-nn": "topoloc/retrieval/vlad_nn.py",
 }
 TEACHING_MODULES = {
     name: f"topoloc_training/{name.replace('-', '_')}.py"
     for name in COARSE_MODULES
     if name != "surf-vlad"
 }
-_READING = "topoloc/sequences/open.py"
+_READING = "topoloc/recordings/open.py"
 _COUNTING = (
     "topoloc/evaluation/metrics.py",
     "topoloc_paper/settings.py",
@@ -70,7 +70,7 @@ class StageCode:
         ).hexdigest()[:16]
 
 
-MAPPING = StageCode(("topoloc/map/build.py", _READING))
+MAPPING = StageCode(("topoloc/mapping/build.py", _READING))
 
 
 def asking(coarse: str, *others: str) -> StageCode:
@@ -92,9 +92,9 @@ def learning(*modules: str) -> StageCode:
     read and stored does not count."""
     apart = (
         "topoloc/features",
-        "topoloc/sequences",
-        "topoloc/map/topomap.py",
-        "topoloc/places/coarse.py",
+        "topoloc/recordings",
+        "topoloc/mapping/topomap.py",
+        "topoloc/retrieval/coarse.py",
     )
     return StageCode(("topoloc_training/coarse_training.py", *modules), apart)
 

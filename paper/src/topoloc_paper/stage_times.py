@@ -10,7 +10,7 @@ import numpy as np
 
 from topoloc.errors import TrainingError, WeightsError
 from topoloc.localization.localizer import Localizer
-from topoloc.map.topomap import TopoMetricMap
+from topoloc.mapping.topomap import TopoMetricMap
 from topoloc_paper.asking import WARM_UP, queries_of
 from topoloc_paper.datasets import Dataset
 from topoloc_paper.maps import MapKind, opened, why_not

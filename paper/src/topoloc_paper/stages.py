@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from topoloc.errors import TopolocError
-from topoloc.sequences.atomic import write_text
+from topoloc.recordings.atomic import write_text
 from topoloc_paper.stage_code import StageCode
 
 

@@ -12,7 +12,7 @@ from topoloc.evaluation.metrics import Answer
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.evidence import Evidence
 from topoloc.localization.result import Localization, NotLocalized, result_from_json
-from topoloc.sequences.frame import StereoSequence
+from topoloc.recordings.frame import StereoSequence
 
 
 def rows_of(answers: Sequence[Answer]) -> list[dict[str, Any]]:

@@ -3,6 +3,7 @@ all its places."""
 
 from __future__ import annotations
 
+import importlib
 import os
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,14 +16,15 @@ from topoloc.atlas.place_vectors import PlaceVectors, read_vectors
 from topoloc.atlas.store import MANIFEST, FolderStore, Store, sha256_of
 from topoloc.errors import AtlasError
 
+_OBJECT_STORES = "topoloc.apps.stores.object_store"
+"""The module of `ObjectStore`. A string: fsspec is an extra, and stores are an app."""
+
 
 def store_at(where: str) -> Store:
     """The folder, or the object store, that an atlas lies in. Raises AtlasError,
     MissingExtraError."""
     if "://" in where:
-        from topoloc.atlas.object_store import ObjectStore
-
-        return ObjectStore(where)
+        return importlib.import_module(_OBJECT_STORES).ObjectStore(where)
     return FolderStore(Path(where))
 
 

@@ -35,8 +35,8 @@ from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.localizer import LocalizerConfig
 from topoloc.localization.query import Picture, Query, StageClock, reduced_image, unknown_camera
 from topoloc.localization.result import Alternative, Localization, NotLocalized, at_time
-from topoloc.places.coarse import Image
-from topoloc.places.shared_vocabulary import shared_vocabulary
+from topoloc.retrieval.coarse import Image
+from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
 Way = Literal["by all means", "at a glance", "as a rival"]
 """How a tile is asked; as a rival of an answer, at a glance, and only where it may be one."""

@@ -22,12 +22,12 @@ from topoloc.atlas.place_vectors import place_vectors, write_vectors
 from topoloc.atlas.store import MANIFEST, Store, sha256_of
 from topoloc.errors import AtlasError, EmptyMapError
 from topoloc.geometry.geodesy import Georeference
-from topoloc.map.contents import map_id_of
-from topoloc.map.edit import undoable_edits
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.map.undo_log import path_of_log
-from topoloc.places.shared_vocabulary import shared_vocabulary
-from topoloc.sequences.atomic import scratch_file
+from topoloc.mapping.contents import map_id_of
+from topoloc.mapping.edit import undoable_edits
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.mapping.undo_log import path_of_log
+from topoloc.recordings.atomic import scratch_file
+from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
 GRACE_S = 3600.0
 """So long files stay that no manifest names any more: readers may have just read the manifest

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float32, Int
 
 from topoloc.atlas.place_shard import PlaceShard
 from topoloc.atlas.place_vectors import PlaceVectors
-from topoloc.places.place_kernels import multiply_rows
+from topoloc.retrieval.place_kernels import multiply_rows
 
 
 class _Places(Protocol):

@@ -28,7 +28,7 @@ from topoloc.atlas.place_shard import PlaceShard, ShardTile
 from topoloc.atlas.place_vectors import PlaceVectors
 from topoloc.errors import AtlasError, StoreError
 from topoloc.features.network_files import cache_folder
-from topoloc.places.shared_vocabulary import shared_vocabulary
+from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
 MAX_EXACT_PLACES, SHARD_PLACES = 20_000, 1 << 20
 """So many places that lie in no shard are compared one by one; so many places a shard holds, but

@@ -9,8 +9,8 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.rough_camera import RoughCamera
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.coarse import Image
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.retrieval.coarse import Image
 
 
 @dataclass(frozen=True, eq=False)

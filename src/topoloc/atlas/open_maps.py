@@ -24,7 +24,7 @@ from topoloc.atlas.manifest import Tile
 from topoloc.atlas.watched_atlas import WatchedAtlas
 from topoloc.errors import MapError, UnknownMapError
 from topoloc.localization.localizer import Localizer
-from topoloc.map.topomap import TopoMetricMap
+from topoloc.mapping.topomap import TopoMetricMap
 
 SUFFIX = ".topo"
 OpenLocalizer = Callable[[TopoMetricMap], Localizer]

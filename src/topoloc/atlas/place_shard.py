@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Bool, Float16, Float32, Int
 
 from topoloc.errors import AtlasError
-from topoloc.sequences.atomic import replaced_file
+from topoloc.recordings.atomic import replaced_file
 
 NUM_COMPARED, MAX_COMPARED = 1024, 16_384
 """Places that are compared by their vectors; where they are of too few tiles, eight times as many,

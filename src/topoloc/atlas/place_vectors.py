@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float32
 
 from topoloc.errors import AtlasError
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.shared_vocabulary import shared_vocabulary
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
 PlaceVectors = Mapping[str, Float32[np.ndarray, "_ _"]]
 """Unit vectors of a tile's nodes by the kind of features."""

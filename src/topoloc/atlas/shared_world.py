@@ -10,7 +10,7 @@ from topoloc.atlas.manifest import Manifest, Tile
 from topoloc.errors import AtlasError, MapError, StoreError
 from topoloc.geometry.geodesy import Georeference
 from topoloc.geometry.rigid import Rigid3
-from topoloc.map.topomap import TopoMetricMap
+from topoloc.mapping.topomap import TopoMetricMap
 
 
 @dataclass(frozen=True, eq=False)

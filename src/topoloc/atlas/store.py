@@ -19,7 +19,7 @@ from typing import Protocol, runtime_checkable
 
 from topoloc.atlas.manifest import TILES
 from topoloc.errors import AtlasError, TopolocError
-from topoloc.sequences.atomic import remove_all_leftovers, replaced_file, write_bytes
+from topoloc.recordings.atomic import remove_all_leftovers, replaced_file, write_bytes
 
 try:
     import fcntl

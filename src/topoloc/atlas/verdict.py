@@ -137,11 +137,11 @@ def _refusal(heard: Sequence[Heard]) -> NotLocalized:
         refused,
         key=lambda one: (
             one.is_full,
-            one.result.reason == "ambiguous",
+            one.result.reason == "ambiguous",  # pyright: ignore
             one.result.num_inliers,
             one.likeness,
         ),
-    )  # pyright: ignore
+    )
     assert isinstance(best.result, NotLocalized)
     result = best.result
     alternatives = tuple(replace(one, tile=best.tile.tile_id) for one in result.alternatives)

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from topoloc.apps.report.report_tables import PublishedResult, ReportWords
 from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION
-from topoloc.evaluation.report_tables import PublishedResult, ReportWords
 
 PAPER_LAB = ("the paper's Lab, by day", 0.0202, 0.35)
 DAY, NIGHT = "day", "night"

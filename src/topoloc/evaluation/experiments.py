@@ -14,9 +14,9 @@ from topoloc.evaluation.metrics import Answer
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.map.nodes import NodePoses, node_distances
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.sequences.frame import Image, StereoFrame, StereoSequence
+from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.frame import Image, StereoFrame, StereoSequence
 
 # A node this many times D_thresh away, or nearer, sees the query's view as the nearest one does.
 NEIGHBOUR_SHARE = 1.5

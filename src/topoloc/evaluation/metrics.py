@@ -12,7 +12,7 @@ from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization, NotLocalized, pose_json
-from topoloc.sequences.frame import Image
+from topoloc.recordings.frame import Image
 
 # A query counts as recalled when its pose is within both (metres, degrees), of all queries.
 RECALL_THRESHOLDS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))

@@ -65,8 +65,12 @@ class SideView:
         its own."""
         # None is right here, whatever the stubs say: OpenCV 5 takes an empty second map for a map.
         return cv2.remap(
-            grey, self.points_img, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )  # pyright: ignore
+            grey,
+            self.points_img,
+            None,  # pyright: ignore
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
 
     def within(self, features: Features) -> Features:
         """The features that lie in what the picture holds, with the dense descriptors of all of

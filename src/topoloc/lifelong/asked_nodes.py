@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.query import Picture
 from topoloc.localization.result import Localization
-from topoloc.map.topomap import TopoMetricMap
+from topoloc.mapping.topomap import TopoMetricMap
 
 
 def ask_nodes(

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float32, Int8
 
 from topoloc.lifelong.overlay import Changed
-from topoloc.map.points import unit_descriptors
-from topoloc.map.topomap import TopoMetricMap, TopoNode
+from topoloc.mapping.points import unit_descriptors
+from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 
 # stored numbers no larger than so many times those of this step are in it, or a larger one, already
 _ROUNDED_TWICE = 1.5

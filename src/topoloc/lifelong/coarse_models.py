@@ -10,10 +10,10 @@ import numpy as np
 
 from topoloc.errors import MissingExtraError
 from topoloc.features.features import Features
-from topoloc.map.topomap import PlaceImage, TopoMetricMap
-from topoloc.places.coarse import CoarseModel, GrowsByPictures, open_coarse
-from topoloc.places.network_pictures import decode_picture
-from topoloc.places.vlad import SurfVlad
+from topoloc.mapping.topomap import PlaceImage, TopoMetricMap
+from topoloc.retrieval.coarse import CoarseModel, GrowsByPictures, open_coarse
+from topoloc.retrieval.network_pictures import decode_picture
+from topoloc.retrieval.vlad import SurfVlad
 
 
 @dataclass(frozen=True, eq=False)

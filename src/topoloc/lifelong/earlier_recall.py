@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from topoloc.lifelong.left_out import ask_left_out, evenly
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.map.topomap import TopoMetricMap
+from topoloc.mapping.topomap import TopoMetricMap
 
 
 def earlier_recall(

@@ -18,10 +18,10 @@ from jaxtyping import Int
 
 from topoloc.lifelong.observed_nodes import observe_node
 from topoloc.lifelong.overlay import Selected
-from topoloc.map.nodes import NearestNodes, NodePoses
-from topoloc.map.side_nodes import gather_sides
-from topoloc.map.topomap import Edge, PlaceImage, SideNodes, TopoMetricMap, TopoNode
-from topoloc.places.coarse import CoarseModel
+from topoloc.mapping.nodes import NearestNodes, NodePoses
+from topoloc.mapping.side_nodes import gather_sides
+from topoloc.mapping.topomap import Edge, PlaceImage, SideNodes, TopoMetricMap, TopoNode
+from topoloc.retrieval.coarse import CoarseModel
 
 _PER_VECTOR = ("vectors", "centres", "cell_vectors")
 

@@ -6,9 +6,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.map.entries import SideNodes, TopoNode
-from topoloc.map.side_nodes import gather_sides, nodes_with_sides
-from topoloc.map.topomap import TopoMetricMap
+from topoloc.mapping.entries import SideNodes, TopoNode
+from topoloc.mapping.side_nodes import gather_sides, nodes_with_sides
+from topoloc.mapping.topomap import TopoMetricMap
 
 
 def new_walls(topomap: TopoMetricMap, world_from_cams: Sequence[Rigid3]) -> set[int]:

@@ -19,8 +19,8 @@ from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.query import Picture
 from topoloc.localization.result import Localization
-from topoloc.map.nodes import NodePoses, node_distances
-from topoloc.map.topomap import TopoMetricMap
+from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.topomap import TopoMetricMap
 
 MAX_TRANSLATION, MAX_ROTATION_DEG = 0.5, 10.0
 """An answer further off than this (metres, degrees) is that of another place."""

@@ -24,9 +24,9 @@ from topoloc.lifelong.session_poses import Progress, SessionPoses, held_by
 from topoloc.lifelong.update import UpdateConfig, is_well_held
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.building import with_map_facts
-from topoloc.map.nodes import NodePoses, node_distances
-from topoloc.map.sums import LandmarkSums
-from topoloc.map.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
+from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.sums import LandmarkSums
+from topoloc.mapping.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
 
 
 @dataclass(frozen=True, eq=False)

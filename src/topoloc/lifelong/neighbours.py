@@ -22,7 +22,7 @@ from topoloc.bounds import check_bounds
 from topoloc.errors import AtlasError, MapError
 from topoloc.lifelong.tile_joins import Found, NotJoined, OpenTile, TileJoinConfig, joined
 from topoloc.localization.localizer import Localizer
-from topoloc.map.build import Progress
+from topoloc.mapping.build import Progress
 
 _NUM_LOOKED_UP = 32
 _BEST = 3

@@ -8,10 +8,10 @@ import numpy as np
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.map.config import MapConfig
-from topoloc.map.landmarks import Observations, observe_points
-from topoloc.map.topomap import TopoNode
-from topoloc.slam.metric_points import keypoint_sigmas
+from topoloc.mapping.config import MapConfig
+from topoloc.mapping.landmarks import Observations, observe_points
+from topoloc.mapping.topomap import TopoNode
+from topoloc.points.metric_points import keypoint_sigmas
 
 
 def observe_node(

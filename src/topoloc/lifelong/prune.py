@@ -28,10 +28,10 @@ from topoloc.lifelong.earlier_recall import earlier_recall
 from topoloc.lifelong.fewer_nodes import fewest_dropped, holds_of, without_nodes
 from topoloc.lifelong.overlay import Changed, Overlay
 from topoloc.localization.map_facts.building import with_map_facts
-from topoloc.map.sums import LandmarkSums, with_counts_together
-from topoloc.map.topomap import TopoMetricMap, TopoNode
-from topoloc.map.writing import write_map
-from topoloc.sequences.atomic import scratch_file
+from topoloc.mapping.sums import LandmarkSums, with_counts_together
+from topoloc.mapping.topomap import TopoMetricMap, TopoNode
+from topoloc.mapping.writing import write_map
+from topoloc.recordings.atomic import scratch_file
 
 _PAGES = 4096  # what an entry in the history may take
 _POINT_COLUMNS = ("points_img", "shapes", "descriptors", "points_cam", "sqrt_covs")

@@ -13,7 +13,7 @@ from topoloc.lifelong.left_out import evenly
 from topoloc.localization.calibration_doubt import verdicts_of
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.sequences.frame import StereoSequence
+from topoloc.recordings.frame import StereoSequence
 
 _NUM_TRIED, _LEAST_FOUND = 7, 3
 _RANGE = 1.5  # times the focal length that is said

@@ -27,10 +27,10 @@ from topoloc.lifelong.session_calibration import check_by_other_focal_lengths, c
 from topoloc.lifelong.straightened_walk import BendConfig
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.map.config import MapConfig
-from topoloc.map.nodes import place_nodes
-from topoloc.sequences.frame import StereoSequence
-from topoloc.sequences.recording import SequenceView
+from topoloc.mapping.config import MapConfig
+from topoloc.mapping.nodes import place_nodes
+from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.recording import SequenceView
 from topoloc.slam.bundle import BundleConfig
 from topoloc.slam.pose_graph import Edge, PoseGraphConfig, optimise_graph
 from topoloc.slam.single_camera_config import SingleCameraConfig

@@ -20,7 +20,7 @@ from topoloc.geometry.transform_consensus import (
     diagonal_covariance,
     find_consensus,
 )
-from topoloc.map.topomap import TopoMetricMap
+from topoloc.mapping.topomap import TopoMetricMap
 
 _MAX_USED = 200
 _SIGMA_M, _SIGMA_DEG = 0.01, 0.1  # of the way from one map to the other as one picture has it

@@ -23,9 +23,9 @@ from topoloc.lifelong.session_calibration import check_by_other_focal_lengths, c
 from topoloc.lifelong.session_poses import Progress, SessionPoses, SessionPosesConfig, held_by
 from topoloc.lifelong.straightened_walk import straightened
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.map.config import MapConfig
-from topoloc.map.nodes import place_nodes
-from topoloc.sequences.frame import StereoSequence
+from topoloc.mapping.config import MapConfig
+from topoloc.mapping.nodes import place_nodes
+from topoloc.recordings.frame import StereoSequence
 from topoloc.slam.single_camera import SingleCameraOdometry
 from topoloc.tracking.tracker import Tracker
 

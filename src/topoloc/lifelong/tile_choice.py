@@ -16,7 +16,7 @@ from topoloc.bounds import Between, check_bounds
 from topoloc.errors import TrajectoryError
 from topoloc.lifelong.session_poses import Progress
 from topoloc.localization.result import Localization
-from topoloc.sequences.frame import StereoSequence
+from topoloc.recordings.frame import StereoSequence
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,8 @@ from topoloc.lifelong.asked_nodes import ask_nodes
 from topoloc.lifelong.shared_pictures import by_shared_pictures
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization
-from topoloc.map.nodes import NodePoses, node_distances
-from topoloc.map.topomap import TopoMetricMap
+from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.topomap import TopoMetricMap
 
 
 @dataclass(frozen=True)

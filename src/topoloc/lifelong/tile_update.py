@@ -12,8 +12,8 @@ from topoloc.atlas.editing import NewTile, replace_tile
 from topoloc.atlas.manifest import StoredFile, Tile
 from topoloc.atlas.store import sha256_of
 from topoloc.errors import AtlasError, TopolocError
-from topoloc.map.undo_log import path_of_log
-from topoloc.sequences.atomic import scratch_folder
+from topoloc.mapping.undo_log import path_of_log
+from topoloc.recordings.atomic import scratch_folder
 
 _MAX_TRIES = 5
 T = TypeVar("T")

@@ -36,9 +36,9 @@ from topoloc.lifelong.single_camera_poses import poses_by_map
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.building import with_map_facts
 from topoloc.localization.result import Localization
-from topoloc.map.drafts import NodeDraft, draft_node, finish_node, observe
-from topoloc.map.landmarks import Observations, counted_again
-from topoloc.map.mapping_frames import (
+from topoloc.mapping.drafts import NodeDraft, draft_node, finish_node, observe
+from topoloc.mapping.landmarks import Observations, counted_again
+from topoloc.mapping.mapping_frames import (
     PLACE_QUALITY,
     MappingFrame,
     MappingImage,
@@ -47,12 +47,12 @@ from topoloc.map.mapping_frames import (
     posed_frames,
     small_jpeg,
 )
-from topoloc.map.nodes import NodePoses, node_distances
-from topoloc.map.sessions import Light, Session, mean_light, path_of
-from topoloc.map.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
-from topoloc.sequences.frame import StereoSequence
-from topoloc.sequences.frame_view import frame_view
-from topoloc.sequences.recording import SequenceView
+from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.sessions import Light, Session, mean_light, path_of
+from topoloc.mapping.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
+from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.frame_view import frame_view
+from topoloc.recordings.recording import SequenceView
 from topoloc.tracking.tracker import Tracker
 
 _PICTURES_COMPARED = 3

@@ -18,8 +18,8 @@ from topoloc.bounds import Above, AtLeast, Between, check_bounds
 from topoloc.geometry.rigid import Rigid3
 from topoloc.lifelong.left_out import LeftOutAnswer, ask_left_out, evenly
 from topoloc.localization.localizer import Localizer
-from topoloc.map.nodes import NodePoses, node_distances
-from topoloc.map.topomap import TopoMetricMap, TopoNode
+from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 
 Reason = Literal["not_held", "few_landmarks", "one_direction", "single_session"]
 REASONS: tuple[Reason, ...] = get_args(Reason)

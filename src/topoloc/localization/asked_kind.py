@@ -11,8 +11,8 @@ from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.fitted_weights import FittedWeights, weights_of
 from topoloc.localization.map_facts.correlated_errors import correlated_errors_of
 from topoloc.localization.open_map import OpenMap
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.coarse import CoarseLocalizer
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.retrieval.coarse import CoarseLocalizer
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from topoloc.map.topomap import TopoNode
+from topoloc.mapping.topomap import TopoNode
 
 
 @dataclass(frozen=True, eq=False)

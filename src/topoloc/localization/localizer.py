@@ -32,9 +32,9 @@ from topoloc.localization.provenance import Provenance
 from topoloc.localization.query import Picture, Query, reduced_image, unknown_camera
 from topoloc.localization.result import Localization, NotLocalized, at_time
 from topoloc.localization.search import Search, Trace
-from topoloc.map.contents import map_id_of
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.coarse import CoarseLocalizer, Image
+from topoloc.mapping.contents import map_id_of
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.retrieval.coarse import CoarseLocalizer, Image
 
 __all__ = ["Localizer", "LocalizerConfig"]
 
@@ -49,7 +49,7 @@ class Localizer:
 
     Args:
         coarse: names the candidate nodes instead of one of the map's own coarse localizers: any
-            object with `CoarseLocalizer.rank` (`topoloc/places/coarse.py`), such as retrieval of
+            object with `CoarseLocalizer.rank` (`topoloc/retrieval/coarse.py`), such as retrieval of
             another kind or a prior from elsewhere. `config.coarse` is then left aside.
         weights: what the evidence counts, instead of what ships for the map's kind of features.
 

@@ -25,11 +25,11 @@ from topoloc.localization.map_facts.repetition import (
     shifts_of,
 )
 from topoloc.localization.walls.wall_index import WallIndex
-from topoloc.map.memory import RememberedNodes
-from topoloc.map.nodes import NodePoses, node_distances
-from topoloc.map.topomap import TopoMetricMap, TopoNode, open_coarse_of
-from topoloc.places.coarse import CoarseLocalizer, Image, NodeScore
-from topoloc.places.vlad import SurfVlad
+from topoloc.mapping.memory import RememberedNodes
+from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.topomap import TopoMetricMap, TopoNode, open_coarse_of
+from topoloc.retrieval.coarse import CoarseLocalizer, Image, NodeScore
+from topoloc.retrieval.vlad import SurfVlad
 
 _NO_MOVES = np.zeros((0, 4, 4))
 _LEAST_REACH = 2.5  # metres: how far shifts are looked for, at least

@@ -38,8 +38,8 @@ from topoloc.localization.map_facts.repetition import LEAST_SHIFT
 from topoloc.localization.pose_fit import PoseFit, fit_pose
 from topoloc.localization.search import Proposal, Search, Source
 from topoloc.localization.walls.propose_walls import propose_walls
-from topoloc.map.nodes import node_distances
-from topoloc.places.coarse import NodeScore
+from topoloc.mapping.nodes import node_distances
+from topoloc.retrieval.coarse import NodeScore
 
 _BESIDE = 0.25  # radians
 _MAX_OTHERS = 3  # poses of other features that are asked

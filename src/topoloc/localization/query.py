@@ -24,9 +24,9 @@ from topoloc.features.extraction import FeatureConfig, extract_normalized, norma
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rough_camera import RoughCamera, usual_camera
-from topoloc.places.coarse import Image
-from topoloc.sequences.frame_checks import picture_problem
-from topoloc.sequences.pictures import grey_image
+from topoloc.recordings.frame_checks import picture_problem
+from topoloc.recordings.pictures import grey_image
+from topoloc.retrieval.coarse import Image
 
 
 class StageClock:

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from topoloc.errors import QueryError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rough_camera import RoughCamera
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.sequences.calibration import calibration_of
-from topoloc.sequences.frame import StereoFrame
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.calibration import calibration_of
+from topoloc.recordings.frame import StereoFrame
 
 CameraOfSize = Callable[[int, int], Camera | RoughCamera]
 """The camera of a picture of this width and height."""

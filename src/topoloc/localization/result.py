@@ -18,7 +18,7 @@ from topoloc.localization import checked_json as checked
 from topoloc.localization.checked_json import pose_json
 from topoloc.localization.evidence import Evidence
 from topoloc.localization.provenance import NOTHING_KNOWN, Provenance
-from topoloc.places.coarse import NodeScore
+from topoloc.retrieval.coarse import NodeScore
 
 Reason = Literal[
     "too_few_matches", "too_few_inliers", "ambiguous", "not_in_map", "jump", "unreadable"

@@ -13,7 +13,7 @@ from topoloc.localization.fitted_weights import FittedWeights
 from topoloc.localization.open_map import OpenMap
 from topoloc.localization.pose_fit import PoseFit
 from topoloc.localization.query import Query
-from topoloc.places.coarse import NodeScore
+from topoloc.retrieval.coarse import NodeScore
 
 
 @dataclass(frozen=True, eq=False)

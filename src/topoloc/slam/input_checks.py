@@ -11,10 +11,10 @@ from jaxtyping import Float, Float32
 
 from topoloc.bounds import Above, AtLeast, Between
 from topoloc.errors import CalibrationError, RecordingError
-from topoloc.sequences.frame import StereoFrame
-from topoloc.slam.disparity import DisparityConfig, MeasuredView, measure_disparities
+from topoloc.points.disparity import DisparityConfig, MeasuredView, measure_disparities
+from topoloc.points.tracking import TrackingConfig, align_with_reference, follow
+from topoloc.recordings.frame import StereoFrame
 from topoloc.slam.keyframes import KeyFrame, Landmarks
-from topoloc.slam.tracking import TrackingConfig, align_with_reference, follow
 
 
 @dataclass(frozen=True)

@@ -10,30 +10,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from topoloc.features.features import Features
-from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.points.disparity import StereoCamera
+from topoloc.points.metric_points import MetricPoints
 from topoloc.shelf import Shelf
-from topoloc.slam.metric_points import MetricPoints
-
-
-@dataclass(frozen=True)
-class StereoCamera:
-    """A pinhole that measures disparity, too: ``disparity = bf / depth``, bf in pixels times
-    metres."""
-
-    camera: Camera
-    bf: float
-
-    def points_cam(self, measured: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Points (metres) of pixels and disparities (x, y, d); rows of NaN where d is unknown or
-        not positive."""
-        z = self.bf / np.where(measured[:, 2] > 0.0, measured[:, 2], np.nan)
-        return np.column_stack([self.camera.normalized_from_img(measured[:, :2]) * z[:, None], z])
-
-    def project(self, points_cam: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """(x, y, d) of points in the camera's frame; NaN behind it."""
-        z = np.where(points_cam[:, 2] > 1e-9, points_cam[:, 2], np.nan)
-        return np.column_stack([self.camera.img_from_cam(points_cam), self.bf / z])
 
 
 @dataclass(eq=False)

@@ -19,7 +19,7 @@ from topoloc.bounds import Above, AtLeast, Between
 from topoloc.features.bands import in_order
 from topoloc.features.features import Features
 from topoloc.geometry.rigid import Rigid3
-from topoloc.places.vlad import SurfVlad, VladConfig, learn_words_of, vlad
+from topoloc.retrieval.vlad import SurfVlad, VladConfig, learn_words_of, vlad
 from topoloc.shelf import Shelf
 from topoloc.slam.keyframes import KeyFrame
 from topoloc.slam.place_matching import PlaceMatch, PlaceMatchingConfig, match_places

@@ -18,10 +18,10 @@ from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.relative_pose import estimate_relative_pose
 from topoloc.geometry.rigid import Rigid3
-from topoloc.sequences.frame import StereoFrame, StereoSequence
-from topoloc.sequences.frame_view import frame_view
-from topoloc.sequences.recording import left_frame
-from topoloc.slam.metric_points import MetricPoints, MetricPointsConfig, locate_points
+from topoloc.points.metric_points import MetricPoints, MetricPointsConfig, locate_points
+from topoloc.recordings.frame import StereoFrame, StereoSequence
+from topoloc.recordings.frame_view import frame_view
+from topoloc.recordings.recording import left_frame
 
 
 @dataclass(frozen=True)

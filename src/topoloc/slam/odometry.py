@@ -17,10 +17,11 @@ import numpy as np
 
 from topoloc.compiled import be_one_of_several
 from topoloc.geometry.rigid import Rigid3
-from topoloc.sequences.frame import StereoFrame
+from topoloc.points.disparity import MeasuredView, measure_disparities, measured_view
+from topoloc.points.tracking import find_corners
+from topoloc.recordings.frame import StereoFrame
 from topoloc.shelf import Shelf
 from topoloc.slam.bundle import adjust_bundle
-from topoloc.slam.disparity import MeasuredView, measure_disparities, measured_view
 from topoloc.slam.input_checks import InputChecks
 from topoloc.slam.keyframes import (
     DisparityBias,
@@ -34,7 +35,6 @@ from topoloc.slam.keyframes import (
 from topoloc.slam.motion_prediction import MotionHistory, expected_one
 from topoloc.slam.place_matching import match_places, place_view
 from topoloc.slam.steps import LastFrame, OdometryConfig, Step, StepSeeker, Tracks
-from topoloc.slam.tracking import find_corners
 
 # of places in memory, about 80: the last few are asked, and comparing two takes ten times as long
 # as reading

@@ -15,9 +15,10 @@ from topoloc.features.kinds import FeatureConfig, find_kind
 from topoloc.features.matching import MatchingConfig, match_features
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.rigid import Rigid3
-from topoloc.sequences.frame_view import FrameView
-from topoloc.slam.keyframes import PlaceView, StereoCamera
-from topoloc.slam.metric_points import MetricPointsConfig, locate_points
+from topoloc.points.disparity import StereoCamera
+from topoloc.points.metric_points import MetricPointsConfig, locate_points
+from topoloc.recordings.frame_view import FrameView
+from topoloc.slam.keyframes import PlaceView
 
 _ELSEWHERE = 0.05  # of the picture's width, so that a feature is not itself at another scale
 

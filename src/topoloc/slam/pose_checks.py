@@ -30,8 +30,8 @@ from topoloc.geometry.pose_conventions import (
     mended,
 )
 from topoloc.geometry.rigid import Rigid3
-from topoloc.sequences.frame import StereoSequence
-from topoloc.sequences.trajectory import Trajectory, poses_at
+from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.trajectory import Trajectory, poses_at
 from topoloc.slam.measured_steps import MeasuredStep, MeasuredStepsConfig, measure_steps
 
 _MIN_TELLING = 5

@@ -17,10 +17,11 @@ from jaxtyping import Float, Float32, Int
 
 from topoloc.geometry.relative_pose import estimate_relative_pose
 from topoloc.geometry.rigid import Rigid3
-from topoloc.sequences.frame import StereoFrame
-from topoloc.sequences.frame_view import single_view
+from topoloc.points.disparity import MeasuredView, StereoCamera
+from topoloc.points.tracking import find_corners, follow
+from topoloc.recordings.frame import StereoFrame
+from topoloc.recordings.frame_view import single_view
 from topoloc.slam.bundle import adjust_bundle
-from topoloc.slam.disparity import MeasuredView
 from topoloc.slam.keyframes import (
     DisparityBias,
     FramePose,
@@ -28,12 +29,10 @@ from topoloc.slam.keyframes import (
     Landmarks,
     Motion,
     Observations,
-    StereoCamera,
 )
 from topoloc.slam.motion_prediction import MotionHistory
 from topoloc.slam.single_camera_config import SingleCameraConfig
 from topoloc.slam.steps import LastFrame, Step, StepSeeker, Tracks
-from topoloc.slam.tracking import find_corners, follow
 from topoloc.slam.triangulation import is_clear, triangulate
 
 _CLEAREST_AND_LEAST_CLEAR = 0.5, 10.0

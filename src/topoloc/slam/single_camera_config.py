@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from topoloc.bounds import Above, AtLeast, Between
+from topoloc.points.tracking import TrackingConfig
 from topoloc.slam.bundle import BundleConfig
 from topoloc.slam.steps import OdometryConfig
-from topoloc.slam.tracking import TrackingConfig
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,10 @@ from jaxtyping import Float
 from topoloc.bounds import check_bounds
 from topoloc.errors import RecordingError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.sequences.frame import StereoFrame, StereoSequence
-from topoloc.sequences.frame_view import frame_view
-from topoloc.sequences.recording import SequenceView
-from topoloc.slam.disparity import MeasuredView, measured_view
+from topoloc.points.disparity import MeasuredView, measured_view
+from topoloc.recordings.frame import StereoFrame, StereoSequence
+from topoloc.recordings.frame_view import frame_view
+from topoloc.recordings.recording import SequenceView
 from topoloc.slam.global_map import GlobalMapConfig, adjust_all, close_loops, join_submaps
 from topoloc.slam.input_checks import InputCheckConfig, InputChecks
 from topoloc.slam.keyframes import FramePose, KeyFrame, Landmarks, PlaceView

@@ -18,12 +18,12 @@ from topoloc.features.bands import in_order
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.stereo import ray_covariances
+from topoloc.points.disparity import DisparityConfig, MeasuredView, StereoCamera
+from topoloc.points.tracking import TrackingConfig, align_with_reference, follow
 from topoloc.slam.bundle import BundleConfig
-from topoloc.slam.disparity import DisparityConfig, MeasuredView
-from topoloc.slam.keyframes import KeyFrame, Landmarks, StereoCamera
+from topoloc.slam.keyframes import KeyFrame, Landmarks
 from topoloc.slam.motion_prediction import Prediction, PredictionConfig
 from topoloc.slam.place_matching import PlaceMatchingConfig
-from topoloc.slam.tracking import TrackingConfig, align_with_reference, follow
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.stereo import ray_covariances
 from topoloc.localization.pose_fit import SeenPoints
-from topoloc.slam.tracking import TrackingConfig, align_with_reference, follow
+from topoloc.points.tracking import TrackingConfig, align_with_reference, follow
 
 # Where a point lies beside its ray: the pixel defines the ray, so this only keeps the covariance
 # regular.

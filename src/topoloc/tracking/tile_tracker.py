@@ -15,8 +15,8 @@ from topoloc.errors import QueryError
 from topoloc.geometry.camera import Camera
 from topoloc.localization.query import check_size
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.places.coarse import Image
-from topoloc.sequences.frame_checks import time_problem
+from topoloc.recordings.frame_checks import time_problem
+from topoloc.retrieval.coarse import Image
 from topoloc.tracking.stream_result import StreamedPose
 from topoloc.tracking.tracker import Tracker, TrackerConfig
 

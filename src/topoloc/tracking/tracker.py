@@ -30,9 +30,9 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.query import StageClock, check_size
 from topoloc.localization.result import Localization, NotLocalized, at_time
-from topoloc.places.coarse import Image
-from topoloc.sequences.frame_checks import time_problem
-from topoloc.sequences.pictures import grey_image
+from topoloc.recordings.frame_checks import time_problem
+from topoloc.recordings.pictures import grey_image
+from topoloc.retrieval.coarse import Image
 from topoloc.tracking.following import Followed, FollowingConfig, PointFollower
 from topoloc.tracking.motion import MotionState, update_motion
 from topoloc.tracking.pose_errors import lasting_change, noise_floor

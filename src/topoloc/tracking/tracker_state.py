@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization
-from topoloc.places.coarse import Image
+from topoloc.retrieval.coarse import Image
 from topoloc.tracking.following import Followed, PointFollower
 from topoloc.tracking.motion import MotionState
 from topoloc.tracking.pose_errors import PoseErrors

@@ -25,8 +25,8 @@ from topoloc.localization.guided_kernels import match_projections
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.building import build_map
 from topoloc.localization.walls.wall_poses import agreeing_pose
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.sequences.frame import DepthImage, StereoFrame
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.frame import DepthImage, StereoFrame
 from topoloc.slam.block_kernels import solve_factored
 from topoloc.tracking.tracker import Tracker
 

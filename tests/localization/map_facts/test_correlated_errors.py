@@ -19,7 +19,7 @@ from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts import correlated_errors
 from topoloc.localization.map_facts.correlated_errors import CorrelatedErrorsConfig, inflation
-from topoloc.map.topomap import TopoMetricMap
+from topoloc.mapping.topomap import TopoMetricMap
 
 CONFIG, WEIGHTS = CorrelatedErrorsConfig(min_nodes=3), weights_of("surf").shared_errors
 
@@ -140,7 +140,7 @@ def test_the_first_query_computes_nothing_of_the_map(
     def never(*args: object) -> None:
         raise AssertionError("a digest of the nodes, or what the map knows, at a query")
 
-    monkeypatch.setattr("topoloc.map.nodes.hashlib.sha256", never)
+    monkeypatch.setattr("topoloc.mapping.nodes.hashlib.sha256", never)
     monkeypatch.setattr(correlated_errors, "measure_correlated_errors", never)
     assert localizer.localize(frame.image, frame.camera).localized
     localizer.map.moves(0)

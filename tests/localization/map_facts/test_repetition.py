@@ -21,9 +21,9 @@ from topoloc.localization.map_facts.building import with_repetitions
 from topoloc.localization.map_facts.repetition import copies, folded, shifts_of
 from topoloc.localization.open_map import OpenMap
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.map.checking import damages
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.coarse import Image, NodeScore
+from topoloc.mapping.checking import damages
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.retrieval.coarse import Image, NodeScore
 
 PERIOD = np.array([0.8, 0.0, 0.0])
 PANEL = np.random.default_rng(3).uniform([0.0, -1.0, 2.0], [0.8, 1.0, 2.0], (40, 3))

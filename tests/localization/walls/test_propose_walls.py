@@ -40,8 +40,8 @@ from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Search
 from topoloc.localization.walls import propose_walls as propose_walls_module
 from topoloc.localization.walls.propose_walls import SeenWalls, propose_walls
-from topoloc.map.build import BuildConfig
-from topoloc.map.topomap import SideNodes, TopoMetricMap
+from topoloc.mapping.build import BuildConfig
+from topoloc.mapping.topomap import SideNodes, TopoMetricMap
 
 NO_WALLS = LocalizerConfig(walls=WallsConfig(num_places=0))
 DISTORTED = Camera("OPENCV", 560, 400, (260.0, 262.0, 283.0, 197.0, -0.12, 0.02, 0.0005, -0.0003))

@@ -25,7 +25,7 @@ from topoloc.localization.walls.wall_matching import (
     nearest_sides,
     of_picture,
 )
-from topoloc.map.topomap import SideNodes
+from topoloc.mapping.topomap import SideNodes
 
 PICTURE, TRUTH = seen_on_the_way_back()[2]
 GUIDED = GuidedConfig(radius_px=25.0).resolved(SURF)

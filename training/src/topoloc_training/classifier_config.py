@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from topoloc.bounds import Above, AtLeast, Between
-from topoloc.places.network_config import ClassifierNetwork, PooledNetwork, VladNetworkConfig
+from topoloc.retrieval.network_config import ClassifierNetwork, PooledNetwork, VladNetworkConfig
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,11 @@ from jaxtyping import Float32
 from torch import Generator, Tensor, nn
 
 from topoloc.errors import TrainingError
-from topoloc.places.cnn_fc import NAME, NodeClassifier
-from topoloc.places.coarse import CoarseModel
-from topoloc.places.inference import BATCH_SIZE, in_channels_last
-from topoloc.places.network_config import BackboneName
-from topoloc.places.network_pictures import network_pictures
+from topoloc.retrieval.cnn_fc import NAME, NodeClassifier
+from topoloc.retrieval.coarse import CoarseModel
+from topoloc.retrieval.inference import BATCH_SIZE, in_channels_last
+from topoloc.retrieval.network_config import BackboneName
+from topoloc.retrieval.network_pictures import network_pictures
 from topoloc_training.classifier_config import CnnFcConfig
 from topoloc_training.frozen_maps import FrozenMaps, plain_maps
 from topoloc_training.stored_weights import rounded_to_half, to_arrays

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from topoloc.places.cnn_nn import network_of
-from topoloc.places.coarse import CoarseModel
-from topoloc.places.network_config import BackboneName
+from topoloc.retrieval.cnn_nn import network_of
+from topoloc.retrieval.coarse import CoarseModel
+from topoloc.retrieval.network_config import BackboneName
 from topoloc_training.classifier_config import CnnNnConfig
 from topoloc_training.place_vectors import fit_vectors
 from topoloc_training.training_set import Progress, TrainingSet

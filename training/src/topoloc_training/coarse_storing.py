@@ -6,11 +6,11 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from topoloc.map.edit import editing
-from topoloc.map.schema import SCHEMA_VERSION
-from topoloc.map.sessions import Edit, today
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.coarse import CoarseModel
+from topoloc.mapping.edit import editing
+from topoloc.mapping.schema import SCHEMA_VERSION
+from topoloc.mapping.sessions import Edit, today
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.retrieval.coarse import CoarseModel
 
 
 def store_coarse(path: Path, target: Path, model: CoarseModel, make_default: bool) -> None:

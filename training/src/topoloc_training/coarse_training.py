@@ -12,10 +12,10 @@ import numpy as np
 
 from topoloc.bounds import check_bounds
 from topoloc.errors import EmptyMapError, TrainingError
-from topoloc.map.nodes import NodePoses, node_distances
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.coarse import CoarseModel
-from topoloc.places.network_config import BackboneName
+from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.retrieval.coarse import CoarseModel
+from topoloc.retrieval.network_config import BackboneName
 from topoloc_training.classifier_config import CnnFcConfig, CnnNnConfig, VladNnConfig
 from topoloc_training.training_set import Progress, TrainingSet
 

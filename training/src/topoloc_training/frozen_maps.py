@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Int
 from torch import Generator, Tensor, nn
 
-from topoloc.places.backbones import normalize_pictures
-from topoloc.places.inference import BATCH_SIZE
+from topoloc.retrieval.backbones import normalize_pictures
+from topoloc.retrieval.inference import BATCH_SIZE
 from topoloc_training.augmentation import augment
 from topoloc_training.classifier_config import CnnFcConfig
 from topoloc_training.training_set import Progress

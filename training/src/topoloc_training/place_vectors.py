@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from torch import nn
 
-from topoloc.places.coarse import CoarseModel
-from topoloc.places.inference import Predictor
-from topoloc.places.neighbours import Whitening, learn_whitening
-from topoloc.places.network_pictures import network_pictures
+from topoloc.retrieval.coarse import CoarseModel
+from topoloc.retrieval.inference import Predictor
+from topoloc.retrieval.neighbours import Whitening, learn_whitening
+from topoloc.retrieval.network_pictures import network_pictures
 from topoloc_training.classifier_config import CnnNnConfig, VladNnConfig
 from topoloc_training.stored_weights import rounded_to_half, to_arrays
 from topoloc_training.training_set import Progress, TrainingSet, decode_pictures

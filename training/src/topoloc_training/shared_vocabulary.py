@@ -1,4 +1,5 @@
-"""The shared vocabularies of `topoloc/places/vocabularies`, learned over recordings of many places.
+"""The shared vocabularies of `topoloc/retrieval/vocabularies`, learned over recordings of many
+places.
 
     python -m topoloc_training.shared_vocabulary KIND OUT.npz RECORDING ...
 
@@ -21,12 +22,12 @@ import topoloc
 from topoloc.features.extraction import extract_features
 from topoloc.features.features import Features
 from topoloc.features.kinds import FeatureConfig, find_kind
-from topoloc.places.neighbours import Whitening, learn_whitening
-from topoloc.places.shared_vocabulary import SharedVocabulary
-from topoloc.places.vlad import VladConfig, learn_words, placed
-from topoloc.sequences.open import open_sequence
-from topoloc.sequences.pictures import grey_image
-from topoloc.sequences.recording import single_pictures
+from topoloc.recordings.open import open_sequence
+from topoloc.recordings.pictures import grey_image
+from topoloc.recordings.recording import single_pictures
+from topoloc.retrieval.neighbours import Whitening, learn_whitening
+from topoloc.retrieval.shared_vocabulary import SharedVocabulary
+from topoloc.retrieval.vlad import VladConfig, learn_words, placed
 
 NUM_PICTURES = 160  # of each recording
 NUM_WORDS, DIMENSION = 32, 128

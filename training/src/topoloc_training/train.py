@@ -10,14 +10,14 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from topoloc.apps.cli.output import File, Flag, UsageError, check_outputs, progress_bar, write_json
+from topoloc.apps.cli.settings_file import read_settings
+from topoloc.apps.cli.tile_option import TileOption, edited_at
 from topoloc.atlas.atlas import is_atlas
-from topoloc.cli.output import File, Flag, UsageError, check_outputs, progress_bar, write_json
-from topoloc.cli.settings_file import read_settings
-from topoloc.cli.tile_option import TileOption, edited_at
-from topoloc.map.checking import list_coarse
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.coarse import CoarseModel
-from topoloc.places.network_config import BackboneName
+from topoloc.mapping.checking import list_coarse
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.retrieval.coarse import CoarseModel
+from topoloc.retrieval.network_config import BackboneName
 from topoloc_training.coarse_storing import store_coarse
 from topoloc_training.coarse_training import CoarseTrainingConfig, train_coarse
 

@@ -22,8 +22,8 @@ from jaxtyping import Bool, Int
 from torch import Generator, Tensor, nn
 
 from topoloc.errors import TrainingError
-from topoloc.places.inference import has_bfloat16, threads
-from topoloc.sequences.atomic import replaced_file
+from topoloc.recordings.atomic import replaced_file
+from topoloc.retrieval.inference import has_bfloat16, threads
 from topoloc_training.classifier_config import TrainingConfig
 from topoloc_training.training_set import Progress
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.places.network_pictures import PictureShape, RgbPicture, decode_picture
+from topoloc.retrieval.network_pictures import PictureShape, RgbPicture, decode_picture
 
 Progress = Callable[[str, int, int], None]
 """Called with a stage's name, steps done and steps in all."""

@@ -11,13 +11,13 @@ from jaxtyping import Bool, Float32
 from torch import Tensor, nn
 
 from topoloc.errors import TrainingError
-from topoloc.places.backbones import Backbone, normalize_pictures
-from topoloc.places.coarse import CoarseModel
-from topoloc.places.inference import BATCH_SIZE
-from topoloc.places.neighbours import visual_words
-from topoloc.places.network_config import BackboneName
-from topoloc.places.network_pictures import RgbPictures, network_pictures
-from topoloc.places.vlad_nn import DEPTHS, NetVlad, VladNetwork
+from topoloc.retrieval.backbones import Backbone, normalize_pictures
+from topoloc.retrieval.coarse import CoarseModel
+from topoloc.retrieval.inference import BATCH_SIZE
+from topoloc.retrieval.neighbours import visual_words
+from topoloc.retrieval.network_config import BackboneName
+from topoloc.retrieval.network_pictures import RgbPictures, network_pictures
+from topoloc.retrieval.vlad_nn import DEPTHS, NetVlad, VladNetwork
 from topoloc_training.classifier_config import TripletConfig, VladNnConfig
 from topoloc_training.place_vectors import fit_vectors
 from topoloc_training.stored_weights import rounded_to_half

@@ -24,9 +24,9 @@ from torch import Tensor
 
 from topoloc.errors import WeightsError
 from topoloc.features.network_files import cache_folder
-from topoloc.places.backbones import NUM_CHANNELS, Backbone
-from topoloc.places.network_config import BackboneName
-from topoloc.sequences.atomic import replaced_file
+from topoloc.recordings.atomic import replaced_file
+from topoloc.retrieval.backbones import NUM_CHANNELS, Backbone
+from topoloc.retrieval.network_config import BackboneName
 from topoloc_training.efficientnet_weights import installed_file, is_efficientnet, named_as_backbone
 
 SCRATCH = "scratch"

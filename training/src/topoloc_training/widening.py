@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Int
 
 from topoloc.errors import TrainingError
-from topoloc.map.nodes import NodePoses, node_distances
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.places.cnn_fc import NAME, open_model
-from topoloc.places.network_config import BackboneName
+from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.retrieval.cnn_fc import NAME, open_model
+from topoloc.retrieval.network_config import BackboneName
 from topoloc_training.weights import Weights
 
 MAP = "map"

@@ -17,7 +17,7 @@ from jaxtyping import UInt8
 
 from topoloc.errors import TopolocError
 from topoloc.geometry.camera import Camera
-from topoloc.sequences.atomic import write_bytes, write_text
+from topoloc.recordings.atomic import write_bytes, write_text
 from topoloc_worlds.conditions import find_condition
 from topoloc_worlds.noise import fractal_noise, rng_of
 from topoloc_worlds.recorder import ZED, RecordConfig, record

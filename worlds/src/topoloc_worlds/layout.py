@@ -22,10 +22,10 @@ from jaxtyping import Float32, UInt16
 
 from topoloc.errors import TopolocError
 from topoloc.geometry.camera import Camera
-from topoloc.sequences.atomic import write_bytes, write_text
-from topoloc.sequences.frame import Image
-from topoloc.sequences.pictures import grey_image
-from topoloc.sequences.trajectory import Trajectory, write_tum
+from topoloc.recordings.atomic import write_bytes, write_text
+from topoloc.recordings.frame import Image
+from topoloc.recordings.pictures import grey_image
+from topoloc.recordings.trajectory import Trajectory, write_tum
 from topoloc_worlds.shots import Shot
 
 SETTINGS = "world.json"

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from topoloc.errors import CalibrationError, TopolocError
 from topoloc.geometry.camera import Camera
-from topoloc.sequences.trajectory import Trajectory
+from topoloc.recordings.trajectory import Trajectory
 from topoloc_worlds.conditions import Condition
 from topoloc_worlds.layout import Layout, missing_frames, prepare, write_shot
 from topoloc_worlds.rendering.renderer import RenderConfig, Renderer

@@ -16,8 +16,8 @@ import numpy as np
 from topoloc.demo.recordings import SHIPPED
 from topoloc.errors import RecordingError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.sequences.frame import StereoSequence
-from topoloc.sequences.open import open_sequence
+from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.open import open_sequence
 
 FAMILIES = {
     "corridor": "corridor",

@@ -20,10 +20,10 @@ from topoloc.localization.evidence import Evidence, EvidenceConfig, tolerated_tr
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.building import build_map
 from topoloc.localization.search import Trace
-from topoloc.map.build import BuildConfig
-from topoloc.map.side_nodes import SideNodesConfig
-from topoloc.map.topomap import TopoMetricMap
-from topoloc.sequences.frame import StereoSequence
+from topoloc.mapping.build import BuildConfig
+from topoloc.mapping.side_nodes import SideNodesConfig
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.frame import StereoSequence
 from topoloc_paper.fit.corpus import GAMMAS, AskedPlace, read_rigid
 from topoloc_paper.fit.pictures import darkened, drawn_pictures
 

@@ -16,9 +16,9 @@ from topoloc.localization.fitted_weights import weights_of
 from topoloc.localization.map_facts.correlated_errors import correlated_errors_to_keep
 from topoloc.localization.map_facts.repetition import digest_of
 from topoloc.localization.open_map import OpenMap
-from topoloc.map import build
-from topoloc.map.topomap import Repetitions, SharedErrors, TopoMetricMap
-from topoloc.sequences.frame import StereoSequence
+from topoloc.mapping import build
+from topoloc.mapping.topomap import Repetitions, SharedErrors, TopoMetricMap
+from topoloc.recordings.frame import StereoSequence
 from topoloc.slam.pose_checks import check_gaps, check_poses
 from topoloc.slam.slam import posed_by_slam
 

@@ -18,9 +18,9 @@ from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute
 from topoloc.localization.fitted_weights import weights_of
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.map_facts.correlated_errors import inflation
-from topoloc.map.entries import TopoNode
-from topoloc.map.nodes import NodePoses, node_distances
-from topoloc.map.topomap import TopoMetricMap
+from topoloc.mapping.entries import TopoNode
+from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.topomap import TopoMetricMap
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,8 @@ from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, est
 from topoloc.localization.fitted_weights import SharedErrorWeights
 from topoloc.localization.guided import GuidedConfig, match_guided
 from topoloc.localization.local_map import LocalMap
-from topoloc.map.nodes import NodePoses, digest_of_nodes, node_distances
-from topoloc.map.topomap import SharedErrors, TopoMetricMap, TopoNode
+from topoloc.mapping.nodes import NodePoses, digest_of_nodes, node_distances
+from topoloc.mapping.topomap import SharedErrors, TopoMetricMap, TopoNode
 
 _MEDIAN_CHI_SQUARE_6 = 5.348
 _METHOD = 1  # part of the digest: one more whenever the same settings come to give another rho

@@ -27,8 +27,8 @@ from topoloc.features.matching import MatchingConfig, alike_pairs, match_feature
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.local_map import LocalMap
-from topoloc.map.entries import NodeSummary, TopoNode
-from topoloc.map.nodes import digest_of_nodes
+from topoloc.mapping.entries import NodeSummary, TopoNode
+from topoloc.mapping.nodes import digest_of_nodes
 
 NUM_NEIGHBOURS = 9
 LEAST_SHIFT = 0.3

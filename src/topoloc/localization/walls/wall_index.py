@@ -10,10 +10,10 @@ from topoloc.errors import MapError
 from topoloc.features.features import Features
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.walls.wall_matching import of_picture
-from topoloc.map.memory import RememberedNodes
-from topoloc.map.topomap import SideNodes, TopoMetricMap, in_rows
-from topoloc.places.coarse import Image
-from topoloc.places.vlad import SurfVlad
+from topoloc.mapping.memory import RememberedNodes
+from topoloc.mapping.topomap import SideNodes, TopoMetricMap, in_rows
+from topoloc.retrieval.coarse import Image
+from topoloc.retrieval.vlad import SurfVlad
 
 
 class WallIndex:

@@ -16,10 +16,10 @@ from jaxtyping import Float
 
 from topoloc.errors import RecordingError
 from topoloc.geometry.camera import Camera
-from topoloc.sequences.folder import open_folder
-from topoloc.sequences.frame import StereoFrame
-from topoloc.sequences.kitti import open_kitti
-from topoloc.sequences.pictures import grey_image
+from topoloc.recordings.folder import open_folder
+from topoloc.recordings.frame import StereoFrame
+from topoloc.recordings.kitti import open_kitti
+from topoloc.recordings.pictures import grey_image
 
 _NEAREST = 3  # day's pictures for one of the others
 _REACH = 2.0  # metres

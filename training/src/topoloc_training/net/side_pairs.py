@@ -17,8 +17,8 @@ from PIL import Image
 from topoloc.errors import RecordingError
 from topoloc.features.side_views import SideView, SideViewConfig, side_views
 from topoloc.geometry.camera import Camera
-from topoloc.sequences.frame import StereoFrame, StereoSequence
-from topoloc.sequences.pictures import grey_image
+from topoloc.recordings.frame import StereoFrame, StereoSequence
+from topoloc.recordings.pictures import grey_image
 from topoloc_training.net.pairs import Pair, located_pixels, seen_by
 from topoloc_training.net.teacher import HEIGHT, WIDTH
 

@@ -13,8 +13,8 @@ import numpy as np
 import onnxruntime
 from jaxtyping import Float, Float32, Int8, UInt8
 
-from topoloc.sequences.pictures import grey_image, read_image
-from topoloc.sequences.recording import list_pictures
+from topoloc.recordings.pictures import grey_image, read_image
+from topoloc.recordings.recording import list_pictures
 
 WIDTH, HEIGHT = 640, 384
 STRIDE = 4

@@ -23,7 +23,7 @@ import torch
 import tyro
 from torch import Tensor, nn
 
-from topoloc.sequences.open import open_sequence
+from topoloc.recordings.open import open_sequence
 from topoloc_training.net.losses import likeness, peaks, placed, sampled, told_apart
 from topoloc_training.net.network import KIND, STRIDE, TopolocNet
 from topoloc_training.net.pairs import Pair, find_pairs

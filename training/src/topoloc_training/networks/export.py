@@ -17,7 +17,7 @@ import onnx
 import torch
 from torch import Tensor, nn
 
-from topoloc.sequences.atomic import replaced_file
+from topoloc.recordings.atomic import replaced_file
 from topoloc_training.networks.edgepoint2 import SIZES, EdgePoint2
 from topoloc_training.networks.lean import made_lean
 from topoloc_training.networks.xfeat import UNUSED, XFeat

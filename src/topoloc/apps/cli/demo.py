@@ -1,0 +1,169 @@
+"""topoloc demo: the whole pipeline on the built-in world."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from topoloc.apps.cli.output import (
+    File,
+    UsageError,
+    check_outputs,
+    print_recordings,
+    progress_bar,
+    report_writer,
+    write_json,
+)
+from topoloc.demo.recordings import ROLES, SHIPPED, Role, missing_recordings
+from topoloc.demo.words import PAPER_LAB, night_in_words, words_of
+from topoloc.errors import MissingExtraError, TopolocError
+from topoloc.evaluation.experiments import answer_elsewhere, answer_queries
+from topoloc.evaluation.metrics import Answer, by_recording, summarize
+from topoloc.localization.localizer import Localizer
+from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.result import Localization
+from topoloc.mapping.description import describe_map
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.atomic import write_text
+from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.open import open_sequence
+from topoloc.recordings.trajectory import Trajectory, write_tum
+
+Progress = Callable[[str, int, int], None]
+ELSEWHERE = "elsewhere"
+
+
+@dataclass(frozen=True)
+class Command:
+    """What `topoloc demo` takes."""
+
+    out: Annotated[str, tyro.conf.arg(metavar="DIR")] = "topoloc-demo"
+    """Where map, results, trajectories and report.html are written."""
+    recordings: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="DIR", help_behavior_hint="(default: those that topoloc brings along)"
+        ),
+    ] = None
+    """Take the recordings from here, as `topoloc simulate demo` renders them."""
+    json: File = None
+    """Write the evaluation as JSON to this file (- for standard output)."""
+
+    def run(self) -> int:
+        start = time.perf_counter()
+        out = _made_folder(Path(self.out))
+        check_outputs(
+            [str(out / "lab.topo"), str(out / "results.jsonl"), str(out / "report.html"), self.json]
+        )
+        with progress_bar() as progress:
+            folder = self._recordings()
+            topomap = _map_the_lab(folder, out / "lab.topo", progress)
+            mapped = time.perf_counter()
+            answers = _ask(topomap, folder, progress)
+        evaluation = summarize(answers) | {"map": describe_map(topomap, out / "lab.topo")}
+        _write_results(out, folder, answers)
+        try:
+            report_writer()(out / "report.html", evaluation, answers, topomap, words_of(evaluation))
+            report = str(out / "report.html")
+        except MissingExtraError as missing:
+            report = f"none; {missing}"
+        write_json(self.json, evaluation | {"answers": [answer.to_json() for answer in answers]})
+        if self.json != "-":
+            seconds = (
+                f"{time.perf_counter() - start:.0f} s in all, {mapped - start:.0f} s of them until"
+                " the map was there"
+            )
+            _print(out, evaluation, seconds, report)
+        return 0
+
+    def _recordings(self) -> Path:
+        """The folder of the recordings, whole."""
+        folder = Path(self.recordings) if self.recordings else SHIPPED
+        if not folder.is_dir():
+            raise TopolocError(
+                f"{folder}: no such folder; `topoloc simulate demo {folder}` renders the recordings"
+                " into it"
+            )
+        if missing := missing_recordings(folder):
+            what = (
+                "this installation of topoloc lacks the demo's recordings"
+                if folder == SHIPPED
+                else f"{folder} lacks recordings"
+            )
+            raise TopolocError(
+                f"{what} ({', '.join(missing)}); `topoloc simulate demo DIR` renders them"
+            )
+        return folder
+
+
+def _made_folder(folder: Path) -> Path:
+    if not folder.name and not folder.is_dir():
+        raise UsageError("--out names no folder")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise TopolocError(f"cannot write {folder}: it is a file") from None
+    except OSError as error:
+        raise TopolocError(f"cannot write {folder}: {error.strerror}") from error
+    return folder
+
+
+def _open(folder: Path, role: Role) -> list[StereoSequence]:
+    return [open_sequence(folder / name) for name, its_role in ROLES.items() if its_role == role]
+
+
+def _map_the_lab(folder: Path, path: Path, progress: Progress) -> TopoMetricMap:
+    """Build the map and open it from its file, as everybody else will."""
+    build_map(_open(folder, "map"), progress=progress).save(path)
+    return TopoMetricMap.load(path)
+
+
+def _ask(topomap: TopoMetricMap, folder: Path, progress: Progress) -> list[Answer]:
+    """Every query of the lab, then every picture of somewhere else."""
+    localizer = Localizer(topomap)
+    answers: list[Answer] = []
+    for sequence in _open(folder, "queries"):
+        answers += answer_queries(localizer, sequence, progress=progress, label=_label(sequence))
+    for sequence in _open(folder, "elsewhere"):
+        answers += answer_elsewhere(localizer, sequence, progress, ELSEWHERE)
+    return answers
+
+
+def _label(sequence: StereoSequence) -> str:
+    return sequence.name.replace("_", " ")
+
+
+def _write_results(out: Path, folder: Path, answers: Sequence[Answer]) -> None:
+    """One JSON line a query, and the poses found in each recording as a trajectory."""
+    lines = [json.dumps(a.result.to_json(f"{a.recording}/{a.query}")) for a in answers]
+    write_text(out / "results.jsonl", "\n".join(lines) + "\n")
+    groups = by_recording(answers)
+    for sequence in _open(folder, "queries"):
+        t_ns = dict(zip(sequence.names, sequence.t_ns, strict=True))
+        found = [
+            (t_ns[a.query], a.result.world_from_cam)
+            for a in groups[_label(sequence)]
+            if isinstance(a.result, Localization)
+        ]
+        write_tum(
+            out / f"{sequence.name}.tum",
+            Trajectory([pose for _, pose in found], [t for t, _ in found]),
+        )
+
+
+def _print(out: Path, evaluation: dict[str, Any], seconds: str, report: str) -> None:
+    print_recordings(evaluation, [PAPER_LAB])
+    m = evaluation["map"]
+    print(f"\n{night_in_words(evaluation)}\n")
+    print(
+        f"map: {out / 'lab.topo'} ({m['num_nodes']} nodes, {m['bytes'] / 1e6:.1f} MB,"
+        f" {m['length_m']:.1f} m mapped; {seconds})"
+    )
+    print(f"poses: {out / 'results.jsonl'}, and a .tum file for each recording beside it")
+    print(f"report: {report}")

@@ -1,0 +1,372 @@
+"""topoloc evaluate MAP|ATLAS SEQ [SEQ ...], topoloc evaluate MAP --against-itself."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+
+from topoloc.apps.cli.against_itself import evaluate_against_itself
+from topoloc.apps.cli.features_option import ASKED_FEATURES
+from topoloc.apps.cli.map_or_atlas import localizer_at
+from topoloc.apps.cli.output import (
+    CameraOption,
+    File,
+    Flag,
+    Format,
+    Topics,
+    UsageError,
+    check_outputs,
+    print_facts,
+    print_recordings,
+    progress_bar,
+    report_writer,
+    write_json,
+)
+from topoloc.apps.cli.recording_queries import Queries, QueryRecording, SentMap, answers_on_ray
+from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
+from topoloc.apps.cluster.config import ClusterConfig
+from topoloc.atlas.config import AtlasConfig
+from topoloc.atlas.judged_tile import JudgedTile
+from topoloc.errors import TrajectoryError
+from topoloc.evaluation.metrics import (
+    MAX_ROTATION_DEG,
+    MAX_TRANSLATION,
+    Answer,
+    by_recording,
+    length_text,
+    summarize,
+)
+from topoloc.evaluation.world_fit import WorldFit, fit_worlds
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.calibration_doubt import verdicts_of
+from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.mapping.description import describe_map
+from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.json_file import read_json
+
+
+@dataclass(frozen=True)
+class Command:
+    """What `topoloc evaluate` takes."""
+
+    map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
+    """The map file, or an atlas."""
+    sequences: Annotated[
+        tyro.conf.Positional[tuple[str, ...]],
+        tyro.conf.arg(metavar="SEQ ...", help_behavior_hint=""),
+    ] = ()
+    """Recordings with known truth. PATH@1::2 takes every second frame of PATH, from the second
+    on."""
+    tile: Annotated[
+        str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(atlases only)")
+    ] = None
+    """Of an atlas: the tile in whose world the recordings' truth is given. A pose in a tile of
+    another world is a false accept."""
+    elsewhere: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]],
+        tyro.conf.arg(metavar="SEQ", help_behavior_hint="(may be given several times)"),
+    ] = ()
+    """A recording of another place: every pose given for one of its images counts as a false
+    accept."""
+    against_itself: Flag = False
+    """No recording is needed: which parts of the map are weakly held, and where to walk next. Each
+    node is asked of the rest of the map."""
+    map_from_truth: File = None
+    """A JSON file with the 4x4 matrix (metres) that takes the world of the recordings' truth into
+    the map's, where they differ."""
+    fit_map_from_truth: File = None
+    """Where one rigid transform between the two worlds explains the errors, write it to this file;
+    --map-from-truth reads it."""
+    coarse: Annotated[
+        str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")
+    ] = None
+    """Coarse localizer that is asked; `topoloc info` names those of the map."""
+    features: ASKED_FEATURES = None
+    """Which of the map's features are asked; of several, the next where the one before leaves the
+    pose unclear."""
+    format: Format = None
+    """The recordings' format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap,
+    rosbag, mcap, zed, video or folder."""
+    camera: CameraOption = None
+    """Calibration of the recordings instead of their own: camera.json, OpenCV's or Kalibr's YAML,
+    SN*.conf, or `fx,fy,cx,cy`."""
+    poses: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="CONVENTION[,CONVENTION]",
+            help_behavior_hint="(default: world_from_cam, metres)",
+        ),
+    ] = None
+    """How the recordings' truth is written, where it is not world_from_cam in metres: inverse,
+    opengl, wxyz, mm, as of `build`."""
+    topics: Topics = None
+    """Of a bag, which topic is what: left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom."""
+    json: File = None
+    """Write the evaluation as JSON to this file (- for standard output)."""
+    report: File = None
+    """Write a page with the table, the map from above, the error curves and the worst queries to
+    this file (report.html)."""
+    ray: Annotated[
+        str | None,
+        tyro.conf.arg(metavar="HOST:PORT|auto|local", help_behavior_hint="(default: none)"),
+    ] = None
+    """A Ray cluster whose machines answer the pictures, with the same figures: `auto` is the one
+    that runs on this machine, `local` one of this machine's processors alone."""
+    config: File = None
+    """All other settings: a TOML file, as `topoloc config evaluate` prints it."""
+
+    def run(self) -> int:
+        if self.against_itself:
+            self._refuse_beside_itself()
+            outputs = {"json": self.json, "report": self.report}
+            return evaluate_against_itself(
+                self.map, self.coarse, self.features, outputs, self.config
+            )
+        if not self.sequences and not self.elsewhere:
+            raise UsageError(
+                "evaluate takes a map and at least one recording, with truth or --elsewhere, or"
+                " --against-itself"
+            )
+        if self.fit_map_from_truth and (self.map_from_truth or len(self.sequences) != 1):
+            raise UsageError("--fit-map-from-truth is of one recording, without --map-from-truth")
+        inputs = [path for path in (self.map, self.map_from_truth, self.config) if path]
+        check_outputs([self.json, self.report, self.fit_map_from_truth], inputs)
+        settings = read_settings(self.config)
+        config = with_option(settings.of(LocalizerConfig), "coarse", self.coarse, "--coarse")
+        write_report = report_writer() if self.report else None
+        judged = self._judged(settings, config)
+        topomap = judged.topomap
+        info = describe_map(topomap, topomap.file.path if topomap.file else Path(self.map))
+        map_from_truth = _read_rigid(Path(self.map_from_truth)) if self.map_from_truth else None
+        asked = self._opened(map_from_truth)
+        with progress_bar() as progress:
+            if self.ray is None:
+                answers = [
+                    answer for queries in asked for answer in queries.answers(judged, progress)
+                ]
+            else:
+                sent = SentMap.of(judged, config, self.features)
+                answers = answers_on_ray(
+                    sent, asked, self.ray, settings.of(ClusterConfig), progress
+                )
+        of_worlds = [] if isinstance(judged, JudgedTile) else by_recording(answers).values()
+        fits = [fit for of_one in of_worlds if (fit := fit_worlds(of_one)) is not None]
+        calibrations = _calibrations(answers)
+        evaluation = summarize(answers) | {
+            "map": info,
+            "world_fits": [fit.to_json() for fit in fits],
+            "calibrations": calibrations,
+        }
+        if self.json != "-":
+            _print(evaluation)
+        for fit in fits:
+            print(
+                _offer(fit, self.fit_map_from_truth),
+                file=sys.stderr if self.json == "-" else sys.stdout,
+            )
+        write_json(self.json, evaluation | {"answers": [answer.to_json() for answer in answers]})
+        if write_report and self.report:
+            write_report(Path(self.report), evaluation, answers, topomap)
+            if self.json != "-":
+                print(f"report: {self.report}")
+        self._write_fit(fits)
+        return 0
+
+    def _opened(self, map_from_truth: Rigid3 | None) -> list[Queries]:
+        """The recordings, those with truth first."""
+        paths, count = [*self.sequences, *self.elsewhere], len(self.sequences)
+        how = (self.format, self.camera, self.topics, self.poses)
+        recordings = [
+            QueryRecording(path, *how, is_elsewhere=number >= count)
+            for number, path in enumerate(paths)
+        ]
+        sequences = [recording.open() for recording in recordings]
+        labels = _labels(paths, sequences)
+        return [
+            Queries(*one, map_from_truth) for one in zip(recordings, sequences, labels, strict=True)
+        ]
+
+    def _refuse_beside_itself(self) -> None:
+        """Hold that nothing is given that is of recordings."""
+        names = (
+            "elsewhere",
+            "tile",
+            "map_from_truth",
+            "fit_map_from_truth",
+            "format",
+            "camera",
+            "poses",
+            "topics",
+            "ray",
+        )
+        given = ["recordings"] * bool(self.sequences) + [
+            f"--{name.replace('_', '-')}" for name in names if getattr(self, name)
+        ]
+        if given:
+            raise UsageError(f"--against-itself asks the map alone, without {', '.join(given)}")
+
+    def _judged(self, settings: Settings, config: LocalizerConfig) -> Localizer | JudgedTile:
+        """The map; or the atlas, in the world of the tile that the recordings' truth is given
+        in."""
+        localizer = localizer_at(self.map, config, self.features, settings.of(AtlasConfig))
+        if isinstance(localizer, Localizer):
+            if self.tile is not None:
+                raise UsageError(f"--tile is of an atlas, and {self.map} is none")
+            return localizer
+        tiles = list(localizer.atlas.manifest.by_id)
+        tile_id = self.tile or (tiles[0] if len(tiles) == 1 or not self.sequences else None)
+        if tile_id is None:
+            raise UsageError("--tile: which tile's world is the recordings' truth in?")
+        if self.report or self.fit_map_from_truth:
+            raise UsageError(
+                "--report and --fit-map-from-truth are of a map: give the tile's own file"
+            )
+        return JudgedTile.of(localizer, tile_id)
+
+    def _write_fit(self, fits: Sequence[WorldFit]) -> None:
+        if self.fit_map_from_truth and not fits:
+            raise TrajectoryError(
+                f"{self.fit_map_from_truth} is not written: no rigid transform between two worlds"
+                " explains the errors"
+            )
+        if self.fit_map_from_truth:
+            write_json(
+                self.fit_map_from_truth,
+                {"map_from_truth": fits[0].map_from_truth.matrix().tolist()},
+            )
+
+
+def _calibrations(answers: Sequence[Answer]) -> list[dict[str, Any]]:
+    """What the pictures of each recording say together of their cameras."""
+    return [
+        {"recording": name} | verdict.to_json()
+        for name, of_one in by_recording(answers).items()
+        for verdict in verdicts_of(
+            answer.result for answer in of_one if answer.world_from_cam is not None
+        )
+    ]
+
+
+def _offer(fit: WorldFit, written: str | None) -> str:
+    """One line: that the worlds differ, what is left of the errors in one world, and how to judge
+    by that."""
+    left = f"{length_text(fit.median_translation_m)} and {fit.median_rotation_deg:.2f} deg"
+    apart = (
+        f"{length_text(float(np.linalg.norm(fit.map_from_truth.translation)))},"
+        f" {np.degrees(fit.map_from_truth.angle()):.1f} deg"
+    )
+    how = (
+        f"--map-from-truth {written}"
+        if written
+        else "--fit-map-from-truth FILE writes that transform, --map-from-truth FILE judges by it"
+    )
+    return (
+        f"{fit.recording}: its truth is in another world than the map: one rigid transform"
+        f" ({apart}) explains {fit.num_answers} of {fit.num_localized} answers, median error then"
+        f" {left}; {how}"
+    )
+
+
+def _labels(paths: Sequence[str], sequences: Sequence[StereoSequence]) -> list[str]:
+    """The recordings' names; where two have one name, the ends of their paths, or all of them."""
+    choices = ([sequence.name for sequence in sequences], [Path(path).name for path in paths])
+    return next((names for names in choices if len(set(names)) == len(names)), list(paths))
+
+
+def _read_rigid(path: Path) -> Rigid3:
+    """A 4x4 matrix, alone or as the only matrix of a JSON object."""
+    data = read_json(path, TrajectoryError)
+    matrices = (
+        [value for value in data.values() if isinstance(value, list)]
+        if isinstance(data, dict)
+        else [data]
+    )
+    try:
+        (matrix,) = matrices
+        return Rigid3.from_matrix(np.array(matrix, dtype=np.float64))
+    except (ValueError, TypeError, OverflowError):
+        raise TrajectoryError(f"{path}: one 4x4 matrix is needed") from None
+    except TrajectoryError as error:
+        raise TrajectoryError(f"{path}: {error}") from None
+
+
+def _print(evaluation: dict[str, Any]) -> None:
+    e = evaluation
+    if len(e["recordings"]) > 1:
+        print_recordings(e)
+        print()
+    facts = []
+    if e["num_queries"]:
+        facts.append(
+            (
+                "localized",
+                (
+                    f"{e['num_localized']} of {e['num_queries']}"
+                    f" ({100 * e['num_localized'] / e['num_queries']:.1f} %)"
+                ),
+            )
+        )
+    if e["num_localized"]:
+        facts.append(
+            (
+                "median error",
+                f"{100 * e['median_translation_m']:.2f} cm, {e['median_rotation_deg']:.3f} deg",
+            )
+        )
+    if e["num_queries"]:
+        facts.append(
+            (
+                "recall",
+                ", ".join(
+                    f"{name.replace('_', ' ')} {100 * share:.1f} %"
+                    for name, share in e["recall"].items()
+                ),
+            )
+        )
+    if e["topological_accuracy"] is not None:
+        facts.append(
+            (
+                "nearest node named first",
+                (
+                    f"{100 * e['topological_accuracy']:.1f} %, or a neighbour"
+                    f" {100 * e['neighbour_accuracy']:.1f} %"
+                ),
+            )
+        )
+    elsewhere = f"of {e['num_elsewhere']} images from elsewhere, and " if e["num_elsewhere"] else ""
+    facts.append(
+        (
+            "false accepts",
+            (
+                f"{e['false_accepts']} ({elsewhere}of poses off by more than {MAX_TRANSLATION} m or"
+                f" {MAX_ROTATION_DEG:g} deg)"
+            ),
+        )
+    )
+    if e["not_localized"]:
+        facts.append(
+            (
+                "not localized",
+                ", ".join(f"{reason} {count}" for reason, count in e["not_localized"].items()),
+            )
+        )
+    facts.append(
+        ("median ms", ", ".join(f"{stage} {ms:.1f}" for stage, ms in e["median_times_ms"].items()))
+    )
+    facts += [("calibration", f"{one['recording']}: {one['detail']}") for one in e["calibrations"]]
+    facts.append(
+        (
+            "map",
+            (
+                f"{e['map']['num_nodes']} nodes, {e['map']['bytes'] / 1e6:.2f} MB,"
+                f" {e['map']['length_m']:.1f} m"
+            ),
+        )
+    )
+    print_facts(facts)

@@ -1,0 +1,140 @@
+"""topoloc explain MAP IMAGE."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from topoloc.apps.cli.features_option import ASKED_FEATURES, localizer_of
+from topoloc.apps.cli.map_or_atlas import camera_for, is_atlas, open_atlas
+from topoloc.apps.cli.output import File, UsageError, check_outputs, write_json
+from topoloc.apps.cli.settings_file import read_settings, with_option
+from topoloc.apps.report.explanation import Explanation, explain, facts_of
+from topoloc.apps.report.explanation_page import row_of, verdict, write_explanation
+from topoloc.atlas.atlas_localizer import AtlasLocalizer
+from topoloc.atlas.config import AtlasConfig
+from topoloc.localization.localizer import LocalizerConfig
+from topoloc.localization.query import Picture
+from topoloc.localization.query_camera import camera_of_frame, named_camera
+from topoloc.localization.result import Localization
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.frame import StereoFrame
+from topoloc.recordings.open import open_sequence
+from topoloc.recordings.recording import single_pictures
+
+
+@dataclass(frozen=True)
+class Command:
+    """What `topoloc explain` takes."""
+
+    map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
+    """The map file; or an atlas, of which the tile is explained that answers."""
+    image: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="IMAGE")]
+    """The picture; or one of a recording, as in walk@17."""
+    camera: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="FILE|fx,fy,cx,cy|map|unknown",
+            help_behavior_hint="(default: that of the recording)",
+        ),
+    ] = None
+    """Its calibration, as `topoloc localize` takes it."""
+    coarse: Annotated[
+        str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")
+    ] = None
+    """Coarse localizer that is asked; `topoloc info` names those of the map."""
+    features: ASKED_FEATURES = None
+    """Which of the map's features are asked; of several, the next where the one before leaves the
+    pose unclear."""
+    out: File = None
+    """Write a page with the pictures, the matches and all that was tried to this file (HTML)."""
+    json: File = None
+    """Write what is printed as JSON to this file (- for standard output)."""
+    config: File = None
+    """All other settings: a TOML file, as `topoloc config explain` prints it."""
+
+    def run(self) -> int:
+        check_outputs(
+            [self.out, self.json], inputs=[path for path in (self.map, self.config) if path]
+        )
+        settings = read_settings(self.config)
+        config = with_option(settings.of(LocalizerConfig), "coarse", self.coarse, "--coarse")
+        path, ranking = Path(self.map), list[str]()
+        if is_atlas(self.map):
+            path, ranking = self._tile_of(
+                open_atlas(self.map, config, self.features, settings.of(AtlasConfig))
+            )
+        with TopoMetricMap.load(path) as topomap:
+            of_size = None if self.camera is None else named_camera(self.camera, topomap)
+            localizer = localizer_of(topomap, config, self.features)
+            frame = self._frame()
+            explanation = explain(localizer, frame.image, camera_of_frame(frame, of_size))
+            if self.out:
+                write_explanation(Path(self.out), frame.name, frame.image, explanation, topomap)
+        if self.json != "-":
+            for line in ranking:
+                print(line)
+            _print(explanation, self.out)
+        write_json(
+            self.json, facts_of(frame.name, explanation) | ({"tiles": ranking} if ranking else {})
+        )
+        return 0
+
+    def _frame(self) -> StereoFrame:
+        sequence = single_pictures(open_sequence(self.image))
+        if len(sequence) != 1:
+            raise UsageError(
+                f"explain takes one picture, and {self.image} has {len(sequence)}; {self.image}@0"
+                " is its first"
+            )
+        return sequence[0]
+
+    def _tile_of(self, localizer: AtlasLocalizer) -> tuple[Path, list[str]]:
+        """The map of the tile that answers for the picture, and in words what the atlas made of
+        it."""
+        frame, of_size = (
+            self._frame(),
+            None if self.camera is None else camera_for(localizer, self.camera),
+        )
+        camera = camera_of_frame(frame, of_size)
+        result = localizer.localize(frame.image, camera)
+        tile_id = result.provenance.tile
+        assert tile_id is not None
+        likest = ", ".join(
+            f"{name} {likeness:.2f}"
+            for name, likeness in localizer.rank(Picture(frame.image, camera))[:5]
+        )
+        said = f"in tile {tile_id}"
+        if not isinstance(result, Localization):
+            said = (
+                f"not localized ({result.reason}{f', {result.detail}' if result.detail else ''});"
+                f" most of it is known to tile {tile_id}"
+            )
+        return localizer.atlas.map_path(localizer.atlas.tile(tile_id)), [
+            f"atlas: {said}",
+            f"looks most like: {likest}",
+        ]
+
+
+def _print(explanation: Explanation, page: str | None) -> None:
+    print(verdict(explanation))
+    for line in explanation.advice:
+        print(f"- {line}")
+    for pose in explanation.poses:
+        source, features, node, first, found, _, _, probability, became = row_of(pose)
+        facts = ", ".join(
+            text
+            for text in (
+                node and f"node {node}",
+                f"{first} at first",
+                found and f"found {found}",
+                probability,
+            )
+            if text
+        )
+        print(f"  {source} ({features}): {facts}: {became}")
+    if page:
+        print(f"page: {page}")

@@ -1,0 +1,168 @@
+"""topoloc georeference MAP|ATLAS --origin LAT,LON,H,HEADING | --gnss FILE | --points FILE."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+
+from topoloc.apps.cli.output import File, UsageError, check_outputs, print_facts, write_json
+from topoloc.apps.cli.tile_option import TileOption, edited_at
+from topoloc.apps.cli.waiting import say_waiting
+from topoloc.errors import GeoreferenceError
+from topoloc.geometry.geodesy import GeoPoint, Georeference
+from topoloc.geometry.rigid import Rigid3
+from topoloc.mapping.edit import editing
+from topoloc.mapping.georeferencing import (
+    Up,
+    WorldFit,
+    find_up,
+    fit_georeference,
+    georeference_by_view,
+)
+from topoloc.mapping.known_places import KnownPlaces, read_gnss, read_points
+from topoloc.mapping.topomap import TopoMetricMap
+
+
+@dataclass(frozen=True)
+class Command:
+    """What `topoloc georeference` takes."""
+
+    map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
+    """The map file; it is replaced by one that knows where on earth it lies. Or an atlas, with
+    `--tile`."""
+    origin: Annotated[
+        str | None, tyro.conf.arg(metavar="LAT,LON,H,HEADING", help_behavior_hint="")
+    ] = None
+    """Where the first mapping picture was taken (degrees, metres above the ellipsoid), and which
+    way it looks: degrees clockwise from true north."""
+    gnss: File = None
+    """Where the camera was: lines of `time,lat,lon,h` or `name of a mapping picture,lat,lon,h`;
+    fitted robustly."""
+    points: File = None
+    """Three or more known points: lines of `x,y,z,lat,lon,h`, x, y, z metres in the map's world."""
+    up: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="x|-x|y|-y|z|-z",
+            help_behavior_hint="(default: the axis nearest to the cameras' up)",
+        ),
+    ] = None
+    """The axis of the map's world that is up; --points do not need it."""
+    tile: TileOption = None
+    """Of an atlas: the tile; those that share its world, or are joined with it, then know where
+    they lie, too."""
+    json: File = None
+    """Write what is printed as JSON to this file (- for standard output)."""
+
+    def run(self) -> int:
+        given = [option for option in (self.origin, self.gnss, self.points) if option is not None]
+        if len(given) != 1:
+            raise UsageError("georeference takes a map and one of --origin, --gnss and --points")
+        check_outputs(
+            [self.json], inputs=[path for path in (self.map, self.gnss, self.points) if path]
+        )
+        origin = None if self.origin is None else _origin_from(self.origin)
+        found, facts, fitted = edited_at(
+            self.map, self.tile, lambda path: self._edited(path, origin)
+        )
+        if self.json != "-":
+            _print(found, facts, fitted)
+        write_json(self.json, facts)
+        return 0
+
+    def _edited(
+        self, path: Path, origin: tuple[GeoPoint, float] | None
+    ) -> tuple[Georeference, dict[str, Any], tuple[KnownPlaces, WorldFit] | None]:
+        """Where the map lies, with what is said of it, and what it was fitted to."""
+        with editing(path, say_waiting) as edit:
+            topomap = edit.topomap
+            posed = [image.world_from_cam for image in topomap.place_images] or [
+                s.world_from_cam for s in topomap.summaries
+            ]
+            if not posed:
+                raise GeoreferenceError(f"map {path} has no mapping picture")
+            up = find_up(posed, self.up)
+            found, fitted = self._found(topomap, posed[0], up, origin)
+            edit.commit(replace(topomap, georeference=found), f"georeference {found.source}")
+        facts = found.to_json() | {
+            "heading_deg": found.heading_deg(posed[0].rotation[:, 2]),
+            "up": None if self.points else up.axis,
+        }
+        if fitted is not None:
+            fit = fitted[1]
+            facts |= {
+                "num_points": len(fit.used),
+                "num_used": int(fit.used.sum()),
+                "residuals_m": fit.residuals_m.round(4).tolist(),
+            }
+        return found, facts, fitted
+
+    def _found(
+        self, topomap: TopoMetricMap, first: Rigid3, up: Up, origin: tuple[GeoPoint, float] | None
+    ) -> tuple[Georeference, tuple[KnownPlaces, WorldFit] | None]:
+        """Where the map lies, and what that was fitted to."""
+        if origin is not None:
+            return georeference_by_view(first, *origin, up), None
+        if self.points is not None:
+            known = read_points(Path(self.points))
+            fit = fit_georeference(known.points_world, known.places, "points")
+        else:
+            known = read_gnss(Path(self.gnss or ""), topomap)
+            fit = fit_georeference(known.points_world, known.places, "gnss", up)
+        return fit.georeference, (known, fit)
+
+
+def _origin_from(text: str) -> tuple[GeoPoint, float]:
+    try:
+        lat, lon, h, heading_deg = map(float, text.split(","))
+    except ValueError:
+        raise GeoreferenceError(
+            f"--origin {text[:80]}: four numbers LAT,LON,H,HEADING are needed"
+        ) from None
+    if not -360.0 <= heading_deg <= 360.0:
+        raise GeoreferenceError(
+            f"--origin: a heading of {heading_deg:g}; degrees clockwise from true north are needed"
+        )
+    return GeoPoint(lat, lon, h), heading_deg
+
+
+def place_line(georeference: Georeference) -> str:
+    """Where a map lies, and how well that is known, in one line."""
+    o, rms = georeference.origin, georeference.rms_m
+    fitted = "" if rms is None else f", rms {rms:.2f} m"
+    return f"{o.lat:.7f}, {o.lon:.7f}, {o.h:.2f} m (from {georeference.source}{fitted})"
+
+
+def _print(
+    found: Georeference, facts: dict[str, Any], fitted: tuple[KnownPlaces, WorldFit] | None
+) -> None:
+    lines = [
+        ("origin", place_line(found)),
+        (
+            "first picture looks to",
+            f"{facts['heading_deg']:.1f} degrees from true north, clockwise",
+        ),
+    ]
+    if facts["up"] is not None:
+        lines.append(("up", f"the world's {facts['up']}"))
+    if fitted is not None:
+        known, fit = fitted
+        worst = int(np.argmax(np.where(fit.used, fit.residuals_m, -1.0)))
+        lines.append(("points", f"{facts['num_used']} of {facts['num_points']} agree"))
+        lines.append(
+            (
+                "residuals",
+                (
+                    f"rms {found.rms_m:.3f} m, largest {fit.residuals_m[worst]:.3f} m"
+                    f" ({known.names[worst]})"
+                ),
+            )
+        )
+        if not fit.used.all():
+            left_out = ", ".join(known.names[k] for k in np.flatnonzero(~fit.used)[:5].tolist())
+            lines.append(("left out", f"{left_out}{', ...' if (~fit.used).sum() > 5 else ''}"))
+    print_facts(lines)

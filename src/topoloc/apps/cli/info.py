@@ -1,0 +1,139 @@
+"""topoloc info MAP."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from topoloc.apps.cli import atlas
+from topoloc.apps.cli.output import File, Flag, UsageError, check_outputs, print_facts, write_json
+from topoloc.atlas.atlas import is_atlas
+from topoloc.errors import MapError
+from topoloc.mapping.description import describe_map
+
+MAX_DAMAGES = 20
+
+
+@dataclass(frozen=True)
+class Command:
+    """What `topoloc info` takes."""
+
+    map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
+    """The map file, or an atlas."""
+    json: File = None
+    """Write the same as JSON to this file (- for standard output)."""
+
+    check: Flag = False
+    """Also look at every byte of the map, and whether its nodes agree with their neighbours; exit
+    status 1 where something is wrong."""
+
+    graph: Annotated[
+        str | None, tyro.conf.arg(metavar="FILE.graphml|FILE.geojson", help_behavior_hint="")
+    ] = None
+    """Write nodes, junctions and the ways between them to this file; GeoJSON of a map that knows
+    its place on earth."""
+
+    def run(self) -> int:
+        from topoloc.mapping.topomap import TopoMetricMap
+
+        if is_atlas(self.map) and self.graph:
+            raise UsageError("--graph is of one map; name a tile's file")
+        if is_atlas(self.map):
+            return atlas.Command("info", self.map, check=self.check, json=self.json).run()
+        check_outputs([self.json, self.graph], inputs=[self.map])
+        with TopoMetricMap.load(self.map) as topomap:
+            found = _damages(topomap, Path(self.map)) if self.check else []
+            if found:
+                print("\n".join(found[:MAX_DAMAGES]))
+                raise MapError(
+                    f"map {self.map} is damaged: {len(found)} things are wrong, the first:"
+                    f" {found[0]}"
+                )
+            if self.graph:
+                from topoloc.apps.export.map_graph import write_graph
+
+                write_graph(topomap, Path(self.graph))
+            info = describe_map(topomap, Path(self.map)) | ({"check": "ok"} if self.check else {})
+        if self.json != "-":
+            _print(info)
+        write_json(self.json, info)
+        return 0
+
+
+def _damages(topomap: Any, path: Path) -> list[str]:
+    """What is wrong with the bytes of the file, or, where nothing is, with what they say."""
+    from topoloc.localization.map_facts.contradictions import contradictions
+    from topoloc.mapping.checking import damages
+
+    found = damages(path)
+    return found or [str(contradiction) for contradiction in contradictions(topomap)]
+
+
+def _print(info: dict[str, Any]) -> None:
+    nodes, normalization = (
+        info["config"].get("nodes", {}),
+        info["config"].get("features", {}).get("normalization"),
+    )
+    nan = float("nan")
+    print_facts(
+        [
+            ("map", info["path"]),
+            ("id", f"{info['map']}, version {info['version']}"),
+            ("size", f"{info['bytes'] / 1e6:.2f} MB"),
+            ("nodes", f"{info['num_nodes']}, {info['num_points']} points with 3-D position"),
+            ("side nodes", str(info["num_side_nodes"])),
+            ("place images", str(info["num_place_images"])),
+            (
+                "mapped",
+                (
+                    f"{info['length_m']:.1f} m, extent"
+                    f" {' x '.join(f'{e:.1f}' for e in info['extent_m'])} m"
+                ),
+            ),
+            ("recordings", ", ".join(info["recordings"])),
+            ("on earth", _place_line(info["georeference"])),
+            *(
+                ("coarse localizer", _coarse_line(facts, info["default_coarse"]))
+                for facts in info["coarse_models"]
+            ),
+            (
+                "Eq. 1",
+                (
+                    f"D_thresh {nodes.get('d_thresh', nan):.3g} m, lambda"
+                    f" {nodes.get('lambda_rot', nan):.3g} m/rad"
+                ),
+            ),
+            (
+                "features",
+                ", ".join(info["kinds"])
+                + (f", normalization {normalization}" if normalization else ""),
+            ),
+            *([("check", info["check"])] if "check" in info else []),
+        ]
+    )
+
+
+def _place_line(facts: dict[str, Any] | None) -> str:
+    from topoloc.apps.cli.georeference import place_line
+    from topoloc.geometry.geodesy import Georeference
+
+    return (
+        "unknown (topoloc georeference says where)"
+        if facts is None
+        else place_line(Georeference.from_json(facts))
+    )
+
+
+def _coarse_line(facts: dict[str, Any], default: str) -> str:
+    weights = facts.get("weights")
+    source = (
+        f"{weights['file']}, SHA-256 {weights['sha256'][:12]}" if weights else "from random weights"
+    )
+    network = f", {facts['backbone']} ({source})" if "backbone" in facts else ""
+    return (
+        f"{facts['name']}{' (default)' if facts['name'] == default else ''}{network},"
+        f" {facts['bytes'] / 1e6:.2f} MB"
+    )

@@ -1,0 +1,355 @@
+"""topoloc localize MAP|ATLAS INPUT ..."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from topoloc.apps.cli.features_option import ASKED_FEATURES
+from topoloc.apps.cli.live_answers import NEEDS_CALIBRATION, live_answers, live_input
+from topoloc.apps.cli.map_or_atlas import camera_for, is_atlas, localizer_at
+from topoloc.apps.cli.output import (
+    File,
+    Flag,
+    Format,
+    Topics,
+    UsageError,
+    check_outputs,
+    interruptible,
+    open_recording,
+    progress_bar,
+    write_text,
+)
+from topoloc.apps.cli.query_answers import (
+    QueryAnswer,
+    answer_line,
+    exit_status,
+    say_verdicts,
+    stream_summary,
+    trajectory_of,
+)
+from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
+from topoloc.atlas.atlas_localizer import AtlasLocalizer
+from topoloc.atlas.config import AtlasConfig
+from topoloc.atlas.near import NearPlace
+from topoloc.errors import (
+    AtlasError,
+    CalibrationError,
+    QueryError,
+    TopolocError,
+    UnreadableImageError,
+)
+from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.rough_camera import RoughCamera
+from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.query_camera import CameraOfSize, camera_of_frame
+from topoloc.localization.result import NotLocalized
+from topoloc.mapping.sessions import path_of
+from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.open import find_format
+from topoloc.recordings.recording import single_pictures
+from topoloc.recordings.trajectory import frame_poses, read_trajectory, write_tum
+from topoloc.tracking.tracker import Tracker, TrackerConfig
+
+
+@dataclass(frozen=True, eq=False)
+class _Query:
+    """An input: its pictures, whether they are a stream, the pose of each by external odometry, and
+    whether their times mean anything."""
+
+    path: str
+    sequence: StereoSequence
+    is_stream: bool
+    odom_from_cams: list[Rigid3 | None]
+    has_times: bool
+
+
+@dataclass(frozen=True)
+class StreamOptions:
+    """Videos and recordings are streams: each picture helps with the next."""
+
+    stream: Flag = False
+    """Take folders of pictures for streams, too."""
+    single: Flag = False
+    """Localize each picture alone, those of videos and recordings, too."""
+    smoothed: Flag = False
+    """--tum takes the smoothed poses instead of the raw ones."""
+    odometry: File = None
+    """Poses of the stream by external odometry, TUM format, in any world: they predict where the
+    next picture was taken."""
+    max_jump: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="")] = None
+    """The paper's rule instead of the motion model: a pose further than this from the one before is
+    refused, and that one copied."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """What `topoloc localize` takes."""
+
+    map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
+    """The map file; or an atlas, of which each picture is asked alone."""
+    inputs: Annotated[
+        tyro.conf.Positional[tuple[str, ...]],
+        tyro.conf.arg(metavar="INPUT ...", help_behavior_hint="(required)"),
+    ] = ()
+    """Images, folders of images, videos, recordings; PATH@0:100 takes the first hundred frames of
+    PATH. Or one camera that runs now: a device number, rtsp:// or http:// URL, or GStreamer
+    pipeline."""
+    camera: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="FILE|fx,fy,cx,cy|map|unknown",
+            help_behavior_hint="(default: that of the recording)",
+        ),
+    ] = None
+    """Calibration of the queries: a camera.json, YAML of OpenCV or Kalibr, `fx,fy,cx,cy` in pixels,
+    `map` for that of the map, `unknown` to find the focal length."""
+    format: Format = None
+    """The recordings' format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap,
+    rosbag, mcap, zed, video or folder."""
+    topics: Topics = None
+    """Of a bag, which topic is what: left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom."""
+    coarse: Annotated[
+        str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")
+    ] = None
+    """Coarse localizer that is asked; `topoloc info` names those of the map."""
+    features: ASKED_FEATURES = None
+    """Which of the map's features are asked; of several, the next where the one before leaves the
+    pose unclear."""
+    max_ms: Annotated[
+        float | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: no limit)")
+    ] = None
+    """After so many milliseconds no further hypothesis is sought for an image; the first one is
+    always tried."""
+    near: Annotated[
+        str | None, tyro.conf.arg(metavar="LAT,LON,METRES", help_behavior_hint="(atlases only)")
+    ] = None
+    """Of an atlas: tiles that are known to lie further from this place on earth are not asked."""
+    json: File = None
+    """Write one JSON line a query to this file (- for standard output)."""
+    tum: File = None
+    """Write the poses found to this file: TUM format, world_from_cam. Single photos have no times:
+    t is then the query's number."""
+    streams: Annotated[tyro.conf.OmitArgPrefixes[StreamOptions], tyro.conf.arg(name="stream")] = (
+        field(default_factory=StreamOptions)
+    )
+    config: File = None
+    """All other settings: a TOML file, as `topoloc config localize` prints it."""
+
+    def run(self) -> int:
+        if not self.inputs:
+            raise UsageError("localize takes a map and at least one image, folder or recording")
+        self._check_usage()
+        check_outputs(
+            [self.json, self.tum],
+            inputs=[
+                path
+                for path in (self.map, *self.inputs, self.streams.odometry, self.config)
+                if path
+            ],
+        )
+        near, settings = self._near, read_settings(self.config)
+        tracking = self._tracking(settings.of(TrackerConfig))
+        localizer = self._localizer(settings, near)
+        camera = (
+            None
+            if self.camera is None or self._stereo_calibration
+            else camera_for(localizer, self.camera)
+        )
+        live = live_input(self.inputs)
+        queries = [] if live else [self._open(path) for path in self.inputs]
+        answers: list[QueryAnswer] = []
+        total = sum(len(query.sequence) for query in queries)
+        coming = _answers(localizer, tracking, queries, camera)
+        if live:
+            if camera is None:
+                raise UsageError(f"{live} has no calibration: --camera says it")
+            tracker = (
+                Tracker(localizer, tracking)
+                if isinstance(localizer, Localizer) and not self.streams.single
+                else None
+            )
+            coming = live_answers(localizer, tracker, live, camera)
+        start = time.perf_counter()
+        try:
+            with interruptible(), progress_bar() as progress:
+                for answer in coming:
+                    answers.append(answer)
+                    as_json = self.json == "-"
+                    print(
+                        json.dumps(answer.to_json()) if as_json else answer_line(answer), flush=True
+                    )
+                    progress("queries", len(answers), total or len(answers))
+        except (KeyboardInterrupt, TopolocError) as stopped:
+            files = self._write_files(answers) if answers else []
+            if not files:
+                raise
+            what = "interrupted" if isinstance(stopped, KeyboardInterrupt) else str(stopped)
+            raise TopolocError(
+                f"{what} (results of the {len(answers)} queries before: {', '.join(files)})"
+            ) from stopped
+        self._write_files(answers)
+        if any(answer.streamed for answer in answers) and self.json != "-":
+            print(stream_summary(answers, time.perf_counter() - start))
+        say_verdicts(answers)
+        return exit_status(answers)
+
+    def _localizer(self, settings: Settings, near: NearPlace | None) -> Localizer | AtlasLocalizer:
+        config = with_option(settings.of(LocalizerConfig), "coarse", self.coarse, "--coarse")
+        config = with_option(config, "max_ms", self.max_ms, "--max-ms")
+        localizer = localizer_at(self.map, config, self.features, settings.of(AtlasConfig))
+        return (
+            localizer.near(near)
+            if isinstance(localizer, AtlasLocalizer) and near is not None
+            else localizer
+        )
+
+    @property
+    def _near(self) -> NearPlace | None:
+        if self.near is not None and not is_atlas(self.map):
+            raise UsageError("--near is of an atlas: a map is one place")
+        try:
+            return None if self.near is None else NearPlace.parse(self.near)
+        except AtlasError as error:
+            raise UsageError(f"--near: {error}") from None
+
+    def _check_usage(self) -> None:
+        if self.streams.stream and self.streams.single:
+            raise UsageError("--stream and --single cannot both be meant")
+        if self.streams.odometry is not None and (len(self.inputs) > 1 or live_input(self.inputs)):
+            raise UsageError("--odometry is that of one recorded stream: give one input with it")
+        streams = self.streams
+        if is_atlas(self.map) and (
+            streams.stream or streams.smoothed or streams.odometry or streams.max_jump is not None
+        ):
+            raise UsageError(
+                "an atlas is asked picture by picture: --stream, --smoothed, --odometry and"
+                " --max-jump are for maps"
+            )
+
+    def _open(self, path: str) -> _Query:
+        """Recordings and videos are streams; pictures, and folders of them, are single unless they
+        are said not to be."""
+        is_single = self.streams.single or is_atlas(self.map)
+        is_stream = self.streams.stream or (
+            not is_single and find_format(path, self.format) != "folder"
+        )
+        sequence = single_pictures(
+            open_recording(path, self.format, self._stereo_calibration, self.topics)
+        )
+        is_stream = is_stream and len(sequence) > 1
+        odometry = None
+        if self.streams.odometry is not None:
+            if not is_stream:
+                raise UsageError(
+                    f"--odometry is for streams, and {path} is none; --stream makes it one"
+                )
+            odometry = frame_poses(
+                read_trajectory(Path(self.streams.odometry)),
+                sequence.t_ns,
+                Path(self.streams.odometry),
+            )
+        has_times = is_stream or find_format(path, self.format) != "folder" or _has_times(sequence)
+        return _Query(path, sequence, is_stream, odometry or [None] * len(sequence), has_times)
+
+    @property
+    def _stereo_calibration(self) -> str | None:
+        """`--camera` where it is a pair's, which its recording is opened with."""
+        return self.camera if self.camera is not None and self.camera.endswith(".conf") else None
+
+    def _tracking(self, config: TrackerConfig) -> TrackerConfig:
+        config = with_option(config, "max_jump", self.streams.max_jump, "--max-jump")
+        return config if self.streams.max_jump is None else replace(config, mode="paper")
+
+    def _write_files(self, answers: list[QueryAnswer]) -> list[str]:
+        """The paths written."""
+        files = []
+        if self.json is not None and self.json != "-":
+            write_text(Path(self.json), "".join(json.dumps(a.to_json()) + "\n" for a in answers))
+            files.append(self.json)
+        if self.tum is not None:
+            write_tum(Path(self.tum), trajectory_of(answers, self.streams.smoothed))
+            files.append(self.tum)
+        return files
+
+
+def _answers(
+    localizer: Localizer | AtlasLocalizer,
+    tracking: TrackerConfig,
+    queries: list[_Query],
+    camera_of_size: CameraOfSize | None,
+) -> Iterator[QueryAnswer]:
+    for query in queries:
+        tracker = (
+            Tracker(localizer, tracking)
+            if query.is_stream and isinstance(localizer, Localizer)
+            else None
+        )
+        for i, frame_name in enumerate(query.sequence.names):
+            name = (
+                frame_name
+                if len(queries) == 1
+                else query.path
+                if len(query.sequence) == 1
+                else f"{query.path}/{frame_name}"
+            )
+            try:
+                answer = _answer(name, query, i, localizer, tracker, camera_of_size)
+            except (QueryError, CalibrationError) as error:
+                if query.is_stream or len(queries) == len(query.sequence) == 1:
+                    raise type(error)(f"{name}: {error}") from error
+                # One picture of another shape than its camera; the rest are asked.
+                answer = QueryAnswer(
+                    name,
+                    query.sequence.t_ns[i],
+                    NotLocalized("unreadable", detail=f"{name}: {error}"),
+                )
+            yield answer
+
+
+def _has_times(photos: StereoSequence) -> bool:
+    """Photos, and folders of them without times.txt, are read as if they were taken ten a
+    second."""
+    root = path_of(photos)
+    return root is None or (photos.names != [photos.name] and (Path(root) / "times.txt").is_file())
+
+
+def _answer(
+    name: str,
+    query: _Query,
+    index: int,
+    localizer: Localizer | AtlasLocalizer,
+    tracker: Tracker | None,
+    camera_of_size: CameraOfSize | None,
+) -> QueryAnswer:
+    """One picture, alone or as the next of a stream."""
+    t_ns, odom_from_cam = query.sequence.t_ns[index], query.odom_from_cams[index]
+    try:
+        frame = query.sequence[index]
+    except UnreadableImageError as error:
+        unreadable = localizer.completed(
+            NotLocalized("unreadable", detail=str(error)), t_ns=t_ns if query.has_times else None
+        )
+        return QueryAnswer(
+            name,
+            t_ns,
+            unreadable,
+            tracker.miss(t_ns, unreadable, odom_from_cam) if tracker is not None else None,
+        )
+    camera = camera_of_frame(frame, camera_of_size)
+    if tracker is None:
+        return QueryAnswer(
+            name,
+            t_ns,
+            localizer.localize(frame.image, camera, t_ns=t_ns if query.has_times else None),
+        )
+    if isinstance(camera, RoughCamera):
+        raise CalibrationError(NEEDS_CALIBRATION)
+    streamed = tracker.process(frame.image, camera, t_ns, odom_from_cam)
+    return QueryAnswer(name, t_ns, streamed.result, streamed)

@@ -1,0 +1,105 @@
+"""topoloc merge A B OUT."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from topoloc.apps.cli.atlas import describe, print_atlas
+from topoloc.apps.cli.joined_neighbours import joined_neighbours
+from topoloc.apps.cli.output import File, UsageError, check_outputs, progress_bar, write_json
+from topoloc.apps.cli.session_joining import describe_untaught
+from topoloc.apps.cli.settings_file import Settings, read_settings
+from topoloc.atlas.atlas import Atlas, is_atlas
+from topoloc.lifelong.merge import merge_maps
+from topoloc.lifelong.update import UpdateConfig
+from topoloc.localization.localizer import LocalizerConfig
+from topoloc.mapping.schema import SCHEMA_VERSION
+from topoloc.mapping.sessions import Edit, today
+from topoloc.mapping.topomap import TopoMetricMap
+
+
+@dataclass(frozen=True)
+class Command:
+    """What `topoloc merge` takes."""
+
+    first: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="A")]
+    """A map; its world is that of the result. Or an atlas."""
+    second: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="B")]
+    """A map of a place that overlaps with it. Or an atlas."""
+    out: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="OUT")]
+    """The map file to write; neither A nor B. Where one of these is an atlas, the new atlas of the
+    tiles of both, joined where they overlap."""
+    json: File = None
+    """Write what was merged to this file (- for standard output)."""
+    config: File = None
+    """All other settings: a TOML file, as `topoloc config update` prints it."""
+
+    def run(self) -> int:
+        if Path(self.out).exists() and any(
+            Path(self.out).samefile(path)
+            for path in (self.first, self.second)
+            if Path(path).exists()
+        ):
+            raise UsageError("OUT is one of the maps that are merged; give it a name of its own")
+        is_of_tiles = is_atlas(self.first) or is_atlas(self.second)
+        check_outputs(
+            [None if is_of_tiles else self.out, self.json],
+            inputs=[path for path in (self.first, self.second, self.config) if path],
+        )
+        settings = read_settings(self.config)
+        if is_of_tiles:
+            return self._merge_tiles(settings)
+        with (
+            TopoMetricMap.load(self.first) as first,
+            TopoMetricMap.load(self.second) as second,
+            progress_bar() as progress,
+        ):
+            merged = merge_maps(
+                first, second, settings.of(UpdateConfig), settings.of(LocalizerConfig), progress
+            )
+            edit = Edit(
+                first.free_ids.edit,
+                f"merge {Path(self.second).name}",
+                today(),
+                SCHEMA_VERSION,
+                merged.changes,
+            )
+            replace(merged.topomap, edits=[*first.edits, edit]).save(self.out)
+        c = merged.changes | {"bytes": Path(self.out).stat().st_size}
+        if self.json != "-":
+            recognised = (
+                f"{c['agreeing']} of {c['nodes_of_second']} nodes of {self.second} were recognised"
+                f" in {self.first}"
+            )
+            print(
+                f"{self.out}: {recognised}, {c['nodes_added']} added, {c['bytes'] / 1e6:.2f}"
+                f" MB{describe_untaught(c)}"
+            )
+        write_json(self.json, {"map": self.out} | c)
+        return 0
+
+    def _merge_tiles(self, settings: Settings) -> int:
+        """An atlas of two; then tiles of the second are compared with those of the first. Status 1
+        where some could not be."""
+        from topoloc.atlas.merging import merge_atlases
+
+        first = Atlas.open(self.first).manifest.by_id if is_atlas(self.first) else {}
+        merged = merge_atlases([self.first, self.second], self.out)
+        second = (
+            Atlas.open(self.second).manifest.by_id
+            if is_atlas(self.second)
+            else merged.by_id.keys() - first.keys()
+        )
+        joined = joined_neighbours(self.out, sorted(second), settings, self.json != "-")
+        facts = describe(self.out, joined.manifest) | {"tried": joined.rows}
+        if self.json != "-":
+            print_atlas(facts)
+        write_json(self.json, facts)
+        for problem in joined.not_compared:
+            print(f"error: {problem}", file=sys.stderr)
+        return 1 if joined.not_compared else 0

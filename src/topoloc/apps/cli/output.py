@@ -1,0 +1,263 @@
+"""What the commands share: kinds of options, output paths checked before the work, progress on a
+terminal, tables, results written."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from topoloc.errors import MissingExtraError, TopolocError
+from topoloc.recordings.atomic import remove_leftovers, write_text
+from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.open import open_sequence
+from topoloc.recordings.recording import notes_of
+
+# Given or not: no `--no-...`, and no "(default: False)" in the help.
+Flag = Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(help_behavior_hint="")]
+# A path that may be left out.
+File = Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
+# The format of the recordings.
+Format = Annotated[
+    str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: recognised)")
+]
+# The calibration of the recordings.
+CameraOption = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="FILE|fx,fy,cx,cy", help_behavior_hint="(default: that of the recording)"
+    ),
+]
+# Which topic of a bag is what.
+Topics = Annotated[
+    str | None, tyro.conf.arg(metavar="ROLE=TOPIC,...", help_behavior_hint="(default: guessed)")
+]
+# A Ray cluster.
+RayOption = Annotated[
+    str | None, tyro.conf.arg(metavar="HOST:PORT|auto|local", help_behavior_hint="(default: none)")
+]
+_COLUMNS = (
+    "recording",
+    "localized",
+    "median error",
+    "in 5 cm, 5 deg",
+    "in 25 cm, 2 deg",
+    "false accepts",
+    "ms",
+)
+
+
+def open_recording(
+    path: str,
+    format: str | None,
+    camera: str | None = None,
+    topics: str | None = None,
+    images: str | None = None,
+) -> StereoSequence:
+    """`open_sequence`; what is to be known of the recording is said in a line each on stderr.
+    Raises as that does."""
+    sequence = open_sequence(path, format, camera, images, topics)
+    for note in notes_of(sequence):
+        print(f"warning: {note}", file=sys.stderr)
+    return sequence
+
+
+class UsageError(TopolocError):
+    """The command was called in a way that cannot be meant: exit status 2."""
+
+
+def check_outputs(outputs: Sequence[str | None], inputs: Sequence[str] = ()) -> None:
+    """Hold that the files a command is to write can be written, so that it fails before the work
+    and not after.
+
+    Args:
+        outputs: paths; None and ``-`` are no files.
+        inputs: files that must not be overwritten.
+
+    Raises:
+        TopolocError: the folder is missing or read-only, the path is no regular file, or it is
+            named for two things.
+    """
+    taken = {Path(path).resolve() for path in inputs}
+    for path in (Path(output) for output in outputs if output not in (None, "-")):
+        if not path.parent.is_dir():
+            raise TopolocError(f"cannot write {path}: folder {path.parent} does not exist")
+        if path.is_dir():
+            raise TopolocError(f"cannot write {path}: it is a folder")
+        if path.exists() and not path.is_file():  # a device would be replaced by a file of its name
+            raise TopolocError(f"cannot write {path}: it is no regular file")
+        if not os.access(path.parent, os.W_OK):
+            raise TopolocError(f"cannot write {path}: folder {path.parent} is read-only")
+        if path.resolve() in taken:
+            raise TopolocError(f"cannot write {path}: this file is named for something else, too")
+        remove_leftovers(path)
+        taken.add(path.resolve())
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Ctrl-C or too little memory inside a compiled function come out of it as a SystemError; here
+    they become what they were."""
+    try:
+        yield
+    except Exception as error:
+        cause: BaseException | None = error
+        while cause is not None and isinstance(error, SystemError):
+            if isinstance(cause, KeyboardInterrupt | MemoryError):
+                raise type(cause) from error
+            cause = cause.__cause__ or cause.__context__
+        if _is_out_of_memory(error):
+            raise MemoryError from error
+        raise
+
+
+@contextmanager
+def ended_by_signals() -> Iterator[threading.Event]:
+    """Ctrl-C and SIGTERM set the event, at which work that could go on for ever ends in good order;
+    a second one interrupts it."""
+    stop = threading.Event()
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def end(number: int, _: object) -> None:
+        stop.set()
+        signal.signal(number, before[signal.Signals(number)])
+
+    if threading.current_thread() is not threading.main_thread():  # only there can signals be heard
+        yield stop
+        return
+    for number in before:
+        signal.signal(number, end)
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    """OpenCV, FAISS and the loader of shared libraries have words of their own for it."""
+    text = str(error)
+    words = (
+        "Insufficient memory",
+        "std::bad_alloc",
+        "Cannot allocate memory",
+        "failed to map segment",
+        "can't start new thread",
+    )
+    return (isinstance(error, OSError) and error.errno == 12) or any(word in text for word in words)
+
+
+@contextmanager
+def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
+    """A callable (stage, done, total) that draws one bar a stage where stderr is a terminal, and
+    nothing elsewhere."""
+    if not sys.stderr.isatty():
+        yield lambda stage, done, total: None
+        return
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[speed]}"),
+        TimeRemainingColumn(),
+    )
+    # Lines printed meanwhile go above the bar; where stdout is a file they must stay in that file.
+    with Progress(
+        *columns, console=Console(stderr=True), redirect_stdout=sys.stdout.isatty()
+    ) as progress:
+        tasks: dict[str, Any] = {}
+
+        def update(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = progress.add_task(stage, total=total, speed="")
+            speed = progress.tasks[tasks[stage]].speed
+            progress.update(
+                tasks[stage], completed=done, total=total, speed=f"{speed:.1f}/s" if speed else ""
+            )
+
+        yield update
+
+
+def report_writer() -> Callable[..., None]:
+    """`write_report`, of the extra `report`. Raises MissingExtraError where that is not
+    installed."""
+    try:
+        from topoloc.apps.report.report import write_report
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.split(".")[0] != "matplotlib":
+            raise
+        raise MissingExtraError(
+            "a report needs matplotlib: pip install 'topoloc[report]'"
+        ) from error
+    return write_report
+
+
+def print_facts(facts: Sequence[tuple[str, str]]) -> None:
+    """Names and values, one pair a line, the values in one column."""
+    width = max(len(name) for name, _ in facts)
+    for name, value in facts:
+        print(f"{name:<{width}}  {value}".rstrip())
+
+
+def print_recordings(
+    evaluation: dict[str, Any], published: Sequence[tuple[str, float, float]] = ()
+) -> None:
+    """Print the rows of an evaluation (`summarize`), then what others published: (name, metres,
+    degrees)."""
+    rows = [_COLUMNS, *(_row(recording) for recording in evaluation["recordings"])]
+    rows += [
+        (name, "", _error(metres, degrees), "", "", "", "") for name, metres, degrees in published
+    ]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(_COLUMNS))]
+    for name, *cells in rows:
+        padded = [f"{cell:>{width}}" for cell, width in zip(cells, widths[1:], strict=True)]
+        print("  ".join([f"{name:<{widths[0]}}", *padded]).rstrip())
+
+
+def _row(recording: dict[str, Any]) -> tuple[str, ...]:
+    recall, num = recording["recall"], recording["num_queries"]
+    shares = [f"{100 * recall[key]:.0f} %" if num else "" for key in ("0.05m_5deg", "0.25m_2deg")]
+    median = (
+        _error(recording["median_translation_m"], recording["median_rotation_deg"])
+        if recording["num_localized"]
+        else ""
+    )
+    total = recording["median_times_ms"].get("total")
+    return (
+        recording["name"],
+        f"{recording['num_localized']} of {num}" if num else "",
+        median,
+        *shares,
+        f"{recording['false_accepts']} of {num + recording['num_elsewhere']}",
+        "" if total is None else f"{total:.0f}",
+    )
+
+
+def _error(metres: float, degrees: float) -> str:
+    return f"{100 * metres:.2f} cm, {degrees:.2f} deg"
+
+
+def write_json(path: str | None, data: Any) -> None:
+    """Write `data` to the file of `--json`; `-` is standard output, None nowhere."""
+    if path == "-":
+        json.dump(data, sys.stdout, indent=1)
+        print()
+    elif path is not None:
+        write_text(Path(path), json.dumps(data, indent=1) + "\n")

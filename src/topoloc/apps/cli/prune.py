@@ -1,0 +1,102 @@
+"""topoloc prune MAP|ATLAS [--max-mb N] [--descriptors coarse]."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from topoloc.apps.cli.output import File, UsageError, check_outputs, write_json
+from topoloc.apps.cli.settings_file import read_settings
+from topoloc.apps.cli.tile_option import TileOption, check_tile_option, edited_at, of_each_tile
+from topoloc.apps.cli.waiting import say_waiting
+from topoloc.atlas.atlas import Atlas, is_atlas
+from topoloc.lifelong.prune import PruneConfig, prune_map
+from topoloc.mapping.edit import editing
+
+
+@dataclass(frozen=True)
+class Command:
+    """What `topoloc prune` takes."""
+
+    map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
+    """The map file, which is replaced; or an atlas, whose tiles are, one after the other."""
+    max_mb: Annotated[
+        float | None,
+        tyro.conf.arg(metavar="N", help_behavior_hint="(default: only what is gone is dropped)"),
+    ] = None
+    """Megabytes that the file may have, of an atlas that of each tile: every node keeps the
+    landmarks that add most, and nodes that others hold go before it keeps few."""
+    descriptors: Annotated[
+        Literal["fine", "coarse"] | None,
+        tyro.conf.arg(help_behavior_hint="(default: as [prune] says, fine)"),
+    ] = None
+    """With `coarse` descriptors are rounded, to a third of their bytes, before anything goes that
+    may be there."""
+    tile: TileOption = None
+    """Of an atlas: only this tile is pruned."""
+    json: File = None
+    """Write what was dropped to this file (- for standard output)."""
+    config: File = None
+    """All other settings: a TOML file, as `topoloc config prune` prints it."""
+
+    def run(self) -> int:
+        if self.max_mb is not None and not 0.0 < self.max_mb < 1e6:
+            raise UsageError(f"--max-mb must be megabytes, not {self.max_mb:g}")
+        check_outputs([self.json], inputs=[path for path in (self.map, self.config) if path])
+        check_tile_option(self.map, self.tile)
+        config = read_settings(self.config).of(PruneConfig)
+        config = (
+            config if self.descriptors is None else replace(config, descriptors=self.descriptors)
+        )
+        if not is_atlas(self.map):
+            changes = self._pruned(Path(self.map), config, self.map)
+            write_json(self.json, {"map": self.map} | changes)
+            return 0
+        atlas = Atlas.open(self.map)
+        ids = list(atlas.manifest.by_id) if self.tile is None else [atlas.tile(self.tile).tile_id]
+        tiles, are_all_pruned = of_each_tile(
+            atlas,
+            ids,
+            lambda name: edited_at(
+                self.map, name, lambda path: self._pruned(path, config, f"{self.map}, tile {name}")
+            ),
+        )
+        write_json(self.json, {"atlas": self.map, "tiles": tiles})
+        return 0 if are_all_pruned else 1
+
+    def _pruned(self, path: Path, config: PruneConfig, name: str) -> dict[str, Any]:
+        """What was dropped from a map file, which is said of it by its name."""
+        with editing(path, say_waiting) as edit:
+            before = edit.path.stat().st_size
+            pruned = prune_map(
+                edit.topomap,
+                edit.path,
+                None if self.max_mb is None else round(self.max_mb * 1e6),
+                config,
+            )
+            changes = pruned.changes | {"bytes_before": before}
+            walked_km = edit.topomap.length_m / 1e3
+            if pruned.topomap is not edit.topomap:
+                to_size = "" if self.max_mb is None else f" to {self.max_mb:g} MB"
+                how = ", descriptors coarse" if config.descriptors == "coarse" else ""
+                edit.commit(pruned.topomap, f"prune{to_size}{how}", changes)
+        changes["bytes"] = path.stat().st_size
+        if self.json != "-":
+            print(f"{name}: {describe_prune(changes, walked_km)}")
+        return changes
+
+
+def describe_prune(changes: Mapping[str, Any], walked_km: float) -> str:
+    """What was dropped, in one line."""
+    c = changes
+    nodes = f"{c['nodes_dropped']} nodes that others hold, " if c["nodes_dropped"] else ""
+    dropped = (
+        f"{c['landmarks_gone']} landmarks are gone, {nodes}{c['landmarks_dropped']} more landmarks"
+        " dropped"
+    )
+    per_km = f" ({c['bytes'] / 1e6 / walked_km:.0f} MB a km walked)" if walked_km > 0 else ""
+    return f"{dropped}, {c['bytes_before'] / 1e6:.2f} to {c['bytes'] / 1e6:.2f} MB{per_km}"

@@ -1,0 +1,78 @@
+"""What `topoloc serve` answers from, and how: all that another process needs to answer the same."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from topoloc.apps.cli.features_option import localizer_of
+from topoloc.apps.service.config import ServiceConfig
+from topoloc.atlas.config import AtlasConfig
+from topoloc.atlas.open_maps import Maps
+from topoloc.atlas.tile_fetches import TileFetches
+from topoloc.compiled import set_num_threads
+from topoloc.errors import TopolocError
+from topoloc.localization.localizer import LocalizerConfig
+from topoloc.mapping.memory import set_node_memory
+from topoloc.tracking.tracker import TrackerConfig
+from topoloc.tracking.warm_up import is_warm, warm_up
+
+LEAST_TOKEN = 16
+
+
+@dataclass(frozen=True)
+class ServedMaps:
+    """Maps, and how they are asked. The token is named by its file, so that it is nowhere but
+    there."""
+
+    paths: tuple[str, ...]
+    features: str | None
+    token_file: str | None
+    loopback_only: bool
+    service: ServiceConfig
+    localizer: LocalizerConfig
+    tracker: TrackerConfig
+    atlas: AtlasConfig
+
+    def application(self):  # no return type: the service is an extra, and loaded here alone
+        """The application, its maps opened as they are asked for. Raises TopolocError."""
+        from topoloc.apps.service.application import Access, make_application
+
+        access = Access(read_token(self.token_file), self.loopback_only)
+        return make_application(self._opened(), self.service, access, self.tracker, self.atlas)
+
+    def _opened(self) -> Maps:
+        """The maps, with half of the memory for nodes, and half for the rest of those that are
+        open."""
+        if not is_warm():
+            print("compiling, once, a minute ...", file=sys.stderr, flush=True)
+            warm_up()
+        if self.service.num_workers > 1:
+            set_num_threads(1)
+        budget = self.service.memory_mb * 500_000
+        set_node_memory(budget)
+        fetches = TileFetches(self.service.fetch_s)
+        return Maps(
+            self.paths,
+            lambda topomap: localizer_of(topomap, self.localizer, self.features),
+            budget,
+            fetches.path,
+        )
+
+
+def read_token(path: str | None) -> str | None:
+    """The token in a file. Raises TopolocError where there is none that can be used."""
+    if path is None:
+        return None
+    try:
+        token = Path(path).read_text(encoding="utf-8").strip()
+    except (OSError, ValueError) as error:
+        raise TopolocError(
+            f"cannot read the token in {path}: {getattr(error, 'strerror', None) or 'no text'}"
+        ) from None
+    if len(token) < LEAST_TOKEN or not token.isascii() or not token.isprintable() or " " in token:
+        raise TopolocError(
+            f"{path}: a token has at least {LEAST_TOKEN} letters, digits or signs, and no spaces"
+        )
+    return token

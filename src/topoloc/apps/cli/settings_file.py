@@ -1,0 +1,214 @@
+"""Settings as TOML: what `topoloc config` prints and `--config FILE` reads, both from the
+configurations as they are declared."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import json
+import textwrap
+import tomllib
+from collections.abc import Iterator, Sequence
+from dataclasses import is_dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args, get_origin
+
+from topoloc.apps.cli import BROUGHT, all_commands, brought
+from topoloc.apps.cli.output import UsageError
+from topoloc.bounds import (
+    annotations_of,
+    bare,
+    bounds_of,
+    complaint,
+    did_you_mean,
+    quoted,
+    settings_from,
+)
+from topoloc.errors import ConfigError
+
+T = TypeVar("T")
+
+# table of the file: module and class of its configuration, and the commands that it is for; more
+# come with other distributions
+_ASKING = ("localize", "evaluate", "explain", "serve", "follow")
+TABLES: dict[str, tuple[str, str, tuple[str, ...]]] = {
+    "build": ("topoloc.mapping.build", "BuildConfig", ("build",)),
+    "localize": (
+        "topoloc.localization.localizer",
+        "LocalizerConfig",
+        (*_ASKING, "update", "merge"),
+    ),
+    "atlas": (
+        "topoloc.atlas.config",
+        "AtlasConfig",
+        ("localize", "evaluate", "explain", "serve", "follow", "update"),
+    ),
+    "track": ("topoloc.tracking.tracker", "TrackerConfig", ("localize", "serve", "follow")),
+    "slam": ("topoloc.slam.slam", "SlamConfig", ("slam", "build", "update")),
+    "update": ("topoloc.lifelong.update", "UpdateConfig", ("update", "merge")),
+    "tile_choice": ("topoloc.lifelong.tile_choice", "TileChoiceConfig", ("update",)),
+    "against_itself": ("topoloc.lifelong.weak_parts", "WeakPartsConfig", ("evaluate",)),
+    "join": ("topoloc.lifelong.tile_joins", "TileJoinConfig", ("atlas", "build", "merge")),
+    "prune": ("topoloc.lifelong.prune", "PruneConfig", ("prune",)),
+    "serve": ("topoloc.apps.service.config", "ServiceConfig", ("serve",)),
+    "cluster": (
+        "topoloc.apps.cluster.config",
+        "ClusterConfig",
+        ("build", "atlas", "update", "evaluate"),
+    ),
+    "replicas": ("topoloc.apps.cluster.config", "ReplicasConfig", ("serve",)),
+}
+_WIDTH = 110
+_LARGEST_FILE = 1_000_000
+
+
+class Settings:
+    """The configurations that a file sets; of all others the defaults."""
+
+    def __init__(self, configs: dict[type, Any]) -> None:
+        self._configs = configs
+
+    def of(self, kind: type[T]) -> T:
+        """The configuration of this class."""
+        return self._configs[kind] if kind in self._configs else kind()
+
+
+def read_settings(path: str | None) -> Settings:
+    """What the TOML file of `--config` says; None says nothing. Tables of other commands are read,
+    too, and left aside.
+
+    Raises:
+        ConfigError: no such file, not TOML, or a key that is unknown, of the wrong type or out of
+            its bounds; file and key are named.
+    """
+    if path is None:
+        return Settings({})
+    try:
+        configs = []
+        for name, table in _parsed(path).items():
+            if name not in all_tables():
+                is_missing = name in BROUGHT and name not in all_commands()
+                unknown = f"no such table{did_you_mean(name, all_tables())}"
+                raise ConfigError(
+                    f"{quoted(name)}:"
+                    f" {f'comes with {BROUGHT[name]}, which is not installed' if is_missing else unknown}"  # noqa: E501
+                )
+            kind = config_class(name)
+            configs.append(settings_from(kind, table, name, default=kind()))
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+    return Settings({type(config): config for config in configs})
+
+
+def all_tables() -> dict[str, tuple[str, str, tuple[str, ...]]]:
+    """Our tables and those that other distributions bring, as `TABLES`; a name of ours is ours."""
+    return TABLES | brought("topoloc.settings") | TABLES
+
+
+def config_class(table: str) -> type:
+    """The configuration that a table of the file sets."""
+    module, name, _ = all_tables()[table]
+    return getattr(importlib.import_module(module), name)
+
+
+def with_option(config: T, key: str, value: Any, option: str) -> T:
+    """The configuration with an option of the command line at `key` ("nodes.d_thresh"), unless that
+    is None: was not given.
+
+    Raises:
+        UsageError: out of bounds; names the option.
+    """
+    if value is None:
+        return config
+    name, _, rest = key.partition(".")
+    if rest:
+        return replace(config, **{name: with_option(getattr(config, name), rest, value, option)})  # pyright: ignore[reportArgumentType]
+    if wrong := complaint(value, annotations_of(type(config))[name]):
+        raise UsageError(f"{option}: {wrong}")
+    return replace(config, **{name: value})  # pyright: ignore[reportArgumentType]
+
+
+def settings_text(tables: Sequence[str]) -> str:
+    """The TOML of these tables: every setting with its default, what it means and its bounds."""
+    return "\n".join("\n".join(_table_lines(config_class(table)(), table)) for table in tables)
+
+
+def _table_lines(config: Any, key: str, note: str = "") -> Iterator[str]:
+    """A table and those in it."""
+    kinds, notes = annotations_of(type(config)), meanings_of(type(config))
+    nested = [name for name in kinds if is_dataclass(getattr(config, name))]
+    yield from _comment(" ".join(filter(None, (_about(type(config)), note))))
+    yield f"[{key}]"
+    for name, kind in kinds.items():
+        if name not in nested:
+            value = getattr(config, name)
+            yield from _comment(notes.get(name, ""))
+            line = f"# {name} =" if value is None else f"{name} = {_toml(value)}"
+            yield f"{line}  # {_range(kind)}" if _range(kind) else line
+    yield ""
+    for name in nested:
+        yield from _table_lines(getattr(config, name), f"{key}.{name}", notes.get(name, ""))
+
+
+def _comment(text: str) -> list[str]:
+    return textwrap.wrap(
+        text, _WIDTH, initial_indent="# ", subsequent_indent="# ", break_on_hyphens=False
+    )
+
+
+def _about(kind: type) -> str:
+    """The first paragraph of a class's docstring."""
+    return " ".join((inspect.getdoc(kind) or "").partition("\n\n")[0].split())
+
+
+def _range(kind: Any) -> str:
+    plain, _ = bare(kind)
+    if get_origin(plain) is Literal:
+        return "one of " + ", ".join(map(_toml, get_args(plain)))
+    return " and ".join(map(str, bounds_of(kind)))
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_toml, value))}]"
+    if isinstance(value, bool | str):
+        return json.dumps(value)
+    return repr(value)
+
+
+@cache
+def meanings_of(kind: type) -> dict[str, str]:
+    """The docstrings of a dataclass's fields, each in one line."""
+    if not is_dataclass(kind):
+        return {}
+    (body,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
+    assert isinstance(body, ast.ClassDef)
+    meanings = {name: text for base in kind.__bases__ for name, text in meanings_of(base).items()}
+    for item, after in zip(body.body, body.body[1:], strict=False):
+        if (
+            isinstance(item, ast.AnnAssign)
+            and isinstance(after, ast.Expr)
+            and isinstance(after.value, ast.Constant)
+        ):
+            meanings[ast.unparse(item.target)] = " ".join(str(after.value.value).split())
+    return meanings
+
+
+def _parsed(path: str) -> dict[str, Any]:
+    try:
+        with Path(path).open("rb") as file:
+            content = file.read(_LARGEST_FILE + 1)
+    except OSError as error:
+        raise ConfigError(error.strerror or "cannot be read") from None
+    if len(content) > _LARGEST_FILE:
+        raise ConfigError(f"larger than {_LARGEST_FILE} bytes, no file of settings")
+    try:
+        return tomllib.loads(content.decode())
+    except (
+        ValueError,
+        RecursionError,
+        # tomllib's own error is a ValueError, as are those of bad UTF-8 and of numbers too long
+    ) as error:
+        raise ConfigError(f"not TOML ({error})") from None

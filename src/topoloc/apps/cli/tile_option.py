@@ -1,0 +1,109 @@
+"""`--tile`, of commands that are about one map: of an atlas, the tile that is meant."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import tyro
+
+from topoloc.apps.cli.output import UsageError
+from topoloc.atlas.atlas import Atlas, is_atlas
+from topoloc.atlas.shared_world import SharedWorld, shared_worlds, world_of_tile
+from topoloc.errors import AtlasError, MapError, StoreError
+
+TileOption = Annotated[str | None, tyro.conf.arg(metavar="ID", help_behavior_hint="(atlases only)")]
+_MAX_NAMED = 8
+T = TypeVar("T")
+
+
+def edited_at(where: str, tile_id: str | None, edit: Callable[[Path], T]) -> T:
+    """What the edit of a map file says, or of the map of an atlas's tile, which is replaced by the
+    edited one.
+
+    Raises:
+        UsageError: an atlas without a tile, or a tile of what is no atlas.
+        TopolocError: as of `edit`, and of `edited_tile`.
+    """
+    check_tile_option(where, tile_id)
+    if not is_atlas(where):
+        return edit(Path(where))
+    if tile_id is None:
+        raise UsageError(
+            f"{where} is an atlas: --tile says which of its maps is meant"
+            f" ({_listed(list(Atlas.open(where).manifest.by_id))})"
+        )
+    from topoloc.lifelong.tile_update import edited_tile
+
+    return edited_tile(where, tile_id, edit)[1]
+
+
+def check_tile_option(where: str, tile_id: str | None) -> None:
+    """Raises UsageError: a tile of what is no atlas."""
+    if tile_id is not None and not is_atlas(where):
+        raise UsageError(f"--tile is of an atlas, and {where} is none")
+
+
+def _listed(ids: Sequence[str]) -> str:
+    return ", ".join(ids[:_MAX_NAMED]) + (", ..." if len(ids) > _MAX_NAMED else "") or "it has none"
+
+
+def chosen_world(atlas: Atlas, tile_id: str | None) -> SharedWorld:
+    """The tile alone; without one the tiles that share a world, those with most nodes, and a line
+    where there are others.
+
+    Raises:
+        AtlasError: there is no such tile, or none at all.
+    """
+    if tile_id is not None:
+        return world_of_tile(atlas.manifest, atlas.tile(tile_id))
+    worlds = shared_worlds(atlas.manifest)
+    if not worlds:
+        raise AtlasError(
+            f"the atlas {atlas.store.where} has no tiles; `topoloc atlas add` adds them"
+        )
+    others = [placed.tile.tile_id for world in worlds[1:] for placed in world.tiles]
+    if others:
+        what = (
+            "1 tile of another world is"
+            if len(others) == 1
+            else f"{len(others)} tiles of other worlds are"
+        )
+        say_warning(f"{what} left out ({_listed(others)}); --tile names one")
+    return worlds[0]
+
+
+def name_of_atlas(where: str) -> str:
+    """The last part of its address."""
+    return where.rstrip("/").rpartition("/")[2] or "atlas"
+
+
+def say_warning(text: str) -> None:
+    print(f"warning: {text}", file=sys.stderr)
+
+
+def of_each_tile(
+    atlas: Atlas, tile_ids: Sequence[str], work: Callable[[str], dict[str, Any]]
+) -> tuple[list[dict[str, Any]], bool]:
+    """What `work` says of each tile, beside its id, and whether all went well: one that fails is
+    told of and leaves the others.
+
+    Raises:
+        StoreError: the store does not answer; the other tiles would be waited for as long, one
+            after the other.
+    """
+    done = list[dict[str, Any]]()
+    for tile_id in tile_ids:
+        try:
+            done.append({"tile_id": tile_id} | work(tile_id))
+        except StoreError:
+            raise
+        except MapError as error:
+            said = str(error)
+            print(
+                f"error: {said if f'tile {tile_id}' in said else f'tile {tile_id}: {said}'}",
+                file=sys.stderr,
+            )
+    return done, len(done) == len(tile_ids)

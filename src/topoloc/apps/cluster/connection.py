@@ -1,0 +1,162 @@
+"""A Ray cluster that this process is a driver of: one that runs already, or one of this machine's
+processors for as long as it is needed.
+
+Ray is the extra `cluster`; it is imported here and in functions alone, when somebody asks for a
+cluster.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from topoloc.errors import ClusterError, MissingExtraError
+from topoloc.recordings.atomic import scratch_folder
+
+LOCAL, AUTO = "local", "auto"
+_PATIENCE_S = 5.0
+_FOLDER = "topoloc-ray-"  # short, for sockets lie in it
+_CONNECTED: list[str] = []
+_TOKEN_SETTINGS = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
+
+
+def ray_module() -> Any:
+    """Ray. Raises MissingExtraError."""
+    try:
+        import ray
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(
+            f"a cluster needs {error.name}: pip install 'topoloc[cluster]'"
+        ) from error
+    return ray
+
+
+@contextmanager
+def connected(address: str) -> Iterator[Any]:
+    """Ray, connected to the cluster at `address` (HOST:PORT; `auto`: the one that runs on this
+    machine, or that RAY_ADDRESS names; `local`: one of this machine's processors, which ends with
+    the block). Tasks that still run when the block ends are ended. Inside of a block of the same
+    address it is that one's connection.
+
+    Raises:
+        MissingExtraError: Ray is not installed.
+        ClusterError: nothing answers there, it is no Ray, or one of another version.
+    """
+    ray = ray_module()
+    if address in _CONNECTED:
+        yield ray
+        return
+    _check_address(address)
+    with contextlib.ExitStack() as at_end:
+        options: dict[str, Any] = {"address": address}
+        if address == LOCAL:
+            os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+            at_end.enter_context(_own_token())
+            options |= {
+                "include_dashboard": False,
+                "_temp_dir": str(at_end.enter_context(scratch_folder(_FOLDER))),
+            }
+        before = signal.getsignal(signal.SIGTERM)
+        try:
+            with _quiet():
+                ray.init(**options, log_to_driver=False, logging_level="error")
+        except Exception as error:  # of many classes, which are no API; the text says what it was
+            ray.shutdown()
+            raise ClusterError(_why(address, error)) from error
+        at_end.callback(ray.shutdown)
+        if (
+            threading.current_thread() is threading.main_thread()
+        ):  # Ray's own handler prints where it was
+            signal.signal(signal.SIGTERM, _interrupt)
+            at_end.callback(signal.signal, signal.SIGTERM, before or signal.SIG_DFL)
+        _CONNECTED.append(address)
+        at_end.callback(_CONNECTED.remove, address)
+        yield ray
+
+
+def _interrupt(number: int, _: object) -> None:
+    """SIGTERM ends the work as Ctrl-C does: in good order."""
+    raise KeyboardInterrupt
+
+
+def _check_address(address: str) -> None:
+    """Ray itself would try for a minute, and tell of it at length."""
+    if address in (LOCAL, AUTO):
+        return
+    if "://" in address:
+        raise ClusterError(
+            f"--ray {address}: no client of Ray is used here; run the command on a machine of the"
+            " cluster, with HOST:PORT or auto"
+        )
+    host, colon, port = address.rpartition(":")
+    if not colon or not host or not port.isdecimal() or not 0 < int(port) < 65536:
+        raise ClusterError(f"--ray {address[:80]}: a cluster is named by HOST:PORT, auto or local")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), _PATIENCE_S).close()
+    except (OSError, UnicodeError) as error:
+        raise ClusterError(
+            f"no Ray cluster answers at {address}: {getattr(error, 'strerror', None) or error}"
+        ) from None
+
+
+def _why(address: str, error: Exception) -> str:
+    text = " ".join(str(error).split())
+    if "ersion mismatch" in text:
+        return (
+            f"the Ray cluster at {address} is of another version:"
+            f" {text.partition('mismatch')[2].strip(' :!.')[:300]}"
+        )
+    if "Could not find any running Ray instance" in text:
+        return (
+            "no Ray cluster runs on this machine; `ray start --head` starts one, and --ray local"
+            " takes this machine's processors"
+        )
+    told = f"no Ray cluster answers at {address}: {text[:300] or type(error).__name__}"
+    return (
+        told
+        if "RAY_AUTH_MODE" in os.environ
+        else f"{told}; one with a token needs RAY_AUTH_MODE=token and it, as on its machines"
+    )
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """The C++ part of Ray writes to standard error past all of Python; what matters of it is in the
+    error that follows."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # closed by the caller
+        yield
+        return
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        sys.stderr.flush()
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+
+
+@contextmanager
+def _own_token() -> Iterator[None]:
+    """A cluster of our own answers to us alone. Without this Ray would leave a token in the user's
+    home, which later ones ask for."""
+    if any(name in os.environ for name in _TOKEN_SETTINGS):
+        yield
+        return
+    os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
+    try:
+        yield
+    finally:  # the mode was set by Ray meanwhile
+        for name in _TOKEN_SETTINGS:
+            os.environ.pop(name, None)

@@ -1,0 +1,113 @@
+"""COLMAP's sparse model as text: cameras, images with their key points, points with their tracks,
+and rigs and frames as 3.12 and later have them. https://colmap.github.io/format.html
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+
+import numpy as np
+
+from topoloc.apps.viewer.scene import Scene, View
+from topoloc.errors import TopolocError
+from topoloc.geometry.rigid import Rigid3
+
+_HALF_PIXEL = 0.5  # the centre of COLMAP's top-left pixel
+
+
+def colmap_files(scene: Scene) -> dict[str, bytes]:
+    """The files of a model, by their names.
+
+    Raises:
+        TopolocError: a view has no camera.
+    """
+    ids = _camera_ids(scene.views)
+    images, frames = [], []
+    for number, view in enumerate(scene.views, 1):
+        camera_id, pose = ids[number - 1], _pose(view.world_from_cam.inverse())
+        key_points = (
+            f"{x:.6f} {y:.6f} {row + 1 if row >= 0 else -1}"
+            for (x, y), row in zip(
+                (view.points_img + _HALF_PIXEL).tolist(), view.point_rows.tolist(), strict=True
+            )
+        )
+        images += [f"{number} {pose} {camera_id} {_image_name(view)}", " ".join(key_points)]
+        frames.append(f"{number} {camera_id} {pose} 1 CAMERA {camera_id} {number}")
+    known = sorted(set(ids))
+    return {
+        "cameras.txt": _file(
+            "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
+            [_camera_line(k, scene.views[ids.index(k)]) for k in known],
+        ),
+        "images.txt": _file(
+            "IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, and a line of POINTS2D[] as (X,"
+            " Y, POINT3D_ID)",
+            images,
+        ),
+        "points3D.txt": _file(
+            "POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
+            _point_lines(scene),
+        ),
+        "rigs.txt": _file(
+            "RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, SENSORS[]",
+            [f"{k} 1 CAMERA {k}" for k in known],
+        ),
+        "frames.txt": _file(
+            "FRAME_ID, RIG_ID, RIG_FROM_WORLD[QW, QX, QY, QZ, TX, TY, TZ], NUM_DATA_IDS,"
+            " DATA_IDS[]",
+            frames,
+        ),
+    }
+
+
+def _file(columns: str, lines: Iterable[str]) -> bytes:
+    return "\n".join([f"# {columns}", *lines, ""]).encode()
+
+
+def _camera_ids(views: Iterable[View]) -> list[int]:
+    """From 1, one for each camera that is different, in the order of the views."""
+    known: dict[object, int] = {}
+    ids = []
+    for view in views:
+        if view.camera is None:
+            raise TopolocError(f"{view.name}: a COLMAP model needs its camera, which is not known")
+        ids.append(known.setdefault(view.camera, len(known) + 1))
+    return ids
+
+
+def _camera_line(camera_id: int, view: View) -> str:
+    assert view.camera is not None
+    model, width, height, params = view.camera.to_colmap()
+    return f"{camera_id} {model} {width} {height} {' '.join(map(repr, params))}"
+
+
+def _image_name(view: View) -> str:
+    """COLMAP reads a name up to the first blank."""
+    return re.sub(r"\s", "_", view.name) or "_"
+
+
+def _pose(cam_from_world: Rigid3) -> str:
+    return " ".join(
+        repr(value)
+        for value in (*cam_from_world.quat_wxyz().tolist(), *cam_from_world.translation.tolist())
+    )
+
+
+def _point_lines(scene: Scene) -> list[str]:
+    tracks: list[list[str]] = [[] for _ in scene.points.world]
+    for number, view in enumerate(scene.views, 1):
+        for place in np.flatnonzero(view.point_rows >= 0).tolist():
+            tracks[view.point_rows[place]].append(f"{number} {place}")
+    points = zip(
+        scene.points.world.tolist(),
+        scene.points.rgb.tolist(),
+        scene.points.errors_px.tolist(),
+        tracks,
+        strict=True,
+    )
+    return [
+        f"{number} {' '.join(map(repr, xyz))} {' '.join(map(str, rgb))} {error:.6f}"
+        f" {' '.join(track)}"
+        for number, (xyz, rgb, error, track) in enumerate(points, 1)
+    ]

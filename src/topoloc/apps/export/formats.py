@@ -1,0 +1,65 @@
+"""The forms in which maps and results leave for other programs, and how each is written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from topoloc.apps.export.colmap import colmap_files
+from topoloc.apps.export.foxglove import mcap_file
+from topoloc.apps.export.nerfstudio import nerfstudio_files
+from topoloc.apps.export.text_forms import geojson_file, kitti_file, ply_file, tum_file
+from topoloc.apps.viewer.scene import Scene
+from topoloc.errors import TopolocError
+from topoloc.recordings.atomic import write_bytes, write_folder
+
+
+@dataclass(frozen=True)
+class ExportFormat:
+    """Either of one file or of a folder. `with_points`: does it take a map's points?"""
+
+    file: Callable[[Scene], bytes] | None = None
+    folder: Callable[[Scene], Mapping[str, bytes]] | None = None
+    with_points: bool = True
+
+
+FORMATS = {
+    "colmap": ExportFormat(folder=colmap_files),
+    "nerfstudio": ExportFormat(folder=nerfstudio_files),
+    "ply": ExportFormat(ply_file),
+    "geojson": ExportFormat(geojson_file, with_points=False),
+    "mcap": ExportFormat(mcap_file),
+    "tum": ExportFormat(tum_file, with_points=False),
+    "kitti": ExportFormat(kitti_file, with_points=False),
+}
+
+
+def find_export_format(out: Path, named: str | None = None) -> ExportFormat:
+    """The format that is named, or else by the suffix of `out`; a name without one is the folder of
+    a COLMAP model.
+
+    Raises:
+        TopolocError: there is no such format, or the suffix says none.
+    """
+    name = named or out.suffix.lower().removeprefix(".") or "colmap"
+    if named is None and out.is_dir():
+        name = "colmap"
+    if name not in FORMATS:
+        raise TopolocError(
+            f"{out if named is None else named}: no format of ours; --format takes"
+            f" {', '.join(FORMATS)}"
+        )
+    return FORMATS[name]
+
+
+def write_scene(scene: Scene, out: Path, form: ExportFormat) -> None:
+    """Write the file or the folder at once or not at all.
+
+    Raises:
+        TopolocError: it cannot be written, or the scene lacks what the format needs.
+    """
+    if form.file is not None:
+        write_bytes(out, form.file(scene))
+    elif form.folder is not None:
+        write_folder(out, form.folder(scene))

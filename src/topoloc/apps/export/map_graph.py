@@ -1,0 +1,155 @@
+"""A map's graph for other programs: nodes, the ways between them, junctions; GraphML, or GeoJSON of
+a map that knows its place on earth."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter, defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from topoloc.apps.export.text_forms import feature
+from topoloc.errors import GeoreferenceError, TopolocError
+from topoloc.geometry.rigid import Rigid3
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.atomic import write_bytes
+
+_TYPES = {bool: "boolean", int: "long", float: "double", str: "string"}
+
+
+@dataclass(frozen=True, eq=False)
+class MapGraph:
+    """`nodes` by their ids and `ways` by the ids of the node that one leaves and the one that one
+    comes to, with what is known of each.
+
+    Of a node: session, world_from_cam (x, y, z in metres; qw, qx, qy, qz), points, ways out,
+    whether it is a junction: more than two neighbours. Of a way: metres, source_from_target (x, y,
+    z, qw, qx, qy, qz), the times that mapping pictures went it.
+    """
+
+    nodes: dict[int, dict[str, Any]]
+    ways: dict[tuple[int, int], dict[str, Any]]
+
+
+def graph_of(topomap: TopoMetricMap) -> MapGraph:
+    """The graph of a map. Times are those of the place images that the map keeps."""
+    poses = {summary.node_id: summary.world_from_cam for summary in topomap.summaries}
+    out, neighbours = Counter(edge.source_id for edge in topomap.edges), defaultdict(set)
+    for edge in topomap.edges:
+        neighbours[edge.source_id].add(edge.target_id)
+        neighbours[edge.target_id].add(edge.source_id)
+    nodes = {
+        s.node_id: {
+            "session": s.session_id,
+            "name": s.name,
+            **_pose(s.world_from_cam),
+            "points": s.num_points,
+        }
+        | {"ways_out": out[s.node_id], "is_junction": len(neighbours[s.node_id]) > 2}
+        for s in topomap.summaries
+    }
+    walked = _times_walked(topomap)
+    ways = {}
+    for edge in topomap.edges:
+        source_from_target = poses[edge.source_id].inverse() @ poses[edge.target_id]
+        metres = float(np.linalg.norm(source_from_target.translation))
+        pair = (edge.source_id, edge.target_id)
+        ways[pair] = {"metres": metres, **_pose(source_from_target), "times": walked[pair]}
+    return MapGraph(nodes, ways)
+
+
+def write_graph(topomap: TopoMetricMap, path: Path) -> None:
+    """Write the graph as the ending of the name says: .graphml, or .geojson.
+
+    Raises:
+        TopolocError: another ending, or the file cannot be written.
+        GeoreferenceError: GeoJSON of a map of which nobody said where on earth it lies.
+    """
+    graph, ending = graph_of(topomap), path.suffix.lower()
+    if ending == ".graphml":
+        write_bytes(path, _graphml(graph))
+    elif ending in (".geojson", ".json"):
+        write_bytes(path, _geojson(topomap, graph))
+    else:
+        raise TopolocError(f"{path}: a graph is written as .graphml or .geojson")
+
+
+def _times_walked(topomap: TopoMetricMap) -> Counter[tuple[int, int]]:
+    """How often the mapping pictures of a session, one after the other, went from node to node."""
+    last, walked = dict[int, int](), Counter[tuple[int, int]]()
+    for image in topomap.place_images:
+        before = last.get(image.session_id)
+        if before is not None and before != image.node_id:
+            walked[before, image.node_id] += 1
+        last[image.session_id] = image.node_id
+    return walked
+
+
+def _pose(a_from_b: Rigid3) -> dict[str, float]:
+    values = [*a_from_b.translation.tolist(), *a_from_b.quat_wxyz().tolist()]
+    return dict(zip(("x", "y", "z", "qw", "qx", "qy", "qz"), values, strict=True))
+
+
+def _graphml(graph: MapGraph) -> bytes:
+    root = ElementTree.Element("graphml", xmlns="http://graphml.graphdrawing.org/xmlns")
+    for of, entries in (("node", graph.nodes), ("edge", graph.ways)):
+        first = next(iter(entries.values()), {})
+        for name, value in first.items():
+            attributes = {
+                "id": f"{of}_{name}",
+                "for": of,
+                "attr.name": name,
+                "attr.type": _TYPES[type(value)],
+            }
+            ElementTree.SubElement(root, "key", attributes)
+    top = ElementTree.SubElement(root, "graph", id="map", edgedefault="directed")
+    for node_id, facts in graph.nodes.items():
+        _add_facts(ElementTree.SubElement(top, "node", id=f"n{node_id}"), "node", facts)
+    for (source, target), facts in graph.ways.items():
+        _add_facts(
+            ElementTree.SubElement(top, "edge", source=f"n{source}", target=f"n{target}"),
+            "edge",
+            facts,
+        )
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
+
+
+def _add_facts(element: ElementTree.Element, of: str, facts: dict[str, Any]) -> None:
+    for name, value in facts.items():
+        text = (
+            str(value).lower()
+            if isinstance(value, bool)
+            else "".join(c for c in str(value) if c.isprintable())
+        )
+        ElementTree.SubElement(element, "data", key=f"{of}_{name}").text = text
+
+
+def _geojson(topomap: TopoMetricMap, graph: MapGraph) -> bytes:
+    if topomap.georeference is None:
+        raise GeoreferenceError(
+            "nobody said where on earth this map lies (topoloc georeference); .graphml needs no"
+            " place"
+        )
+    places = {s.node_id: _lon_lat_h(topomap, s.world_from_cam) for s in topomap.summaries}
+    features = [
+        feature("Point", places[node_id], {"node": node_id} | facts)
+        for node_id, facts in graph.nodes.items()
+    ]
+    features += [
+        feature(
+            "LineString", [places[source], places[target]], {"from": source, "to": target} | facts
+        )
+        for (source, target), facts in graph.ways.items()
+    ]
+    return json.dumps({"type": "FeatureCollection", "features": features}).encode()
+
+
+def _lon_lat_h(topomap: TopoMetricMap, world_from_cam: Rigid3) -> list[float]:
+    assert topomap.georeference is not None
+    position = topomap.georeference.geopose(world_from_cam).position
+    return [round(position.lon, 9), round(position.lat, 9), round(position.h, 4)]

@@ -1,0 +1,178 @@
+"""A bag: one file of messages, or a folder of the parts that a recorder split it into; topics and
+messages of all of them together."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from topoloc.apps.formats.bags.message_file import MessageFile, MessageRef, Topic
+from topoloc.errors import MissingExtraError, RecordingError
+from topoloc.recordings.recording import natural_key
+
+BAG_SUFFIXES = (".bag", ".bag.active", ".db3")
+MCAP_SUFFIXES = (".mcap",)
+_PACKED_FILE, _ZSTD = ".zstd", b"\x28\xb5\x2f\xfd"
+_MAX_MESSAGE_BYTES = 1 << 29
+
+
+@dataclass(eq=False)
+class Bag:
+    """The files of a recording, opened. `notes` is what the user should know of them: what was cut
+    off."""
+
+    path: Path
+    files: list[MessageFile]
+    topics: dict[str, Topic] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        for file in self.files:
+            for name, topic in file.topics.items():
+                if f"{name}{topic.type}{topic.encoding}".isprintable():  # else damaged
+                    self.topics.setdefault(name, topic)
+
+    def messages(self, topic: str) -> list[MessageRef]:
+        """The messages of a topic in all files, in the order in which they were written."""
+        found = [
+            (number, file.messages(topic))
+            for number, file in enumerate(self.files)
+            if topic in file.topics
+        ]
+        return sorted(ref._replace(file=number) for number, refs in found for ref in refs)
+
+    def read(self, ref: MessageRef, most: int | None = None) -> bytes:
+        """The bytes of a message, or at least the first `most` of them; unpacked where each message
+        is packed.
+
+        Raises:
+            RecordingError: they are not there.
+        """
+        file = self.files[ref.file]
+        data = file.read(ref, most)
+        return _unpacked(file.read(ref)) if data.startswith(_ZSTD) else data
+
+    def listed(self) -> str:
+        """The topics with their types, for errors."""
+        names = [
+            f"{topic.name} ({topic.type or topic.encoding})"
+            for topic in sorted(self.topics.values(), key=lambda its: its.name)
+        ]
+        return (
+            ", ".join(names[:40]) + (f" and {len(names) - 40} more" if len(names) > 40 else "")
+            if names
+            else "none"
+        )
+
+    def note_faults(self) -> None:
+        """Adds what is wrong with the files; after the messages that are used were looked for."""
+        self.notes += [
+            f"{self.path}: {file.fault}; what is whole is used" for file in self.files if file.fault
+        ]
+
+
+def is_bag(path: Path, suffixes: tuple[str, ...] = BAG_SUFFIXES) -> bool:
+    """Whether this is a file of one of these names, or a folder of files that ROS 2 recorded."""
+    if path.is_dir():
+        return suffixes == BAG_SUFFIXES and bool((path / "metadata.yaml").is_file() or _parts(path))
+    return path.name.lower().endswith(suffixes) and path.is_file()
+
+
+def open_bag_files(path: Path) -> Bag:
+    """Open a bag. Nothing but where its messages are is read.
+
+    Raises:
+        RecordingError: no bag, or damaged at its beginning.
+        MissingExtraError: the extra `bags` is not installed.
+    """
+    paths = _parts(path) if path.is_dir() else [path]
+    if not paths:
+        packed = [part.name for part in sorted(path.iterdir()) if part.name.endswith(_PACKED_FILE)]
+        said = (
+            f"{packed[0]} is packed as a whole: `zstd -d` unpacks it"
+            if packed
+            else "no .db3 and no .mcap file here"
+        )
+        raise RecordingError(f"{path}: {said}")
+    return Bag(path, [_open_file(part) for part in paths])
+
+
+def _parts(folder: Path) -> list[Path]:
+    parts = [
+        part
+        for part in folder.iterdir()
+        if part.suffix.lower() in (".db3", ".mcap") and part.is_file()
+    ]
+    return sorted(parts, key=lambda part: natural_key(part.name))
+
+
+def _open_file(path: Path) -> MessageFile:
+    try:
+        with path.open("rb") as file:
+            begin = file.read(16)
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror}") from None
+    for magic, kind in _KINDS.items():
+        if begin.startswith(magic):
+            try:
+                return kind(path)
+            except ModuleNotFoundError as error:
+                raise missing_bags(error, path) from error
+    raise RecordingError(
+        f"{path}: {'empty' if not begin else 'neither a ROS bag (2.0, or SQLite) nor an MCAP file'}"
+    )
+
+
+def missing_bags(error: ModuleNotFoundError, path: Path) -> Exception:
+    """What is said where a library of the extra is missing."""
+    if error.name is None or error.name.split(".")[0] not in (
+        "rosbags",
+        "mcap",
+        "lz4",
+        "zstandard",
+        "google",
+    ):
+        return error
+    return MissingExtraError(
+        f"{path}: bags and MCAP files need the extra bags: pip install 'topoloc[bags]'"
+    )
+
+
+def _ros1(path: Path) -> MessageFile:
+    from topoloc.apps.formats.bags.ros1_file import Ros1File
+
+    return Ros1File(path)
+
+
+def _mcap(path: Path) -> MessageFile:
+    from topoloc.apps.formats.bags.mcap_file import McapFile
+
+    return McapFile(path)
+
+
+def _sqlite(path: Path) -> MessageFile:
+    from topoloc.apps.formats.bags.sqlite_file import SqliteFile
+
+    return SqliteFile(path)
+
+
+_KINDS: dict[bytes, Callable[[Path], MessageFile]] = {
+    b"#ROSBAG V2.0\n": _ros1,
+    b"\x89MCAP0\r\n": _mcap,
+    b"SQLite format 3\0": _sqlite,
+}
+
+
+def _unpacked(data: bytes) -> bytes:
+    import zstandard
+
+    try:
+        return (
+            zstandard.ZstdDecompressor()
+            .stream_reader(data)
+            .read(min(_MAX_MESSAGE_BYTES, sys.maxsize))
+        )
+    except zstandard.ZstdError:
+        raise RecordingError("a packed message is damaged") from None

@@ -1,0 +1,336 @@
+"""ROS bags and MCAP files as recordings: opened by an index of their messages, a picture read when
+its frame is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from topoloc.apps.formats.bags.bag import MCAP_SUFFIXES, Bag, is_bag, missing_bags, open_bag_files
+from topoloc.apps.formats.bags.bag_pictures import depth_of, picture_of
+from topoloc.apps.formats.bags.bag_poses import camera_poses, read_frames
+from topoloc.apps.formats.bags.camera_info import CameraInfo, camera_info
+from topoloc.apps.formats.bags.frame_tree import FrameTree
+from topoloc.apps.formats.bags.message_file import MessageRef, Topic
+from topoloc.apps.formats.bags.messages import decode, frame_id, head_size, stamp_of_head
+from topoloc.apps.formats.bags.topics import (
+    Roles,
+    choose_topics,
+    is_rectified,
+    is_registered,
+    parse_topics,
+)
+from topoloc.errors import CalibrationError, RecordingError, UnreadableImageError
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rig import StereoRig
+from topoloc.geometry.rigid import Rigid3
+from topoloc.recordings.camera_json import FILE_NAME, read_camera_json
+from topoloc.recordings.format import SequenceFormat
+from topoloc.recordings.frame import DepthImage, Image, StereoFrame
+from topoloc.recordings.recording import nearest_rows
+
+LOOKS_FOR = "a ROS bag: .bag, .db3, or a folder with metadata.yaml"
+LOOKS_FOR_MCAP = "an .mcap file"
+MAX_PAIR_DELAY_MS, MAX_DEPTH_DELAY_MS = 5, 20
+
+
+def recognises(path: Path) -> bool:
+    """Whether this is a ROS bag, by its name."""
+    return is_bag(path)
+
+
+def recognises_mcap(path: Path) -> bool:
+    """Whether this is an MCAP file, by its name."""
+    return is_bag(path, MCAP_SUFFIXES)
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """The messages of a topic of pictures: one a frame."""
+
+    topic: Topic
+    refs: list[MessageRef]
+
+
+@dataclass(frozen=True, eq=False)
+class BagRecording:
+    """A StereoSequence in a bag. `names` are the times of the frames in seconds; `notes` what the
+    user should know."""
+
+    name: str
+    bag: Bag
+    t_ns: list[int]
+    poses: list[Rigid3 | None]
+    camera: Camera | None
+    left: Pictures
+    right: tuple[Pictures, StereoRig] | None = None
+    depth: tuple[Pictures, Camera, Rigid3] | None = None
+    names: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.names.extend(
+            f"{t_ns // 1_000_000_000}.{t_ns % 1_000_000_000:09d}"
+            for t_ns in self.t_ns[len(self.names) :]
+        )
+
+    @property
+    def notes(self) -> list[str]:
+        return self.bag.notes
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    def single(self) -> BagRecording:
+        """The same recording without its right and depth pictures."""
+        return replace(self, right=None, depth=None)
+
+    def __getitem__(self, index: int) -> StereoFrame:
+        """Read one frame.
+
+        Raises:
+            IndexError: no such frame.
+            UnreadableImageError: a picture is damaged, or of another size than its camera.
+        """
+        frame = self.left_frame(index)
+        if self.right is not None:
+            right, rig = self.right
+            return replace(frame, right=self._picture(right, index, rig.right))
+        if self.depth is not None:
+            pictures, camera, cam_from_depth = self.depth
+            message, name = self._message(pictures, index)
+            depth = depth_of(message, name)
+            _check_size(name, depth.shape, camera)
+            return replace(frame, depth=DepthImage(depth, camera, cam_from_depth))
+        return frame
+
+    def left_frame(self, index: int) -> StereoFrame:
+        """Read one frame but for its right or depth picture. Raises as the whole frame does."""
+        image, rig = (
+            self._picture(self.left, index, self.camera),
+            None if self.right is None else self.right[1],
+        )
+        return StereoFrame(
+            self.names[index],
+            self.t_ns[index],
+            image,
+            self.camera,
+            rig=rig,
+            world_from_cam=self.poses[index],
+        )
+
+    def _picture(self, pictures: Pictures, index: int, camera: Camera | None) -> Image:
+        message, name = self._message(pictures, index)
+        image = picture_of(message, name)
+        if camera is not None:
+            _check_size(name, image.shape, camera)
+        return image
+
+    def _message(self, pictures: Pictures, index: int) -> tuple[Any, str]:
+        name = f"{self.bag.path}, {pictures.topic.name} at {self.names[index]}"
+        try:
+            return decode(pictures.topic, self.bag.read(pictures.refs[index])), name
+        except RecordingError as error:
+            raise UnreadableImageError(f"{name}: {error}") from None
+
+
+def open_bag(path: Path, topics: str | Mapping[str, str] | None = None) -> BagRecording:
+    """Open a bag: its topics are guessed but for those that are said. No picture is read.
+
+    Args:
+        topics: the topic of a role (``left``, ``right``, ``depth``, ``left_info``, ``right_info``,
+            ``depth_info``, ``pose``), and ``pose_frame``, the frame that the poses are of; as a
+            dictionary or ``left=/cam0/image_raw,pose=/odom``. ``pose`` may be ``tf`` or ``none``.
+
+    Raises:
+        RecordingError: no bag, a topic that is not in it, no pictures, or none with its right
+            picture or depth.
+        CalibrationError: the calibration of a pair or of depth is missing or not usable.
+        TrajectoryError: the poses that were asked for fit no frame.
+        MissingExtraError: the extra `bags` is not installed.
+    """
+    bag = open_bag_files(path)
+    try:
+        said = parse_topics(topics) if isinstance(topics, str) else dict(topics or {})
+        roles = choose_topics(bag, said)
+        recording = _opened(bag, roles)
+    except ModuleNotFoundError as error:
+        raise missing_bags(error, path) from error
+    bag.note_faults()
+    return recording
+
+
+def _opened(bag: Bag, roles: Roles) -> BagRecording:
+    t_ns, left = _timed(bag, roles.left)
+    tree, info = read_frames(bag), _read_info(bag, roles.left_info)
+    frame = (info.frame if info is not None else "") or _frame_of(bag, left)
+    camera = info.camera(is_rectified(roles.left)) if info is not None else _camera_beside(bag)[0]
+    right, depth = None, None
+    if roles.right is not None:
+        rig = _rig(bag, roles, info, tree)
+        t_ns, left, pictures = _paired(bag, (t_ns, left), roles.right, MAX_PAIR_DELAY_MS)
+        camera, right = rig.left, (pictures, rig)
+    elif roles.depth is not None:
+        if camera is None:
+            raise CalibrationError(
+                f"{bag.path}: no calibration of {roles.left}; --topics left_info=TOPIC, or a"
+                " camera.json beside the bag"
+            )
+        t_ns, left, pictures = _paired(bag, (t_ns, left), roles.depth, MAX_DEPTH_DELAY_MS)
+        depth = (pictures, *_depth_camera(bag, roles, camera, frame, tree))
+    poses = camera_poses(bag, roles, frame, tree, t_ns)
+    return BagRecording(bag.path.resolve().name, bag, t_ns, poses, camera, left, right, depth)
+
+
+def _timed(bag: Bag, name: str) -> tuple[list[int], Pictures]:
+    """The messages of a topic by their own times, in order; damaged ones are left out, and said."""
+    topic, num_damaged = bag.topics[name], 0
+    stamped: list[tuple[int | None, MessageRef]] = []
+    for ref in sorted(
+        bag.messages(name), key=lambda ref: (ref.file, ref.chunk, ref.offset)
+    ):  # as they lie: a chunk is unpacked once
+        try:
+            stamped.append((stamp_of_head(topic, bag.read(ref, head_size(topic))), ref))
+        except RecordingError:
+            num_damaged += 1
+    if num_damaged:
+        bag.notes.append(f"{bag.path}: {num_damaged} messages of {name} are damaged and left out")
+    is_stamped = (
+        sum(not stamp for stamp, _ in stamped) <= 1
+    )  # a driver that sets no times writes 0 into each
+    by_time = {
+        stamp if is_stamped and stamp is not None else ref.log_t_ns: ref for stamp, ref in stamped
+    }
+    if not by_time:
+        raise RecordingError(f"{bag.path}: no whole message of {name}")
+    t_ns = sorted(by_time)
+    return t_ns, Pictures(topic, [by_time[time] for time in t_ns])
+
+
+def _paired(
+    bag: Bag, first: tuple[list[int], Pictures], name: str, delay_ms: int
+) -> tuple[list[int], Pictures, Pictures]:
+    """Times and pictures that have a partner on the topic `name` within `delay_ms`, and the
+    partners."""
+    t_ns, left = first
+    others, pictures = _timed(bag, name)
+    nearest = nearest_rows(np.array(t_ns), np.array(others))
+    kept = [
+        row
+        for row, other in enumerate(nearest)
+        if abs(t_ns[row] - others[other]) <= delay_ms * 1_000_000
+    ]
+    lacking = (
+        f"of {len(t_ns)} pictures of {left.topic.name} have none of {name} ({len(others)}) within"
+        f" {delay_ms} ms"
+    )
+    if not kept:
+        off = (
+            min(abs(time - others[other]) for time, other in zip(t_ns, nearest, strict=True)) / 1e6
+        )
+        raise RecordingError(f"{bag.path}: {len(t_ns)} {lacking}; the nearest is {off:.1f} ms away")
+    if len(kept) < len(t_ns):
+        bag.notes.append(f"{bag.path}: {len(t_ns) - len(kept)} {lacking} and are left out")
+    times, refs = [t_ns[row] for row in kept], [left.refs[row] for row in kept]
+    return (
+        times,
+        Pictures(left.topic, refs),
+        Pictures(pictures.topic, [pictures.refs[nearest[row]] for row in kept]),
+    )
+
+
+def _read_info(bag: Bag, name: str | None) -> CameraInfo | None:
+    """The first whole calibration of a topic."""
+    if name is None:
+        return None
+    for ref in bag.messages(name)[:10]:
+        try:
+            return camera_info(decode(bag.topics[name], bag.read(ref)), name)
+        except CalibrationError:
+            raise
+        except RecordingError:
+            continue
+    raise CalibrationError(f"{bag.path}: no whole message of {name}")
+
+
+def _frame_of(bag: Bag, pictures: Pictures) -> str:
+    try:
+        return frame_id(decode(pictures.topic, bag.read(pictures.refs[0])))
+    except (RecordingError, AttributeError):
+        return ""
+
+
+def _rig(bag: Bag, roles: Roles, left: CameraInfo | None, tree: FrameTree) -> StereoRig:
+    """By P of both calibrations; else by the transform between their frames; else by a camera.json
+    with a baseline."""
+    right = _read_info(bag, roles.right_info)
+    if left is not None and right is not None:
+        rig = left.rig(right, is_rectified(roles.left))
+        if rig is not None:
+            return rig
+        right_from_left = (
+            tree.fixed_between(right.frame, left.frame) if left.frame != right.frame else None
+        )
+        if right_from_left is not None:
+            if is_rectified(roles.left):
+                return StereoRig.rectified(
+                    left.camera(True), float(np.linalg.norm(right_from_left.translation))
+                )
+            return StereoRig(left.camera(False), right.camera(False), right_from_left)
+    camera, baseline = _camera_beside(bag)
+    if camera is not None and baseline is not None:
+        return StereoRig.rectified(camera, baseline)
+    lacking = " and ".join(
+        side for side, info in (("left", left), ("right", right)) if info is None
+    )
+    what = (
+        f"no calibration of the {lacking} camera"
+        if lacking
+        else f"neither P of {roles.right_info} nor TF says where the right camera is"
+    )
+    raise CalibrationError(
+        f"{bag.path}: {what}; --topics left_info=TOPIC,right_info=TOPIC, or a camera.json with a"
+        " baseline beside the bag"
+    )
+
+
+def _depth_camera(
+    bag: Bag, roles: Roles, camera: Camera, frame: str, tree: FrameTree
+) -> tuple[Camera, Rigid3]:
+    """The camera of the depth pictures, and cam_from_depth; registered ones are the colour
+    camera's."""
+    info = _read_info(bag, roles.depth_info)
+    if info is None:
+        return camera, Rigid3.identity()
+    cam_from_depth = tree.fixed_between(frame, info.frame) if frame and info.frame else None
+    if cam_from_depth is None:
+        cam_from_depth = Rigid3.identity()
+        if not is_registered(roles.depth or ""):
+            bag.notes.append(
+                f"{bag.path}: no fixed transform from that of {roles.depth} to the camera of the"
+                " pictures: taken for the same place"
+            )
+    return info.camera(is_rectified(roles.depth or "")), cam_from_depth
+
+
+def _camera_beside(bag: Bag) -> tuple[Camera | None, float | None]:
+    path = (bag.path if bag.path.is_dir() else bag.path.parent) / FILE_NAME
+    if not path.is_file():
+        return None, None
+    file = read_camera_json(path)
+    return file.camera, None if file.rig is None else file.rig.baseline
+
+
+def _check_size(name: str, shape: tuple[int, ...], camera: Camera) -> None:
+    if shape[:2] != (camera.height, camera.width):
+        raise UnreadableImageError(
+            f"{name}: {shape[1]}x{shape[0]} pixels, but its camera is of"
+            f" {camera.width}x{camera.height}"
+        )
+
+
+ROSBAG_FORMAT = SequenceFormat(LOOKS_FOR, recognises, open_bag, ("topics",))
+MCAP_FORMAT = SequenceFormat(LOOKS_FOR_MCAP, recognises_mcap, open_bag, ("topics",))

@@ -1,0 +1,219 @@
+"""Messages of cameras and poses, in one form whether ROS 1, ROS 2 or Foxglove wrote them.
+
+ROS's types are those of sensor_msgs, geometry_msgs, nav_msgs and tf2_msgs, decoded by rosbags;
+Foxglove's are its schemas of the same things, as JSON or protobuf.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import struct
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from types import SimpleNamespace
+from typing import Any
+
+from topoloc.apps.formats.bags.message_file import Topic
+from topoloc.errors import RecordingError
+
+RAW = frozenset({"sensor_msgs/msg/Image", "foxglove.RawImage"})
+COMPRESSED = frozenset({"sensor_msgs/msg/CompressedImage", "foxglove.CompressedImage"})
+PICTURES = RAW | COMPRESSED
+CALIBRATIONS = frozenset({"sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration"})
+TRANSFORMS = frozenset(
+    {
+        "tf2_msgs/msg/TFMessage",
+        "tf/msg/tfMessage",
+        "foxglove.FrameTransform",
+        "foxglove.FrameTransforms",
+    }
+)
+POSES = frozenset(
+    {
+        "nav_msgs/msg/Odometry",
+        "geometry_msgs/msg/PoseStamped",
+        "geometry_msgs/msg/PoseWithCovarianceStamped",
+        "geometry_msgs/msg/TransformStamped",
+        "foxglove.PoseInFrame",
+    }
+)
+_NANOSECONDS = 1_000_000_000
+_HEAD_BYTES = 32
+_FAR, _ROTATION_TOLERANCE = (
+    1e9,
+    1e-2,
+)  # metres that nobody goes; how far a quaternion's length may be from 1
+
+
+@dataclass(frozen=True)
+class TimedTransform:
+    """`child` as seen from `parent` at a time: translation in metres, quaternion x y z w. An empty
+    `child` is one that nobody named."""
+
+    t_ns: int
+    parent: str
+    child: str
+    translation: tuple[float, float, float]
+    quat_xyzw: tuple[float, float, float, float]
+
+
+def decode(topic: Topic, data: bytes) -> Any:
+    """A message with its fields as attributes.
+
+    Raises:
+        RecordingError: an encoding that is not known, or bytes that are no message of the topic's
+            type.
+    """
+    try:
+        if topic.encoding in ("cdr", "ros1"):
+            # A message's type says what it is, so what a file says of the type is not needed, nor
+            # believed.
+            store, kind = (
+                _typestore(topic.encoding),
+                topic.type.replace("tf/msg/tfMessage", "tf2_msgs/msg/TFMessage"),
+            )
+            return (
+                store.deserialize_cdr(data, kind)
+                if topic.encoding == "cdr"
+                else store.deserialize_ros1(data, kind)
+            )
+        if topic.encoding == "json":
+            return json.loads(data, object_hook=lambda fields: SimpleNamespace(**fields))
+        if topic.encoding == "protobuf":
+            return _protobuf_class(topic.type, topic.schema).FromString(data)
+    except (RecordingError, ModuleNotFoundError):
+        raise
+    except (
+        Exception
+    ) as error:  # whatever the decoders raise of damaged bytes, of which there is no list
+        raise RecordingError(
+            f"{topic.name}: no whole message of type {topic.type} ({type(error).__name__})"
+        ) from None
+    raise RecordingError(
+        f"{topic.name}: messages encoded as {topic.encoding or 'nothing'} cannot be read"
+    )
+
+
+def head_size(topic: Topic) -> int | None:
+    """How many bytes of a message are needed for its time; None where all are."""
+    return None if topic.encoding == "json" else _HEAD_BYTES
+
+
+def stamp_of_head(topic: Topic, head: bytes) -> int | None:
+    """The time (nanoseconds) in the first bytes of a message that begins with a header; None where
+    it has none."""
+    try:
+        if topic.encoding == "cdr":
+            seconds, nanoseconds = struct.unpack_from("<iI" if head[1] & 1 else ">iI", head, 4)
+        elif topic.encoding == "ros1":
+            seconds, nanoseconds = struct.unpack_from("<II", head, 4)
+        elif topic.encoding == "protobuf" and head[:1] == b"\x0a":  # field 1, a Timestamp
+            stamp = _timestamp_class().FromString(head[2 : 2 + head[1]])
+            seconds, nanoseconds = stamp.seconds, stamp.nanos
+        elif topic.encoding == "json":
+            return stamp_ns(decode(topic, head).timestamp)
+        else:
+            return None
+    except ModuleNotFoundError:
+        raise
+    except Exception:  # as in `decode`
+        return None
+    t_ns = seconds * _NANOSECONDS + nanoseconds
+    return t_ns if 0 <= t_ns < 1 << 63 else None
+
+
+def stamp_ns(stamp: Any) -> int:
+    """Nanoseconds of a time, which ROS, JSON and protobuf write with names of their own."""
+    for seconds, nanoseconds in (
+        ("sec", "nanosec"),
+        ("sec", "nsec"),
+        ("secs", "nsecs"),
+        ("seconds", "nanos"),
+    ):
+        if hasattr(stamp, seconds) and hasattr(stamp, nanoseconds):
+            return int(getattr(stamp, seconds)) * _NANOSECONDS + int(getattr(stamp, nanoseconds))
+    raise RecordingError("a message without a time")
+
+
+def frame_id(message: Any) -> str:
+    """The frame that a message is in."""
+    return _frame_name(message.header.frame_id if hasattr(message, "header") else message.frame_id)
+
+
+def _frame_name(text: Any) -> str:
+    """Without the slash of older ROS, and without what a line cannot show."""
+    return "".join(letter for letter in str(text) if letter.isprintable()).lstrip("/")
+
+
+def bytes_of(message: Any) -> bytes:
+    """The data of a picture."""
+    return base64.b64decode(message.data) if isinstance(message.data, str) else bytes(message.data)
+
+
+def transforms_of(topic: Topic, data: bytes) -> list[TimedTransform]:
+    """The transforms of a message of TF, or the one of a message of a pose.
+
+    Raises:
+        RecordingError: no whole message of this type, or numbers that are no pose.
+    """
+    message = decode(topic, data)
+    try:
+        return [
+            _transform(part)
+            for part in getattr(message, "transforms", None)
+            or ([] if hasattr(message, "transforms") else [message])
+        ]
+    except (AttributeError, TypeError, ValueError, OverflowError):
+        raise RecordingError(f"{topic.name}: not poses, or not as {topic.type} has them") from None
+
+
+def _transform(part: Any) -> TimedTransform:
+    stamp = stamp_ns(part.header.stamp if hasattr(part, "header") else part.timestamp)
+    parent = (
+        _frame_name(part.parent_frame_id) if hasattr(part, "parent_frame_id") else frame_id(part)
+    )
+    child = _frame_name(getattr(part, "child_frame_id", ""))
+    inner = getattr(part, "transform", None) or getattr(part, "pose", part)
+    inner = getattr(inner, "pose", inner)  # with covariance
+    position = inner.position if hasattr(inner, "position") else inner.translation
+    rotation = inner.orientation if hasattr(inner, "orientation") else inner.rotation
+    translation = (float(position.x), float(position.y), float(position.z))
+    quat_xyzw = (float(rotation.x), float(rotation.y), float(rotation.z), float(rotation.w))
+    if (
+        not all(abs(value) < _FAR for value in translation)
+        or not abs(math.hypot(*quat_xyzw) - 1.0) <= _ROTATION_TOLERANCE
+    ):
+        raise ValueError
+    return TimedTransform(stamp, parent, child, translation, quat_xyzw)
+
+
+@cache
+def _typestore(encoding: str) -> Any:
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE if encoding == "cdr" else Stores.ROS1_NOETIC)
+    if encoding == "ros1":
+        store.register(
+            get_types_from_msg(
+                "geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"
+            )
+        )
+    return store
+
+
+@lru_cache(maxsize=32)
+def _protobuf_class(name: str, schema: bytes) -> Any:
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+
+    pool = descriptor_pool.DescriptorPool()
+    for file in descriptor_pb2.FileDescriptorSet.FromString(schema).file:
+        pool.Add(file)  # pyright: ignore[reportAttributeAccessIssue]
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
+
+
+def _timestamp_class() -> Any:
+    from google.protobuf.timestamp_pb2 import Timestamp
+
+    return Timestamp

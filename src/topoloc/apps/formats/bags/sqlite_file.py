@@ -1,0 +1,102 @@
+"""ROS 2 bags in SQLite (``.db3``): one row a message. Of a database that was cut off, the rows
+before are read.
+
+Beginnings of messages are read through SQLite's incremental blobs, which leaves the pages of a
+picture where they are.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from topoloc.apps.formats.bags.message_file import MessageRef, Topic, damaged
+from topoloc.errors import RecordingError
+
+MAGIC = b"SQLite format 3\0"
+_ROW = -2  # in place of a chunk's number
+_BROKEN = (
+    sqlite3.Error,
+    UnicodeDecodeError,
+)  # the second of an error's text, which quotes what is damaged
+
+
+@dataclass(eq=False)
+class SqliteFile:
+    """A ROS 2 bag's database."""
+
+    path: Path
+    topics: dict[str, Topic] = field(default_factory=dict)
+    fault: str | None = None
+    _numbers: dict[str, list[int]] = field(default_factory=dict)
+    _database: sqlite3.Connection = field(init=False)
+
+    def __post_init__(self) -> None:
+        uri = f"{self.path.resolve().as_uri()}?mode=ro"
+        try:
+            self._database = sqlite3.connect(uri, uri=True, check_same_thread=False)
+            self._database.text_factory = lambda data: data.decode(errors="replace")
+            self._database.execute("PRAGMA trusted_schema = OFF")
+            if self._is_cut():
+                # SQLite refuses a file that is shorter than its header says, but for this switch;
+                # nothing is written.
+                self._database.execute("PRAGMA writable_schema = ON")
+            rows = self._database.execute(
+                "SELECT id, name, type, serialization_format FROM topics"
+            ).fetchall()
+        except _BROKEN as error:
+            why = " ".join(str(error).split())[:120]
+            raise RecordingError(
+                f"{self.path}: not a ROS 2 bag, or damaged at its beginning ({why})"
+            ) from None
+        for number, name, kind, encoding in rows:
+            if isinstance(number, int) and all(
+                isinstance(text, str) for text in (name, kind, encoding)
+            ):
+                self.topics.setdefault(name, Topic(name, kind, encoding))
+                self._numbers.setdefault(name, []).append(number)
+
+    def messages(self, topic: str) -> list[MessageRef]:
+        """The messages of a topic, in the order in which they were written."""
+        refs: list[MessageRef] = []
+        for number in self._numbers[topic]:
+            try:
+                for row, t_ns in self._database.execute(
+                    "SELECT id, timestamp FROM messages WHERE topic_id = ?", (number,)
+                ):
+                    if isinstance(row, int) and isinstance(t_ns, int):
+                        refs.append(MessageRef(t_ns, _ROW, row))
+            except _BROKEN as error:
+                self.fault = self.fault or f"damaged ({' '.join(str(error).split())[:120]})"
+        refs.sort()
+        while self.fault and refs and not self._is_whole(refs[-1]):
+            refs.pop()
+        return refs
+
+    def read(self, ref: MessageRef, most: int | None = None) -> bytes:
+        """The bytes of a message, or the first `most` of them. Raises RecordingError."""
+        try:
+            with self._database.blobopen("messages", "data", ref.offset, readonly=True) as blob:
+                return blob.read(-1 if most is None else most)
+        except (ValueError, *_BROKEN):
+            raise damaged(self.path.name, ref) from None
+
+    def _is_whole(self, ref: MessageRef) -> bool:
+        try:
+            return bool(self.read(ref))
+        except RecordingError:
+            return False
+
+    def _is_cut(self) -> bool:
+        """Whether the database says in its header that it has more pages than the file, which is
+        then noted."""
+        with self.path.open("rb") as file:
+            header = file.read(32)
+        page_size, size = int.from_bytes(header[16:18], "big"), self.path.stat().st_size
+        is_cut = (
+            int.from_bytes(header[28:32], "big") * (65536 if page_size == 1 else page_size) > size
+        )
+        if is_cut:
+            self.fault = f"cut off after {size / 1e6:.3f} MB"
+        return is_cut

@@ -1,0 +1,276 @@
+"""A COLMAP model, text or binary, as a recording of single pictures with poses: its cameras, where
+they stood, in the model's own unit.
+
+Read by pycolmap (the extra `colmap`), which knows all versions of the files. Pictures come in the
+order of their names. A name that is a number is the picture's time in seconds (nanoseconds above
+1e12), so that a trajectory fits by time; else pictures are 1 s apart. A model made of pictures
+alone knows no metre (`Recording.has_scale`): `scaled` and `aligned` give it one.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path, PurePath
+from typing import Any
+
+import numpy as np
+
+from topoloc.errors import CalibrationError, MissingExtraError, RecordingError, TrajectoryError
+from topoloc.geometry.alignment import align_scaled_poses
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.recordings.format import SequenceFormat
+from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.json_file import name_below
+from topoloc.recordings.recording import Recording, SequenceView, natural_key
+from topoloc.recordings.text_rows import NANOSECONDS
+from topoloc.recordings.trajectory import frame_poses, read_trajectory
+
+LOOKS_FOR = "cameras and images (.bin or .txt) of COLMAP"
+_FILES = ("cameras", "images", "points3D")
+_BELOW = ("sparse/0", "sparse", "0")
+_MAX_SECONDS = 10**12
+
+
+def recognises(path: Path) -> bool:
+    """Whether this folder is a model, or holds one where COLMAP puts it."""
+    return _model_of(path) is not None
+
+
+def open_colmap(path: Path, images: Path | None = None) -> Recording:
+    """Open a model.
+
+    Args:
+        images: the folder of the pictures that the model names; sought as `images` beside the model
+            or above it where None.
+
+    Raises:
+        RecordingError: no model, damaged, without a picture that has a pose, or no folder of its
+            pictures.
+        CalibrationError: a camera of a model that is not known here.
+        MissingExtraError: pycolmap is not installed.
+    """
+    model = _model_of(path)
+    if model is None:
+        raise RecordingError(f"{path}: not a model of COLMAP, which has {LOOKS_FOR}")
+    root = images or next(
+        (folder for folder in _picture_folders(path, model) if folder.is_dir()), None
+    )
+    if root is None or not root.is_dir():
+        raise RecordingError(
+            f"{path}: the pictures of this model are needed, too; name their folder with --images"
+        )
+    read = _read(model)
+    posed = sorted(
+        (image for image in read.images.values() if image.has_pose),
+        key=lambda image: natural_key(image.name),
+    )
+    if not posed:
+        raise RecordingError(f"{model}: no picture of this model has a pose")
+    names = [name_below(image.name, str(model), RecordingError) for image in posed]
+    cameras = {number: _camera(camera, model) for number, camera in read.cameras.items()}
+    of_images = [cameras[image.camera_id] for image in posed]
+    poses: list[Rigid3 | None] = [_world_from_cam(image, model) for image in posed]
+    same = len(set(of_images)) == 1
+    of_frames = (None, of_images) if not same else (of_images[0], None)
+    return Recording(
+        path.resolve().name,
+        root,
+        names,
+        times_of(names),
+        poses,
+        of_frames[0],
+        cameras=of_frames[1],
+        has_scale=False,
+    )
+
+
+def aligned(sequence: StereoSequence, path: Path) -> StereoSequence:
+    """A model's recording in the world and the metres of a trajectory file: its own poses, moved
+    and scaled to fit best.
+
+    Raises:
+        TrajectoryError: the file is malformed, fits no frame, or its positions fix no scale.
+    """
+    theirs = frame_poses(read_trajectory(path), sequence.t_ns, path)
+    pairs = [
+        (ours, other)
+        for ours, other in zip(sequence.poses, theirs, strict=True)
+        if ours is not None and other is not None
+    ]
+    if not pairs:
+        raise TrajectoryError(f"{path}: no frame has a pose in it and in {sequence.name}")
+    try:
+        scale, world_from_model = align_scaled_poses(
+            [other for _, other in pairs], [ours for ours, _ in pairs]
+        )
+    except TrajectoryError as error:
+        raise TrajectoryError(f"{path}: {error}") from None
+    poses = [
+        None if p is None else world_from_model @ Rigid3(p.rotation, scale * p.translation)
+        for p in sequence.poses
+    ]
+    return SequenceView(sequence, list(range(len(sequence))), poses)
+
+
+def _model_of(path: Path) -> Path | None:
+    if not path.is_dir():
+        return None
+    candidates = (path, *(path / below for below in _BELOW))
+    return next((folder for folder in candidates if _suffix(folder) is not None), None)
+
+
+def _suffix(folder: Path) -> str | None:
+    return next(
+        (
+            suffix
+            for suffix in (".bin", ".txt")
+            if all((folder / f"{name}{suffix}").is_file() for name in _FILES)
+        ),
+        None,
+    )
+
+
+def _picture_folders(path: Path, model: Path) -> list[Path]:
+    absolute = model.resolve()
+    return [folder / "images" for folder in (path, model, absolute.parent, absolute.parent.parent)]
+
+
+def _read(model: Path) -> Any:
+    try:
+        import pycolmap  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        raise MissingExtraError(
+            f"{model}: models of COLMAP need the extra colmap: pip install 'topoloc[colmap]'"
+        ) from None
+    if _suffix(model) == ".bin":
+        _check_counts(model)
+    with _silent(pycolmap):
+        try:
+            read = pycolmap.Reconstruction(str(model))
+            "".join(image.name for image in read.images.values())  # one that is no text raises here
+            return read
+        except (
+            Exception
+        ) as error:  # ValueError, IndexError, RuntimeError: whatever the files make of its C++
+            raise RecordingError(
+                f"{model}: damaged, or no model of COLMAP ({' '.join(str(error).split())[:120]})"
+            ) from None
+
+
+@contextmanager
+def _silent(pycolmap: Any) -> Iterator[None]:
+    """No messages of its log on stderr beside the error that says it."""
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = 3
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = level
+
+
+def _check_counts(model: Path) -> None:
+    """Hold that binary files have room for what their counts announce: pycolmap would read on past
+    the end without end."""
+    for name, length_of in _RECORDS.items():
+        file = model / f"{name}.bin"
+        if not file.is_file():
+            continue
+        data, at = file.read_bytes(), 8
+        try:
+            (count,) = struct.unpack_from("<Q", data)
+            fits = count <= len(data)
+            for _ in range(count if fits else 0):
+                at += length_of(data, at)
+                if at > len(data):
+                    fits = False
+                    break
+        except (struct.error, ValueError):
+            fits = False
+        if not fits:
+            raise RecordingError(
+                f"{file}: damaged, or no model of COLMAP (it ends before what it announces)"
+            )
+
+
+def _image_length(data: bytes, at: int) -> int:
+    end = data.index(b"\0", at + 64)  # after number, rotation, position and camera comes the name
+    return end + 9 + 24 * struct.unpack_from("<Q", data, end + 1)[0] - at
+
+
+def _point_length(data: bytes, at: int) -> int:
+    return (
+        51 + 8 * struct.unpack_from("<Q", data, at + 43)[0]
+    )  # number, position, colour and error; then the track
+
+
+def _frame_length(data: bytes, at: int) -> int:
+    return (
+        68 + 16 * struct.unpack_from("<I", data, at + 64)[0]
+    )  # two numbers and a pose; then what it consists of
+
+
+def _rig_length(data: bytes, at: int) -> int:
+    (count,) = struct.unpack_from("<I", data, at + 4)
+    if count > len(data):
+        raise ValueError("more sensors than bytes")
+    end = at + (16 if count else 8)
+    for _ in range(max(count, 1) - 1):  # beside the first each sensor may have a pose
+        end += 65 if struct.unpack_from("<B", data, end + 8)[0] else 9
+    return end - at
+
+
+_RECORDS = {
+    "images": _image_length,
+    "points3D": _point_length,
+    "frames": _frame_length,
+    "rigs": _rig_length,
+}
+
+
+def _camera(camera: Any, model: Path) -> Camera:
+    try:
+        return Camera.from_colmap(
+            str(camera.model_name),
+            int(camera.width),
+            int(camera.height),
+            tuple(map(float, camera.params)),
+        )
+    except CalibrationError as error:
+        raise CalibrationError(f"{model}: {error}") from None
+
+
+def _world_from_cam(image: Any, model: Path) -> Rigid3:
+    try:
+        return Rigid3.from_matrix(
+            np.asarray(image.cam_from_world().matrix(), dtype=np.float64)
+        ).inverse()
+    except TrajectoryError as error:
+        raise TrajectoryError(f"{model}, {image.name}: {error}") from None
+
+
+def times_of(names: list[str]) -> list[int]:
+    """Nanoseconds: the pictures' names where these are increasing numbers, else their places in the
+    list as seconds."""
+    stems = [PurePath(name).stem for name in names]
+    if all(
+        len(stem) <= 24
+        and stem.replace(".", "", 1).isascii()
+        and stem.replace(".", "", 1).isdigit()
+        for stem in stems
+    ):
+        whole = [stem.partition(".") for stem in stems]
+        is_ns = max(int(seconds or 0) for seconds, _, _ in whole) > _MAX_SECONDS
+        t_ns = [
+            int(seconds or 0) if is_ns else int(seconds or 0) * NANOSECONDS + int(f"{part:0<9.9}")
+            for seconds, _, part in whole
+        ]
+        if all(after > before for before, after in pairwise(t_ns)):
+            return t_ns
+    return [number * NANOSECONDS for number in range(len(names))]
+
+
+FORMAT = SequenceFormat(LOOKS_FOR, recognises, open_colmap, ("images",))

@@ -1,0 +1,156 @@
+"""Pictures of a camera that is running now: a webcam, an RTSP or HTTP stream, a GStreamer pipeline,
+by OpenCV.
+
+A thread reads the source all the time and keeps the newest picture only, so that who is slower than
+the camera gets each picture late by one picture at most, and misses others. Who wants them all (a
+recording) makes the thread wait instead.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+
+from topoloc.errors import RecordingError
+from topoloc.recordings.frame import Image
+from topoloc.recordings.video import opencv_silent
+
+_URL = re.compile(r"(rtsps?|rtmp|https?|udp|tcp)://\S+", re.IGNORECASE)
+_DEVICE = re.compile(r"\d{1,3}|/dev/video\d{1,3}")
+_WAIT_S = 0.2
+_CLOSING_S = 1.0
+
+
+def is_live(source: str) -> bool:
+    """Whether this names a live source and no file: a device number or ``/dev/video0``, a URL, a
+    pipeline with `` ! ``."""
+    if _URL.fullmatch(source) or " ! " in source or source.startswith("/dev/video"):
+        return True
+    return bool(_DEVICE.fullmatch(source)) and not os.path.exists(source)
+
+
+@dataclass(frozen=True, eq=False)
+class LivePicture:
+    """A picture as it arrived: grey (H, W) or RGB (H, W, 3), uint8; `t_ns` is the clock's time
+    then, nanoseconds; `number` counts all that the source gave, also those that nobody took."""
+
+    image: Image
+    t_ns: int
+    number: int
+
+
+class LiveSource:
+    """An open source; iterating gives its pictures until it ends or `stop` is set. A context
+    manager that closes it.
+
+    Args:
+        source: see `is_live`; a video file is read as if it were live.
+        keep_all: no picture is dropped; the source waits.
+        size: width and height (pixels) that the device is asked for.
+        stall_s: seconds without a picture after which the source has stalled.
+
+    Raises:
+        RecordingError: it cannot be opened; while iterating: it has stalled.
+    """
+
+    def __init__(
+        self,
+        source: str,
+        keep_all: bool = False,
+        size: tuple[int, int] | None = None,
+        stall_s: float = 10.0,
+    ) -> None:
+        self.source, self.keep_all, self.stall_s = source, keep_all, stall_s
+        self.num_read, self.stop = 0, threading.Event()
+        self._capture = _open(source, size, stall_s)
+        self._changed, self._newest = threading.Condition(), None
+        self._is_ended = self._is_closed = False
+        self._thread = threading.Thread(target=self._read_on, name=f"live {source}", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> LiveSource:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __iter__(self) -> Iterator[LivePicture]:
+        while (picture := self._next()) is not None:
+            yield picture
+
+    def close(self) -> None:
+        """Let the source go. A read that hangs is left to its own time limit."""
+        with self._changed:
+            self._is_closed = True
+            self._changed.notify_all()
+        self._thread.join(_CLOSING_S)
+
+    def _next(self) -> LivePicture | None:
+        since = time.monotonic()
+        with self._changed:
+            while self._newest is None and not self._is_ended and not self.stop.is_set():
+                if time.monotonic() - since > self.stall_s:
+                    raise RecordingError(f"{self.source}: no picture for {self.stall_s:g} s")
+                self._changed.wait(_WAIT_S)
+            picture, self._newest = self._newest, None
+            self._changed.notify_all()
+        return None if self.stop.is_set() else picture
+
+    def _read_on(self) -> None:
+        """The thread: reads until the source ends or is closed."""
+        last_ns = 0
+        while not self._is_closed:
+            is_read, pixels = self._capture.read()
+            last_ns = max(time.time_ns(), last_ns + 1)
+            with self._changed:
+                if not is_read or pixels is None:
+                    break
+                while self.keep_all and self._newest is not None and not self._is_closed:
+                    self._changed.wait(_WAIT_S)
+                image = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
+                self._newest = LivePicture(image, last_ns, self.num_read)
+                self.num_read += 1
+                self._changed.notify_all()
+        with self._changed:
+            self._is_ended = True
+            self._changed.notify_all()
+        self._capture.release()
+
+
+def _open(source: str, size: tuple[int, int] | None, stall_s: float) -> Any:
+    """An OpenCV capture. Raises RecordingError."""
+    is_pipeline = " ! " in source
+    if is_pipeline and not cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER):
+        raise RecordingError(
+            f"{source}: OpenCV is built without GStreamer here; rtsp://, http:// and device numbers"
+            " go without"
+        )
+    with opencv_silent():
+        if is_pipeline:
+            capture = cv2.VideoCapture(source, cv2.CAP_GSTREAMER)
+        elif _URL.fullmatch(source):
+            limit_ms = round(1e3 * stall_s)
+            limits = [
+                cv2.CAP_PROP_OPEN_TIMEOUT_MSEC,
+                limit_ms,
+                cv2.CAP_PROP_READ_TIMEOUT_MSEC,
+                2 * limit_ms,
+            ]
+            capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, limits)
+        else:
+            capture = cv2.VideoCapture(
+                int(source) if source.isdigit() and not os.path.exists(source) else source
+            )
+        if capture.isOpened() and size is not None:
+            capture.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
+            capture.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
+    if not capture.isOpened():
+        raise RecordingError(f"{source}: no such camera or stream, or it does not answer")
+    return capture

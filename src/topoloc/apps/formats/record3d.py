@@ -1,0 +1,164 @@
+"""Record3D's export of an iPhone's or iPad's recording as EXR and JPG: ``rgb/0.jpg``,
+``depth/0.exr``, ``metadata.json``.
+
+`poses` are rows qx qy qz qw tx ty tz, world_from_cam with ARKit's axes (y up, z back), metres; `K`
+is a 3x3 matrix column by column, `perFrameIntrinsicCoeffs` rows fx fy cx cy, both of pictures of
+`w` x `h`; depth is in metres, of the picture's view and coarser. Where pictures are of another size
+than `w` x `h`, as LiDAR's finer ones are, the calibration is that of `w` x `h` scaled.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from topoloc.apps.formats.nerfstudio import rigid_from_gl
+from topoloc.errors import CalibrationError, RecordingError, TrajectoryError
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3, matrix_from_quat_wxyz
+from topoloc.recordings.format import SequenceFormat
+from topoloc.recordings.json_file import json_number, json_numbers, read_json
+from topoloc.recordings.pictures import image_size
+from topoloc.recordings.recording import (
+    DepthPictures,
+    Recording,
+    list_pictures,
+    natural_key,
+    times_by_rate,
+)
+
+FILE_NAME = "metadata.json"
+LOOKS_FOR = "rgb/ and metadata.json of Record3D's EXR + JPG export"
+_FOLDER = "EXR_RGBD"
+_RATE_HZ = 60
+
+
+def recognises(path: Path) -> bool:
+    """Whether this is such a folder, or holds one."""
+    return _root(path) is not None
+
+
+def open_record3d(path: Path) -> Recording:
+    """Open an export; single pictures with poses where it has no depth.
+
+    Raises:
+        RecordingError: metadata.json is malformed, or poses, times, pictures and depth differ in
+            number.
+        CalibrationError: the intrinsics are missing or not usable.
+        TrajectoryError: a row of the poses is no pose.
+    """
+    root = _root(path)
+    if root is None:
+        raise RecordingError(f"{path}: not an export of Record3D, which has {LOOKS_FOR}")
+    file = root / FILE_NAME
+    data = read_json(file, RecordingError)
+    if not isinstance(data, dict):
+        raise RecordingError(f"{file}: not a JSON object")
+    pictures = list_pictures(root / "rgb")
+    rows = data.get("poses")
+    if not isinstance(rows, list) or len(rows) != len(pictures):
+        raise RecordingError(
+            f"{file}: {len(rows) if isinstance(rows, list) else 0} poses for {len(pictures)}"
+            " pictures"
+        )
+    poses: list[Rigid3 | None] = [_pose(row, f"{file}, pose {k}") for k, row in enumerate(rows)]
+    cameras = _cameras(data, pictures, file)
+    same = len(set(cameras)) == 1
+    return Recording(
+        path.resolve().name,
+        root,
+        [picture.relative_to(root).as_posix() for picture in pictures],
+        _times(data, len(pictures), file),
+        poses,
+        cameras[0] if same else None,
+        depth=_depth(root, pictures),
+        cameras=None if same else cameras,
+    )
+
+
+def _root(path: Path) -> Path | None:
+    candidates = (path, path / _FOLDER, path / "EXR")
+    return next(
+        (
+            folder
+            for folder in candidates
+            if (folder / "rgb").is_dir() and (folder / FILE_NAME).is_file()
+        ),
+        None,
+    )
+
+
+def _pose(row: Any, where: str) -> Rigid3:
+    numbers = json_numbers(row, 7, where, TrajectoryError)
+    length = float(np.linalg.norm(numbers[:4]))
+    if not 0.99 < length < 1.01:
+        raise TrajectoryError(f"{where}: qx qy qz qw is no rotation")
+    x, y, z, w = numbers[:4] / length
+    return rigid_from_gl(Rigid3(matrix_from_quat_wxyz(np.array([w, x, y, z])), numbers[4:]))
+
+
+def _cameras(data: dict[str, Any], pictures: list[Path], file: Path) -> list[Camera]:
+    """The camera of each picture, of the size that the pictures are of."""
+    w, h = (
+        int(json_number(data.get(key), f"{file}: {key}", CalibrationError)) for key in ("w", "h")
+    )
+    width, height = image_size(pictures[0])
+    if abs(width * h - height * w) > max(w, h, width, height):
+        raise CalibrationError(f"{file}: of {w}x{h}, but {pictures[0].name} is {width}x{height}")
+    per_frame = data.get("perFrameIntrinsicCoeffs")
+    if isinstance(per_frame, list) and per_frame:
+        if len(per_frame) != len(pictures):
+            raise CalibrationError(
+                f"{file}: {len(per_frame)} perFrameIntrinsicCoeffs for {len(pictures)} pictures"
+            )
+        numbers = [
+            json_numbers(row, 4, f"{file}, perFrameIntrinsicCoeffs {k}", CalibrationError)
+            for k, row in enumerate(per_frame)
+        ]
+    else:
+        k = json_numbers(data.get("K"), 9, f"{file}: K", CalibrationError)
+        numbers = [k[[0, 4, 6, 7]]] * len(pictures)
+    return [_camera(row, (w, h), (width, height), file) for row in numbers]
+
+
+def _camera(
+    numbers: Float[np.ndarray, "4"], stated: tuple[int, int], size: tuple[int, int], file: Path
+) -> Camera:
+    try:
+        return Camera.pinhole(*stated, *numbers.tolist()).rescaled(*size)
+    except CalibrationError as error:
+        raise CalibrationError(f"{file}: {error}") from None
+
+
+def _times(data: dict[str, Any], count: int, file: Path) -> list[int]:
+    """Nanoseconds; by the frame rate where the export has no times."""
+    seconds = data.get("frameTimestamps")
+    if not isinstance(seconds, list) or not seconds:
+        fps = json_number(data.get("fps", _RATE_HZ), f"{file}: fps", RecordingError)
+        return times_by_rate(count, round(fps) if fps >= 1.0 else _RATE_HZ)
+    numbers = json_numbers(seconds, count, f"{file}: frameTimestamps", RecordingError)
+    if np.any(np.diff(numbers) <= 0.0) or np.abs(numbers).max() > 1e9 * 9:
+        raise RecordingError(f"{file}: frameTimestamps do not increase from frame to frame")
+    return [round(float(number) * 1e9) for number in numbers]
+
+
+def _depth(root: Path, pictures: list[Path]) -> DepthPictures | None:
+    folder = root / "depth"
+    if not folder.is_dir():
+        return None
+    paths = sorted(
+        (file for file in folder.iterdir() if file.suffix.lower() == ".exr"),
+        key=lambda file: natural_key(file.name),
+    )
+    if [file.stem for file in paths] != [picture.stem for picture in pictures]:
+        raise RecordingError(
+            f"{folder}: {len(paths)} EXR files, but {len(pictures)} pictures in rgb/; every picture"
+            " needs its partner"
+        )
+    return DepthPictures(paths, 1.0, None, Rigid3.identity())
+
+
+FORMAT = SequenceFormat(LOOKS_FOR, recognises, open_record3d)

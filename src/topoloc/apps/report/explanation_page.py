@@ -1,0 +1,217 @@
+"""An explanation as one self-contained page."""
+
+from __future__ import annotations
+
+import base64
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from topoloc.apps.report.explanation import Explanation, TriedPose
+from topoloc.apps.report.match_pictures import JPEG_QUALITY, NodeMatches, draw_pair
+from topoloc.apps.report.page_shell import page_text
+from topoloc.localization.result import Localization
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.atomic import write_text
+from topoloc.recordings.frame import Image
+from topoloc.recordings.pictures import jpeg_of
+from topoloc.retrieval.network_pictures import decode_picture
+
+_POSES = (
+    "Of each first pose: points were sought where the map expects them, and weighed. Found counts"
+    " those of all that must be in view."
+)
+_MAX_SHOWN, MAX_MATCHES = 3, 300
+_COLUMNS = (
+    "tried",
+    "features",
+    "near node",
+    "first inliers",
+    "found",
+    "by chance",
+    "unguided",
+    "probability",
+    "what became of it",
+)
+
+
+def write_explanation(
+    path: Path, name: str, image: Image, explanation: Explanation, topomap: TopoMetricMap
+) -> None:
+    """Write the page, at once or not at all. Raises TopolocError where the file cannot be
+    written."""
+    write_text(path, explanation_page(name, image, explanation, topomap))
+
+
+def explanation_page(
+    name: str, image: Image, explanation: Explanation, topomap: TopoMetricMap
+) -> str:
+    """The page, HTML."""
+    title = f"Why {name} {'is here' if explanation.result.localized else 'was not localized'}"
+    advice = (
+        "".join(f"<li>{escape(line)}</li>" for line in explanation.advice)
+        or "<li>Nothing is amiss.</li>"
+    )
+    table = (
+        '<div class="wide" tabindex="0" role="region" aria-label="What was'
+        f' tried">{_table(explanation)}</div>'
+    )
+    sections = (
+        '<section style="margin-top:-48px"><h2>What would'
+        f" help</h2><ul>{advice}</ul></section><section><h2>What it was compared"
+        f" with</h2><p>{_shown_words(explanation)}</p>{_pairs(image, explanation, topomap)}</section><section><h2>What"  # noqa: E501
+        f" was tried</h2><p>{_POSES}</p>{table}</section>"
+    )
+    return page_text(title, verdict(explanation), sections)
+
+
+def verdict(explanation: Explanation) -> str:
+    """The result in one sentence."""
+    result = explanation.result
+    if not isinstance(result, Localization):
+        return (
+            f"Not localized: {result.reason.replace('_', ' ')}. {len(explanation.poses)} poses were"
+            " looked into."
+        )
+    x, y, z = result.world_from_cam.translation
+    sigmas = f"{100.0 * result.position_sigma_m:.1f} cm, {result.rotation_sigma_deg:.2f} deg"
+    return (
+        f"At ({x:.2f}, {y:.2f}, {z:.2f}) m near node {result.node_id}, probability"
+        f" {result.probability:.2f}, standard deviations {sigmas}."
+    )
+
+
+def _ranked(explanation: Explanation) -> list[TriedPose]:
+    """The poses that are shown, the likeliest first, each node once."""
+    with_pose = [
+        pose for pose in explanation.poses if pose.fit.pose is not None and pose.fit.node_id >= 0
+    ]
+    with_pose.sort(key=lambda pose: (pose.probability or 0.0, pose.fit.num_inliers), reverse=True)
+    return list({pose.fit.node_id: pose for pose in reversed(with_pose)}.values())[::-1][
+        :_MAX_SHOWN
+    ]
+
+
+def _shown_words(explanation: Explanation) -> str:
+    if not _ranked(explanation):
+        return (
+            "No pose came of any part of the map; beside it stands the node that looks most"
+            " like it."
+        )
+    return "Left the picture, right the node of the map. Lines join what the pose explains."
+
+
+def _pairs(image: Image, explanation: Explanation, topomap: TopoMetricMap) -> str:
+    articles = [_article(image, pose, topomap) for pose in _ranked(explanation)]
+    if not articles and explanation.result.candidates:
+        node = topomap.nodes[topomap.row_of(explanation.result.candidates[0].node_id)]
+        pair = draw_pair(image, decode_picture(node.template_jpeg))
+        articles = [_figure(pair, f"left the picture, right node {node.summary.node_id}")]
+    return '<div class="queries">' + "".join(articles) + "</div>"
+
+
+def compared_json(
+    image: Image, explanation: Explanation, topomap: TopoMetricMap
+) -> list[dict[str, Any]]:
+    """The likeliest poses as the page shows them; rows of `matches` are a pixel of the picture and
+    one of the node's camera."""
+    compared = list[dict[str, Any]]()
+    for pose in _ranked(explanation):
+        node, matches = (
+            topomap.nodes[topomap.row_of(pose.fit.node_id)],
+            _matches_of(image, pose, topomap),
+        )
+        pixels = np.column_stack([matches.points_query, matches.points_node]).round(1)[:MAX_MATCHES]
+        facts = {
+            "node": pose.fit.node_id,
+            "node_size": [node.camera.width, node.camera.height],
+            "verdict": pose.verdict,
+        }
+        compared.append(facts | {"num_inliers": _num_inliers(pose), "matches": pixels.tolist()})
+    return compared
+
+
+def _matches_of(image: Image, pose: TriedPose, topomap: TopoMetricMap) -> NodeMatches:
+    """What the pose explains, as far as its node would see it."""
+    node, fit = topomap.nodes[topomap.row_of(pose.fit.node_id)], pose.fit
+    assert fit.pose is not None
+    rows = np.flatnonzero(fit.pose.inliers)
+    scale = image.shape[1] / fit.camera.width
+    query = (
+        fit.features.points_img[fit.matches.query_idx[rows]].astype(np.float64) + 0.5
+    ) * scale - 0.5
+    points = fit.local_map.points_world[fit.matches.train_idx[rows]]
+    seen = node.camera.img_from_cam(node.summary.world_from_cam.inverse().apply(points))
+    inside = (
+        np.isfinite(seen).all(axis=1)
+        & (seen >= 0).all(axis=1)
+        & (seen < [node.camera.width, node.camera.height]).all(axis=1)
+    )
+    return NodeMatches(
+        query[inside], seen[inside], np.full(int(inside.sum()), pose.verdict == "the answer")
+    )
+
+
+def _num_inliers(pose: TriedPose) -> int:
+    return 0 if pose.fit.pose is None else int(pose.fit.pose.inliers.sum())
+
+
+def _article(image: Image, pose: TriedPose, topomap: TopoMetricMap) -> str:
+    node = topomap.nodes[topomap.row_of(pose.fit.node_id)]
+    pair = draw_pair(
+        image, decode_picture(node.template_jpeg), _matches_of(image, pose, topomap), node.camera
+    )
+    kind = "good" if pose.verdict == "the answer" else "bad"
+    node_id = node.summary.node_id
+    facts = (
+        f'<div class="facts"><b>node {node_id}, {_num_inliers(pose)} inliers</b><p'
+        f' class="{kind}">{escape(pose.verdict)}</p></div>'
+    )
+    return f"<article>{_figure(pair, f'left the picture, right node {node_id}')}{facts}</article>"
+
+
+def _figure(pair: Image, caption: str) -> str:
+    data = base64.b64encode(jpeg_of(pair, JPEG_QUALITY)).decode("ascii")
+    return (
+        f'<figure><img alt="{caption}"'
+        f' src="data:image/jpeg;base64,{data}"><figcaption>{caption}</figcaption></figure>'
+    )
+
+
+def _table(explanation: Explanation) -> str:
+    head = "".join(f"<th>{name}</th>" for name in _COLUMNS)
+    rows = [zip(_COLUMNS, row_of(pose), strict=True) for pose in explanation.poses]
+    body = "".join(
+        "<tr>"
+        + "".join(f'<td data-column="{name}">{escape(cell)}</td>' for name, cell in row)
+        + "</tr>"
+        for row in rows
+    )
+    return f'<table class="tried folds"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
+
+
+def row_of(pose: TriedPose) -> tuple[str, ...]:
+    """What `_COLUMNS` name, as text."""
+    evidence = pose.tried.hypothesis.evidence if pose.tried.hypothesis is not None else None
+    node = str(pose.fit.node_id) if pose.fit.node_id >= 0 else ""
+    first = f"{pose.tried.first.num_inliers} of {len(pose.tried.first.matches)}"
+    if evidence is None:
+        return pose.tried.source, pose.tried.features, node, first, "", "", "", "", pose.verdict
+    found, unguided = (
+        f"{evidence.num_found} of {evidence.num_visible}",
+        f"{evidence.num_inliers} of {evidence.num_matches}",
+    )
+    probability = "" if pose.probability is None else f"{pose.probability:.2f}"
+    return (
+        pose.tried.source,
+        pose.tried.features,
+        node,
+        first,
+        found,
+        str(evidence.num_by_chance),
+        unguided,
+        probability,
+        pose.verdict,
+    )

@@ -1,0 +1,177 @@
+"""The part of a report that shows single queries: the worst, and a typical one of each recording,
+each beside its node."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from html import escape
+
+import numpy as np
+
+from topoloc.apps.report.match_pictures import JPEG_QUALITY, NodeMatches, draw_pair, match_with_node
+from topoloc.errors import UnreadableImageError
+from topoloc.evaluation.metrics import (
+    MAX_ROTATION_DEG,
+    MAX_TRANSLATION,
+    Answer,
+    by_recording,
+    length_text,
+)
+from topoloc.localization.result import Localization, NotLocalized
+from topoloc.mapping.topomap import TopoMetricMap, TopoNode
+from topoloc.recordings.frame import Image
+from topoloc.recordings.pictures import jpeg_of
+from topoloc.retrieval.network_pictures import decode_picture
+
+NUM_WORST = 6
+
+
+def worst_queries(answers: Sequence[Answer], count: int = NUM_WORST) -> list[Answer]:
+    """False accepts first, then queries without a pose that should have one, then the largest
+    errors.
+
+    Where there are several recordings each gets its share of the places, so that a hard one does
+    not hide the others.
+    """
+    groups = by_recording([a for a in answers if a.world_from_cam is not None or a.is_false_accept])
+    share = max(count // max(len(groups), 1), 1)
+    ranked = [
+        (rank, answer)
+        for group in groups.values()
+        for rank, answer in enumerate(sorted(group, key=_badness, reverse=True))
+    ]
+    ranked.sort(key=lambda entry: (entry[0] < share, _badness(entry[1])), reverse=True)
+    return sorted((answer for _, answer in ranked[:count]), key=_badness, reverse=True)
+
+
+def typical_queries(answers: Sequence[Answer]) -> list[Answer]:
+    """Of each recording the query with the median error; the middle one where none was
+    localized."""
+    typical = []
+    for group in by_recording(answers).values():
+        localized = sorted(
+            (a for a in group if np.isfinite(a.translation_m)), key=lambda a: a.translation_m
+        )
+        chosen = localized or group
+        typical.append(chosen[(len(chosen) - 1) // 2])
+    return typical
+
+
+def gallery(answers: Sequence[Answer], topomap: TopoMetricMap) -> str:
+    """HTML of these queries, each with its picture, its node's, the matches between them, and what
+    came of it."""
+    return (
+        '<div class="queries">'
+        + "".join(_article(answer, topomap) for answer in answers)
+        + "</div>"
+    )
+
+
+def _badness(answer: Answer) -> tuple[int, float]:
+    if answer.world_from_cam is None:
+        return 2 * answer.is_false_accept, 0.0
+    if isinstance(answer.result, NotLocalized):
+        return 1, 0.0
+    return 2 * answer.is_false_accept, max(
+        answer.translation_m / MAX_TRANSLATION, answer.rotation_deg / MAX_ROTATION_DEG
+    )
+
+
+def _article(answer: Answer, topomap: TopoMetricMap) -> str:
+    result = answer.result
+    node_id = _node_to_show(answer)
+    node = None if node_id is None else topomap.nodes[topomap.row_of(node_id)]
+    evidence = f"{result.num_inliers} inliers of {result.num_matches} matches"
+    if isinstance(result, Localization):
+        sigma = float(np.sqrt(max(np.trace(result.camera_covariance[:3, :3]), 0.0)))
+        evidence += (
+            f", probability {result.probability:.2f}, its own standard deviation"
+            f" {length_text(sigma)}"
+        )
+    if answer.nearest_node_id is not None and answer.nearest_node_id != node_id:
+        evidence += f"; nearest to the truth is node {answer.nearest_node_id}"
+    kind = (
+        "good"
+        if result.localized != (answer.world_from_cam is None) and not answer.is_false_accept
+        else "bad"
+    )
+    title = escape(f"{answer.recording}/{answer.query}" if answer.recording else answer.query)
+    return (
+        f'<article>{_pictures(answer, node, topomap)}<div class="facts"><b>{title}</b>'
+        f'<p class="{kind}">{_verdict(answer)}</p><p>{evidence}</p></div></article>'
+    )
+
+
+def _node_to_show(answer: Answer) -> int | None:
+    """The node that the pose comes from; without a pose, the one that the picture should have been
+    matched with."""
+    if isinstance(answer.result, Localization):
+        return answer.result.node_id
+    if answer.nearest_node_id is not None:
+        return answer.nearest_node_id
+    return answer.result.candidates[0].node_id if answer.result.candidates else None
+
+
+def _verdict(answer: Answer) -> str:
+    if isinstance(answer.result, NotLocalized):
+        reason = answer.result.reason.replace("_", " ")
+        return (
+            f"rightly rejected: {reason}"
+            if answer.world_from_cam is None
+            else f"not localized: {reason}"
+        )
+    if answer.world_from_cam is None:
+        return "false accept: this image was not taken here"
+    error = f"{length_text(answer.translation_m)}, {answer.rotation_deg:.2f}°"
+    return f"false accept: off by {error}" if answer.is_false_accept else f"off by {error}"
+
+
+def _pictures(answer: Answer, node: TopoNode | None, topomap: TopoMetricMap) -> str:
+    image = _query_image(answer)
+    if image is None:
+        shown, caption = (
+            node.template_jpeg if node else None,
+            "the query's picture cannot be read any more",
+        )
+    elif node is None:
+        shown, caption = (
+            jpeg_of(draw_pair(image, None), JPEG_QUALITY),
+            "query; no node to compare it with",
+        )
+    else:
+        pair = draw_pair(
+            image,
+            decode_picture(node.template_jpeg),
+            _matches(answer, image, node, topomap),
+            node.camera,
+        )
+        shown = jpeg_of(pair, JPEG_QUALITY)
+        caption = f"left the query, right node {node.summary.node_id}"
+    return f"<figure>{_img(shown, caption)}<figcaption>{caption}</figcaption></figure>"
+
+
+def _matches(
+    answer: Answer, image: Image, node: TopoNode, topomap: TopoMetricMap
+) -> NodeMatches | None:
+    """Matches to draw; None where the node has no points or the camera is not known."""
+    if answer.camera is None or node.summary.num_points == 0:
+        return None
+    return match_with_node(answer, image, answer.camera, node, topomap.config.features)
+
+
+def _query_image(answer: Answer) -> Image | None:
+    """The query's picture, read again; None where it cannot be had any more."""
+    try:
+        return answer.read_image() if answer.read_image else None
+    except UnreadableImageError:
+        return None
+
+
+def _img(jpeg: bytes | None, words: str) -> str:
+    if jpeg is None:
+        return ""
+    return (
+        f'<img loading="lazy" src="data:image/jpeg;base64,{base64.b64encode(jpeg).decode("ascii")}"'
+        f' alt="{escape(words)}">'
+    )

@@ -1,0 +1,80 @@
+"""The camera that a request names.
+
+Nothing (what EXIF says of the focal length, else any usual lens), ``exif`` (the same), ``unknown``,
+``map``, ``fx,fy,cx,cy`` in pixels, or a JSON object: parameters by name as in camera.json, or
+COLMAP's `model` and `params` in its own convention, where the centre of the top-left pixel is (0.5,
+0.5). Files of the server are none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from topoloc.apps.service.asked import json_of
+from topoloc.errors import CalibrationError
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rough_camera import RoughCamera
+from topoloc.localization.query_camera import named_camera
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.calibration import calibration_of_numbers
+from topoloc.recordings.pictures import PictureBytes, exif_focal_length
+
+_MAX_PARAMS = 20
+
+
+def camera_named(
+    text: str | None, picture: PictureBytes, size: tuple[int, int], topomap: TopoMetricMap | None
+) -> Camera | RoughCamera:
+    """The camera of a picture of this width and height (pixels); `map` only where one map is asked.
+
+    Raises:
+        CalibrationError, QueryError: it is none, or of another picture.
+        Refusal: what looks like JSON is none.
+    """
+    width, height = size
+    text = (text or "exif").strip()
+    if text == "exif":
+        focal = exif_focal_length(picture, width, height)
+        return (
+            RoughCamera.unknown(width, height)
+            if focal is None
+            else RoughCamera.noted(width, height, focal)
+        )
+    if text == "unknown" or (text == "map" and topomap is not None):
+        return named_camera(text, topomap)(width, height)
+    if text.startswith("{"):
+        return camera_of_json(json_of(text, "camera"), width, height)
+    if "," in text:
+        return calibration_of_numbers(text)(width, height).camera
+    raise CalibrationError(
+        f"camera {text[:40]!r}: exif, unknown, map, fx,fy,cx,cy or a JSON object is expected"
+    )
+
+
+def camera_of_json(data: Any, width: int, height: int) -> Camera:
+    """The camera of an object; its size is the picture's where it names none.
+
+    Raises:
+        CalibrationError: it is no camera.
+    """
+    if not isinstance(data, Mapping):
+        raise CalibrationError("camera: a JSON object is expected")
+    sized: dict[str, Any] = {"width": width, "height": height, **data}
+    if "params" not in sized:
+        return Camera.from_json(sized)
+    params, size = sized["params"], (sized["width"], sized["height"])
+    if (
+        not isinstance(params, list)
+        or len(params) > _MAX_PARAMS
+        or not all(_is_number(value) for value in [*params, *size])
+    ):
+        raise CalibrationError("camera: params must be a list of numbers, width and height numbers")
+    return Camera.from_colmap(
+        str(sized.get("model", "PINHOLE")), int(size[0]), int(size[1]), tuple(map(float, params))
+    )
+
+
+def _is_number(value: Any) -> bool:
+    """One that fits into the bounds of a camera; NaN and the infinite are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e9

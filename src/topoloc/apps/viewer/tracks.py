@@ -1,0 +1,193 @@
+"""Tracks: which points of a map's nodes are one and the same point, and which nodes therefore see
+it.
+
+Every node keeps points of its own. Those of one node are sought in its neighbours' pictures where
+they must be seen (`localization/guided.py`), and what is found to be one is joined, the most alike
+first; no track has two key points of one picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from topoloc.features.kinds import find_kind
+from topoloc.localization.guided import GuidedConfig, match_guided
+from topoloc.localization.local_map import LocalMap
+from topoloc.mapping.entries import TopoNode
+from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.topomap import TopoMetricMap
+
+NUM_NEIGHBOURS = 8
+MAX_ERROR_PX = 3.0
+"""Of a picture whose longer side is 640 pixels: key points further from where a point must be seen
+do not show it."""
+_GUIDED = GuidedConfig(radius_px=MAX_ERROR_PX)
+_NUM_STEPS = 5
+_LEAST_SIGMA = 1e-4  # metres; no map knows its points better
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Point k lies at `points_world[k]` (metres). Key point i, all nodes' in their order, shows the
+    point `point_rows[i]`, or -1 where it agrees with none. `errors_px[i]` is how far it is from the
+    point's projection (NaN: behind the camera)."""
+
+    points_world: Float[np.ndarray, "n 3"]
+    point_rows: Int[np.ndarray, " m"]
+    errors_px: Float[np.ndarray, " m"]
+
+
+def find_tracks(
+    topomap: TopoMetricMap, rows: list[int], progress: Callable[[str, int, int], None] | None = None
+) -> Tracks:
+    """Tracks through these nodes. Raises MapError from reading them."""
+    nodes = [topomap.nodes[row] for row in rows]
+    starts = np.concatenate([[0], np.cumsum([len(node.points_cam) for node in nodes])]).astype(
+        np.int64
+    )
+    maps = [LocalMap.of_node(node) for node in nodes]
+    pairs = [np.zeros((0, 3))]
+    poses = NodePoses.of([node.summary.world_from_cam for node in nodes])
+    config = _GUIDED.resolved(find_kind(topomap.kind))
+    for a, node in enumerate(nodes):
+        order = np.argsort(
+            node_distances(node.summary.world_from_cam, poses, topomap.config.lambda_rot),
+            kind="stable",
+        )
+        for b in (int(k) for k in order[: NUM_NEIGHBOURS + 1] if k != a):
+            other = nodes[b]
+            found = match_guided(
+                other.features,
+                maps[a],
+                other.summary.world_from_cam.inverse(),
+                other.camera,
+                config,
+            )
+            pairs.append(
+                np.column_stack(
+                    [starts[a] + found.train_idx, starts[b] + found.query_idx, found.distances]
+                )
+            )
+        if progress:
+            progress("tracks", a + 1, len(nodes))
+    labels = _joined(np.concatenate(pairs), np.repeat(np.arange(len(nodes)), np.diff(starts)))
+    return _located(labels, nodes, maps)
+
+
+def _joined(
+    pairs: Float[np.ndarray, "p 3"], of_node: Int[np.ndarray, " m"]
+) -> Int[np.ndarray, " m"]:
+    """A label for each point: that of the points that it is one with. Rows of `pairs`: two points,
+    and how unlike they are."""
+    parents, seen_by = list(range(len(of_node))), [{int(node)} for node in of_node]
+
+    def root(i: int) -> int:
+        while parents[i] != i:
+            parents[i] = parents[parents[i]]
+            i = parents[i]
+        return i
+
+    for one, other in pairs[np.argsort(pairs[:, 2], kind="stable"), :2].astype(np.int64).tolist():
+        low, high = sorted((root(one), root(other)))
+        if low != high and seen_by[low].isdisjoint(seen_by[high]):
+            parents[high] = low
+            seen_by[low] |= seen_by[high]
+    return np.unique([root(i) for i in range(len(parents))], return_inverse=True)[1].astype(
+        np.int64
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _KeyPoints:
+    """All key points of the nodes: key point i shows the point `labels[i]`, at `normalized[i]` on
+    the plane z = 1 of its camera."""
+
+    labels: Int[np.ndarray, " m"]
+    normalized: Float[np.ndarray, "m 2"]
+    focals: Float[np.ndarray, " m"]
+    max_errors_px: Float[np.ndarray, " m"]
+    rotations: Float[np.ndarray, "m 3 3"]
+    translations: Float[np.ndarray, "m 3"]
+
+    @staticmethod
+    def of(nodes: list[TopoNode], labels: Int[np.ndarray, " m"]) -> _KeyPoints:
+        counts = [len(node.points_cam) for node in nodes]
+        poses = [node.summary.world_from_cam.inverse() for node in nodes]
+        sides = np.array([max(node.camera.width, node.camera.height) for node in nodes], np.float64)
+        seen = [
+            node.camera.normalized_from_img(node.features.points_img.astype(np.float64))
+            for node in nodes
+        ]
+        return _KeyPoints(
+            labels,
+            np.concatenate(seen),
+            np.repeat([node.camera.fx for node in nodes], counts),
+            np.repeat(MAX_ERROR_PX * np.maximum(sides / 640.0, 0.5), counts),
+            np.repeat(np.array([pose.rotation for pose in poses]), counts, axis=0),
+            np.repeat(np.array([pose.translation for pose in poses]), counts, axis=0),
+        )
+
+    def residuals(
+        self, points: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 3"]]:
+        """How far each is from its point's projection, pixels of an undistorted picture; and the
+        points in the cameras."""
+        points_cam = (
+            np.einsum("mij,mj->mi", self.rotations, points[self.labels]) + self.translations
+        )
+        z = np.where(points_cam[:, 2] > 1e-3, points_cam[:, 2], np.nan)
+        return (points_cam[:, :2] / z[:, None] - self.normalized) * self.focals[:, None], points_cam
+
+
+def _located(labels: Int[np.ndarray, " m"], nodes: list[TopoNode], maps: list[LocalMap]) -> Tracks:
+    """Each track's point by least squares: where its nodes have it, by their covariances, and where
+    their key points are."""
+    num_points, key_points = int(labels.max(initial=-1)) + 1, _KeyPoints.of(nodes, labels)
+    prior, pull = np.zeros((num_points, 3, 3)), np.zeros((num_points, 3))
+    information = np.linalg.inv(
+        np.concatenate([part.covariances for part in maps]) + _LEAST_SIGMA**2 * np.eye(3)
+    )
+    np.add.at(prior, labels, information)
+    np.add.at(
+        pull,
+        labels,
+        np.einsum("mij,mj->mi", information, np.concatenate([part.points_world for part in maps])),
+    )
+    points = first = np.linalg.solve(prior, pull[:, :, None])[:, :, 0]
+    for _ in range(_NUM_STEPS):
+        points = points + _step(points, first, prior, key_points)
+    errors = np.linalg.norm(key_points.residuals(points)[0], axis=1)
+    kept = errors <= key_points.max_errors_px  # NaN is not
+    of_kept, places = np.unique(labels[kept], return_inverse=True)
+    point_rows = np.full(len(labels), -1, np.int64)
+    point_rows[kept] = places
+    return Tracks(points[of_kept], point_rows, errors)
+
+
+def _step(
+    points: Float[np.ndarray, "n 3"],
+    first: Float[np.ndarray, "n 3"],
+    prior: Float[np.ndarray, "n 3 3"],
+    key_points: _KeyPoints,
+) -> Float[np.ndarray, "n 3"]:
+    """One step of Gauss-Newton, every point on its own; key points off by more than a pixel count
+    less (Huber)."""
+    residuals, points_cam = key_points.residuals(points)
+    used = np.isfinite(residuals[:, 0])
+    labels, residuals, points_cam = key_points.labels[used], residuals[used], points_cam[used]
+    by_cam, by_depth = np.zeros((len(labels), 2, 3)), key_points.focals[used] / points_cam[:, 2]
+    by_cam[:, 0, 0] = by_cam[:, 1, 1] = by_depth
+    by_cam[:, :, 2] = -by_depth[:, None] * points_cam[:, :2] / points_cam[:, 2:]
+    jacobians = by_cam @ key_points.rotations[used]
+    weighted = (
+        jacobians.transpose(0, 2, 1)
+        / np.maximum(np.linalg.norm(residuals, axis=1), 1.0)[:, None, None]
+    )
+    information, gradient = prior.copy(), np.einsum("nij,nj->ni", prior, points - first)
+    np.add.at(information, labels, weighted @ jacobians)
+    np.add.at(gradient, labels, np.einsum("mij,mj->mi", weighted, residuals))
+    return -np.linalg.solve(information, gradient[:, :, None])[:, :, 0]

@@ -1,0 +1,255 @@
+"""A node's points made better by the other mapping images that see them too.
+
+One stereo pair or depth image measures a point once, over a short baseline. The mapping images near
+the node see it from elsewhere, at poses that are known; triangulating from all of them, with the
+first measurement as the prior, shrinks the long axis of its uncertainty, and shows up points that
+are not where they seemed (mismatched, or moving). What each session contributed to that is kept as
+sums (`sums.py`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from topoloc.bounds import Above, AtLeast, Between
+from topoloc.features.features import Features
+from topoloc.features.matching import MatchingConfig, match_features
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.mapping.landmark_kernels import add_observations
+from topoloc.mapping.sums import LandmarkSums
+
+_CAUCHY_SCALE = 2.385  # of a residual in standard deviations
+
+
+@dataclass(frozen=True)
+class LandmarkConfig:
+    """How points are re-observed and refined."""
+
+    nodes_per_image: Annotated[int, Between(0, 1000)] = 3
+    """Each mapping image is matched with this many of its nearest nodes; 0 leaves every point as it
+    was first measured."""
+    matching: MatchingConfig = field(default_factory=lambda: MatchingConfig(ratio=0.85))
+    gate: Annotated[float, Above(0)] = 4.0
+    """An observation further from the point's projection than this many standard deviations (of
+    both) is none."""
+    pose_sigma_px: Annotated[float, AtLeast(0)] = 0.7
+    """What the errors of the mapping poses and of rectification add to a key point's own
+    uncertainty, pixels."""
+    num_iterations: Annotated[int, Between(0, 1000)] = 6
+    """Steps of the least squares that refine a point."""
+    max_disagreement: Annotated[float, Above(0)] = 3.0
+    """Points whose refined residuals stay above this many standard deviations (root mean square)
+    are dropped."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """One mapping image's view of a node's points: point `rows[k]` is seen at `normalized[k]`
+    (plane z = 1).
+
+    `sigmas` are standard deviations on that plane, `cam_from_node` the transform into the image's
+    camera. `in_view` are the points that lie in the image's view, seen or not; the image is one of
+    the session `session_id`.
+    """
+
+    rows: Int[np.ndarray, " m"]
+    normalized: Float[np.ndarray, "m 2"]
+    sigmas: Float[np.ndarray, " m"]
+    cam_from_node: Rigid3
+    in_view: Int[np.ndarray, " v"] = field(default_factory=lambda: np.zeros(0, np.int64))
+    session_id: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedPoints:
+    """`agrees` is False for points that their observations contradict; `num_observations` counts
+    images besides the node's own."""
+
+    points_cam: Float[np.ndarray, "n 3"]
+    covariances: Float[np.ndarray, "n 3 3"]
+    num_observations: Int[np.ndarray, " n"]
+    agrees: Bool[np.ndarray, " n"]
+
+
+def observe_points(
+    node_features: Features,
+    points_cam: Float[np.ndarray, "n 3"],
+    covariances: Float[np.ndarray, "n 3 3"],
+    features: Features,
+    feature_sigmas_px: Float[np.ndarray, " m"],
+    camera: Camera,
+    cam_from_node: Rigid3,
+    config: LandmarkConfig,
+    session_id: int = 0,
+) -> Observations:
+    """Find a node's points among the features of another mapping image: by descriptor, then by
+    where they must be."""
+    matches = match_features(node_features.descriptors, features.descriptors, config.matching)
+    rows, columns = matches.query_idx.astype(np.int64), matches.train_idx
+    normalized = camera.normalized_from_img(features.points_img[columns].astype(np.float64))
+    sigmas = np.hypot(feature_sigmas_px[columns], config.pose_sigma_px) / camera.fx
+    residuals, jacobians, in_front = _project(points_cam[rows], normalized, cam_from_node)
+    expected = jacobians @ covariances[rows] @ jacobians.transpose(0, 2, 1) + sigmas[
+        :, None, None
+    ] ** 2 * np.eye(2)
+    squares = np.einsum("mi,mij,mj->m", residuals, np.linalg.inv(expected), residuals)
+    seen = in_front & (squares < config.gate**2)
+    in_view = _in_view(points_cam, camera, cam_from_node)
+    return Observations(
+        rows[seen], normalized[seen], sigmas[seen], cam_from_node, in_view, session_id
+    )
+
+
+def refine_points(
+    points_cam: Float[np.ndarray, "n 3"],
+    covariances: Float[np.ndarray, "n 3 3"],
+    observations: list[Observations],
+    config: LandmarkConfig,
+) -> RefinedPoints:
+    """Triangulate a node's points (node's camera frame, metres) from all observations, poses held
+    fixed.
+
+    Gauss-Newton, every point on its own, Cauchy's loss on each observation; the first measurement
+    and its covariance are the prior.
+    """
+    prior = np.linalg.inv(covariances)
+    points = points_cam.copy()
+    information = prior
+    for _ in range(config.num_iterations):
+        information, gradient, _ = _normal_equations(points, points_cam, prior, observations)
+        points = points - np.linalg.solve(information, gradient[:, :, None])[:, :, 0]
+    information, _, squares = _normal_equations(points, points_cam, prior, observations)
+    num_observations = np.zeros(len(points), np.int64)
+    for seen in observations:
+        num_observations[seen.rows] += 1
+    rms = np.sqrt(squares / np.maximum(2 * num_observations, 1))
+    agrees = (rms < config.max_disagreement) & np.isfinite(points).all(axis=1) & (points[:, 2] > 0)
+    return RefinedPoints(points, np.linalg.inv(information), num_observations, agrees)
+
+
+def session_sums(
+    refined: Float[np.ndarray, "n 3"],
+    points_cam: Float[np.ndarray, "n 3"],
+    covariances: Float[np.ndarray, "n 3 3"],
+    observations: list[Observations],
+    kept: Int[np.ndarray, " k"],
+    own_session: int,
+) -> list[LandmarkSums]:
+    """What each session contributed to the `refined` positions of the points `kept`, whose rows are
+    counted anew.
+
+    Args:
+        points_cam, covariances: the first measurement, which belongs to the session `own_session`;
+            its image saw every point.
+    """
+    prior, sums = np.linalg.inv(covariances), []
+    for session_id in sorted({own_session, *(seen.session_id for seen in observations)}):
+        is_own, of_session = (
+            session_id == own_session,
+            [seen for seen in observations if seen.session_id == session_id],
+        )
+        information, pulls, _ = _normal_equations(
+            refined, points_cam, prior if is_own else np.zeros_like(prior), of_session
+        )
+        expected, num_seen = (np.full(len(refined), int(is_own)) for _ in range(2))
+        for seen in of_session:
+            expected[np.union1d(seen.in_view, seen.rows)] += 1
+            num_seen[seen.rows] += 1
+        rows = np.flatnonzero(expected[kept] > 0)
+        known = kept[rows]
+        if len(rows):
+            sums.append(
+                LandmarkSums.of(
+                    session_id,
+                    rows,
+                    information[known],
+                    pulls[known],
+                    expected[known],
+                    num_seen[known],
+                )
+            )
+    return sums
+
+
+def counted_again(
+    num_points: int, observations: list[Observations], session_id: int
+) -> LandmarkSums | None:
+    """How often a later session's pictures should have shown a node's points, and did; None where
+    they should have shown none.
+
+    The points stay where they are, so of information next to nothing is kept, and the counts alone
+    take room in the file.
+    """
+    expected, num_seen = np.zeros(num_points, np.int64), np.zeros(num_points, np.int64)
+    for seen in observations:
+        expected[np.union1d(seen.in_view, seen.rows)] += 1
+        num_seen[seen.rows] += 1
+    rows = np.flatnonzero(expected > 0)
+    if len(rows) == 0:
+        return None
+    nothing = np.zeros((len(rows), 3, 3)), np.zeros((len(rows), 3))
+    return LandmarkSums.of(session_id, rows, *nothing, expected[rows], num_seen[rows])
+
+
+def _in_view(
+    points_node: Float[np.ndarray, "n 3"], camera: Camera, cam_from_node: Rigid3
+) -> Int[np.ndarray, " v"]:
+    """The points that lie in the camera's picture, whatever may stand before them."""
+    with np.errstate(invalid="ignore"):
+        pixels = camera.img_from_cam(cam_from_node.apply(points_node))
+        inside = (
+            (pixels >= -0.5).all(axis=1)
+            & (pixels[:, 0] < camera.width - 0.5)
+            & (pixels[:, 1] < camera.height - 0.5)
+        )
+    return np.flatnonzero(inside)
+
+
+def _normal_equations(
+    points: Float[np.ndarray, "n 3"],
+    first: Float[np.ndarray, "n 3"],
+    prior: Float[np.ndarray, "n 3 3"],
+    observations: list[Observations],
+) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    """Information, gradient, and the summed squared residuals (in standard deviations) of each
+    point."""
+    offset = points - first
+    information, gradient = prior.copy(), np.einsum("nij,nj->ni", prior, offset)
+    squares = np.einsum("ni,ni->n", gradient, offset)
+    for seen in observations:
+        pose = seen.cam_from_node
+        add_observations(
+            points,
+            seen.rows,
+            seen.normalized,
+            seen.sigmas,
+            pose.rotation,
+            pose.translation,
+            _CAUCHY_SCALE,
+            information,
+            gradient,
+            squares,
+        )
+    return information, gradient, squares
+
+
+def _project(
+    points_node: Float[np.ndarray, "m 3"],
+    normalized: Float[np.ndarray, "m 2"],
+    cam_from_node: Rigid3,
+) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2 3"], Bool[np.ndarray, " m"]]:
+    """Residuals on the plane z = 1, their derivatives by the points, and which points are in front
+    of the camera."""
+    points = cam_from_node.apply(points_node)
+    in_front = points[:, 2] > 1e-3
+    z = np.where(in_front, points[:, 2], 1.0)
+    projected = points[:, :2] / z[:, None]
+    by_cam = np.zeros((len(points), 2, 3))
+    by_cam[:, 0, 0] = by_cam[:, 1, 1] = 1.0 / z
+    by_cam[:, :, 2] = -projected / z[:, None]
+    return projected - normalized, by_cam @ cam_from_node.rotation, in_front

@@ -1,0 +1,200 @@
+"""The frames that a map is made of: read, described, and their features given 3-D positions.
+
+A stereo pair or a depth image locates its features itself. Those of a single picture are located by
+the pictures around it, under the poses that all of them have.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import chain, groupby
+from typing import TypeVar
+
+import cv2
+
+from topoloc.errors import TrajectoryError
+from topoloc.features.bands import in_order
+from topoloc.features.extraction import extract_features
+from topoloc.features.features import Features
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.mapping.config import MapConfig
+from topoloc.mapping.sessions import Light, light_of
+from topoloc.points.metric_points import MetricPoints, keypoint_sigmas, locate_points
+from topoloc.points.motion_points import OtherPicture, choose_pictures, locate_by_motion, usual_step
+from topoloc.recordings.frame import Image, StereoFrame, StereoSequence
+from topoloc.recordings.frame_view import FrameView, frame_view
+from topoloc.recordings.pictures import jpeg_of
+from topoloc.recordings.recording import has_scale, left_frame
+
+R = TypeVar("R")
+
+PLACE_QUALITY = 60  # of the place images' JPEG
+_KEPT_IMAGES = (
+    48  # single pictures locate the points of several nodes; their features are found once
+)
+
+
+@dataclass(frozen=True, eq=False)
+class MappingFrame:
+    """A frame with a pose, not yet read."""
+
+    sequence: StereoSequence
+    session_id: int
+    index: int
+    name: str
+    t_ns: int
+    world_from_cam: Rigid3
+
+    def read(self) -> StereoFrame:
+        """Recordings are read by one thread, and videos best in their order."""
+        return self.sequence[self.index]
+
+    def read_left(self) -> StereoFrame:
+        """As `read`, but for the right or depth picture: whoever only describes the frame needs
+        none."""
+        return left_frame(self.sequence, self.index)
+
+    def view(self, with_depth: bool = True) -> FrameView:
+        return view_of(self.read(), with_depth)
+
+
+@dataclass(frozen=True, eq=False)
+class MappingImage:
+    """What the map needs of a frame once its pixels are let go: its features, by their kinds. The
+    pose is that of `camera`, which rectification may have turned."""
+
+    camera: Camera
+    world_from_cam: Rigid3
+    features: dict[str, Features]
+    place_jpeg: bytes
+    light: Light
+
+
+def view_of(frame: StereoFrame, with_depth: bool = True) -> FrameView:
+    """A frame that was read, made ready for measuring; a single picture has no depth in any
+    case."""
+    return frame_view(frame, with_depth and not _is_single(frame))
+
+
+def _is_single(frame: StereoFrame) -> bool:
+    return frame.right is None and frame.depth is None
+
+
+def posed_frames(sequence: StereoSequence, session_id: int) -> list[MappingFrame]:
+    """The frames of a recording that have a pose.
+
+    Raises:
+        TrajectoryError: none has one, or the poses are of a model without a scale.
+    """
+    if not has_scale(sequence):
+        raise TrajectoryError(
+            f"{sequence.name}: a model of pictures alone has no scale; give --scale METRES (a unit"
+            " of the model in metres), or --trajectory FILE with metric poses"
+        )
+    described = enumerate(zip(sequence.names, sequence.t_ns, sequence.poses, strict=True))
+    frames = [
+        MappingFrame(sequence, session_id, i, name, t_ns, pose)
+        for i, (name, t_ns, pose) in described
+        if pose is not None
+    ]
+    if not frames:
+        raise TrajectoryError(
+            f"{sequence.name}: no frame has a pose; give a trajectory (TUM or KITTI rows) of this"
+            " recording"
+        )
+    return frames
+
+
+def mapping_image(frame: MappingFrame, view: FrameView, config: MapConfig) -> MappingImage:
+    """A frame that has been read, described by all kinds of features."""
+    jpeg = small_jpeg(view.picture, config.place_side_px, PLACE_QUALITY)
+    world_from_view = frame.world_from_cam @ view.view_from_cam.inverse()
+    features = {
+        kind: extract_features(view.grey, config.features_of(kind)) for kind in config.kinds
+    }
+    return MappingImage(view.camera, world_from_view, features, jpeg, light_of(view.picture))
+
+
+def small_jpeg(picture: Image, side_px: int, quality: int) -> bytes:
+    """The picture as JPEG, its shorter side at most `side_px`."""
+    scale = side_px / min(picture.shape[:2])
+    if scale < 1.0:
+        picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return jpeg_of(picture, quality)
+
+
+class PointLocator:
+    """Gives the features of mapping frames their 3-D positions; keeps the last pictures that it
+    looked at for others."""
+
+    def __init__(self, frames: Sequence[MappingFrame], config: MapConfig) -> None:
+        self._config = config
+        self._sessions: dict[int, list[MappingFrame]] = {}
+        for frame in frames:
+            self._sessions.setdefault(frame.session_id, []).append(frame)
+        self._steps = {
+            number: usual_step([frame.world_from_cam for frame in of_it])
+            for number, of_it in self._sessions.items()
+        }
+        self._images: OrderedDict[int, MappingImage] = OrderedDict()
+
+    def for_each(
+        self, work: Callable[[tuple[MappingFrame, StereoFrame]], R], frames: Sequence[MappingFrame]
+    ) -> Iterator[R]:
+        """What work(frame, as read) gives, in their order; several frames at a time, but for single
+        pictures, for which others are read."""
+        for _, of_session in groupby(frames, lambda frame: frame.session_id):
+            read = ((frame, frame.read()) for frame in of_session)
+            first = next(read)
+            yield from (map if _is_single(first[1]) else in_order)(work, chain([first], read))
+
+    def image(self, frame: MappingFrame, view: FrameView) -> MappingImage:
+        """The frame described, from memory where that is possible."""
+        if id(frame) not in self._images:
+            image = mapping_image(frame, view, self._config)
+            if view.right_grey is not None or view.depth is not None:
+                return image
+            self._images[id(frame)] = image
+            if len(self._images) > _KEPT_IMAGES:
+                self._images.popitem(last=False)
+        self._images.move_to_end(id(frame))
+        return self._images[id(frame)]
+
+    def locate(
+        self, frame: MappingFrame, view: FrameView, image: MappingImage
+    ) -> tuple[dict[str, MetricPoints], list[MappingFrame]]:
+        """The positions of a frame's features, by their kinds, and the other frames that these
+        stand on."""
+        if view.right_grey is not None or view.depth is not None:
+            return {
+                kind: locate_points(features, view, self._config.points)
+                for kind, features in image.features.items()
+            }, []
+        frames = self._sessions[frame.session_id]
+        poses = [other.world_from_cam for other in frames]
+        chosen = choose_pictures(
+            poses, frames.index(frame), self._steps[frame.session_id], self._config.motion
+        )
+        others = [frames[k] for k in chosen]
+        images = [self.image(other, other.view()) for other in others]
+        points = {}
+        for kind, features in image.features.items():
+            sigmas = keypoint_sigmas(features, self._config.points)
+            pictures = [self._other(of_other, kind, image) for of_other in images]
+            relative = self._config.points.max_relative_sigma
+            points[kind] = locate_by_motion(
+                features, sigmas, image.camera, pictures, relative, self._config.motion
+            )
+        return points, others
+
+    def _other(self, other: MappingImage, kind: str, image: MappingImage) -> OtherPicture:
+        sigmas = keypoint_sigmas(other.features[kind], self._config.points)
+        return OtherPicture(
+            other.features[kind],
+            sigmas,
+            other.camera,
+            other.world_from_cam.inverse() @ image.world_from_cam,
+        )

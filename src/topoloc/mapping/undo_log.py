@@ -1,0 +1,249 @@
+"""What it takes to take the last edits of a map file back: `lab.topo.undo`, beside `lab.topo`.
+
+An SQLite database with one entry an edit: the rows that the edit removed or changed, and the keys
+of those that it added. The map needs it for nothing else; who removes it can take nothing back. An
+entry holds for the file that its digest names: where a process was killed between writing the one
+file and the other, the next edit sees it and drops the entry.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import zlib
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from topoloc.errors import MapError
+from topoloc.mapping.file import MapFile, check_header
+from topoloc.mapping.schema import ORDER, SCHEMA_VERSION, TABLES, checksum_of, creation_of
+from topoloc.mapping.writing import copy_in_order
+from topoloc.recordings.atomic import remove_leftovers, replaced_file, scratch_file
+
+_APPLICATION_ID = 0x544F5055  # "TOPU"
+_WIDTH = 1 + max(len(columns) for columns in TABLES.values())  # with the checksum
+_ENTRIES = (
+    "CREATE TABLE entries (depth INTEGER PRIMARY KEY, before TEXT NOT NULL, after TEXT NOT NULL,"
+    " whole BLOB)"
+)
+_ROWS = "CREATE TABLE old_rows (depth INTEGER, of_table TEXT, is_kept INTEGER, {})".format(
+    ", ".join(f"v{k}" for k in range(_WIDTH))
+)
+_MAX_BYTES = 4_000_000_000
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One edit that can be taken back: from the file of digest `after` to that of `before`."""
+
+    depth: int
+    before: str
+    after: str
+
+
+def path_of_log(path: Path) -> Path:
+    """The undo file of a map."""
+    return path.with_name(f"{path.name}.undo")
+
+
+def entries_for(log_path: Path, digest: str) -> list[Entry]:
+    """The entries of an undo file that lead back from the map file of this digest, the last edit's
+    first. Raises MapError."""
+    with closing(_opened(log_path)) as log:
+        rows = [
+            Entry(*row)
+            for row in log.execute(
+                "SELECT depth, before, after FROM entries ORDER BY depth DESC"
+            ).fetchall()
+        ]
+    found = list[Entry]()
+    for entry in rows:
+        if entry.after == digest:
+            found.append(entry)
+            digest = entry.before
+    return found
+
+
+def add_entry(path: Path, changed: Path) -> None:
+    """What leads back from the file `changed` to that at `path`. Entries that lead elsewhere are
+    dropped. Raises MapError, OSError."""
+    before, after = (_digest_of(one) for one in (path, changed))
+    depth = max((entry.depth for entry in entries_for(path_of_log(path), before)), default=0) + 1
+    with _rewritten(path) as log:
+        _drop(log, depth)
+        log.execute("INSERT INTO entries VALUES (?, ?, ?, NULL)", (depth, before, after))
+        if check_header(path) == SCHEMA_VERSION:
+            _keep_rows(log, depth, path, changed)
+        if not _leads_back(
+            log, depth, path, changed
+        ):  # an older file, or one that another version of SQLite laid out
+            log.execute("DELETE FROM old_rows WHERE depth = ?", (depth,))
+            log.execute(
+                "UPDATE entries SET whole = ? WHERE depth = ?",
+                (zlib.compress(path.read_bytes(), 3), depth),
+            )
+
+
+def drop_entries(path: Path, depth: int) -> None:
+    """Drop the entries from `depth` on; an undo file without any is removed. Raises MapError,
+    OSError."""
+    if depth <= 1:
+        path_of_log(path).unlink(missing_ok=True)
+        return
+    with _rewritten(path) as log:
+        _drop(log, depth)
+
+
+def write_before(path: Path, entry: Entry, target: Path) -> None:
+    """The map file as it was before an edit, from the one at `path`, which is that after it. Raises
+    MapError where the log is damaged."""
+    try:
+        with closing(_opened(path_of_log(path))) as log:
+            _write_before(log, entry.depth, path, target)
+    except (sqlite3.Error, zlib.error) as error:
+        raise MapError(f"{path_of_log(path)} is damaged: {error}") from error
+
+
+def _opened(file: Path) -> sqlite3.Connection:
+    """An undo file, or an empty one in memory where there is none."""
+    remove_leftovers(file)
+    if not file.exists():
+        log = sqlite3.connect(":memory:", isolation_level=None)
+        log.execute(_ENTRIES)
+        log.execute(_ROWS)
+        return log
+    try:
+        log = sqlite3.connect(
+            f"{file.absolute().as_uri()}?mode=ro&immutable=1", uri=True, isolation_level=None
+        )
+        with closing(log.execute("SELECT sql FROM sqlite_master LIMIT 10")) as tables:
+            found = {sql for (sql,) in tables}
+        if (
+            found == {_ENTRIES, _ROWS}
+            and log.execute("PRAGMA application_id").fetchone()[0] == _APPLICATION_ID
+        ):
+            return log
+        log.close()
+    except sqlite3.Error:
+        pass
+    raise MapError(
+        f"{file} is not the undo file of a map, or damaged; move it away: the map itself does not"
+        " need it"
+    )
+
+
+@contextmanager
+def _rewritten(path: Path) -> Iterator[sqlite3.Connection]:
+    """The undo file of a map, copied to be changed, and put in its place at the end."""
+    with (
+        replaced_file(path_of_log(path)) as temporary,
+        closing(_opened(path_of_log(path))) as before,
+        closing(sqlite3.connect(temporary, isolation_level=None)) as log,
+    ):
+        before.backup(log)
+        for pragma in (
+            "journal_mode = OFF",
+            "synchronous = OFF",
+            f"application_id = {_APPLICATION_ID}",
+        ):
+            log.execute(f"PRAGMA {pragma}")
+        yield log
+        log.execute("VACUUM")
+
+
+def _drop(log: sqlite3.Connection, depth: int) -> None:
+    for table in ("entries", "old_rows"):
+        log.execute(f"DELETE FROM {table} WHERE depth >= ?", (depth,))
+
+
+def _keep_rows(log: sqlite3.Connection, depth: int, path: Path, changed: Path) -> None:
+    """All rows of the old file that are not in the new one, and the keys of all of the new that are
+    not in the old."""
+    for name, of in (("old", path), ("new", changed)):
+        log.execute(f"ATTACH ? AS {name}", (str(of),))
+    log.execute("BEGIN")
+    for table, columns in TABLES.items():
+        keys = ORDER[table]
+        for is_kept, values, of, other in (
+            (1, [*columns, "checksum"], "old", "new"),
+            (0, keys.split(", "), "new", "old"),
+        ):
+            selected = ", ".join([*values, *["NULL"] * (_WIDTH - len(values))])
+            differing = (
+                f"SELECT {keys}, checksum FROM {of}.{table} EXCEPT SELECT {keys}, checksum FROM"
+                f" {other}.{table}"
+            )
+            query = (
+                f"SELECT ?, ?, ?, {selected} FROM {of}.{table} WHERE ({keys}, checksum) IN"
+                f" ({differing}) ORDER BY {keys}"
+            )
+            log.execute(f"INSERT INTO old_rows {query}", (depth, table, is_kept))
+    log.execute("COMMIT")
+    for name in ("old", "new"):
+        log.execute(f"DETACH {name}")
+
+
+def _leads_back(log: sqlite3.Connection, depth: int, path: Path, changed: Path) -> bool:
+    """Whether what is kept makes the file at `path` of the changed one, to the byte."""
+    if check_header(path) != SCHEMA_VERSION:
+        return False
+    with scratch_file(path_of_log(path)) as tried:
+        _write_before(log, depth, changed, tried)
+        return tried.read_bytes() == path.read_bytes()
+
+
+def _write_before(log: sqlite3.Connection, depth: int, path: Path, target: Path) -> None:
+    (whole,) = log.execute("SELECT whole FROM entries WHERE depth = ?", (depth,)).fetchone()
+    if whole is not None:
+        target.write_bytes(zlib.decompressobj().decompress(whole, _MAX_BYTES))
+        return
+    with closing(sqlite3.connect("", isolation_level=None)) as database:
+        database.execute("PRAGMA journal_mode = OFF")
+        database.execute("ATTACH ? AS now", (str(path),))
+        database.execute("BEGIN")
+        for table, columns in TABLES.items():
+            _restore(
+                database, table, [*columns, "checksum"], lambda *asked: _rows_of(log, depth, *asked)
+            )
+        database.execute("COMMIT")
+        database.execute("DETACH now")
+        copy_in_order(database, target)
+
+
+def _restore(database: sqlite3.Connection, table: str, columns: list[str], rows_of: Any) -> None:
+    """A table as it was before: without what was added or changed since, with what is kept of
+    then."""
+    keys = ORDER[table].split(", ")
+    at = [columns.index(key) for key in keys]
+    kept, added = rows_of(table, 1, len(columns)), rows_of(table, 0, len(keys))
+    if any(checksum_of(table, values) != checksum for *values, checksum in kept):
+        raise MapError(
+            f"the undo file of the map is damaged: a row of {table} is not as it was; the map stays"
+            " as it is"
+        )
+    database.execute(creation_of(table))
+    database.execute(
+        f"CREATE TEMP TABLE gone_{table} ({', '.join(keys)}, PRIMARY KEY ({', '.join(keys)}))"
+    )
+    gone = f"INSERT OR IGNORE INTO gone_{table} VALUES ({', '.join('?' * len(keys))})"
+    database.executemany(gone, [*added, *([row[k] for k in at] for row in kept)])
+    left = f"({', '.join(keys)}) NOT IN (SELECT {', '.join(keys)} FROM gone_{table})"
+    database.execute(f"INSERT INTO main.{table} SELECT * FROM now.{table} WHERE {left}")
+    database.executemany(f"INSERT INTO main.{table} VALUES ({', '.join('?' * len(columns))})", kept)
+
+
+def _rows_of(
+    log: sqlite3.Connection, depth: int, table: str, is_kept: int, width: int
+) -> list[tuple[Any, ...]]:
+    columns = ", ".join(f"v{k}" for k in range(width))
+    return log.execute(
+        f"SELECT {columns} FROM old_rows WHERE depth = ? AND of_table = ? AND is_kept = ?",
+        (depth, table, is_kept),
+    ).fetchall()
+
+
+def _digest_of(path: Path) -> str:
+    with closing(MapFile(path)) as file:
+        return file.digest

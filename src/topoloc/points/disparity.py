@@ -1,0 +1,155 @@
+"""How far left and right see a point apart, to a fraction of a pixel; depth images answer as a
+stereo pair would.
+
+SLAM speaks of disparity only: its noise hardly depends on depth, and points far away stay harmless.
+A depth image becomes the disparity that a second camera 8 cm to the right would measure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from topoloc.bounds import Above, Between
+from topoloc.features.bands import run_in_bands
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.stereo import depth_sigmas
+from topoloc.points.epipolar_kernels import match_in_ranges
+from topoloc.points.metric_points import smooth_depth
+from topoloc.recordings.frame import StereoFrame
+from topoloc.recordings.frame_view import FrameView, frame_view
+
+_BASELINE_OF_DEPTH = 0.08
+_MIN_SIGMA_OF_DEPTH_PX = 0.03
+
+
+@dataclass(frozen=True)
+class DisparityConfig:
+    """How disparities are measured."""
+
+    half_px: Annotated[int, Between(1, 50)] = 5
+    """Half side of the window that is correlated along the row."""
+    min_correlation: Annotated[float, Between(-1, 1)] = 0.8
+    """Least normalised correlation of the two pictures."""
+    max_second_correlation: Annotated[float, Between(0, 1)] = 0.95
+    """A second place on the row that correlates with this share of the best makes the point
+    ambiguous."""
+    search_px: Annotated[int, Between(0, 1000)] = 4
+    """A disparity that is known already is sought again this far on either side."""
+    min_sigma_px: Annotated[float, Above(0)] = 0.15
+    """Stereo: what calibration and interpolation leave even of a perfect correlation."""
+    max_sigma_px: Annotated[float, Above(0)] = 1.0
+    """Disparities that are less certain than this are not used."""
+    max_share_of_width: Annotated[float, Between(0, 1)] = 0.2
+    """Largest disparity, as a share of the picture's width."""
+    max_depth_step: Annotated[float, Between(0, 1)] = 0.05
+    """RGB-D: largest spread of depth around a point, as a share of depth; more is the edge of
+    something."""
+
+
+@dataclass(frozen=True)
+class StereoCamera:
+    """A pinhole that measures disparity, too: ``disparity = bf / depth``, bf in pixels times
+    metres."""
+
+    camera: Camera
+    bf: float
+
+    def points_cam(self, measured: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Points (metres) of pixels and disparities (x, y, d); rows of NaN where d is unknown or
+        not positive."""
+        z = self.bf / np.where(measured[:, 2] > 0.0, measured[:, 2], np.nan)
+        return np.column_stack([self.camera.normalized_from_img(measured[:, :2]) * z[:, None], z])
+
+    def project(self, points_cam: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """(x, y, d) of points in the camera's frame; NaN behind it."""
+        z = np.where(points_cam[:, 2] > 1e-9, points_cam[:, 2], np.nan)
+        return np.column_stack([self.camera.img_from_cam(points_cam), self.bf / z])
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredView:
+    """A view of a frame with what measuring in it needs: `left` and `right` are its pictures as
+    floats."""
+
+    view: FrameView
+    stereo: StereoCamera
+    left: Float32[np.ndarray, "h w"]
+    right: Float32[np.ndarray, "h w"] | None
+
+
+def measured_view(frame: StereoFrame) -> MeasuredView:
+    """Raises CalibrationError, RecordingError as `frame_view`."""
+    view = frame_view(frame)
+    left = view.grey.astype(np.float32)
+    if view.right_grey is not None and view.rig is not None:
+        return MeasuredView(
+            view,
+            StereoCamera(view.camera, view.camera.fx * view.rig.baseline),
+            left,
+            view.right_grey.astype(np.float32),
+        )
+    return MeasuredView(
+        view, StereoCamera(view.camera, view.camera.fx * _BASELINE_OF_DEPTH), left, None
+    )
+
+
+def measure_disparities(
+    measured: MeasuredView,
+    points_img: Float32[np.ndarray, "n 2"],
+    guesses_px: Float[np.ndarray, " n"],
+    config: DisparityConfig,
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Disparity of points of the left picture, that of an infinitely far one being 0, and its
+    standard deviation, pixels.
+
+    A point with a guess (not NaN) is sought around it, others on the whole row. NaN where it is not
+    found.
+    """
+    if measured.right is None:
+        return _from_depth(measured, points_img, config)
+    rig = measured.view.rig
+    assert rig is not None
+    at_infinity = rig.left.cx - rig.right.cx
+    largest = int(measured.view.camera.width * config.max_share_of_width)
+    known = np.isfinite(guesses_px)
+    lows = (
+        np.where(known, np.floor(np.nan_to_num(guesses_px) + at_infinity) - config.search_px, 0.0)
+        .clip(0, largest)
+        .astype(np.int64)
+    )
+    nums = np.where(known, 2 * config.search_px + 2, largest + 1)
+    disparities, sigmas = (
+        np.empty(len(points_img), np.float32),
+        np.empty(len(points_img), np.float32),
+    )
+    # The long searches are shared out evenly.
+    order = np.argsort(nums, kind="stable")
+    order = np.concatenate([order[0::2], order[1::2]])
+    points, lows, nums = points_img[order], lows[order], nums[order]
+
+    def run(first: int, last: int) -> None:
+        part = slice(first, last)
+        match_in_ranges(
+            measured.left, measured.right, points[part], lows[part], nums[part], config.half_px,
+            config.min_correlation, config.max_second_correlation, disparities[part], sigmas[part],
+        )  # fmt: skip
+
+    run_in_bands(run, len(points))
+    found, found_sigmas = np.full(len(points), np.nan), np.full(len(points), np.nan)
+    found[order] = disparities.astype(np.float64) - at_infinity
+    found_sigmas[order] = np.hypot(sigmas.astype(np.float64), config.min_sigma_px)
+    good = (found > 0.0) & (found_sigmas < config.max_sigma_px)
+    return np.where(good, found, np.nan), np.where(good, found_sigmas, np.nan)
+
+
+def _from_depth(
+    measured: MeasuredView, points_img: Float32[np.ndarray, "n 2"], config: DisparityConfig
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    assert measured.view.depth is not None
+    depth = smooth_depth(measured.view.depth, points_img, config.max_depth_step)
+    sigmas = measured.stereo.bf / depth**2 * depth_sigmas(depth)
+    return measured.stereo.bf / depth, np.maximum(sigmas, _MIN_SIGMA_OF_DEPTH_PX)

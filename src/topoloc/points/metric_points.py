@@ -1,0 +1,144 @@
+"""3-D positions of a frame's features, with their covariance: from a rectified stereo pair or from
+depth.
+
+What is dropped, and why:
+
+* points that the other camera does not see distinctly, and depths beside a jump in depth: the
+  position would be that of another surface, an outlier that lies on the right ray and so deceives
+  the robust estimator;
+* points whose depth is uncertain by more than a share of itself: as the query moves away from the
+  map's node they slide along their ray by more than the inlier threshold, and their first-order
+  covariance is no longer true.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from topoloc.bounds import Above, Between
+from topoloc.errors import RecordingError
+from topoloc.features.features import Features
+from topoloc.geometry.stereo import (
+    depth_sigmas,
+    depth_sigmas_of_disparity,
+    points_from_depth,
+    points_from_disparity,
+    ray_covariances,
+)
+from topoloc.points.epipolar_kernels import match_in_ranges
+from topoloc.recordings.frame_view import FrameView
+
+# SURF and SIFT describe a neighbourhood of 20 s and 12 sigma; both report sizes of about 7.5 scales
+# across.
+SCALES_PER_SIZE = 1.2 / 9.0
+
+
+@dataclass(frozen=True)
+class MetricPointsConfig:
+    """How features get their 3-D position."""
+
+    max_relative_sigma: Annotated[float, Above(0)] = 0.3
+    """Points whose depth is uncertain (one sigma) by more than this share of it are dropped."""
+    correlation_half_px: Annotated[int, Between(1, 50)] = 5
+    """Stereo: half side of the window that is correlated along the row."""
+    min_correlation: Annotated[float, Between(-1, 1)] = 0.8
+    """Stereo: least normalised correlation of the two pictures."""
+    max_second_correlation: Annotated[float, Between(0, 1)] = 0.97
+    """Stereo: a second place on the row that correlates with this share of the best makes the point
+    ambiguous."""
+    min_sigma_disparity_px: Annotated[float, Above(0)] = 0.12
+    """Stereo: what calibration and interpolation leave even of a perfect correlation."""
+    max_depth_step: Annotated[float, Between(0, 1)] = 0.05
+    """RGB-D: largest spread of depth over the 5x5 neighbourhood, as a share of depth; more is the
+    edge of something."""
+    sigma_scale: Annotated[float, Above(0)] = 0.4
+    """Standard deviation of a key point's position, in units of its scale."""
+
+
+@dataclass(frozen=True, eq=False)
+class MetricPoints:
+    """Row k belongs to feature k; `points_cam` in metres, rows of NaN where `valid` is False."""
+
+    points_cam: Float[np.ndarray, "n 3"]
+    covariances: Float[np.ndarray, "n 3 3"]
+    valid: Bool[np.ndarray, " n"]
+
+
+def locate_points(features: Features, view: FrameView, config: MetricPointsConfig) -> MetricPoints:
+    """The 3-D positions (camera frame of the view) of `features`, which were found in
+    `view.grey`."""
+    if view.right_grey is not None and view.rig is not None:
+        points_cam, sigma_z = _from_stereo(features, view, config)
+    elif view.depth is not None:
+        points_cam, sigma_z = _from_depth(features, view, config)
+    else:
+        raise RecordingError("3-D positions need a stereo pair or a depth image")
+    with np.errstate(invalid="ignore"):
+        valid = np.isfinite(points_cam).all(axis=1) & (
+            sigma_z < config.max_relative_sigma * points_cam[:, 2]
+        )
+    sigma_px = keypoint_sigmas(features, config)
+    covariances = np.full((len(features), 3, 3), np.nan)
+    covariances[valid] = ray_covariances(
+        points_cam[valid], sigma_z[valid], view.camera, sigma_px[valid]
+    )
+    return MetricPoints(np.where(valid[:, None], points_cam, np.nan), covariances, valid)
+
+
+def keypoint_sigmas(features: Features, config: MetricPointsConfig) -> Float[np.ndarray, " n"]:
+    """Standard deviation (pixels) of where a key point is: it grows with the scale it was found
+    at."""
+    return np.maximum(
+        config.sigma_scale * SCALES_PER_SIZE * features.sizes_px.astype(np.float64), 0.3
+    )
+
+
+def _from_stereo(
+    features: Features, view: FrameView, config: MetricPointsConfig
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    assert view.right_grey is not None
+    assert view.rig is not None
+    # Nearer than a quarter of the picture's width in disparity nothing is seen well by both
+    # cameras.
+    max_disparity, num = max(16, view.camera.width // 4), len(features)
+    disparity, sigma = np.empty(num, np.float32), np.empty(num, np.float32)
+    match_in_ranges(
+        view.grey.astype(np.float32), view.right_grey.astype(np.float32), features.points_img, np.zeros(num, np.int64),  # noqa: E501
+        np.full(num, max_disparity + 1), config.correlation_half_px, config.min_correlation, config.max_second_correlation,  # noqa: E501
+        disparity, sigma,
+    )  # fmt: skip
+    sigma = np.hypot(sigma.astype(np.float64), config.min_sigma_disparity_px)
+    points_cam = points_from_disparity(
+        features.points_img.astype(np.float64), disparity.astype(np.float64), view.rig
+    )
+    return points_cam, depth_sigmas_of_disparity(points_cam[:, 2], sigma, view.rig)
+
+
+def _from_depth(
+    features: Features, view: FrameView, config: MetricPointsConfig
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    assert view.depth is not None
+    depth = smooth_depth(view.depth, features.points_img, config.max_depth_step)
+    points_cam = points_from_depth(features.points_img.astype(np.float64), depth, view.camera)
+    return points_cam, depth_sigmas(points_cam[:, 2])
+
+
+def smooth_depth(
+    depth: np.ndarray, points_img: np.ndarray, max_step: float
+) -> Float[np.ndarray, " n"]:
+    """Mean depth of the 5x5 neighbourhood of each pixel; NaN at its edges, and where half of it is
+    unknown."""
+    height, width = depth.shape
+    columns = np.rint(points_img[:, 0]).astype(np.int64)[:, None] + np.tile(np.arange(-2, 3), 5)
+    rows = np.rint(points_img[:, 1]).astype(np.int64)[:, None] + np.repeat(np.arange(-2, 3), 5)
+    window = depth[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)].astype(np.float64)
+    known = np.isfinite(window)
+    enough = known.sum(axis=1) >= 13
+    mean = np.where(known, window, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+    nearest = np.where(known, window, np.inf).min(axis=1)
+    farthest = np.where(known, window, -np.inf).max(axis=1)
+    return np.where(enough & (farthest - nearest <= max_step * mean), mean, np.nan)

@@ -1,0 +1,193 @@
+"""What a calibration is given as: a file of one of the known kinds, or four numbers; and recordings
+with a calibration from outside.
+
+`camera.json`, YAML of OpenCV or Kalibr, or ``fx,fy,cx,cy`` in pixels. Four numbers and some of the
+files do not say of which picture size they are, so a calibration is asked for with that of the
+pictures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+from topoloc.errors import CalibrationError, RecordingError, UnreadableImageError
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rig import StereoRig
+from topoloc.recordings.camera_json import FILE_NAME, CameraFile, read_camera_json
+from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.pictures import image_size
+from topoloc.recordings.recording import Recording
+from topoloc.recordings.stereo_yaml import YAML_SUFFIXES, is_calibration, read_calibration_yaml
+from topoloc.recordings.video import Video
+
+CalibrationOfSize = Callable[[int, int], CameraFile]
+"""The calibration of pictures of this width and height (pixels). Raises CalibrationError."""
+# Principal points of lenses lie within a few percent of the centre; further off they are those of
+# another size or of a part of a picture.
+_SIZE_TOLERANCE, _SAME_SCALE = 0.12, 0.08
+
+
+def calibration_of(text: str | Path) -> CalibrationOfSize:
+    """A calibration by its file, or by four numbers ``fx,fy,cx,cy``.
+
+    Raises:
+        CalibrationError: neither, or the file is not usable; names it.
+    """
+    path = Path(text)
+    if "," in str(text) and not path.exists():
+        return calibration_of_numbers(str(text))
+    if path.suffix.lower() in YAML_SUFFIXES:
+        read_calibration_yaml(path, 1000, 1000)  # complains before the first picture is read
+        return lambda width, height: read_calibration_yaml(path, width, height)
+    camera_file = read_camera_json(path)
+    return lambda width, height: camera_file
+
+
+def calibration_of_numbers(text: str) -> CalibrationOfSize:
+    """The pinhole camera of four numbers ``fx,fy,cx,cy`` (pixels). Raises CalibrationError."""
+    try:
+        fx, fy, cx, cy = map(float, text.split(","))
+    except ValueError:
+        raise CalibrationError(
+            f"{text[:80]}: neither a file nor four numbers fx,fy,cx,cy"
+        ) from None
+    Camera.pinhole(1, 1, fx, fy, cx, cy)  # complains before the first picture is read
+    return lambda width, height: CameraFile(camera_of_numbers(fx, fy, cx, cy, width, height))
+
+
+def camera_of_numbers(
+    fx: float, fy: float, cx: float, cy: float, width: int, height: int
+) -> Camera:
+    """The pinhole camera of four numbers (pixels).
+
+    Raises:
+        CalibrationError: the principal point is that of a picture of another size, or of one turned
+            by 90 degrees.
+    """
+    camera = Camera.pinhole(width, height, fx, fy, cx, cy)
+    across, down = (2.0 * cx + 1.0) / width, (2.0 * cy + 1.0) / height
+    if min(across, down) > 0.0 and max(abs(across - 1.0), abs(down - 1.0)) > _SIZE_TOLERANCE:
+        numbers, picture = (
+            f"fx,fy,cx,cy = {fx:g},{fy:g},{cx:g},{cy:g}",
+            f"this one has {width}x{height}",
+        )
+        own = "a camera.json says for which size it is, where this is meant"
+        if _near(2.0 * cx + 1.0, height, _SIZE_TOLERANCE) and _near(
+            2.0 * cy + 1.0, width, _SIZE_TOLERANCE
+        ):
+            raise CalibrationError(
+                f"{numbers} are those of a picture turned by 90 degrees, of about {height}x{width};"
+                f" {picture} ({own})"
+            )
+        if _near(across, down, _SAME_SCALE) or not (0.0 < cx < width and 0.0 < cy < height):
+            about = f"about {2.0 * cx + 1.0:.0f}x{2.0 * cy + 1.0:.0f} pixels"
+            raise CalibrationError(
+                f"{numbers} are those of a picture of {about}; {picture} ({own})"
+            )
+    return camera
+
+
+def find_calibration(folder: Path) -> CalibrationOfSize | None:
+    """The calibration that lies in a recording's folder: camera.json, else the only YAML file that
+    holds one.
+
+    Raises:
+        CalibrationError: it is not usable, or there are several.
+    """
+    if (folder / FILE_NAME).is_file():
+        return calibration_of(folder / FILE_NAME)
+    found = [
+        path
+        for path in sorted(folder.iterdir())
+        if path.suffix.lower() in YAML_SUFFIXES and path.is_file() and is_calibration(path)
+    ]
+    if len(found) > 1:
+        raise CalibrationError(
+            f"{folder}: several calibrations ({', '.join(path.name for path in found)}); name one"
+            " with --camera"
+        )
+    return calibration_of(found[0]) if found else None
+
+
+def completed(given: CalibrationOfSize, folder: Path) -> CalibrationOfSize:
+    """A calibration from outside; what it does not say of a rectified pair's baseline and of depth
+    is as in the recording's folder."""
+
+    def of_size(width: int, height: int) -> CameraFile:
+        calibration = given(width, height)
+        with suppress(CalibrationError):
+            if own := find_calibration(folder):
+                of_folder = own(width, height)
+                pair = (
+                    of_folder.rig
+                    if of_folder.rig is not None and of_folder.rig.is_rectified
+                    else None
+                )
+                rig = calibration.rig or (
+                    StereoRig.rectified(calibration.camera, pair.baseline) if pair else None
+                )
+                return CameraFile(
+                    calibration.camera, rig, calibration.depth_factor or of_folder.depth_factor
+                )
+        return calibration
+
+    return of_size
+
+
+def recalibrated(sequence: StereoSequence, calibration: CalibrationOfSize) -> StereoSequence:
+    """A recording that brings a calibration of its own, with another one in its place.
+
+    A single camera takes the place of both of a rectified pair, and of that of registered depth.
+
+    Raises:
+        CalibrationError: the calibration is not usable, or is of one camera and the pair is not
+            rectified.
+        RecordingError: a recording of a kind that keeps its own.
+    """
+    if isinstance(sequence, Video):
+        camera = calibration(*sequence.size).camera
+        if (camera.width, camera.height) != sequence.size:
+            raise CalibrationError(
+                f"{sequence.name}: of {sequence.size[0]}x{sequence.size[1]}, the camera of"
+                f" {camera.width}x{camera.height}"
+            )
+        return replace(sequence, camera=camera)
+    if not isinstance(sequence, Recording):
+        raise RecordingError(
+            f"{sequence.name}: a recording of this kind keeps its own calibration; --camera does"
+            " not go with it"
+        )
+    given = calibration(*size_of_first([sequence.root / name for name in sequence.names]))
+    right, depth = sequence.right, sequence.depth
+    if right is not None:
+        if given.rig is None and not right.rig.is_rectified:
+            raise CalibrationError(
+                f"{sequence.name}: its stereo pair is not rectified, so that both cameras'"
+                " calibrations are needed"
+            )
+        right = replace(
+            right, rig=given.rig or StereoRig.rectified(given.camera, right.rig.baseline)
+        )
+    if depth is not None:
+        registered = depth.camera is not None and depth.camera == sequence.camera
+        units = given.depth_factor or depth.units_per_metre
+        depth = replace(
+            depth, camera=given.camera if registered else depth.camera, units_per_metre=units
+        )
+    return replace(sequence, camera=given.camera, cameras=None, right=right, depth=depth)
+
+
+def size_of_first(pictures: Sequence[Path]) -> tuple[int, int]:
+    """Width and height of the first picture that can be read; (0, 0) where none can, which is said
+    when they are asked for."""
+    for path in pictures:
+        with suppress(UnreadableImageError):
+            return image_size(path)
+    return 0, 0
+
+
+def _near(one: float, other: float | int, tolerance: float) -> bool:
+    return abs(one - other) <= tolerance * other

@@ -1,0 +1,81 @@
+"""``camera.json``: the calibration of a recording whose format has none of its own, or of a
+query."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from topoloc.errors import CalibrationError
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rig import StereoRig
+from topoloc.recordings.json_file import json_number, json_rigid, read_json
+
+FILE_NAME = "camera.json"
+
+
+@dataclass(frozen=True)
+class CameraFile:
+    """A camera; of a stereo pair the left one, with its `rig`. `depth_factor` is that of depth
+    pictures: file units a metre."""
+
+    camera: Camera
+    rig: StereoRig | None = None
+    depth_factor: float | None = None
+
+
+def read_camera_json(path: Path) -> CameraFile:
+    """Read a camera.json: one camera, with a "baseline" (metres) where it is the left one of a
+    rectified pair; or two of any calibration, "left" and "right", with "right_from_left" (4x4,
+    metres).
+
+    Raises:
+        CalibrationError: missing, not JSON, a key is missing or out of range; names the file.
+    """
+    data = read_json(path, CalibrationError, "no such camera file")
+    if not isinstance(data, dict):
+        raise CalibrationError(f"{path}: not a JSON object")
+    try:
+        depth_factor = _positive(data, "depth_factor")
+        if "left" in data or "right" in data:
+            rig = _two_cameras(data)
+            return CameraFile(rig.left, rig, depth_factor)
+        camera, baseline = Camera.from_json(data), _positive(data, "baseline")
+        return CameraFile(
+            camera,
+            None if baseline is None else StereoRig.rectified(camera, baseline),
+            depth_factor,
+        )
+    except CalibrationError as error:
+        raise CalibrationError(f"{path}: {error}") from None
+
+
+def _two_cameras(data: dict[str, Any]) -> StereoRig:
+    for key in ("left", "right", "right_from_left"):
+        if key not in data:
+            raise CalibrationError(
+                f'{key!r} is missing; a stereo pair has "left", "right" and "right_from_left" (4x4,'
+                " metres)"
+            )
+    right_from_left = json_rigid(data["right_from_left"], "right_from_left", CalibrationError)
+    return StereoRig(_named(data, "left"), _named(data, "right"), right_from_left)
+
+
+def _named(data: dict[str, Any], key: str) -> Camera:
+    try:
+        return Camera.from_json(data[key])
+    except CalibrationError as error:
+        raise CalibrationError(f"{key}: {error}") from None
+
+
+def _positive(data: dict[str, Any], key: str) -> float | None:
+    if data.get(key) is None:
+        return None
+    try:
+        number = json_number(data[key], key, CalibrationError)
+    except CalibrationError:
+        number = -1.0
+    if number <= 0.0:
+        raise CalibrationError(f"{key} must be a positive number, not {str(data[key])[:40]}")
+    return number

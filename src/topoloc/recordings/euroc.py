@@ -1,0 +1,130 @@
+"""EuRoC / ASL recordings (Burri et al., IJRR 2016): ``mav0/cam0``, ``mav0/cam1``, distorted and
+unrectified.
+
+Pairs are the pictures of equal time stamp; a picture without its partner is left out, as some of
+the published recordings lack frames of one camera. Truth is ``state_groundtruth_estimate0`` (or
+``mocap0``): poses of the body, brought to the left camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from topoloc.errors import CalibrationError, RecordingError, TrajectoryError
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rig import StereoRig
+from topoloc.geometry.rigid import Rigid3
+from topoloc.recordings.format import SequenceFormat
+from topoloc.recordings.recording import Recording, RightPictures
+from topoloc.recordings.stereo_yaml import kalibr_camera
+from topoloc.recordings.text_rows import read_file_list
+from topoloc.recordings.trajectory import poses_at, read_asl_poses
+from topoloc.recordings.yaml_numbers import needed_numbers, read_yaml
+
+LOOKS_FOR = "mav0/ with cam0/data.csv, or cam0/data.csv"
+MAX_TRUTH_GAP = 0.05
+_TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0")
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """One camera's sensor.yaml."""
+
+    camera: Camera
+    body_from_cam: Rigid3
+
+
+def recognises(path: Path) -> bool:
+    """Whether this folder is a mav0, or has one."""
+    return any((path / below / "cam0" / "data.csv").is_file() for below in ("mav0", ""))
+
+
+def open_euroc(path: Path) -> Recording:
+    """Open a recording by its folder or its mav0; a plain recording of the left camera where there
+    is no cam1.
+
+    Raises:
+        RecordingError: no data.csv, a malformed one, or no two pictures of the same time.
+        CalibrationError: a sensor.yaml is missing or not usable.
+        TrajectoryError: the truth is malformed, or fits no frame.
+    """
+    mav = next(
+        (folder for folder in (path / "mav0", path) if (folder / "cam0" / "data.csv").is_file()),
+        None,
+    )
+    if mav is None:
+        raise RecordingError(f"{path}: not an EuRoC recording, which has {LOOKS_FOR}")
+    left = _read_csv(mav / "cam0" / "data.csv")
+    sensor = read_sensor(mav / "cam0" / "sensor.yaml")
+    t_ns, right = sorted(left), None
+    if (mav / "cam1" / "data.csv").is_file():
+        right_by_time = _read_csv(mav / "cam1" / "data.csv")
+        right_sensor = read_sensor(mav / "cam1" / "sensor.yaml")
+        t_ns = [time for time in t_ns if time in right_by_time]
+        if not t_ns:
+            raise RecordingError(
+                f"{mav}: none of the {len(left)} pictures of cam0 has a partner of its time among"
+                f" {len(right_by_time)} of cam1"
+            )
+        right = RightPictures(
+            [right_by_time[time] for time in t_ns], _rig(mav, sensor, right_sensor)
+        )
+    names = [left[time].relative_to(path).as_posix() for time in t_ns]
+    name = mav.resolve().parent.name if mav.resolve().name == "mav0" else path.resolve().name
+    return Recording(name, path, names, t_ns, _truth(mav, t_ns, sensor), sensor.camera, right)
+
+
+def read_sensor(path: Path) -> Sensor:
+    """Camera and mounting of a sensor.yaml.
+
+    Raises:
+        CalibrationError: missing, a key or number is missing, or a model that is not known.
+    """
+    text = read_yaml(path)
+    camera = kalibr_camera(path, text)
+    try:
+        return Sensor(
+            camera,
+            Rigid3.from_matrix(np.array(needed_numbers(path, text, 16, "T_BS")).reshape(4, 4)),
+        )
+    except TrajectoryError as error:
+        raise CalibrationError(f"{path}: {error}") from None
+
+
+def _rig(mav: Path, left: Sensor, right: Sensor) -> StereoRig:
+    try:
+        return StereoRig(
+            left.camera, right.camera, right.body_from_cam.inverse() @ left.body_from_cam
+        )
+    except CalibrationError as error:
+        raise CalibrationError(
+            f"{mav / 'cam1' / 'sensor.yaml'}: with that of cam0, {error}"
+        ) from None
+
+
+def _read_csv(path: Path) -> dict[int, Path]:
+    """Picture of each time stamp."""
+    t_ns, names = read_file_list(path, RecordingError)
+    return {time: path.parent / "data" / name for time, name in zip(t_ns, names, strict=True)}
+
+
+def _truth(mav: Path, t_ns: list[int], sensor: Sensor) -> list[Rigid3 | None]:
+    path = next(
+        (mav / name / "data.csv" for name in _TRUTH_FOLDERS if (mav / name / "data.csv").is_file()),
+        None,
+    )
+    if path is None:
+        return [None] * len(t_ns)
+    poses = poses_at(read_asl_poses(path), t_ns, MAX_TRUTH_GAP)
+    if all(world_from_body is None for world_from_body in poses):
+        raise TrajectoryError(f"{path}: none of the {len(t_ns)} frames has a pose")
+    return [
+        world_from_body @ sensor.body_from_cam if world_from_body is not None else None
+        for world_from_body in poses
+    ]
+
+
+FORMAT = SequenceFormat(LOOKS_FOR, recognises, open_euroc)

@@ -1,0 +1,138 @@
+"""KITTI odometry (Geiger et al., CVPR 2012), and any folder of the same layout.
+
+``image_0/ image_1/`` (or, where these are missing, the colour ``image_2/ image_3/``), ``calib.txt``
+and ``times.txt``. Truth is ``truth.tum`` or ``poses.txt`` in the folder, or KITTI's own
+``poses/<name>.txt`` beside ``sequences/``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from topoloc.errors import CalibrationError, RecordingError
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rig import StereoRig
+from topoloc.geometry.rigid import Rigid3
+from topoloc.recordings.format import SequenceFormat
+from topoloc.recordings.pictures import image_size
+from topoloc.recordings.recording import Recording, RightPictures, check_pairs, list_pictures
+from topoloc.recordings.text_rows import read_text
+from topoloc.recordings.trajectory import read_times, read_truth
+
+LOOKS_FOR = "image_0/ and image_1/ (or image_2/ and image_3/) with calib.txt"
+_PAIRS = ((0, 1), (2, 3))
+
+
+def recognises(path: Path) -> bool:
+    """Whether this folder has KITTI's picture folders; with a camera.json instead of a calib.txt it
+    is a plain folder."""
+    has_pictures = any((path / f"image_{left}").is_dir() for left, _ in _PAIRS)
+    return has_pictures and ((path / "calib.txt").is_file() or not (path / "camera.json").is_file())
+
+
+def open_kitti(path: Path) -> Recording:
+    """Open a KITTI-like folder; a plain recording of the left camera where there is no right
+    folder.
+
+    Raises:
+        RecordingError: no pictures, or left, right and times differ in number.
+        CalibrationError: calib.txt is missing or not usable.
+        TrajectoryError: the truth is malformed or fits no frame.
+    """
+    pair = next((pair for pair in _PAIRS if (path / f"image_{pair[0]}").is_dir()), None)
+    if pair is None:
+        raise RecordingError(f"{path}: not a KITTI folder, which has {LOOKS_FOR}")
+    left = list_pictures(path / f"image_{pair[0]}")
+    projections = read_calib(path / "calib.txt")
+    size = image_size(left[0])
+    camera = _camera(path, projections, pair[0], size)
+    right = None
+    if (path / f"image_{pair[1]}").is_dir():
+        right_paths = list_pictures(path / f"image_{pair[1]}")
+        check_pairs(left, right_paths)
+        right = RightPictures(right_paths, _rig(path, projections, pair, size))
+    t_ns = read_times(path / "times.txt", len(left))
+    cam0_from_cam = Rigid3(np.eye(3), -_cam_from_cam0(projections[f"P{pair[0]}"]))
+    poses = _truth(path, t_ns, cam0_from_cam)
+    names = [f"{file.parent.name}/{file.name}" for file in left]
+    return Recording(path.resolve().name, path, names, t_ns, poses, camera, right)
+
+
+def read_calib(path: Path) -> dict[str, Float[np.ndarray, "3 4"]]:
+    """The projection matrices P0, P1, ... of a calib.txt.
+
+    Raises:
+        CalibrationError: missing, or a P line is not 12 finite numbers.
+    """
+    lines = read_text(
+        path,
+        CalibrationError,
+        "no calibration here; a camera.json with a baseline beside it would do as well",
+    ).splitlines()
+    projections = {}
+    for number, line in enumerate(lines, start=1):
+        key, _, values = line.partition(":")
+        if not (key.startswith("P") and key[1:].isdigit()):
+            continue
+        try:
+            matrix = np.array([float(value) for value in values.split()]).reshape(3, 4)
+        except ValueError:
+            raise CalibrationError(f"{path}, line {number}: {key} is not 12 numbers") from None
+        is_finite = np.all(np.isfinite(matrix))
+        if (
+            not is_finite
+            or matrix[0, 0] <= 0
+            or matrix[1, 1] <= 0
+            or np.linalg.matrix_rank(matrix[:, :3]) < 3
+        ):
+            raise CalibrationError(f"{path}, line {number}: {key} is not a projection matrix")
+        projections[key] = matrix
+    return projections
+
+
+def _camera(
+    path: Path, projections: dict[str, np.ndarray], number: int, size: tuple[int, int]
+) -> Camera:
+    if f"P{number}" not in projections:
+        raise CalibrationError(f"{path / 'calib.txt'}: no line P{number} for image_{number}")
+    p = projections[f"P{number}"]
+    return Camera.pinhole(*size, p[0, 0], p[1, 1], p[0, 2], p[1, 2])
+
+
+def _rig(
+    path: Path, projections: dict[str, np.ndarray], pair: tuple[int, int], size: tuple[int, int]
+) -> StereoRig:
+    left, right = (_camera(path, projections, number, size) for number in pair)
+    # The colour cameras' P has some millimetres in y and z as well; the pictures are rectified to
+    # equal rows all the same.
+    shift = (
+        _cam_from_cam0(projections[f"P{pair[1]}"])[0]
+        - _cam_from_cam0(projections[f"P{pair[0]}"])[0]
+    )
+    if shift >= 0:
+        raise CalibrationError(
+            f"{path / 'calib.txt'}: P{pair[1]} puts the right camera {shift:g} m to the left of the"
+            " left one"
+        )
+    return StereoRig(left, right, Rigid3(np.eye(3), np.array([shift, 0.0, 0.0])))
+
+
+def _cam_from_cam0(projection: Float[np.ndarray, "3 4"]) -> Float[np.ndarray, "3"]:
+    """The translation t of P = K [I | t]."""
+    return np.linalg.solve(projection[:, :3], projection[:, 3])
+
+
+def _truth(path: Path, t_ns: list[int], cam0_from_cam: Rigid3) -> list[Rigid3 | None]:
+    absolute = path.resolve()
+    rows = [path / "poses.txt", absolute.parent.parent / "poses" / f"{absolute.name}.txt"]
+    poses = read_truth(path / "truth.tum", rows, t_ns)
+    if (path / "truth.tum").is_file():
+        return poses
+    # KITTI's rows are the poses of camera 0 whichever pair is used.
+    return [pose @ cam0_from_cam if pose is not None else None for pose in poses]
+
+
+FORMAT = SequenceFormat(LOOKS_FOR, recognises, open_kitti)

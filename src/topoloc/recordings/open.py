@@ -1,0 +1,135 @@
+"""Open a recording of any known format by looking at its folder."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+
+from topoloc.errors import RecordingError, UnknownFormatError
+from topoloc.recordings import video
+from topoloc.recordings.calibration import calibration_of, recalibrated
+from topoloc.recordings.format import SequenceFormat
+from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.recording import parse_selection, sequence_subset
+
+# name -> "module:attribute" of a SequenceFormat, in the order of recognition: the plain folder
+# accepts whatever is left. A format's module is loaded when the format is tried.
+FORMATS = {
+    "euroc": "topoloc.recordings.euroc:FORMAT",
+    "tum": "topoloc.recordings.tum:FORMAT",
+    "seven_scenes": "topoloc.recordings.seven_scenes:FORMAT",
+    "nerfstudio": "topoloc.apps.formats.nerfstudio:FORMAT",
+    "record3d": "topoloc.apps.formats.record3d:FORMAT",
+    "colmap": "topoloc.apps.formats.colmap:FORMAT",
+    "colmap_database": "topoloc.apps.formats.colmap_database:FORMAT",
+    "kitti": "topoloc.recordings.kitti:FORMAT",
+    "rosbag": "topoloc.apps.formats.bags.bag_recording:ROSBAG_FORMAT",
+    "mcap": "topoloc.apps.formats.bags.bag_recording:MCAP_FORMAT",
+    "zed": "topoloc.apps.formats.zed:FORMAT",
+    "video": "topoloc.recordings.video:FORMAT",
+    "folder": "topoloc.recordings.folder:FORMAT",
+}
+
+
+@cache
+def load_format(name: str) -> SequenceFormat:
+    """Return the format of a name of `FORMATS`."""
+    module, _, attribute = FORMATS[name].partition(":")
+    return getattr(importlib.import_module(module), attribute)
+
+
+def open_sequence(
+    path: str | Path,
+    format: str | None = None,
+    camera: str | Path | None = None,
+    images: str | Path | None = None,
+    topics: str | Mapping[str, str] | None = None,
+) -> StereoSequence:
+    """Open a recording, or some frames of it. Pictures are read frame by frame, when asked for.
+
+    Args:
+        path: a folder, a video, or one picture file. A part is chosen by a suffix:
+            ``PATH@START:STOP:STEP`` as Python slices, several of them by commas (``@0:10,50:60``);
+            ``PATH@0-59/100`` are the frames whose number modulo 100 is 0 to 59.
+        format: one of `FORMATS`; recognised where None.
+        camera: the calibration instead of the recording's: a camera.json, YAML of OpenCV or Kalibr,
+            Stereolabs' ``SN*.conf``, or ``"fx,fy,cx,cy"`` in pixels.
+        images: the folder of the pictures that a model of COLMAP names, where it is not `images`
+            beside the model.
+        topics: of bags, which topic is what:
+            ``left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom``, or a dictionary of these.
+
+    Raises:
+        UnknownFormatError: `format` is none of these, or no format recognises the folder.
+        RecordingError: nothing is there, the format takes no `topics` or `calibration`, nothing is
+            chosen, or the recording is broken; CalibrationError is one of these.
+        TrajectoryError: the recording's truth is malformed or fits no frame.
+    """
+    folder, selection = split_selection(str(path))
+    is_side_by_side = format is None and str(camera).endswith(".conf") and video.recognises(folder)
+    name = "zed" if is_side_by_side else find_format(path, format)
+    sequence = _open_whole(
+        folder, name, camera, {"images": images and Path(images), "topics": topics}
+    )
+    if selection is None:
+        return sequence
+    indices = parse_selection(selection, len(sequence))
+    if not indices:
+        raise RecordingError(f"{path}: none of the {len(sequence)} frames is chosen")
+    return sequence_subset(sequence, indices)
+
+
+def _open_whole(
+    folder: Path, name: str, camera: str | Path | None, options: Mapping[str, object]
+) -> StereoSequence:
+    of, given = (
+        load_format(name),
+        {key: value for key, value in options.items() if value is not None},
+    )
+    if unused := [key for key in given if key not in of.takes]:
+        raise RecordingError(f"{folder}: a recording of format {name} takes no {unused[0]}")
+    if camera is None:
+        return of.open(folder, **given)
+    if "calibration_file" in of.takes:
+        return of.open(folder, calibration=camera, **given)
+    if "calibration" in of.takes:
+        return of.open(folder, calibration=calibration_of(camera), **given)
+    return recalibrated(of.open(folder, **given), calibration_of(camera))
+
+
+def find_format(path: str | Path, format: str | None = None) -> str:
+    """The name of a recording's format, which `open_sequence` opens it by; `format` where it is
+    named.
+
+    Raises:
+        UnknownFormatError: `format` is none of `FORMATS`, or no format recognises the folder.
+        RecordingError: nothing is there.
+    """
+    if format is not None and format not in FORMATS:
+        raise UnknownFormatError(f"format {format!r} is not known; there are {', '.join(FORMATS)}")
+    folder, _ = split_selection(str(path))
+    if not os.path.exists(folder):  # no error of a name that is too long
+        raise RecordingError(f"{folder}: no such file or folder")
+    return format or _recognise(folder)
+
+
+def split_selection(path: str) -> tuple[Path, str | None]:
+    """The recording's folder or file, and the part of it that is chosen behind an @; None: all of
+    it."""
+    folder, at, selection = path.rpartition("@")
+    if not at or os.path.exists(path):
+        return Path(path), None
+    return Path(folder), selection
+
+
+def _recognise(path: Path) -> str:
+    for name in FORMATS:
+        if load_format(name).recognises(path):
+            return name
+    if path.is_dir() and not any(path.iterdir()):
+        raise UnknownFormatError(f"{path}: no known recording: the folder is empty")
+    looked_for = "; ".join(f"{name}: {load_format(name).looks_for}" for name in FORMATS)
+    raise UnknownFormatError(f"{path}: no known recording. Looked for {looked_for}")

@@ -1,0 +1,113 @@
+"""7-Scenes (Shotton et al., CVPR 2013): RGB-D runs of a Kinect, ``frame-000000.color.png .depth.png
+.pose.txt`` in ``seq-01/``.
+
+Depth is not registered to colour, and the poses are the depth camera's. No calibration comes with
+the recordings; the focal lengths and the transform between the two cameras are those in use for the
+first Kinect.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from topoloc.errors import RecordingError, TrajectoryError
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.recordings.format import SequenceFormat
+from topoloc.recordings.recording import DepthPictures, Recording, list_pictures
+
+LOOKS_FOR = "frame-*.color.png or .jpg with .pose.txt, or one seq-* folder of these"
+DEPTH_CAMERA = Camera.pinhole(640, 480, 585.0, 585.0, 320.0, 240.0)
+COLOUR_CAMERA = Camera.pinhole(640, 480, 525.0, 525.0, 320.0, 240.0)
+COLOUR_FROM_DEPTH = Rigid3(
+    exp_so3(np.array([0.00816, -0.00789, -0.00271])), np.array([-0.02556, 0.00010, 0.00203])
+)
+UNITS_PER_METRE = 1000.0
+RATE_HZ = 30
+
+
+def recognises(path: Path) -> bool:
+    """Whether this folder is a run of 7-Scenes, or a scene with runs in it."""
+    return path.is_dir() and (
+        _is_run(path) or any(_is_run(folder) for folder in path.glob("seq-*"))
+    )
+
+
+def open_seven_scenes(path: Path) -> Recording:
+    """Open a run (``seq-01``), or a scene with a single run. Frames are 1/30 s apart by their
+    number.
+
+    Raises:
+        RecordingError: no run, several runs, or depth for some of the frames only.
+        TrajectoryError: a .pose.txt is no pose.
+    """
+    run = _find_run(path)
+    colour = list_pictures(run, ".color")
+    stems = [file.name.partition(".color")[0] for file in colour]
+    files = {file.name for file in run.iterdir()}
+    with_depth = [stem for stem in stems if f"{stem}.depth.png" in files]
+    if with_depth and len(with_depth) != len(stems):
+        raise RecordingError(
+            f"{run}: {len(stems)} colour pictures but {len(with_depth)} with depth; every picture"
+            " needs its partner"
+        )
+    depth = None
+    if with_depth:
+        depth_paths = [run / f"{stem}.depth.png" for stem in stems]
+        depth = DepthPictures(depth_paths, UNITS_PER_METRE, DEPTH_CAMERA, COLOUR_FROM_DEPTH)
+    depth_from_colour = COLOUR_FROM_DEPTH.inverse()
+    poses = [
+        (
+            _read_pose(run / f"{stem}.pose.txt") @ depth_from_colour
+            if f"{stem}.pose.txt" in files
+            else None
+        )
+        for stem in stems
+    ]
+    t_ns = [_frame_number(run / stem) * 1_000_000_000 // RATE_HZ for stem in stems]
+    name = f"{run.resolve().parent.name}/{run.resolve().name}"
+    return Recording(
+        name, run, [file.name for file in colour], t_ns, poses, COLOUR_CAMERA, depth=depth
+    )
+
+
+def _is_run(path: Path) -> bool:
+    return path.is_dir() and any(path.glob("frame-*.color.*"))
+
+
+def _find_run(path: Path) -> Path:
+    if _is_run(path):
+        return path
+    runs = sorted(folder for folder in path.glob("seq-*") if _is_run(folder))
+    if not runs:
+        raise RecordingError(f"{path}: not a run of 7-Scenes, which has {LOOKS_FOR}")
+    if len(runs) > 1:
+        raise RecordingError(
+            f"{path}: {len(runs)} runs here, name one: {', '.join(run.name for run in runs)}"
+        )
+    return runs[0]
+
+
+def _frame_number(path: Path) -> int:
+    number = re.fullmatch(r"frame-(\d+)", path.name)
+    if number is None:
+        raise RecordingError(f"{path}: the name of a frame is frame- and a number")
+    return int(number[1])
+
+
+def _read_pose(path: Path) -> Rigid3:
+    """world_from_depth of one frame."""
+    try:
+        return Rigid3.from_matrix(
+            np.array(path.read_text(encoding="utf-8").split(), dtype=np.float64).reshape(4, 4)
+        )
+    except ValueError:
+        raise TrajectoryError(f"{path}: not a matrix of 4x4 numbers") from None
+    except TrajectoryError as error:
+        raise TrajectoryError(f"{path}: {error}") from None
+
+
+FORMAT = SequenceFormat(LOOKS_FOR, recognises, open_seven_scenes)

@@ -1,0 +1,186 @@
+"""Calibrations of one camera or of a stereo rig in YAML: OpenCV's FileStorage, Kalibr's camchain,
+ROS's camera files.
+
+OpenCV: `M1 D1 M2 D2 R T` as its stereo sample writes them (`R` and `T` may stand in an
+extrinsics.yml beside), or the longer names of other programs; `R`, `T` take a point of the left
+camera into the right one. Kalibr: `cam0`, `cam1` with `T_cn_cnm1`. Metres.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from topoloc.errors import CalibrationError, TrajectoryError
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rig import StereoRig
+from topoloc.geometry.rigid import Rigid3
+from topoloc.recordings.camera_json import CameraFile
+from topoloc.recordings.yaml_numbers import needed_numbers, read_yaml, yaml_numbers, yaml_word
+
+YAML_SUFFIXES = frozenset({".yaml", ".yml"})
+_MAX_BASELINE = 5.0  # metres; a wider rig is taken for one in millimetres
+# COLMAP's model of each of Kalibr's distortions, with the number of its coefficients.
+_DISTORTIONS = {
+    "radial-tangential": ("OPENCV", 4),
+    "radtan": ("OPENCV", 4),
+    "equidistant": ("OPENCV_FISHEYE", 4),
+    "none": ("PINHOLE", 0),
+}
+_FISHEYE_WORDS = ("equidistant", "fisheye", "KANNALA_BRANDT")
+# The names that programs give to matrix and distortion of the left, the right, and of an only
+# camera.
+_LEFT = (
+    (
+        "M1",
+        "K1",
+        "cameraMatrix1",
+        "camera_matrix_1",
+        "camera_matrix_left",
+        "left_camera_matrix",
+        "K_left",
+    ),
+    (
+        "D1",
+        "distCoeffs1",
+        "dist_coeffs_1",
+        "distortion_coefficients_left",
+        "dist_coeffs_left",
+        "left_distortion_coefficients",
+        "D_left",
+    ),
+)
+_RIGHT = (
+    tuple(name.replace("1", "2").replace("left", "right") for name in _LEFT[0]),
+    tuple(name.replace("1", "2").replace("left", "right") for name in _LEFT[1]),
+)
+_ONLY = (
+    ("camera_matrix", "cameraMatrix", "K"),
+    ("distortion_coefficients", "distCoeffs", "dist_coeffs", "D"),
+)
+
+
+def is_calibration(path: Path) -> bool:
+    """Whether a YAML file holds a camera by the keys looked for here."""
+    try:
+        text = read_yaml(path)
+    except CalibrationError:
+        return False
+    return _is_kalibr(text) or any(yaml_numbers(text, *names[0]) for names in (_LEFT, _ONLY))
+
+
+def read_calibration_yaml(path: Path, width: int, height: int) -> CameraFile:
+    """The calibration of pictures of this size (pixels), which counts where the file names none.
+
+    Raises:
+        CalibrationError: missing, no calibration, a number is missing, a model that is not known,
+            or a baseline of no rig; names the file.
+    """
+    text = read_yaml(path)
+    if _is_kalibr(text):
+        return _kalibr(path, text)
+    size = _size(text) or (float(width), float(height))
+    if not yaml_numbers(text, *_LEFT[0]):
+        return CameraFile(_opencv_camera(path, text, _ONLY, size))
+    left, right = (_opencv_camera(path, text, names, size) for names in (_LEFT, _RIGHT))
+    beside = path.with_name("extrinsics.yml")
+    motion = read_yaml(beside) if not yaml_numbers(text, "R") and beside.is_file() else text
+    rotation = np.array(
+        needed_numbers(path, motion, 9, "R", "rotation_matrix", "R_right_left")
+    ).reshape(3, 3)
+    translation = np.array(
+        needed_numbers(path, motion, 3, "T", "translation_vector", "T_right_left")
+    )
+    return CameraFile(left, rig=_rig(path, left, right, np.column_stack([rotation, translation])))
+
+
+def kalibr_camera(path: Path, section: str) -> Camera:
+    """The camera of a sensor.yaml, or of a section of a camchain. Raises CalibrationError."""
+    distortion = yaml_word(section, "distortion_model", "none")
+    if yaml_word(section, "camera_model", "pinhole") != "pinhole" or distortion not in _DISTORTIONS:
+        known = ", ".join(_DISTORTIONS)
+        raise CalibrationError(
+            f"{path}: distortion_model {distortion} is not one of {known}, or camera_model is not"
+            " pinhole"
+        )
+    model, count = _DISTORTIONS[distortion]
+    width, height = needed_numbers(path, section, 2, "resolution")
+    params = needed_numbers(path, section, 4, "intrinsics")
+    if count:
+        params += needed_numbers(
+            path, section, count, "distortion_coefficients", "distortion_coeffs"
+        )
+    return _camera(path, model, (width, height), params)
+
+
+def _is_kalibr(text: str) -> bool:
+    return re.search(r"^cam0:", text, re.MULTILINE) is not None
+
+
+def _kalibr(path: Path, text: str) -> CameraFile:
+    parts = re.split(r"^cam(\d+):", text, flags=re.MULTILINE)
+    sections = dict(zip(parts[1::2], parts[2::2], strict=True))
+    left = kalibr_camera(path, sections["0"])
+    if "1" not in sections:
+        return CameraFile(left)
+    right = kalibr_camera(path, sections["1"])
+    motion = np.array(needed_numbers(path, sections["1"], 16, "T_cn_cnm1")).reshape(4, 4)
+    return CameraFile(left, rig=_rig(path, left, right, motion[:3]))
+
+
+def _opencv_camera(
+    path: Path, text: str, names: tuple[Sequence[str], Sequence[str]], size: tuple[float, float]
+) -> Camera:
+    """The camera whose matrix and distortion have one of these names."""
+    matrix, distortion = names
+    fx, skew, cx, _, fy, cy, *_ = needed_numbers(path, text, 9, *matrix)
+    if abs(skew) > 1e-6 * abs(fx):
+        raise CalibrationError(
+            f"{path}: {matrix[0]} has a skew of {skew:g}, which no model here knows"
+        )
+    coefficients = yaml_numbers(text, *distortion)
+    if yaml_word(text, "distortion_model", "") in _FISHEYE_WORDS:
+        return _camera(
+            path, "OPENCV_FISHEYE", size, [fx, fy, cx, cy, *(coefficients + [0.0] * 4)[:4]]
+        )
+    if any(coefficients[8:]):
+        raise CalibrationError(
+            f"{path}: {distortion[0]} has {len(coefficients)} numbers; thin prism and tilted models"
+            " are not known here"
+        )
+    model, count = ("OPENCV", 4) if not any(coefficients[4:]) else ("FULL_OPENCV", 8)
+    return _camera(path, model, size, [fx, fy, cx, cy, *(coefficients + [0.0] * 8)[:count]])
+
+
+def _camera(path: Path, model: str, size: tuple[float, float], params: list[float]) -> Camera:
+    try:
+        return Camera(model, int(size[0]), int(size[1]), tuple(params))
+    except (CalibrationError, ValueError, OverflowError) as error:
+        raise CalibrationError(f"{path}: {error}") from None
+
+
+def _size(text: str) -> tuple[float, float] | None:
+    """Width and height, where the file names them."""
+    pair = yaml_numbers(text, "image_size", "imageSize", "size", "resolution")
+    if len(pair) >= 2:
+        return pair[0], pair[1]
+    width = yaml_numbers(text, "image_width", "imageWidth", "width")
+    height = yaml_numbers(text, "image_height", "imageHeight", "height")
+    return (width[0], height[0]) if width and height else None
+
+
+def _rig(path: Path, left: Camera, right: Camera, right_from_left: np.ndarray) -> StereoRig:
+    try:
+        rig = StereoRig(
+            left, right, Rigid3.from_matrix(np.vstack([right_from_left, [0.0, 0.0, 0.0, 1.0]]))
+        )
+    except (CalibrationError, TrajectoryError) as error:
+        raise CalibrationError(f"{path}: {error}") from None
+    if rig.baseline > _MAX_BASELINE:
+        raise CalibrationError(
+            f"{path}: a baseline of {rig.baseline:g} m; is it in millimetres? Metres are needed"
+        )
+    return rig

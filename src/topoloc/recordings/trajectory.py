@@ -1,0 +1,357 @@
+"""Trajectories: TUM files and KITTI rows, read, written, and looked up at the times of frames.
+
+TUM (Sturm et al., IROS 2012): a line is ``t tx ty tz qx qy qz qw``, seconds, comments start with
+``#``. KITTI (Geiger et al., CVPR 2012): a line is the upper 3x4 of a pose matrix, row by row, one
+line a frame. Both are world_from_cam, in metres.
+"""
+
+from __future__ import annotations
+
+import bisect
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from decimal import Decimal
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from topoloc.errors import RecordingError, TrajectoryError
+from topoloc.geometry.lazy_poses import LazyPoses, pose_of_quaternion, poses_of_matrices
+from topoloc.geometry.pose_conventions import PoseReading
+from topoloc.geometry.rigid import Rigid3
+from topoloc.recordings.atomic import write_text
+from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.recording import SequenceView, times_by_rate
+from topoloc.recordings.text_rows import (
+    NANOSECONDS,
+    parse_times,
+    plain_times,
+    read_plain_table,
+    read_rows,
+)
+
+# Times written with few decimals still mean the frame they were made from.
+_SAME_TIME_NS = 1_000_000
+_ROTATION_TOLERANCE = 1e-2
+_SAME_SPAN = 0.8  # of the time that the frames take, for two clocks to tell of the same
+TUM_HEADER = "# t tx ty tz qx qy qz qw (s, m; world_from_cam)"
+_Rows = Sequence[tuple[int, list[str]]]
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Poses in order of time. `t_ns` are their times, strictly increasing, or None where a pose
+    goes with a frame by its row."""
+
+    world_from_cam: Sequence[Rigid3]
+    t_ns: list[int] | None = None
+
+    def __len__(self) -> int:
+        return len(self.world_from_cam)
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """Read a TUM file (8 columns; times in seconds, or nanoseconds by their size) or KITTI rows (12
+    columns).
+
+    Raises:
+        TrajectoryError: missing, empty, a wrong number of columns, NaN, no rotation, or times that
+            do not increase; with the line.
+    """
+    return _plain_trajectory(path) or _trajectory_of_rows(path)
+
+
+def _plain_trajectory(path: Path) -> Trajectory | None:
+    """A file of numbers alone, all of them good, read at once; None of any other, which is then
+    read line by line."""
+    table = read_plain_table(path, TrajectoryError)
+    if table is None or table.numbers.shape[1] not in (8, 12):
+        return None
+    if table.numbers.shape[1] == 12:
+        poses, is_rotation = poses_of_matrices(table.numbers, _ROTATION_TOLERANCE)
+        return Trajectory(poses) if is_rotation.all() else None
+    t_ns, rows = plain_times(table.lines), table.numbers[:, 1:]
+    is_good = t_ns is not None and _are_of_unit_length(rows[:, 3:]).all()
+    return Trajectory(LazyPoses(rows, pose_of_quaternion), t_ns) if is_good else None
+
+
+def _trajectory_of_rows(path: Path) -> Trajectory:
+    rows = read_rows(path, TrajectoryError)
+    num_columns = len(rows[0][1])
+    if num_columns not in (8, 12):
+        raise TrajectoryError(
+            f"{path}, line {rows[0][0]}: {num_columns} columns; a TUM line has 8, a KITTI line 12"
+        )
+    for line, tokens in rows:
+        if len(tokens) != num_columns:
+            raise TrajectoryError(
+                f"{path}, line {line}: {len(tokens)} columns, the lines before have {num_columns}"
+            )
+    if num_columns == 12:
+        poses, is_rotation = poses_of_matrices(_numbers(path, rows, range(12)), _ROTATION_TOLERANCE)
+        _check(is_rotation, "not a rotation", path, rows)
+        return Trajectory(poses)
+    return _timed_trajectory(path, rows, range(1, 8))
+
+
+def _timed_trajectory(path: Path, rows: _Rows, columns: Iterable[int]) -> Trajectory:
+    """Of rows that begin with a time, and whose other columns are, in this order, x, y, z (metres)
+    and a quaternion (x, y, z, w)."""
+    t_ns, numbers = parse_times(rows, path, TrajectoryError), _numbers(path, rows, columns)
+    _check(_are_of_unit_length(numbers[:, 3:]), "not a rotation", path, rows)
+    return Trajectory(LazyPoses(numbers, pose_of_quaternion), t_ns)
+
+
+def read_asl_poses(path: Path) -> Trajectory:
+    """Read the poses of an ASL ground truth data.csv: ``t [ns], px, py, pz, qw, qx, qy, qz``, and
+    columns beyond, which are left.
+
+    Raises:
+        TrajectoryError: missing, empty, columns missing, NaN, no rotation, or times that do not
+            increase; with the line.
+    """
+    rows = read_rows(path, TrajectoryError)
+    for line, tokens in rows:
+        if len(tokens) < 8:
+            raise TrajectoryError(f"{path}, line {line}: {len(tokens)} columns, a pose has 8")
+    return _timed_trajectory(path, rows, (1, 2, 3, 5, 6, 7, 4))
+
+
+def write_tum(path: Path, trajectory: Trajectory) -> None:
+    """Write a TUM file, atomically.
+
+    Raises:
+        TrajectoryError: the trajectory has no times.
+        TopolocError: the file cannot be written.
+    """
+    if trajectory.t_ns is None:
+        raise TrajectoryError(f"{path}: a TUM file needs times, and these poses have none")
+    write_text(path, tum_text(trajectory))
+
+
+def tum_text(trajectory: Trajectory) -> str:
+    """A TUM file's lines, of a trajectory with times."""
+    assert trajectory.t_ns is not None
+    rows = (
+        tum_line(t_ns, pose)
+        for t_ns, pose in zip(trajectory.t_ns, trajectory.world_from_cam, strict=True)
+    )
+    return "\n".join([TUM_HEADER, *rows]) + "\n"
+
+
+def tum_line(t_ns: int, world_from_cam: Rigid3) -> str:
+    """One line of a TUM file, without its end."""
+    w, x, y, z = world_from_cam.quat_wxyz()
+    return " ".join(
+        [
+            f"{Decimal(t_ns).scaleb(-9):.9f}",
+            *(f"{value:.12g}" for value in (*world_from_cam.translation, x, y, z, w)),
+        ]
+    )
+
+
+def kitti_text(trajectory: Trajectory) -> str:
+    """A line a pose: the upper 3x4 of its matrix, row by row."""
+    rows = (pose.matrix()[:3].ravel().tolist() for pose in trajectory.world_from_cam)
+    return "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows)
+
+
+def poses_at(
+    trajectory: Trajectory, t_ns: Sequence[int], max_gap: float = 0.2
+) -> list[Rigid3 | None]:
+    """The pose at each time: interpolated where its neighbours are at most `max_gap` seconds apart,
+    else the pose within 1 ms, else None.
+
+    Raises:
+        TrajectoryError: the trajectory has no times.
+    """
+    if trajectory.t_ns is None:
+        raise TrajectoryError("these poses have no times, they go with frames row by row")
+    return [
+        _pose_at(trajectory.t_ns, trajectory.world_from_cam, time, round(max_gap * NANOSECONDS))
+        for time in t_ns
+    ]
+
+
+def frame_poses(trajectory: Trajectory, t_ns: Sequence[int], path: Path) -> list[Rigid3 | None]:
+    """The pose of each frame: by time, or by row where the trajectory has no times.
+
+    Raises:
+        TrajectoryError: rows and frames differ in number, or no frame has a pose; names `path`, and
+            where the clocks seem to differ, how.
+    """
+    if trajectory.t_ns is None:
+        if len(trajectory) != len(t_ns):
+            raise TrajectoryError(f"{path}: {len(trajectory)} poses for {len(t_ns)} frames")
+        return list(trajectory.world_from_cam)
+    poses = poses_at(trajectory, t_ns)
+    if t_ns and all(pose is None for pose in poses):
+        span = f"{trajectory.t_ns[0] / 1e9:.3f} to {trajectory.t_ns[-1] / 1e9:.3f} s"
+        frames = f"the frames {t_ns[0] / 1e9:.3f} to {t_ns[-1] / 1e9:.3f} s"
+        raise TrajectoryError(
+            f"{path}: no frame has a pose; it covers {span},"
+            f" {frames}{_clock_hint(trajectory.t_ns, t_ns)}"
+        )
+    return poses
+
+
+def with_trajectory(
+    sequence: StereoSequence, path: Path, reading: PoseReading | None = None
+) -> StereoSequence:
+    """The same recording with the poses of a trajectory file: TUM by time, KITTI rows frame by
+    frame.
+
+    Rows for a part of a recording may be those of the part or of the whole.
+
+    Raises:
+        TrajectoryError: the file is malformed, or fits no frame.
+    """
+    trajectory, reading = read_trajectory(path), reading or PoseReading()
+    if (
+        trajectory.t_ns is None
+        and isinstance(sequence, SequenceView)
+        and len(trajectory) == len(sequence.base) != len(sequence)
+    ):
+        rows = frame_poses(trajectory, sequence.base.t_ns, path)
+        poses = [rows[index] for index in sequence.indices]
+    else:
+        poses = frame_poses(_on_the_frames_clock(trajectory, reading), sequence.t_ns, path)
+    return _with_poses(sequence, [pose and reading.mend(pose) for pose in poses])
+
+
+def as_read(sequence: StereoSequence, reading: PoseReading) -> StereoSequence:
+    """The same recording, its own poses read so.
+
+    Raises:
+        TrajectoryError: no frame has a pose then.
+    """
+    if reading == PoseReading():
+        return sequence
+    posed = [
+        (pose, t_ns)
+        for pose, t_ns in zip(sequence.poses, sequence.t_ns, strict=True)
+        if pose is not None
+    ]
+    poses = sequence.poses
+    if posed and (reading.shift_s or reading.clock != 1.0):
+        trajectory = Trajectory([pose for pose, _ in posed], [t_ns for _, t_ns in posed])
+        poses = frame_poses(
+            _on_the_frames_clock(trajectory, reading), sequence.t_ns, Path(sequence.name)
+        )
+    return _with_poses(sequence, [pose and reading.mend(pose) for pose in poses])
+
+
+def _with_poses(sequence: StereoSequence, poses: list[Rigid3 | None]) -> StereoSequence:
+    return SequenceView(sequence, list(range(len(sequence))), poses)
+
+
+def _on_the_frames_clock(trajectory: Trajectory, reading: PoseReading) -> Trajectory:
+    if trajectory.t_ns is None or (reading.clock == 1.0 and reading.shift_s == 0.0):
+        return trajectory
+    shift_ns = round(reading.shift_s * NANOSECONDS)
+    return replace(
+        trajectory,
+        t_ns=[
+            (time if reading.clock == 1.0 else round(time * reading.clock)) - shift_ns
+            for time in trajectory.t_ns
+        ],
+    )
+
+
+def _clock_hint(of_poses: Sequence[int], of_frames: Sequence[int]) -> str:
+    """How the clocks of poses and frames seem to differ: by a unit, or by when they began."""
+    for factor in (1e-9, 1e-6, 1e-3, 1e3, 1e6, 1e9):
+        overlap = min(of_poses[-1] * factor, of_frames[-1]) - max(
+            of_poses[0] * factor, of_frames[0]
+        )
+        if overlap > _SAME_SPAN * (of_frames[-1] - of_frames[0]):
+            return f"; its times seem to be in another unit: --poses clock={factor:g}"
+    lasts, frames_last = of_poses[-1] - of_poses[0], of_frames[-1] - of_frames[0]
+    if _SAME_SPAN * frames_last < lasts < frames_last / _SAME_SPAN:
+        shift = (of_poses[0] - of_frames[0]) / NANOSECONDS
+        return f"; if both began at the same moment: --poses shift={shift:.9g}"
+    return ""
+
+
+def read_truth(tum: Path, kitti_rows: list[Path], t_ns: list[int]) -> list[Rigid3 | None]:
+    """The pose of each frame from the first of these files that is there: TUM by time, KITTI rows
+    one a frame.
+
+    Raises:
+        TrajectoryError: the file is malformed, or fits no frame.
+    """
+    for path in (tum, *kitti_rows):
+        if path.is_file():
+            return frame_poses(read_trajectory(path), t_ns, path)
+    return [None] * len(t_ns)
+
+
+def read_times(path: Path, num_frames: int) -> list[int]:
+    """Times in nanoseconds from a file of one time in seconds a line; 10 Hz where there is no file.
+
+    Raises:
+        RecordingError: malformed, not increasing, or their number is not that of the frames.
+    """
+    if not path.is_file():
+        return times_by_rate(num_frames)
+    t_ns = parse_times(read_rows(path, RecordingError), path, RecordingError)
+    if len(t_ns) != num_frames:
+        raise RecordingError(f"{path}: {len(t_ns)} times for {num_frames} pictures")
+    return t_ns
+
+
+def _pose_at(
+    times: list[int], poses: Sequence[Rigid3], time: int, max_gap_ns: int
+) -> Rigid3 | None:
+    after = bisect.bisect_left(times, time)
+    if after < len(times) and times[after] == time:
+        return poses[after]
+    if 0 < after < len(times) and times[after] - times[after - 1] <= max_gap_ns:
+        fraction = (time - times[after - 1]) / (times[after] - times[after - 1])
+        return poses[after - 1].interpolate(poses[after], fraction)
+    neighbours = [index for index in (after - 1, after) if 0 <= index < len(times)]
+    nearest = min(neighbours, key=lambda index: abs(times[index] - time), default=None)
+    return (
+        poses[nearest]
+        if nearest is not None and abs(times[nearest] - time) <= _SAME_TIME_NS
+        else None
+    )
+
+
+def _numbers(path: Path, rows: _Rows, columns: Iterable[int]) -> Float[np.ndarray, "n c"]:
+    """These columns of the rows."""
+    wanted = list(columns)
+    try:
+        numbers = np.array(
+            [float(tokens[column]) for _, tokens in rows for column in wanted]
+        ).reshape(len(rows), -1)
+    except ValueError:
+        for line, tokens in rows:
+            for column in wanted:
+                _number(path, line, tokens[column])
+        raise
+    _check(np.asarray(np.isfinite(numbers).all(axis=1)), "NaN or infinite numbers", path, rows)
+    return numbers
+
+
+def _number(path: Path, line: int, token: str) -> float:
+    try:
+        return float(token)
+    except ValueError:
+        raise TrajectoryError(f"{path}, line {line}: {token[:40]!r} is not a number") from None
+
+
+def _are_of_unit_length(quaternions: Float[np.ndarray, "n 4"]) -> Bool[np.ndarray, " n"]:
+    """But for rounding."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return (
+            np.abs(np.sqrt(np.einsum("ni,ni->n", quaternions, quaternions)) - 1.0)
+            <= _ROTATION_TOLERANCE
+        )
+
+
+def _check(is_good: Bool[np.ndarray, " n"], fault: str, path: Path, rows: _Rows) -> None:
+    if not is_good.all():
+        line, tokens = rows[int(np.argmin(is_good))]
+        raise TrajectoryError(f"{path}, line {line}: {fault} in {' '.join(tokens)[:120]}")

@@ -1,0 +1,110 @@
+"""TUM RGB-D (Sturm et al., IROS 2012): ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``; depth
+registered to colour.
+
+The intrinsics are those the data set's authors give for its three cameras, taken by the freiburg1 /
+2 / 3 in the folder's name; any other recording of this layout needs a ``camera.json``.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from topoloc.errors import CalibrationError, RecordingError
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.recordings.calibration import CalibrationOfSize, size_of_first
+from topoloc.recordings.camera_json import FILE_NAME, CameraFile, read_camera_json
+from topoloc.recordings.format import SequenceFormat
+from topoloc.recordings.recording import DepthPictures, Recording, nearest_rows
+from topoloc.recordings.text_rows import read_file_list
+from topoloc.recordings.trajectory import read_truth
+
+LOOKS_FOR = "rgb.txt and depth.txt"
+DEPTH_FACTOR = 5000.0
+MAX_DEPTH_DELAY = 0.02
+_FREIBURG = {
+    "1": Camera(
+        "FULL_OPENCV",
+        640,
+        480,
+        (517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633, 0.0, 0.0, 0.0),
+    ),
+    "2": Camera(
+        "FULL_OPENCV",
+        640,
+        480,
+        (520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172, 0.0, 0.0, 0.0),
+    ),
+    "3": Camera.pinhole(640, 480, 535.4, 539.2, 320.1, 247.6),
+}
+
+
+def recognises(path: Path) -> bool:
+    """Whether the two lists are there."""
+    return (path / "rgb.txt").is_file() and (path / "depth.txt").is_file()
+
+
+def open_tum(path: Path, calibration: CalibrationOfSize | None = None) -> Recording:
+    """Open a recording; a colour picture without depth within 20 ms is left out.
+
+    Args:
+        calibration: instead of the folder's.
+
+    Raises:
+        RecordingError: a list is missing or malformed, or no colour picture has depth.
+        CalibrationError: neither a camera.json nor a freiburg in the folder's name.
+        TrajectoryError: the truth is malformed or fits no frame.
+    """
+    colour_times, colour = read_file_list(path / "rgb.txt", RecordingError)
+    camera_file = (
+        calibration(*size_of_first([path / name for name in colour]))
+        if calibration
+        else _calibration(path)
+    )
+    depth_times, depth = read_file_list(path / "depth.txt", RecordingError)
+    nearest = nearest_rows(np.array(colour_times), np.array(depth_times))
+    kept = [
+        row
+        for row, other in enumerate(nearest)
+        if abs(colour_times[row] - depth_times[other]) <= MAX_DEPTH_DELAY * 1e9
+    ]
+    if not kept:
+        raise RecordingError(
+            f"{path}: none of {len(colour)} colour pictures has one of {len(depth)} depth pictures"
+            " within 20 ms"
+        )
+    t_ns = [colour_times[row] for row in kept]
+    poses = read_truth(path / "groundtruth.txt", [], t_ns)
+    pictures = DepthPictures(
+        [path / depth[nearest[row]] for row in kept],
+        camera_file.depth_factor or DEPTH_FACTOR,
+        camera_file.camera,
+        Rigid3.identity(),
+    )
+    return Recording(
+        path.resolve().name,
+        path,
+        [colour[row] for row in kept],
+        t_ns,
+        poses,
+        camera_file.camera,
+        depth=pictures,
+    )
+
+
+def _calibration(path: Path) -> CameraFile:
+    if (path / FILE_NAME).is_file():
+        return read_camera_json(path / FILE_NAME)
+    number = re.search(r"freiburg([123])", path.resolve().name)
+    if number is None:
+        raise CalibrationError(
+            f"{path / FILE_NAME}: no calibration here, and the folder's name does not say"
+            " freiburg1, 2 or 3"
+        )
+    return CameraFile(_FREIBURG[number[1]])
+
+
+FORMAT = SequenceFormat(LOOKS_FOR, recognises, open_tum, ("calibration",))

@@ -1,0 +1,192 @@
+"""A video file (MP4, AVI, ...) as a recording of single pictures, by OpenCV's reader.
+
+Calibration is the ``camera.json`` beside it, truth is ``NAME.tum`` for ``NAME.mp4``. Times are the
+container's, so that a camera of varying rate keeps its own. A turn that the file asks players for
+is not applied: a calibration is of the pixels as they are stored.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from topoloc.errors import CalibrationError, RecordingError, UnreadableImageError
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.recordings.camera_json import FILE_NAME, read_camera_json
+from topoloc.recordings.format import SequenceFormat
+from topoloc.recordings.frame import Image, StereoFrame
+from topoloc.recordings.trajectory import read_truth
+
+# FFmpeg prints its own lines about broken files on stderr, beside the error that says it; read once
+# a process, at its first use.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+
+VIDEO_SUFFIXES = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm"})
+_LOG_LEVEL_LOCK = threading.Lock()
+LOOKS_FOR = "a video file (.mp4, .mov, .avi, .mkv, .webm)"
+
+
+def recognises(path: Path) -> bool:
+    """Whether this is a video file, by its name."""
+    return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
+
+
+@dataclass(eq=False)
+class _Reader:
+    """An open video and the number of the frame that it gives next."""
+
+    capture: Any
+    next_idx: int = 0
+
+
+@dataclass(eq=False)
+class Video:
+    """A StereoSequence in one file. Frames are decoded in their order; to ask for an earlier one
+    begins anew."""
+
+    name: str
+    path: Path
+    names: list[str]
+    t_ns: list[int]
+    poses: list[Rigid3 | None]
+    camera: Camera | None
+    size: tuple[int, int]
+    _reader: _Reader | None = field(default=None, repr=False)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, index: int) -> StereoFrame:
+        """Read one frame.
+
+        Raises:
+            IndexError: no such frame.
+            UnreadableImageError: it cannot be decoded, or is of another size than the first.
+        """
+        if index < 0:
+            index += len(self)
+        if not 0 <= index < len(self):
+            raise IndexError(f"frame {index} of a video of {len(self)}")
+        return StereoFrame(
+            self.names[index],
+            self.t_ns[index],
+            self._decode(index),
+            self.camera,
+            world_from_cam=self.poses[index],
+        )
+
+    def _decode(self, index: int) -> Image:
+        reader = self._reader
+        if reader is None or reader.next_idx > index:
+            reader = self._reader = _Reader(_open(self.path))
+        while reader.next_idx <= index:
+            grabbed = reader.capture.grab()
+            reader.next_idx += 1
+            if not grabbed:
+                self._reader = None
+                raise UnreadableImageError(f"{self.path}, frame {index}: cannot be decoded")
+        decoded, picture = reader.capture.retrieve()
+        if not decoded or picture is None:
+            raise UnreadableImageError(f"{self.path}, frame {index}: cannot be decoded")
+        height, width = picture.shape[:2]
+        if (width, height) != self.size:
+            raise UnreadableImageError(
+                f"{self.path}, frame {index}: {width}x{height} pixels, but the first frame is of"
+                f" {self.size[0]}x{self.size[1]}"
+            )
+        return picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+
+
+def open_video(path: Path) -> Video:
+    """Open a video file. It is gone through once for its times; a file that was cut off ends with
+    its last whole frame.
+
+    Raises:
+        RecordingError: no video, no frame in it that can be decoded, or its clock goes backwards.
+        CalibrationError: camera.json is not usable, or is of another size than the frames.
+        TrajectoryError: the truth is malformed or fits no frame.
+    """
+    video = uncalibrated_video(path)
+    if not (path.parent / FILE_NAME).is_file():
+        return video
+    camera, (width, height) = read_camera_json(path.parent / FILE_NAME).camera, video.size
+    if (camera.width, camera.height) != video.size:
+        raise CalibrationError(
+            f"{path.parent / FILE_NAME}: of {camera.width}x{camera.height}, but {path.name} is"
+            f" {width}x{height}"
+        )
+    return replace(video, camera=camera)
+
+
+def uncalibrated_video(path: Path) -> Video:
+    """The video as it is, whatever calibration lies beside it. Raises as `open_video`."""
+    size, rate = frame_size(path)
+    t_ns = _times(path, rate)
+    poses = read_truth(path.with_suffix(".tum"), [], t_ns)
+    return Video(
+        path.name, path, [f"{index:06d}" for index in range(len(t_ns))], t_ns, poses, None, size
+    )
+
+
+def frame_size(path: Path) -> tuple[tuple[int, int], float]:
+    """Width and height of the first frame, in pixels, and the rate that the container names. Raises
+    RecordingError."""
+    capture = _open(path)
+    decoded, first = capture.read()
+    if not decoded or first is None:
+        raise RecordingError(f"{path}: no frame of this video can be decoded")
+    return (first.shape[1], first.shape[0]), capture.get(cv2.CAP_PROP_FPS)
+
+
+def _open(path: Path) -> cv2.VideoCapture:
+    with opencv_silent():
+        capture = cv2.VideoCapture(str(path))
+    if not capture.isOpened():
+        raise RecordingError(f"{path}: not a video, damaged, or of a codec that OpenCV cannot read")
+    capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+    return capture
+
+
+def _times(path: Path, rate: float) -> list[int]:
+    """The time of each frame; by the rate where the container gives none."""
+    capture = _open(path)
+    t_ns = []
+    while capture.grab():
+        t_ns.append(round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6))
+    if len(t_ns) > 1 and not any(t_ns):
+        if not rate > 0:
+            raise RecordingError(f"{path}: neither its frames have times, nor does it name a rate")
+        return [round(index * 1e9 / rate) for index in range(len(t_ns))]
+    for index in range(1, len(t_ns)):
+        if t_ns[index] <= t_ns[index - 1]:
+            raise RecordingError(
+                f"{path}, frame {index}: at {t_ns[index] / 1e9:.3f} s, but the frame before is at"
+                f" {t_ns[index - 1] / 1e9:.3f} s"
+            )
+    return t_ns
+
+
+@contextmanager
+def opencv_silent() -> Iterator[None]:
+    """No OpenCV messages on stderr beside the error that says it."""
+    logging: Any = getattr(
+        cv2.utils, "logging", cv2
+    )  # OpenCV 4 has these functions in its own name space
+    with _LOG_LEVEL_LOCK:
+        level = logging.getLogLevel()
+        logging.setLogLevel(0)
+        try:
+            yield
+        finally:
+            logging.setLogLevel(level)
+
+
+FORMAT = SequenceFormat(LOOKS_FOR, recognises, open_video)

@@ -1,0 +1,57 @@
+"""The numbers of calibration files in YAML, as EuRoC, Kalibr, OpenCV and ROS write them.
+
+The files come with OpenCV's header or without it and in several styles of YAML, so only the words
+and numbers after the needed keys are read: no tag is obeyed, no alias followed.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from topoloc.errors import CalibrationError
+from topoloc.recordings.text_rows import read_text
+
+_MAX_CHARS = 1_000_000
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+
+
+def read_yaml(path: Path) -> str:
+    """The text of a calibration without its comments. Raises CalibrationError, which names the
+    file."""
+    text = read_text(path, CalibrationError, "no calibration here")
+    if len(text) > _MAX_CHARS:
+        raise CalibrationError(f"{path}: {len(text)} characters are no calibration")
+    return re.sub(r"#.*", "", text)
+
+
+def yaml_word(text: str, key: str, default: str) -> str:
+    """The word after a key."""
+    found = re.search(rf"^\s*{key}:\s*[\"']?([\w-]+)", text, re.MULTILINE)
+    return found[1] if found else default
+
+
+def yaml_numbers(text: str, *keys: str) -> list[float]:
+    """All numbers after the first of these keys that is there, up to the next key that is not
+    `cols`, `rows`, `dt` or `data`."""
+    for key in keys:
+        found = re.search(
+            rf"^[ \t]*{key}:(.*?)(?=^[ \t]*(?!(?:cols|rows|dt|data)\b)[A-Za-z_]\w*:|\Z)",
+            text,
+            re.MULTILINE | re.DOTALL,
+        )
+        if found:
+            return [
+                float(number)
+                for number in _NUMBER.findall(re.sub(r"\b(?:cols|rows|dt):.*", "", found[1]))
+            ]
+    return []
+
+
+def needed_numbers(path: Path, text: str, count: int, *keys: str) -> list[float]:
+    """The first `count` numbers after one of these keys. Raises CalibrationError, which names the
+    file."""
+    numbers = yaml_numbers(text, *keys)
+    if len(numbers) < count:
+        raise CalibrationError(f"{path}: {' or '.join(keys[:3])} with {count} numbers is missing")
+    return numbers[:count]

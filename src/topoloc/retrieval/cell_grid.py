@@ -1,0 +1,156 @@
+"""What a network of local features saw in each cell of the picture (`Features.cells`): it tells
+places apart where VLAD does not.
+
+VLAD of key points is sharp, but knows a place only from about where it was mapped, for it counts
+where in the picture things are. Cells are blunt and keep through the night; whoever comes by beside
+the map's way sees the same things in other columns, so two grids are compared at several shifts,
+and the best one counts. Each cell is the mean of one of the network's levels there, less what that
+cell shows in the mapping images on average, its channels whitened by their PCA, brought to unit
+length.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float32, Int, Int8
+
+from topoloc.errors import MapError
+from topoloc.retrieval.coarse import CoarseModel, model_array
+from topoloc.retrieval.place_kernels import multiply_shifted
+
+DIMENSION = 32
+"""Numbers of a cell after PCA, at most."""
+_SOFTENING = (
+    0.1  # so many times the mean variance is added to each axis's: the weakest axes are noise
+)
+_MAX_SHIFT = 1  # columns
+_LARGEST = 1e6  # no network's level comes near it
+_SCALE = np.float32(127.0)  # of the numbers of a cell, which are kept as signed bytes
+
+
+class CellGrid:
+    """The cells of all mapping images.
+
+    Args:
+        mean: (columns, rows, c) of the mapping images' cells. Columns come first, so that a shifted
+            grid lies in one piece.
+        projection: (d, c) of a cell's channels.
+        vectors: (n, columns * rows * d) the mapping images, each cell of length 127.
+    """
+
+    def __init__(
+        self,
+        mean: Float32[np.ndarray, "columns rows c"],
+        projection: Float32[np.ndarray, "d c"],
+        vectors: Int8[np.ndarray, "n m"],
+    ) -> None:
+        self._mean, self._projection, self._stored = mean, projection, vectors
+        self._vectors = vectors.astype(np.float32) / _SCALE
+
+    @staticmethod
+    def fit(cells: Float32[np.ndarray, "n rows columns c"], dimension: int = DIMENSION) -> CellGrid:
+        """From the cells of all mapping images."""
+        by_column = np.ascontiguousarray(cells.transpose(0, 2, 1, 3))
+        mean, channels = by_column.mean(axis=0), by_column.shape[3]
+        centred = (by_column - mean).reshape(-1, channels)
+        if (
+            float(np.abs(centred).max()) < 1e-6
+        ):  # one picture, or all alike: what they show in common is all there is
+            mean, centred = np.zeros_like(mean), by_column.reshape(-1, channels)
+        variances, axes = np.linalg.eigh(centred.T.astype(np.float64) @ centred / len(centred))
+        variances, axes = variances[::-1][:dimension], axes[:, ::-1][:, :dimension]
+        softened = np.sqrt(
+            np.maximum(variances, 0.0) / max(float(variances.mean()), 1e-12) + _SOFTENING
+        )
+        # as the map file keeps it, so that a map says the same before and after
+        projection = (axes / softened).T.astype(np.float16).astype(np.float32)
+        vectors = np.concatenate(
+            [
+                _described(part, mean, projection)
+                for part in np.array_split(by_column, -(-len(cells) // 256))
+            ]
+        )
+        return CellGrid(mean, projection, np.rint(_SCALE * vectors).astype(np.int8))
+
+    def with_cells(self, cells: Float32[np.ndarray, "n rows columns c"]) -> CellGrid:
+        """With the cells of further mapping images, less the same mean and by the same
+        projection."""
+        added = _described(
+            np.ascontiguousarray(cells.transpose(0, 2, 1, 3)), self._mean, self._projection
+        )
+        return CellGrid(
+            self._mean,
+            self._projection,
+            np.concatenate([self._stored, np.rint(_SCALE * added).astype(np.int8)]),
+        )
+
+    def likeness(
+        self, cells: Float32[np.ndarray, "rows columns c"], images: Int[np.ndarray, " k"]
+    ) -> Float32[np.ndarray, " k"]:
+        """The mean cosine between the cells of a picture and those of each of these mapping images,
+        at the best shift.
+
+        Raises:
+            MapError: the cells are not of the form that the map's have.
+        """
+        columns, rows = self._mean.shape[:2]
+        by_column = np.ascontiguousarray(cells.transpose(1, 0, 2)[None])
+        if by_column.shape[1:] != self._mean.shape:
+            raise MapError("the map's cells are not of the form that its features have")
+        vector, products = (
+            _described(by_column, self._mean, self._projection)[0],
+            np.empty(len(images), np.float32),
+        )
+        multiply_shifted(
+            self._vectors,
+            images,
+            vector,
+            len(vector) // columns,
+            min(_MAX_SHIFT, columns - 1),
+            products,
+        )
+        return products / np.float32(rows)
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """What the map file keeps: a byte for each of an image's numbers."""
+        return {
+            "cell_mean": self._mean,
+            "cell_projection": self._projection.astype(np.float16),
+            "cell_vectors": self._stored,
+        }
+
+    @staticmethod
+    def from_model(model: CoarseModel, num_images: int) -> CellGrid | None:
+        """The inverse of `to_arrays`; None of a model without. Raises MapError where the arrays do
+        not belong together."""
+        if "cell_vectors" not in model.arrays:
+            return None
+        mean = model_array(model, "cell_mean", "f", (None, None, None)).astype(
+            np.float32, copy=False
+        )
+        projection = model_array(model, "cell_projection", "f", (None, mean.shape[2])).astype(
+            np.float32
+        )
+        if not max(float(np.abs(mean).max()), float(np.abs(projection).max())) < _LARGEST:
+            raise MapError(
+                f"the map's coarse localizer {model.name!r} is damaged: cells beyond {_LARGEST:g}"
+            )
+        vectors = model_array(
+            model,
+            "cell_vectors",
+            "i",
+            (num_images, mean.shape[0] * mean.shape[1] * len(projection)),
+        )
+        return CellGrid(mean, projection, vectors.astype(np.int8))
+
+
+def _described(
+    cells: Float32[np.ndarray, "n columns rows c"],
+    mean: Float32[np.ndarray, "columns rows c"],
+    projection: Float32[np.ndarray, "d c"],
+) -> Float32[np.ndarray, "n m"]:
+    """Each cell centred, projected and brought to unit length; the cells of a picture one after the
+    other, column by column."""
+    projected = (cells - mean) @ projection.T
+    projected /= np.maximum(np.linalg.norm(projected, axis=3, keepdims=True), 1e-6)
+    return np.ascontiguousarray(projected.reshape(len(cells), -1), np.float32)

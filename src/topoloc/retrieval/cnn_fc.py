@@ -1,0 +1,121 @@
+"""cnn-fc: a network whose output layer has one unit a node, trained on the mapping images.
+
+The paper's first classifier (section III-A): VGG-11 with its last layer replaced, or a smaller
+backbone. Each image is labelled with its nearest node by Eq. 1 (position and heading). Scores are
+probabilities, calibrated on images held out of the training.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float32
+from torch import Tensor, nn
+
+from topoloc.errors import MapError
+from topoloc.features.features import Features
+from topoloc.retrieval.backbones import Backbone, has_wide_classifier
+from topoloc.retrieval.coarse import CoarseModel, Image, NodeScore, model_array, setting
+from topoloc.retrieval.inference import Predictor, from_arrays
+from topoloc.retrieval.network_config import BackboneName, ClassifierNetwork
+from topoloc.retrieval.network_pictures import PictureShape, network_pictures
+
+NAME = "cnn-fc"
+MAX_OUTPUTS = 100_000
+_SQUEEZED, _ROWS, _COLUMNS = 64, 4, 5
+
+
+class NodeClassifier(nn.Module):
+    """Images to one number a node. VGG keeps its classifier but for the last layer; the mean over
+    the picture, which the small networks end with, forgets where things are in it: their features
+    are squeezed and pooled in cells instead."""
+
+    def __init__(self, backbone: BackboneName, num_nodes: int) -> None:
+        super().__init__()
+        wide = has_wide_classifier(backbone)
+        self.backbone = Backbone(backbone, num_outputs=num_nodes if wide else None)
+        self.head = nn.Identity() if wide else _cell_head(self.backbone.num_channels, num_nodes)
+
+    def forward(self, images: Tensor, first: int = 0) -> Tensor:
+        """As that of `Backbone`."""
+        return self.head(self.backbone(images, first))
+
+
+class CnnFc:
+    """The coarse localizer `cnn-fc`.
+
+    Raises:
+        MapError: the model's arrays do not belong together.
+    """
+
+    def __init__(self, model: CoarseModel) -> None:
+        self._picture = setting(model, "config", ClassifierNetwork).picture
+        self._shape = PictureShape(*setting(model, "picture_shape", tuple[int, int]))
+        self._temperature, num_outputs = (
+            setting(model, "temperature", float),
+            setting(model, "num_nodes", int),
+        )
+        if not 0 < num_outputs <= MAX_OUTPUTS or self._temperature <= 0.0:
+            raise MapError(
+                f"the map's coarse localizer {NAME!r} is damaged: {num_outputs} outputs,"
+                f" temperature {self._temperature}"
+            )
+        try:
+            self._predict = Predictor(
+                from_arrays(
+                    NodeClassifier(setting(model, "backbone", BackboneName), num_outputs),
+                    model.arrays,
+                )
+            )
+        except (KeyError, RuntimeError, ValueError) as error:
+            raise MapError(
+                f"the map's coarse localizer {NAME!r} is damaged:"
+                f" {' '.join(str(error).split())[:200]}"
+            ) from error
+        # the node of each output, as its row in the map; -1 of nodes that are no more
+        has_rows = "node_ids" in model.arrays
+        self._rows = (
+            model_array(model, "node_ids", "iu", (num_outputs,))
+            if has_rows
+            else np.arange(num_outputs)
+        )
+
+    def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
+        """See `CoarseLocalizer.rank`; scores are probabilities. The local features are not looked
+        at."""
+        return self.rank_batch([image], num_candidates)[0]
+
+    def rank_batch(self, images: Sequence[Image], num_candidates: int) -> list[list[NodeScore]]:
+        """`rank` of many images, which go through the network together."""
+        ranked = []
+        for row in self.probabilities(images):
+            outputs = np.argsort(-row, kind="stable")
+            outputs = outputs[self._rows[outputs] >= 0][:num_candidates]
+            ranked.append(
+                [NodeScore(int(self._rows[output]), float(row[output])) for output in outputs]
+            )
+        return ranked
+
+    def probabilities(self, images: Sequence[Image]) -> Float32[np.ndarray, "n nodes"]:
+        """Of each node, for each image."""
+        outputs = self._predict(network_pictures(images, self._shape, self._picture)) / np.float32(
+            self._temperature
+        )
+        powers = np.exp(outputs - outputs.max(axis=1, keepdims=True))
+        return powers / powers.sum(axis=1, keepdims=True)
+
+
+open_model = CnnFc
+
+
+def _cell_head(num_channels: int, num_nodes: int) -> nn.Sequential:
+    squeeze = [
+        nn.Conv2d(num_channels, _SQUEEZED, 1),
+        nn.ReLU(True),
+        nn.AdaptiveAvgPool2d((_ROWS, _COLUMNS)),
+        nn.Flatten(),
+    ]
+    return nn.Sequential(
+        *squeeze, nn.Dropout(0.3), nn.Linear(_SQUEEZED * _ROWS * _COLUMNS, num_nodes)
+    )

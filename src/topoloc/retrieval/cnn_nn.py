@@ -1,0 +1,59 @@
+"""cnn-nn: features of a pretrained network, pooled in cells and whitened; the nodes of the nearest
+mapping images.
+
+The paper's second classifier (section III-B). Features are pooled by the generalised mean of
+Radenovic et al. (2018), in a few cells instead of one: neighbouring nodes see the same things, at
+other places of the picture.
+"""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+
+from topoloc.retrieval.backbones import Backbone
+from topoloc.retrieval.coarse import CoarseModel, setting
+from topoloc.retrieval.network_config import BackboneName, PooledNetwork
+from topoloc.retrieval.vector_search import VectorSearch
+
+# Deeper layers know more of things and less of places: the fifth and sixth of SqueezeNet's fire
+# modules rank nodes best.
+DEPTHS: dict[BackboneName, int | None] = {
+    "squeezenet1_1": 11,
+    "vgg11": None,
+    "vgg16": None,
+    "efficientnet_lite0": 11,
+    "compact": None,
+}
+
+
+class PooledFeatures(nn.Module):
+    """Feature maps pooled over a grid of cells by the generalised mean; unit vectors."""
+
+    def __init__(
+        self, backbone: BackboneName, depth: int | None, rows: int, columns: int, power: float
+    ) -> None:
+        super().__init__()
+        self.backbone = Backbone(backbone, num_outputs=None, depth=depth)
+        self.rows, self.columns, self.power = rows, columns, power
+
+    def forward(self, images: Tensor) -> Tensor:
+        """(n, channels * rows * columns) of normalised images (n, 3, h, w)."""
+        maps = self.backbone(images).float().clamp(min=1e-4)
+        pooled = nn.functional.adaptive_avg_pool2d(maps**self.power, (self.rows, self.columns)) ** (
+            1.0 / self.power
+        )
+        return nn.functional.normalize(pooled.flatten(1))
+
+
+def open_model(model: CoarseModel) -> VectorSearch:
+    """The localizer of a stored model. Raises MapError, ConfigError."""
+    config = setting(model, "config", PooledNetwork)
+    return VectorSearch(
+        model, network_of(setting(model, "backbone", BackboneName), config), config.picture
+    )
+
+
+def network_of(backbone: BackboneName, config: PooledNetwork) -> PooledFeatures:
+    """The network with random weights."""
+    depth = config.depth if config.depth is not None else DEPTHS[backbone]
+    return PooledFeatures(backbone, depth, config.grid_rows, config.grid_columns, config.power)

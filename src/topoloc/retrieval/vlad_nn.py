@@ -1,0 +1,74 @@
+"""vlad-nn: NetVLAD of a network's feature maps, whitened; the nodes of the nearest mapping images.
+
+The paper's third classifier (section III-B). The vocabulary comes with the weights where these are
+a NetVLAD checkpoint, else it is learnt from the map's own images, as NetVLAD begins its training;
+it can be tuned to the place by the triplet loss.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from topoloc.retrieval.backbones import Backbone
+from topoloc.retrieval.coarse import CoarseModel, setting
+from topoloc.retrieval.network_config import BackboneName, VladNetworkConfig
+from topoloc.retrieval.vector_search import VectorSearch
+
+# NetVLAD takes VGG's last convolution before its rectifier and pooling, as the public checkpoints
+# do.
+DEPTHS: dict[BackboneName, int | None] = {
+    "squeezenet1_1": 11,
+    "vgg11": 19,
+    "vgg16": 29,
+    "efficientnet_lite0": 11,
+    "compact": None,
+}
+
+
+class NetVlad(nn.Module):
+    """Feature maps (n, c, h, w) -> unit vectors (n, k * c): residuals from each word, summed, each
+    word's sum normalised.
+
+    VLAD with soft assignment (Arandjelovic et al. 2016). Parameters carry the names of the public
+    PyTorch implementation, whose checkpoints load as they are.
+    """
+
+    def __init__(self, num_clusters: int, num_channels: int) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(num_channels, num_clusters, 1, bias=False)
+        self.centroids = nn.Parameter(torch.zeros(num_clusters, num_channels))
+
+    def forward(self, maps: Tensor) -> Tensor:
+        maps = nn.functional.normalize(maps.float(), dim=1)
+        shares = torch.softmax(self.conv(maps.to(self.conv.weight.dtype)).float(), dim=1).flatten(2)
+        sums = (
+            torch.bmm(shares, maps.flatten(2).transpose(1, 2))
+            - shares.sum(dim=2, keepdim=True) * self.centroids.float()
+        )
+        return nn.functional.normalize(nn.functional.normalize(sums, dim=2).flatten(1))
+
+
+class VladNetwork(nn.Module):
+    """A backbone with a NetVLAD layer."""
+
+    def __init__(self, backbone: BackboneName, depth: int | None, num_clusters: int) -> None:
+        super().__init__()
+        self.backbone = Backbone(backbone, num_outputs=None, depth=depth)
+        self.pool = NetVlad(num_clusters, self.backbone.num_channels)
+
+    def forward(self, images: Tensor) -> Tensor:
+        return self.pool(self.backbone(images))
+
+
+def open_model(model: CoarseModel) -> VectorSearch:
+    """The localizer of a stored model. Raises MapError, ConfigError."""
+    config = setting(model, "config", VladNetworkConfig)
+    backbone, num_clusters = (
+        setting(model, "backbone", BackboneName),
+        setting(model, "num_clusters", int),
+    )
+    depth = config.depth if config.depth is not None else DEPTHS[backbone]
+    return VectorSearch(
+        model, VladNetwork(backbone, depth, min(num_clusters, 4096)), config.picture
+    )

@@ -1,0 +1,55 @@
+"""One line at the end: what the pictures of one camera say of its calibration together."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tiny_world import CAMERA
+from topoloc.apps.cli import main
+
+
+def numbers(scale: float) -> str:
+    return f"{scale * CAMERA.fx},{scale * CAMERA.fy},{CAMERA.cx},{CAMERA.cy}"
+
+
+@pytest.mark.parametrize("scale", [0.95, 1.05])
+def test_a_wrong_focal_length_is_said_once(
+    room_map: Path, queries: Path, scale: float, capsys: pytest.CaptureFixture[str]
+):
+    assert main(["localize", str(room_map), str(queries), "--camera", numbers(scale)]) == 0
+    (said,) = [line for line in capsys.readouterr().err.splitlines() if "the pictures say" in line]
+    measured = float(said.split("f = ")[1].split(" ")[0])
+    assert measured == pytest.approx(CAMERA.fx, rel=0.015)
+    assert f"the calibration {scale * CAMERA.fx:.1f}" in said
+
+
+def test_a_right_one_is_not_accused(
+    room_map: Path, queries: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert main(["localize", str(room_map), str(queries)]) == 0
+    assert "the pictures say" not in capsys.readouterr().err
+
+
+def test_evaluate_has_it_in_its_json(
+    room_map: Path, queries: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    out = tmp_path / "evaluation.json"
+    assert main(["evaluate", str(room_map), str(queries), "--json", str(out)]) == 0
+    (right,) = json.loads(out.read_text())["calibrations"]
+    assert not right["contradicted"]
+    assert right["recording"] == queries.name
+    assert right["focal_length_px"] == pytest.approx(CAMERA.fx, rel=0.01)
+    assert right["num_pictures"] >= 5
+    assert (
+        main(
+            ["evaluate", str(room_map), str(queries), "--camera", numbers(1.05), "--json", str(out)]
+        )
+        == 0
+    )
+    (wrong,) = json.loads(out.read_text())["calibrations"]
+    assert wrong["contradicted"]
+    assert wrong["calibrated_focal_length_px"] == pytest.approx(1.05 * CAMERA.fx)
+    assert wrong["detail"] in capsys.readouterr().out

@@ -1,0 +1,129 @@
+"""topoloc follow: a line a picture, and an end when it is told to."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mjpeg_camera import mjpeg_camera
+from topoloc.apps.cli import main
+from topoloc.geometry.rigid import Rigid3
+
+ROOT = Path(__file__).parents[3]
+
+
+def _lines(capsys: pytest.CaptureFixture[str], *args: object) -> list[str]:
+    capsys.readouterr()
+    assert main(["follow", *map(str, args)]) == 0
+    return capsys.readouterr().out.splitlines()
+
+
+def test_a_recording_is_answered_as_the_stream_that_it_is(
+    room_map: Path, tiny_recording: Path, capsys: pytest.CaptureFixture[str]
+):
+    followed = [json.loads(line) for line in _lines(capsys, room_map, f"{tiny_recording}@0:4")]
+    assert main(["localize", str(room_map), f"{tiny_recording}@0:4", "--json", "-"]) == 0
+    localized = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    for one in (*followed, *localized):
+        one.pop("times_ms")
+    assert followed == localized
+    assert followed[0]["state"] == "localized"
+    (first, *_) = _lines(capsys, room_map, f"{tiny_recording}@0:1", "--plain")
+    assert "localized" in first
+
+
+def test_a_camera_that_runs_is_followed_until_it_ends(
+    room_map: Path, tiny_recording: Path, capsys: pytest.CaptureFixture[str]
+):
+    pictures = [
+        cv2.imread(str(path)) for path in sorted((tiny_recording / "image_0").iterdir())[:4]
+    ]
+    before_ns = time.time_ns()
+    with mjpeg_camera([picture for picture in pictures if picture is not None], 0.5) as url:
+        answers = [json.loads(line) for line in _lines(capsys, room_map, url, "--camera", "map")]
+    assert 1 <= len(answers) <= 4
+    assert answers[0]["state"] == "localized"
+    assert before_ns < answers[0]["t_ns"] <= answers[-1]["t_ns"] < time.time_ns()
+
+
+def test_it_ends_when_it_is_told_to(room_map: Path, tiny_recording: Path, tmp_path: Path):
+    """A stream that would go on for minutes: two thousand pictures, the same four again and
+    again."""
+    pictures = sorted((tiny_recording / "image_0").iterdir())[:4]
+    for number in range(2000):
+        (tmp_path / f"{number:06d}.png").symlink_to(pictures[number % 4])
+    command = [
+        sys.executable,
+        "-m",
+        "topoloc",
+        "follow",
+        str(room_map),
+        str(tmp_path),
+        "--camera",
+        "map",
+    ]
+    environment = os.environ | {"PYTHONPATH": str(ROOT / "src")}
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    ) as process:
+        assert process.stdout is not None
+        first = json.loads(process.stdout.readline())
+        process.send_signal(signal.SIGTERM)
+        rest, said = process.communicate(timeout=60)
+    assert (process.returncode, said) == (0, "")
+    assert first["state"] == "localized"
+    lines = [json.loads(line) for line in rest.splitlines()]
+    assert len(lines) < 1000
+
+
+def test_robots_hear_what_was_measured(
+    room_map: Path,
+    tiny_recording: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+):
+    published = list[tuple[int, list[float]]]()
+
+    class Robots:
+        def __init__(self, domain: int) -> None:
+            assert domain == 7
+
+        def publish(self, t_ns: int, world_from_cam: Rigid3, covariance: np.ndarray) -> None:
+            assert covariance.shape == (6, 6)
+            published.append((t_ns, world_from_cam.translation.tolist()))
+
+    monkeypatch.setattr("topoloc.apps.cli.follow.RosPublisher", Robots)
+    answers = [
+        json.loads(line) for line in _lines(capsys, room_map, f"{tiny_recording}@0:3", "--ros", 7)
+    ]
+    measured = [
+        (answer["t_ns"], answer["world_from_cam"]["translation"])
+        for answer in answers
+        if answer["localized"]
+    ]
+    assert published == measured
+    assert len(measured) == 3
+
+
+def test_what_cannot_be_followed_is_one_line(
+    complaint: Callable[..., str], room_map: Path, tiny_recording: Path, tmp_path: Path
+):
+    assert "no such camera or stream" in complaint("follow", room_map, "/dev/video77")
+    assert "calibration" in complaint(
+        "follow", room_map, tiny_recording, "--camera", "unknown", status=2
+    )
+    picture = cv2.imread(str(next((tiny_recording / "image_0").iterdir())))
+    assert picture is not None
+    (tmp_path / "walk").mkdir()
+    cv2.imwrite(str(tmp_path / "walk" / "0.png"), picture)
+    assert "calibration" in complaint("follow", room_map, tmp_path / "walk")

@@ -1,0 +1,136 @@
+"""Files written whole or not at all; a progress bar on terminals only."""
+
+from __future__ import annotations
+
+import io
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from topoloc.apps.cli.output import check_outputs, print_facts, progress_bar, write_text
+from topoloc.errors import TopolocError
+
+
+class _Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_nothing_is_lost_where_a_file_cannot_be_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    path = tmp_path / "result.json"
+    write_text(path, "old")
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(TopolocError, match=r"cannot write .*result\.json: No space left on device"):
+        write_text(path, "new")
+    assert path.read_text() == "old"
+    assert os.listdir(tmp_path) == ["result.json"]
+
+
+def test_outputs_that_can_be_written_pass(tmp_path: Path):
+    (tmp_path / "old.json").write_text("{}")
+    check_outputs(
+        [None, "-", "-", str(tmp_path / "old.json"), str(tmp_path / "new.json")],
+        inputs=[str(tmp_path / "map.topo")],
+    )
+
+
+@pytest.mark.skipif(not Path(os.devnull).is_char_device(), reason="no device files here")
+def test_devices_are_not_replaced_by_files():
+    with pytest.raises(TopolocError, match="no regular file"):
+        check_outputs([os.devnull])
+
+
+def test_one_path_is_not_two_outputs(tmp_path: Path):
+    with pytest.raises(TopolocError, match="named for something else"):
+        check_outputs(
+            [
+                str(tmp_path / "a"),
+                str(tmp_path / "sub" / ".." / "a") if (tmp_path / "sub").mkdir() is None else None,
+            ]
+        )
+
+
+def test_facts_stand_in_columns(capsys: pytest.CaptureFixture[str]):
+    print_facts([("map", "a.topo"), ("nodes", "12")])
+    assert capsys.readouterr().out == "map    a.topo\nnodes  12\n"
+
+
+def test_no_progress_bar_in_files(monkeypatch: pytest.MonkeyPatch):
+    file = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", file)
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    with progress_bar() as progress:
+        progress("nodes", 1, 2)
+    assert file.getvalue() == ""
+
+
+def test_a_progress_bar_on_a_terminal_leaves_results_in_their_file(monkeypatch: pytest.MonkeyPatch):
+    terminal, file = _Terminal(), io.StringIO()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setattr(sys, "stdout", file)
+    monkeypatch.setenv("TERM", "xterm")
+    with progress_bar() as progress:
+        print("a result")
+        progress("nodes", 2, 2)
+    assert "nodes" in terminal.getvalue()
+    assert file.getvalue() == "a result\n"
+
+
+# The help of `build` is longer than Python's buffer: it fails in the middle, not at the end.
+SAYING = [
+    (["--help"], "1"),
+    (["--help"], ""),
+    (["--version"], ""),
+    (["build", "--help"], ""),
+    (["info", "MAP"], ""),
+]
+
+
+@pytest.mark.parametrize(("args", "unbuffered"), SAYING)
+def test_output_that_cannot_be_written_is_one_line_at_most(
+    args: list[str], unbuffered: str, room_map: Path
+):
+    """To a device that is full, and to a reader that went away: neither leaves a traceback, not
+    even as Python ends."""
+    command = [
+        sys.executable,
+        "-m",
+        "topoloc",
+        *(str(room_map) if arg == "MAP" else arg for arg in args),
+    ]
+    environment = os.environ | {"PYTHONUNBUFFERED": unbuffered}
+    reading, writing = os.pipe()
+    os.close(reading)
+    with open(writing, "wb") as gone:
+        done = subprocess.run(
+            command, stdout=gone, stderr=subprocess.PIPE, text=True, env=environment, check=False
+        )
+    assert (done.returncode, done.stderr) == (1, "")
+    if not Path("/dev/full").is_char_device():
+        pytest.skip("no /dev/full here")
+    with open("/dev/full", "wb") as full:
+        done = subprocess.run(
+            command, stdout=full, stderr=subprocess.PIPE, text=True, env=environment, check=False
+        )
+    assert (done.returncode, done.stderr) == (
+        1,
+        "error: cannot write the output: No space left on device\n",
+    )
+
+
+def test_who_closes_the_output_wants_none(room_map: Path):
+    command = [sys.executable, "-m", "topoloc", "info", str(room_map), "--json", "-"]
+    close = "import os, sys; os.close(1); os.execv(sys.argv[1], sys.argv[1:])"
+    done = subprocess.run(
+        [sys.executable, "-c", close, *command], stderr=subprocess.PIPE, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")

@@ -1,0 +1,167 @@
+"""Evaluation on a cluster of two nodes: the figures, words and failures of the plain command."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from dying_piece import DyingPiece
+
+from built_room import unseen_views, write_pictures
+from topoloc.apps.cli import main, recording_queries
+from topoloc.apps.cli.recording_queries import Piece, Queries, QueryRecording, SentMap
+from topoloc.atlas.editing import create_atlas, new_tiles
+from topoloc.errors import MapError, MissingExtraError, RecordingError, TrajectoryError
+from topoloc.evaluation.metrics import summarize
+from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.mapping.topomap import TopoMetricMap
+
+Complaint = Callable[..., str]
+
+
+@pytest.fixture
+def asked(room_map: Path, queries: Path, tmp_path: Path) -> Path:
+    """A folder with `room.topo`, `pictures` of the room and pictures of `elsewhere`, to be
+    broken."""
+    shutil.copy(room_map, tmp_path / "room.topo")
+    shutil.copytree(queries, tmp_path / "pictures")
+    write_pictures(tmp_path / "elsewhere", unseen_views(seed=1, step=4.0))
+    return tmp_path
+
+
+def _timeless(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {
+            key: _timeless(one)
+            for key, one in value.items()
+            if key not in ("times_ms", "median_times_ms")
+        }
+    return [_timeless(one) for one in value] if isinstance(value, list) else value
+
+
+def _evaluated(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[Any, str]:
+    """The JSON without times, and what is said on standard error."""
+    capsys.readouterr()
+    assert main(["evaluate", *map(str, args), "--json", "-"]) == 0
+    printed = capsys.readouterr()
+    return _timeless(json.loads(printed.out)), printed.err
+
+
+def test_the_same_figures_whoever_dies(
+    cluster: Any, asked: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    """Paths begin in the folder of the command; the pictures of a page are read where it is
+    written."""
+    monkeypatch.setattr(recording_queries, "MAX_PICTURES", 2)
+    monkeypatch.setattr(recording_queries, "Piece", DyingPiece)
+    monkeypatch.chdir(asked)
+    args = ("room.topo", "pictures", "--elsewhere", "elsewhere")
+    alone = _evaluated(capsys, *args)
+    assert alone[0]["num_localized"] == len(unseen_views())
+    assert alone[0]["num_elsewhere"] > 0
+    assert _evaluated(capsys, *args, "--report", "page.html", "--ray", cluster.address) == alone
+    assert (
+        len(list(asked.glob("*.begun-*")))
+        == len(list(asked.glob("pictures.begun-*"))) + len(list(asked.glob("elsewhere.begun-*")))
+        >= 3
+    )
+    assert (asked / "page.html").read_text().count("<article>") > 0
+
+
+def test_an_atlas_and_a_tile_that_cannot_be_read(
+    cluster: Any, asked: Path, walks: list[Path], capsys: pytest.CaptureFixture[str]
+):
+    """What is wrong with a tile is said once, however many pieces meet it."""
+    assert main(["build", str(walks[0]), str(asked / "other.topo")]) == 0
+    campus = asked / "campus"
+    create_atlas(str(campus), new_tiles([str(asked / "room.topo"), str(asked / "other.topo")]))
+    args = (campus, asked / "pictures", "--elsewhere", asked / "elsewhere", "--tile", "room")
+    assert _evaluated(capsys, *args, "--ray", cluster.address) == _evaluated(capsys, *args)
+    (rotten,) = (campus / "tiles").glob("other-*.topo")
+    rotten.write_bytes(b"rotten")
+    alone = _evaluated(capsys, *args)
+    assert alone[1].startswith("warning: tile other is not asked: ")
+    assert alone[1].count("\n") == 1
+    assert _evaluated(capsys, *args, "--ray", cluster.address) == alone
+
+
+def test_failures_are_those_of_the_plain_command(cluster: Any, asked: Path, complaint: Complaint):
+    (asked / "pictures" / "view01.png").write_bytes(b"no picture")
+    for args in ((asked / "pictures",), (asked / "nowhere",), (asked / "pictures" / "view00.png",)):
+        alone = complaint("evaluate", asked / "room.topo", *args)
+        assert complaint("evaluate", asked / "room.topo", *args, "--ray", cluster.address) == alone
+
+
+def test_against_itself_asks_no_cluster(room_map: Path, complaint: Complaint):
+    assert "without --ray" in complaint(
+        "evaluate", room_map, "--against-itself", "--ray", "local", status=2
+    )
+
+
+@pytest.fixture
+def piece(asked: Path) -> Piece:
+    """All pictures of the room, as they are sent to a machine."""
+    topomap = TopoMetricMap.load(asked / "room.topo")
+    recording = QueryRecording(str(asked / "pictures"), None, None, None, None)
+    queries = Queries(recording, recording.open(), "walk", None)
+    sent = SentMap.of(Localizer(topomap), LocalizerConfig(), None)
+    (piece,) = recording_queries._pieces(sent, queries)
+    return piece
+
+
+def _silent(stage: str, done: int, total: int) -> None:
+    pass
+
+
+def test_a_piece_travels_small_and_answers_as_here(piece: Piece, queries: Path):
+    packed = pickle.dumps(piece)
+    outcome = pickle.dumps(pickle.loads(packed).run(_silent))
+    assert len(packed) < 20_000
+    assert len(outcome) < 20_000 * len(piece.frames)
+    evaluation = summarize(pickle.loads(outcome).answers)
+    assert evaluation["num_localized"] == len(unseen_views())
+    assert evaluation["median_translation_m"] < 0.01
+
+
+def test_another_map_in_its_place_is_not_asked(piece: Piece, asked: Path):
+    packed = pickle.dumps(piece)
+    with TopoMetricMap.load(asked / "room.topo") as topomap:
+        replace(topomap, length_m=3.0).save(asked / "new.topo")
+    os.replace(asked / "new.topo", asked / "room.topo")
+    with pytest.raises(MapError, match="was replaced since"):
+        pickle.loads(packed).run(_silent)
+
+
+def test_another_recording_in_its_place_is_not_asked(piece: Piece, asked: Path):
+    (asked / "pictures" / "view00.png").rename(asked / "pictures" / "a.png")
+    with pytest.raises((RecordingError, TrajectoryError)):
+        piece.run(_silent)
+    (asked / "pictures" / "a.png").unlink()
+    with pytest.raises((RecordingError, TrajectoryError)):
+        piece.run(_silent)
+
+
+def test_a_machine_without_the_same_features_does_not_answer(piece: Piece):
+    other = replace(piece, asked=replace(piece.asked, kinds=frozenset()))
+    with pytest.raises(
+        MissingExtraError, match="has what features surf need, unlike the machine that asks"
+    ):
+        other.run(_silent)
+
+
+@pytest.mark.parametrize("count", [1, 3, 4, 7])
+def test_pieces_are_of_about_one_size(piece: Piece, count: int, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(recording_queries, "MAX_PICTURES", 3)
+    queries = Queries(piece.recording, piece.recording.open(), "walk", None)
+    monkeypatch.setattr(Queries, "frames", property(lambda self: [k % 2 for k in range(count)]))
+    sizes = [len(one.frames) for one in recording_queries._pieces(piece.asked, queries)]
+    assert sum(sizes) == count
+    assert max(sizes) <= 3
+    assert max(sizes) - min(sizes) <= 1

@@ -1,0 +1,76 @@
+"""What a task does before and beside its work; no cluster is needed for it."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from topoloc.apps.cluster.building import TileTask
+from topoloc.apps.cluster.remote import Board, Terms, Work, _reporter, run_task
+from topoloc.apps.cluster.tiles import Outcome, TileJob
+from topoloc.errors import ClusterError, RecordingError
+
+
+@dataclass(frozen=True)
+class Witness:
+    """Makes nothing, and tells by its error where it was asked and how."""
+
+    def make(self, progress: object):
+        raise RecordingError(
+            f"{os.getcwd()} {os.environ.get('SOURCE_DATE_EPOCH')}"
+            f" {os.environ['OPENBLAS_NUM_THREADS']}"
+        )
+
+    def digest(self) -> str:
+        return "ab" * 32
+
+
+@pytest.fixture
+def undone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A task changes its process: folder, environment, threads."""
+    monkeypatch.chdir(".")
+    for name in ("SOURCE_DATE_EPOCH", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        monkeypatch.setenv(name, os.environ.get(name, "1"))
+    monkeypatch.setattr("topoloc.compiled.set_num_threads", lambda number: None)
+
+
+def _asked(work: Work) -> str:
+    outcome: Outcome = pickle.loads(run_task(pickle.dumps(work), Terms(3), None, 0))
+    assert outcome.state == "failed"
+    assert outcome.reason is not None
+    return outcome.reason
+
+
+@pytest.mark.usefixtures("undone")
+def test_paths_days_and_threads_are_the_drivers(tmp_path: Path):
+    task = TileTask(TileJob("walk", "walk", "walk", Witness()), str(tmp_path / "campus"), False)
+    assert _asked(Work(task, str(tmp_path), "86400")) == f"{tmp_path} 86400 3"
+    assert _asked(Work(task, str(tmp_path / "not here"), None)) == "/ None 3"
+
+
+def test_another_version_of_topoloc():
+    with pytest.raises(ClusterError, match=r"has topoloc \S+, and 9\.9 asks it"):
+        run_task(b"of another version", Terms(1, "9.9"), None, 0)
+
+
+def test_the_board_is_written_now_and_then(monkeypatch: pytest.MonkeyPatch):
+    board, now = Board(), [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    written: list[tuple[str, int, int]] = []
+
+    def write(number: int, line: tuple[str, int, int]) -> None:
+        written.append(line)
+        board.write(number, line)
+
+    report = _reporter(SimpleNamespace(write=SimpleNamespace(remote=write)), 4)
+    for done in range(1, 11):
+        report("nodes", done, 10)
+        now[0] += 0.07
+    report("images", 1, 10)
+    assert written == [("nodes", 1, 10), ("nodes", 6, 10), ("nodes", 10, 10), ("images", 1, 10)]
+    assert board.read() == {4: ("images", 1, 10)}

@@ -1,0 +1,47 @@
+"""A stereo recording of a few frames, and what it is as a bag of each kind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from bag_writing import by_tf, write_stereo_bag
+
+from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.open import open_sequence
+
+SUFFIXES = {"ros1": ".bag", "ros1-lz4": ".bag", "ros2": "", "ros2-mcap": "", "mcap-zstd": ".mcap"}
+
+
+@pytest.fixture(scope="session")
+def walk(tiny_recording: Path) -> StereoSequence:
+    """Five stereo pairs with poses."""
+    return open_sequence(f"{tiny_recording}@0:10:2")
+
+
+@pytest.fixture
+def bag_of(walk: StereoSequence, tmp_path: Path) -> Callable[..., Path]:
+    """Writes `walk` as a bag of a kind."""
+
+    def write(kind: str, **settings: object) -> Path:
+        return write_stereo_bag(
+            tmp_path / f"walk_{kind}{SUFFIXES[kind]}", kind, walk, **({"poses": by_tf} | settings)
+        )  # pyright: ignore[reportArgumentType]
+
+    return write
+
+
+@pytest.fixture
+def file_of(bag_of: Callable[..., Path]) -> Callable[[str], Path]:
+    """The one file of messages of such a bag."""
+
+    def write(kind: str) -> Path:
+        path = bag_of(kind)
+        return (
+            path
+            if path.is_file()
+            else next(part for part in path.iterdir() if part.suffix in (".db3", ".mcap"))
+        )
+
+    return write

@@ -1,0 +1,274 @@
+"""transforms.json as nerfstudio documents it, written by hand here: its converters' shape,
+Polycam's, and what is hostile."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tiny_recordings import HEIGHT, WIDTH, assert_same_pose, picture, pose, write
+
+from topoloc.errors import CalibrationError, RecordingError, TopolocError, TrajectoryError
+from topoloc.geometry.camera import Camera
+from topoloc.recordings.open import find_format, open_sequence
+
+# The columns of nerfstudio's matrix are right, up and back; ours are right, down and forward.
+GL = np.diag([1.0, -1.0, -1.0, 1.0])
+LENS: dict[str, Any] = {"w": WIDTH, "h": HEIGHT, "fl_x": 40.0, "fl_y": 41.0, "cx": 16.0, "cy": 12.0}
+Make = Callable[..., Path]
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Make:
+    """Makes a folder of three frames; `change` may alter what its transforms.json says."""
+
+    def make(
+        change: Callable[[dict[str, Any]], None] | None = None, depth_scale: float | None = 0.001
+    ) -> Path:
+        folder = tmp_path / "capture"
+        frames = []
+        for index in (10, 2, 1):  # as converters list them: in no order that means anything
+            write(folder / "images" / f"frame_{index}.png", picture(index, 3))
+            frame = {
+                "file_path": f"./images/frame_{index}.png",
+                "transform_matrix": (pose(index).matrix() @ GL).tolist(),
+            }
+            if depth_scale is not None:
+                units = np.full((HEIGHT // 2, WIDTH // 2), 1000 * index, np.uint16)
+                units[0, 0] = 0
+                write(folder / "depth" / f"frame_{index}.png", units)
+                frame["depth_file_path"] = f"./depth/frame_{index}.png"
+            frames.append(frame)
+        data = {
+            "camera_model": "OPENCV",
+            **LENS,
+            "k1": 0.1,
+            "k2": -0.02,
+            "p1": 0.001,
+            "p2": 0.0,
+            "frames": frames,
+        }
+        if change is not None:
+            change(data)
+        (folder / "transforms.json").write_text(json.dumps(data))
+        return folder
+
+    return make
+
+
+def test_axes_camera_order_and_depth(capture: Make):
+    folder = capture()
+    assert find_format(folder) == find_format(folder / "transforms.json") == "nerfstudio"
+    sequence = open_sequence(folder)
+    assert sequence.names == ["images/frame_1.png", "images/frame_2.png", "images/frame_10.png"]
+    assert sequence.t_ns == [0, 100_000_000, 200_000_000]
+    for found, index in zip(sequence.poses, (1, 2, 10), strict=True):
+        assert_same_pose(found, pose(index))
+    frame = sequence[2]
+    # nerfstudio counts pixels as COLMAP does, from the corner of the first one; here they count
+    # from its centre
+    assert frame.camera == Camera(
+        "OPENCV", WIDTH, HEIGHT, (40.0, 41.0, 15.5, 11.5, 0.1, -0.02, 0.001, 0.0)
+    )
+    assert frame.depth is not None
+    assert frame.depth.camera == frame.camera
+    assert frame.depth.depth.shape == (HEIGHT, WIDTH)
+    assert np.isnan(frame.depth.depth[0, 0])
+    np.testing.assert_allclose(frame.depth.depth[5:, 5:], 10.0, rtol=1e-6)
+
+
+def test_a_point_in_front_of_the_camera_is_where_the_matrix_says(capture: Make):
+    folder = capture(
+        lambda data: data["frames"].__setitem__(
+            0, data["frames"][0] | {"transform_matrix": np.eye(4).tolist()}
+        )
+    )
+    world_from_cam = open_sequence(folder).poses[2]
+    assert world_from_cam is not None
+    # OpenGL's camera in the origin looks along -z of the world, with y up
+    np.testing.assert_allclose(
+        world_from_cam.apply(np.array([[0.0, 0.0, 2.0], [0.0, 1.0, 0.0]])),
+        [[0, 0, -2], [0, -1, 0]],
+        atol=1e-12,
+    )
+
+
+def test_the_unit_of_depth_and_an_applied_scale(capture: Make):
+    folder = capture(lambda data: data.update(depth_unit_scale_factor=0.0005, applied_scale=2.0))
+    sequence = open_sequence(folder)
+    depth = sequence[0].depth
+    assert depth is not None
+    np.testing.assert_allclose(depth.depth[5:, 5:], 0.5, rtol=1e-6)
+    found = sequence.poses[0]
+    assert found is not None
+    np.testing.assert_allclose(found.translation, pose(1).translation / 2.0, atol=1e-12)
+
+
+def test_cameras_of_each_frame_as_polycam_has_them(capture: Make):
+    def per_frame(data: dict[str, Any]) -> None:
+        for key in (*LENS, "k1", "k2", "p1", "p2"):
+            data.pop(key)
+        data["camera_model"] = "perspective"
+        for number, frame in enumerate(data["frames"]):
+            frame |= LENS | {"fl_x": 40.0 + number}
+
+    sequence = open_sequence(capture(per_frame, depth_scale=None))
+    cameras = [sequence[index].camera for index in range(3)]
+    assert [camera and (camera.model, camera.fx) for camera in cameras] == [
+        ("PINHOLE", 42.0),
+        ("PINHOLE", 41.0),
+        ("PINHOLE", 40.0),
+    ]
+    assert sequence[0].depth is None
+
+
+def test_depth_of_numpy(capture: Make):
+    folder = capture(
+        lambda data: [
+            frame.update(depth_file_path=f"depth/{k}.npy") for k, frame in enumerate(data["frames"])
+        ]
+    )
+    for k in range(3):
+        np.save(folder / "depth" / f"{k}.npy", np.full((HEIGHT, WIDTH, 1), 1500.0, np.float32))
+    depth = open_sequence(folder)[0].depth
+    assert depth is not None
+    np.testing.assert_allclose(depth.depth, 1.5, rtol=1e-6)
+
+
+def test_fisheye(capture: Make):
+    camera = open_sequence(
+        capture(lambda data: data.update(camera_model="OPENCV_FISHEYE", k3=0.01))
+    )[0].camera
+    assert camera == Camera(
+        "OPENCV_FISHEYE", WIDTH, HEIGHT, (40.0, 41.0, 15.5, 11.5, 0.1, -0.02, 0.01, 0.0)
+    )
+
+
+def _matrix(value: Any) -> Callable[[dict[str, Any]], None]:
+    return lambda data: data["frames"][1].update(transform_matrix=value)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "says"),
+    [
+        (lambda data: data.update(frames=[]), RecordingError, "no list of frames"),
+        (lambda data: data.update(frames=[1]), RecordingError, "no list of frames"),
+        (
+            lambda data: data.update(camera_model="EQUIRECTANGULAR"),
+            CalibrationError,
+            "'EQUIRECTANGULAR' is not known",
+        ),
+        (lambda data: data.pop("cx"), CalibrationError, "cx is missing"),
+        (
+            lambda data: data.update(fl_x="wide"),
+            CalibrationError,
+            "fl_x: a finite number is expected",
+        ),
+        (
+            lambda data: data.update(fl_x=float("inf")),
+            CalibrationError,
+            "fl_x: a finite number is expected",
+        ),
+        (
+            lambda data: data.update(fl_x=10**400),
+            CalibrationError,
+            "fl_x: a finite number is expected",
+        ),
+        (lambda data: data.update(k4=0.1), CalibrationError, "fourth radial coefficient"),
+        (
+            lambda data: data.update(applied_scale=0),
+            RecordingError,
+            "applied_scale must be a positive number",
+        ),
+        (
+            lambda data: data.update(depth_unit_scale_factor=-1),
+            RecordingError,
+            "depth_unit_scale_factor must be a positive number",
+        ),
+        (
+            lambda data: data["frames"][1].pop("depth_file_path"),
+            RecordingError,
+            "3 frames but 2 with a depth_file_path",
+        ),
+        (
+            lambda data: data["frames"][1].pop("transform_matrix"),
+            TrajectoryError,
+            "frame_2.png: no transform_matrix",
+        ),
+        (_matrix([[float("nan")] * 4] * 4), TrajectoryError, "16 finite numbers are expected"),
+        (_matrix([[1, 2], [3]]), TrajectoryError, "finite numbers are expected"),
+        (_matrix("eye"), TrajectoryError, "finite numbers are expected"),
+        (_matrix((2 * np.eye(4)).tolist()), TrajectoryError, "the last row of a pose is 0 0 0 1"),
+        (_matrix(np.diag([2, 2, 2, 1]).tolist()), TrajectoryError, "no rotation"),
+        (_matrix((pose(1).matrix().T).tolist()), TrajectoryError, "is this matrix transposed"),
+        (
+            lambda data: data["frames"][1].update(file_path="/etc/passwd"),
+            RecordingError,
+            "'/etc/passwd' is no picture below this folder",
+        ),
+        (
+            lambda data: data["frames"][1].update(file_path="../other.png"),
+            RecordingError,
+            "is no picture below this folder",
+        ),
+        (
+            lambda data: data["frames"][1].update(depth_file_path="a\0b"),
+            RecordingError,
+            "depth_file_path: .* is no picture below",
+        ),
+        (
+            lambda data: data["frames"][1].update(file_path=7),
+            RecordingError,
+            "'7' is no picture below this folder",
+        ),
+    ],
+)
+def test_what_is_refused(
+    capture: Make, change: Callable[[dict[str, Any]], None], error: type[TopolocError], says: str
+):
+    with pytest.raises(error, match=says) as raised:
+        open_sequence(capture(change))
+    assert "transforms.json" in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["[" * 100_000, '{"frames": ' + "[" * 100_000, "{", '{"w": ' + "9" * 5000 + "}", "[]", "\0"],
+)
+def test_files_that_are_no_json(tmp_path: Path, text: str):
+    (tmp_path / "transforms.json").write_text(text)
+    with pytest.raises(RecordingError, match=r"transforms\.json"):
+        open_sequence(tmp_path)
+
+
+def test_a_picture_with_a_name_that_no_disk_holds_is_missing(capture: Make):
+    folder = capture(
+        lambda data: data["frames"][1].update(file_path="images/" + "9" * 5000), depth_scale=None
+    )
+    sequence = open_sequence(folder)
+    with pytest.raises(TopolocError, match="999"):
+        sequence[next(k for k, name in enumerate(sequence.names) if "999" in name)]
+
+
+def test_missing_pictures_and_depth_of_another_shape(capture: Make):
+    folder = capture()
+    (folder / "images" / "frame_1.png").unlink()
+    write(folder / "depth" / "frame_2.png", np.full((HEIGHT, WIDTH // 2), 1000, np.uint16))
+    sequence = open_sequence(folder)
+    with pytest.raises(RecordingError, match=r"frame_1\.png"):
+        sequence[0]
+    with pytest.raises(RecordingError, match=r"frame_2\.png: depth of 16x24 is not of the shape"):
+        sequence[1]
+
+
+def test_a_unit_of_depth_that_no_camera_has(capture: Make):
+    with pytest.raises(
+        RecordingError,
+        match=r"a median depth of 1000 m is that of no camera; 1000 times the depth_factor",
+    ):
+        open_sequence(capture(lambda data: data.update(depth_unit_scale_factor=1.0)))[0]

@@ -1,0 +1,64 @@
+"""Maps, and a service of them that all tests ask."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+from running_service import LIMITS, Running, running
+
+from topoloc.geometry.geodesy import GeoPoint, Georeference
+from topoloc.geometry.rigid import Rigid3
+from topoloc.mapping.topomap import TopoMetricMap
+
+
+@pytest.fixture(scope="session")
+def maps(room_map: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of maps: `room`; `earth`, which knows its place on earth; `damaged`, whose nodes
+    cannot be read."""
+    folder = tmp_path_factory.mktemp("maps")
+    shutil.copy(room_map, folder / "room.topo")
+    shutil.copy(room_map, folder / "damaged.topo")
+    with closing(sqlite3.connect(folder / "damaged.topo")) as database:
+        database.execute("UPDATE node_points SET checksum = zeroblob(8) WHERE node_id > 0")
+        database.commit()
+    with TopoMetricMap.load(room_map) as topomap:
+        turned = Rigid3(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.zeros(3))
+        replace(
+            topomap, georeference=Georeference(GeoPoint(50.87, 4.70, 30.0), turned, "origin")
+        ).save(folder / "earth.topo")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def service(maps: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    """A service of these maps with tight limits, for all tests."""
+    config = tmp_path_factory.mktemp("config") / "limits.toml"
+    config.write_text(LIMITS)
+    with running(maps, "--workers", 2, "--config", config) as service:
+        yield service
+
+
+@pytest.fixture(scope="session")
+def client(service: Running) -> Iterator[httpx.Client]:
+    with service.client() as client:
+        yield client
+
+
+@pytest.fixture(scope="session")
+def view(queries: Path) -> Path:
+    """A picture of the room."""
+    return queries / "view02.png"
+
+
+@pytest.fixture(scope="session")
+def camera(queries: Path) -> str:
+    """Its calibration, as the form's field takes it."""
+    return (queries / "camera.json").read_text()

@@ -1,0 +1,65 @@
+"""A service as its users meet it: `topoloc serve` in a process of its own on 127.0.0.1, asked over
+HTTP."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import httpx
+
+ROOT = Path(__file__).parents[3]
+TOKEN = "a-token-of-some-length"
+LIMITS = (
+    "[serve]\nmax_upload_mb = 3.0\nmax_megapixels = 4.0\nupload_s = 4.0\nmax_sessions ="
+    " 3\nsession_idle_s = 4.0\n"
+)
+
+
+@dataclass
+class Running:
+    """A service that runs; `log` grows as it writes."""
+
+    url: str
+    process: subprocess.Popen[str]
+    log: list[str] = field(default_factory=list)
+
+    def client(self, **options: object) -> httpx.Client:
+        return httpx.Client(base_url=self.url, timeout=60.0, **options)  # pyright: ignore[reportArgumentType]
+
+    def end(self) -> int:
+        """The status that it ends with when it is told to."""
+        self.process.send_signal(signal.SIGTERM)
+        return self.process.wait(30)
+
+
+@contextmanager
+def running(*args: object) -> Iterator[Running]:
+    """`topoloc serve` with these arguments on a free port."""
+    command = [sys.executable, "-m", "topoloc", "serve", *map(str, args), "--port", "0"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT / "src"), "PYTHONUNBUFFERED": "1"}
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
+    assert process.stderr is not None
+    log = list[str]()
+    for line in process.stderr:
+        log.append(line)
+        if found := re.search(r"serves on (\S+)", line):
+            break
+    else:
+        raise AssertionError("".join(log))
+    reader = threading.Thread(target=lambda: log.extend(process.stderr or ()), daemon=True)
+    reader.start()
+    try:
+        yield Running(found.group(1), process, log)
+    finally:
+        process.kill()
+        process.wait()
+        reader.join(5)

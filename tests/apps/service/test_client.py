@@ -1,0 +1,86 @@
+"""The client in Python: what it gets is what a localizer gives."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from running_service import Running
+
+from topoloc import AsyncClient, Camera, Client, Localization, Localizer, TopoMetricMap
+from topoloc.errors import ServiceError
+from topoloc.recordings.pictures import read_image
+
+
+def test_results_are_those_of_a_localizer(service: Running, maps: Path, view: Path, camera: str):
+    calibration, image = Camera.from_json(json.loads(camera)), read_image(view)
+    with Client(service.url) as client, TopoMetricMap.load(maps / "room.topo") as topomap:
+        assert client.maps() == ["damaged", "earth", "room"]
+        assert client.map("room")["num_nodes"] == len(topomap.summaries)
+        own = Localizer(topomap).localize(image, calibration)
+        assert isinstance(own, Localization)
+        for picture in (view, view.read_bytes(), image):
+            result = client.localize("room", picture, calibration, prior=None, max_ms=10_000.0)
+            assert isinstance(result, Localization)
+            assert (
+                result.world_from_cam.translation.tolist()
+                == own.world_from_cam.translation.tolist()
+            )
+            assert np.allclose(
+                result.world_from_cam.rotation, own.world_from_cam.rotation, atol=1e-12
+            )
+            assert (result.num_inliers, result.probability, result.provenance) == (
+                own.num_inliers,
+                own.probability,
+                own.provenance,
+            )
+        near = client.localize("room", view, "map", prior=own.world_from_cam)
+        assert isinstance(near, Localization)
+        assert np.allclose(
+            near.world_from_cam.translation, own.world_from_cam.translation, atol=0.02
+        )
+        assert client.explain("room", view, calibration)["tried"]
+
+
+def test_all_maps_are_asked(service: Running, maps: Path, view: Path, camera: str):
+    (maps / "damaged.topo").rename(maps / "damaged")
+    try:
+        with Client(service.url) as client:
+            answer = client.localize_everywhere(view, Camera.from_json(json.loads(camera)))
+    finally:
+        (maps / "damaged").rename(maps / "damaged.topo")
+    assert {row["map"] for row in answer["answers"]} == {"earth", "room"}
+    assert answer["localized"]
+    assert answer["map"] is None, "both maps are of this place"
+
+
+def test_the_same_in_an_event_loop(service: Running, view: Path, camera: str):
+    async def ask() -> list[bool]:
+        async with AsyncClient(service.url) as client:
+            assert await client.maps() == ["damaged", "earth", "room"]
+            calibration = Camera.from_json(json.loads(camera))
+            results = await asyncio.gather(
+                *(client.localize("room", view, calibration) for _ in range(5))
+            )
+            return [result.localized for result in results]
+
+    assert asyncio.run(ask()) == [True] * 5
+
+
+def test_what_goes_wrong_is_one_line(service: Running, view: Path):
+    with Client(service.url) as client:
+        with pytest.raises(ServiceError, match="no map 'nowhere'") as refused:
+            client.localize("nowhere", view)
+        assert refused.value.status == 404
+        with pytest.raises(ServiceError, match="not a picture"):
+            client.localize("room", b"no picture")
+        with pytest.raises(ServiceError, match=r"missing\.png"):
+            client.localize("room", "missing.png")
+    with (
+        Client("http://127.0.0.1:9", timeout_s=5.0) as nobody,
+        pytest.raises(ServiceError, match="no answer"),
+    ):
+        nobody.maps()

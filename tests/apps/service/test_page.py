@@ -1,0 +1,219 @@
+"""The page at `/`, in a real browser, of a service in a process of its own: a picture of the demo's
+world is dropped, pasted, chosen."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from running_service import TOKEN, Running, running
+
+from in_browser import CONTRASTS, UNNAMED, WIDTHS, chromium, opened
+from topoloc.demo.recordings import SHIPPED, missing_recordings
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.map_facts.building import build_map
+from topoloc.mapping.build import BuildConfig
+from topoloc.recordings.open import open_sequence
+
+pytestmark = pytest.mark.skipif(
+    bool(missing_recordings(SHIPPED)), reason="the demo's recordings are not in this checkout"
+)
+ANSWERED = "#answer h2.good, #answer h2.bad"
+# As if a picture were dropped on the page, or pasted.
+BROUGHT = """([how, name, base64]) => {
+  const bytes = Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
+  const data = new DataTransfer();
+  data.items.add(new File([bytes], name, { type: "image/jpeg" }));
+  const dropped = new DragEvent("drop", { dataTransfer: data, bubbles: true });
+  const pasted = new ClipboardEvent("paste", { clipboardData: data, bubbles: true });
+  document.getElementById("drop").dispatchEvent(how === "drop" ? dropped : pasted);
+}"""
+
+
+@dataclass(frozen=True)
+class Lab:
+    """A service of a map of the demo's first frames, and a picture taken there on another lap."""
+
+    service: Running
+    picture: Path
+    camera: str
+    true: Rigid3
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as browser:
+        yield browser
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
+    folder = tmp_path_factory.mktemp("lab")
+    build_map(open_sequence(f"{SHIPPED / 'map_lap1'}@4:10"), BuildConfig(other_kinds=())).save(
+        folder / "lab.topo"
+    )
+    (folder / "token").write_text(TOKEN)
+    day = open_sequence(SHIPPED / "day")
+    camera, pose = day[4].camera, day.poses[4]
+    assert camera is not None
+    assert pose is not None
+    numbers = f"{camera.fx}, {camera.fy}, {camera.cx}, {camera.cy}"
+    with running(folder, "--workers", 1) as service:
+        yield Lab(service, SHIPPED / "day" / day.names[4], numbers, pose)
+
+
+def _bring(page: Any, lab: Lab, how: str) -> None:
+    """The picture comes to the page in this way, with its calibration; returns when there is an
+    answer."""
+    page.wait_for_selector("#scene canvas")
+    page.locator("#camera-field summary").click()
+    page.get_by_label("fx, fy, cx, cy in pixels").last.fill(lab.camera)
+    if how == "choose":
+        page.set_input_files("#file", lab.picture)
+    else:
+        page.evaluate(
+            BROUGHT, [how, lab.picture.name, base64.b64encode(lab.picture.read_bytes()).decode()]
+        )
+    page.wait_for_selector(ANSWERED, timeout=60_000)
+
+
+def _frustum(page: Any) -> np.ndarray:
+    """The centre of the camera that is drawn, metres."""
+    centres = page.evaluate(
+        """() => { const all = []; document.getElementById("scene").viewer.chosen.traverse((one) => {
+        if (one.userData.kind === "answer") all.push([...one.geometry.attributes.position.array.slice(0, 3)]); }); return all; }"""  # noqa: E501
+    )
+    assert len(centres) == 1
+    return np.array(centres[0])
+
+
+@pytest.mark.parametrize(("how", "width"), [("drop", 1300), ("paste", 400), ("choose", 400)])
+def test_a_picture_shows_where_it_was_taken(browser: Any, lab: Lab, how: str, width: int):
+    with opened(browser, f"{lab.service.url}/", width) as page:
+        _bring(page, lab, how)
+        assert np.linalg.norm(_frustum(page) - lab.true.translation) < 0.01
+        said = page.inner_text("#answer")
+        assert "Here, at" in said
+        assert "Standard deviation" in said
+        assert "It took" in said
+        page.wait_for_selector("#matches:not([hidden])", timeout=60_000)
+        assert "matches agree on a pose" in page.inner_text("#matches figcaption")
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+@pytest.mark.parametrize("width", WIDTHS)
+def test_it_can_be_read_and_named(browser: Any, lab: Lab, width: int, dark: bool):
+    with opened(browser, f"{lab.service.url}/", width, dark) as page:
+        page.wait_for_selector("#scene canvas")
+        page.locator("#camera-field summary").click()
+        lowest = page.evaluate(CONTRASTS)[0]
+        assert lowest[0] >= 4.5, lowest
+        assert page.evaluate(UNNAMED) == []
+
+
+def test_a_picture_of_nothing_is_refused_with_advice(browser: Any, lab: Lab):
+    with opened(browser, f"{lab.service.url}/", 1300) as page:
+        page.wait_for_selector("#scene canvas")
+        nothing = next((SHIPPED / "pictures_of_nothing").rglob("*.jpg"), None) or next(
+            (SHIPPED / "pictures_of_nothing").rglob("*.png")
+        )
+        page.set_input_files("#file", nothing)
+        page.wait_for_selector("#answer h2.bad", timeout=60_000)
+        assert page.inner_text("#answer h2").startswith("Not localized.")
+        page.wait_for_selector("#why li", timeout=60_000)
+
+
+def test_it_is_worked_by_keyboard(browser: Any, lab: Lab):
+    with opened(browser, f"{lab.service.url}/", 1300) as page:
+        page.wait_for_selector("#scene canvas")
+        reached = set[str]()
+        for _ in range(30):
+            page.keyboard.press("Tab")
+            reached.add(
+                page.evaluate(
+                    "document.activeElement.id || document.activeElement.dataset.part ||"
+                    " document.activeElement.tagName"
+                )
+            )
+        assert {"choose", "webcam", "SUMMARY", "canvas", "home", "list"} <= reached
+        with page.expect_file_chooser():
+            page.locator("#choose").focus()
+            page.keyboard.press("Enter")
+
+
+def test_a_live_stream_draws_the_way(lab: Lab, browser: Any):
+    """The browser's camera is a canvas with the picture; the rest is as with a real one."""
+    with opened(browser, f"{lab.service.url}/", 1300) as page:
+        page.wait_for_selector("#scene canvas")
+        page.evaluate(
+            """async (base64) => {
+              const image = new Image();
+              image.src = `data:image/jpeg;base64,${base64}`;
+              await image.decode();
+              const canvas = Object.assign(document.createElement("canvas"), { width: image.width, height: image.height });
+              setInterval(() => canvas.getContext("2d").drawImage(image, 0, 0), 50);
+              navigator.mediaDevices.getUserMedia = async () => canvas.captureStream(20);
+            }""",  # noqa: E501
+            base64.b64encode(lab.picture.read_bytes()).decode(),
+        )
+        page.locator("#camera-field summary").click()
+        page.get_by_label("fx, fy, cx, cy in pixels").last.fill(lab.camera)
+        page.get_by_text("Use the webcam").click()
+        page.get_by_text("Follow live").click()
+        track = (
+            "document.getElementById('scene').viewer.live.children.flatMap((group) =>"
+            " group.children).length"
+        )
+        for _ in range(300):  # `wait_for_function` would be barred by the page's policy
+            if page.evaluate(track) > 0:
+                break
+            page.wait_for_timeout(100)
+        assert page.evaluate(track) > 0, page.inner_text("#answer")
+        assert "State of the stream" in page.inner_text("#answer")
+        assert np.linalg.norm(_frustum(page) - lab.true.translation) < 0.02
+        page.get_by_text("Follow live").click()
+        assert page.locator("#live").get_attribute("aria-pressed") == "false"
+        page.get_by_text("Webcam off").click()
+        assert page.locator("#video").is_hidden()
+
+
+def test_the_token_is_asked_for(room_map: Path, tmp_path: Path, browser: Any):
+    (tmp_path / "token").write_text(TOKEN)
+    with running(room_map, "--token-file", tmp_path / "token") as service:
+        page = browser.new_page()
+        page.goto(f"{service.url}/")
+        page.get_by_label("This service asks for a token").fill("wrong-token-of-some-length")
+        page.keyboard.press("Enter")
+        page.wait_for_selector("#answer h2.bad")
+        page.get_by_label("This service asks for a token").fill(TOKEN)
+        page.keyboard.press("Enter")
+        page.wait_for_selector("#scene canvas")
+        assert page.locator("#token-field").is_hidden()
+        page.close()
+
+
+def test_files_beside_the_page_are_not_given_out(lab: Lab):
+    with lab.service.client() as client:
+        assert client.get("/static/three.js").headers["content-type"].startswith("text/javascript")
+        assert "MIT" in client.get("/static/three.LICENSE").text
+        for name in ("../document.py", "%2e%2e/document.py", "page", "page/", "", "nothing.js"):
+            assert client.get(f"/static/{name}").status_code == 404, name
+        assert "default-src 'none'" in client.get("/").headers["content-security-policy"]
+
+
+def test_the_scene_is_that_of_the_file_that_is_there_now(room_map: Path, lab: Lab, tmp_path: Path):
+    (tmp_path / "a.topo").write_bytes(room_map.read_bytes())
+    with running(tmp_path) as service, service.client() as client:
+        before = client.get("/v1/maps/a/scene").json()
+        assert before == client.get("/v1/maps/a/scene").json()
+        build_map(open_sequence(f"{SHIPPED / 'map_lap1'}@4:6"), BuildConfig(other_kinds=())).save(
+            tmp_path / "a.topo"
+        )
+        assert client.get("/v1/maps/a/scene").json()["map"]["id"] != before["map"]["id"]
+        assert client.get("/v1/maps/b/scene").status_code == 404

@@ -1,0 +1,228 @@
+"""`topoloc view`: the page works from a file, in a real browser, wide and narrow, light and dark,
+by mouse and by keyboard."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import webbrowser
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from in_browser import CONTRASTS, UNNAMED, WIDTHS, chromium, opened
+from topoloc.apps.cli import main
+from topoloc.apps.viewer import screenshot
+from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.localization.result import Alternative, Localization, NotLocalized
+
+VIEWER = "document.querySelector('[data-scene]').viewer"
+COVARIANCE = np.diag([0.04, 0.01, 0.0025, 0.02, 0.01, 0.04])
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A page of the room, and the poses of what it shows: one answer that is off by 5 cm, one that
+    is ambiguous."""
+
+    page: Path
+    found: Rigid3
+    true: Rigid3
+    others: list[Rigid3]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as browser:
+        yield browser
+
+
+@pytest.fixture(scope="module")
+def shown(room_map: Path, tmp_path_factory: pytest.TempPathFactory) -> Shown:
+    folder = tmp_path_factory.mktemp("view")
+    found = Rigid3(exp_so3(np.array([0.1, 0.2, 0.3])), np.array([0.5, 0.1, 0.4]))
+    true = Rigid3(found.rotation, found.translation + np.array([0.0, 0.03, 0.04]))
+    others = [found, Rigid3(found.rotation, found.translation + np.array([1.0, 0.0, 0.0]))]
+    answer = Localization(found, COVARIANCE, 0.97, 0, [], 50, 40, {"total": 12.0}).to_json(
+        "off.png"
+    )
+    unclear = NotLocalized(
+        "ambiguous", alternatives=tuple(Alternative(pose, 0.4, 0) for pose in others)
+    ).to_json("twice.png")
+    truth = {"translation": true.translation.tolist(), "quat_wxyz": true.quat_wxyz().tolist()}
+    answers = [
+        answer | {"recording": "walk", "true_world_from_cam": truth},
+        unclear | {"recording": "walk", "true_world_from_cam": truth},
+    ]
+    (folder / "evaluation.json").write_text(json.dumps({"answers": answers}))
+    assert (
+        main(
+            [
+                "view",
+                str(room_map),
+                str(folder / "evaluation.json"),
+                "--out",
+                str(folder / "room.html"),
+            ]
+        )
+        == 0
+    )
+    return Shown(folder / "room.html", found, true, others)
+
+
+def _centres(page: Any, kind: str) -> np.ndarray:
+    """Where the frustums of this kind really are: the vertex that all their lines from the centre
+    share."""
+    found = page.evaluate(
+        f"""() => {{ const all = []; {VIEWER}.chosen.traverse((one) => {{
+        if (one.userData.kind === "{kind}") all.push([...one.geometry.attributes.position.array.slice(0, 3)]); }}); return all; }}"""  # noqa: E501
+    )
+    return np.array(found).reshape(-1, 3)
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_an_answer_that_is_chosen_is_shown_with_its_ellipsoid_and_the_truth(
+    browser: Any, shown: Shown, width: int
+):
+    with opened(browser, shown.page.as_uri(), width) as page:
+        page.get_by_label("Go to").select_option("off.png")
+        assert np.linalg.norm(_centres(page, "answer") - shown.found.translation) < 1e-5
+        assert np.linalg.norm(_centres(page, "truth") - shown.true.translation) < 1e-5
+        said = page.inner_text("[data-part=details]")
+        assert "Off the truth by 5.0 cm" in said
+        assert "probability 0.97" in said
+        page.get_by_label("Go to").select_option("twice.png (not localized)")
+        centres = _centres(page, "alternative")
+        np.testing.assert_allclose(centres, [pose.translation for pose in shown.others], atol=1e-5)
+        assert "several places that look alike" in page.inner_text("[data-part=details]")
+
+
+def test_the_ellipsoid_is_that_of_the_cameras_own_position(browser: Any, shown: Shown):
+    skew = np.array([[0.0, 0.4, -0.1], [-0.4, 0.0, 0.5], [0.1, -0.5, 0.0]])  # of -(0.5, 0.1, 0.4)
+    jacobian = np.hstack([np.eye(3), skew])
+    expected = 7.8147 * jacobian @ COVARIANCE @ jacobian.T
+    with opened(browser, shown.page.as_uri(), 1300) as page:
+        page.get_by_label("Go to").select_option("off.png")
+        ellipsoids = page.evaluate(f"""() => {{ const all = []; {VIEWER}.chosen.traverse((one) => {{
+            if (!one.isMesh || one.geometry.type !== "SphereGeometry") return;
+            one.updateWorldMatrix(true, false);  // else it is made when the next picture is drawn
+            all.push(one.matrixWorld.elements); }}); return all; }}""")
+    (matrix,) = (np.array(elements).reshape(4, 4).T for elements in ellipsoids)
+    np.testing.assert_allclose(matrix[:3, :3] @ matrix[:3, :3].T, expected, rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(matrix[:3, 3], shown.found.translation, atol=1e-6)
+
+
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+@pytest.mark.parametrize("width", WIDTHS)
+def test_it_fits_can_be_read_and_named(browser: Any, shown: Shown, width: int, dark: bool):
+    with opened(browser, shown.page.as_uri(), width, dark) as page:
+        page.wait_for_function(f"{VIEWER} !== undefined")
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        assert page.evaluate(UNNAMED) == []
+        lowest = page.evaluate(CONTRASTS)[0]
+        assert lowest[0] >= 4.5, lowest
+        picture = cv2.imdecode(
+            np.frombuffer(page.locator("canvas").screenshot(), np.uint8), cv2.IMREAD_COLOR
+        )
+        ground = picture.reshape(-1, 3)[picture.shape[1] // 2]
+        assert (np.abs(picture.astype(int) - ground).max(axis=2) > 40).mean() > 0.005, (
+            "something is drawn"
+        )
+        assert (ground.mean() < 60) == dark
+
+
+def test_it_is_worked_by_keyboard(browser: Any, shown: Shown):
+    eye = f"{VIEWER}.stage.camera.position.toArray()"
+    with opened(browser, shown.page.as_uri(), 1300) as page:
+        page.locator("canvas").focus()
+        first = page.evaluate(eye)
+        for key in ("ArrowLeft", "ArrowUp", "Shift+ArrowRight", "+"):
+            before = page.evaluate(eye)
+            page.keyboard.press(key)
+            assert np.linalg.norm(np.subtract(page.evaluate(eye), before)) > 1e-3, key
+        page.keyboard.press("Home")
+        np.testing.assert_allclose(page.evaluate(eye), first, atol=1e-6)
+        page.keyboard.press("n")
+        assert page.inner_text("[data-part=details] h3") == "off.png"
+        page.locator("body").press("Tab")
+        assert page.evaluate("document.activeElement.tagName") != "BODY"
+
+
+def test_a_layer_goes_and_comes(browser: Any, shown: Shown):
+    with opened(browser, shown.page.as_uri(), 1300) as page:
+        before = page.locator("canvas").screenshot()
+        box = page.locator("label", has_text="points").get_by_role("checkbox")
+        box.uncheck()
+        page.wait_for_timeout(200)
+        assert page.locator("canvas").screenshot() != before
+        page.get_by_label("their pictures").check()
+        page.wait_for_function(
+            f"{VIEWER}.stage.scene.children.some((one) => one.children.some((two) =>"
+            " two.material?.map?.image))"
+        )
+
+
+def test_a_picture_of_the_page(
+    shown: Shown, room_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    try:
+        screenshot.find_browser()
+    except screenshot.TopolocError as error:
+        pytest.skip(str(error))
+    assert main(["view", str(room_map), "--screenshot", str(tmp_path / "room.png")]) == 0
+    assert "room.png" in capsys.readouterr().out
+    picture = cv2.imread(str(tmp_path / "room.png"))
+    assert picture is not None
+    assert picture[:, :900].std() > 5
+    assert [path.name for path in tmp_path.iterdir()] == ["room.png"]
+
+
+def test_no_browser_is_one_line(
+    room_map: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, complaint: Callable[..., str]
+):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert "chromium" in complaint("view", room_map, "--screenshot", tmp_path / "room.png")
+
+
+def test_bad_input_is_one_line(room_map: Path, tmp_path: Path, complaint: Callable[..., str]):
+    (tmp_path / "bad.jsonl").write_text('{"query": "a"}\n')
+    assert "bad.jsonl" in complaint(
+        "view", room_map, tmp_path / "bad.jsonl", "--out", tmp_path / "x.html"
+    )
+    assert "No such file" in complaint("view", tmp_path / "none.topo", "--out", tmp_path / "x.html")
+    assert "--points" in complaint(
+        "view", room_map, "--points", -1, "--out", tmp_path / "x.html", status=2
+    )
+
+
+def test_without_an_output_the_browser_opens(
+    room_map: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    opened_pages = list[str]()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(webbrowser, "open", lambda address: opened_pages.append(address) or True)
+    assert main(["view", str(room_map)]) == 0
+    (page,) = tmp_path.rglob("*.html")
+    assert opened_pages == [page.as_uri()]
+    assert main(["view", str(room_map), "--json", str(tmp_path / "scene.json")]) == 0
+    assert len(opened_pages) == 1
+    assert json.loads((tmp_path / "scene.json").read_text())["format"] == "topoloc-scene"
+
+
+def test_answers_of_another_map_are_told(
+    room_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    other = Localization(Rigid3.identity(), COVARIANCE, 0.9, 0, [], 5, 5).to_json("a") | {
+        "map": "0123456789abcdef"
+    }
+    (tmp_path / "r.jsonl").write_text(json.dumps(other) + "\n")
+    assert (
+        main(["view", str(room_map), str(tmp_path / "r.jsonl"), "--out", str(tmp_path / "x.html")])
+        == 0
+    )
+    assert "warning: some answers are of another map (0123456789abcdef" in capsys.readouterr().err

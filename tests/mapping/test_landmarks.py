@@ -1,0 +1,163 @@
+"""Points refined by what other images see of them: errors shrink, covariances stay honest,
+contradictions are found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from topoloc.features.features import Features
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.geometry.stereo import ray_covariances
+from topoloc.mapping.landmarks import LandmarkConfig, Observations, observe_points, refine_points
+
+CAMERA = Camera.pinhole(640, 480, 500.0, 500.0, 320.0, 240.0)
+CONFIG = LandmarkConfig()
+SIGMA_PX = 0.8
+
+
+@dataclass
+class Scene:
+    """Points as they are and as one stereo pair measured them, and eight views of them from up to a
+    metre away."""
+
+    truth: np.ndarray
+    measured: np.ndarray
+    covariances: np.ndarray
+    observations: list[Observations]
+
+
+def scene(num_points: int = 400, seed: int = 0) -> Scene:
+    rng = np.random.default_rng(seed)
+    z = rng.uniform(2.0, 12.0, num_points)
+    truth = np.column_stack([rng.uniform(-0.5, 0.5, (num_points, 2)) * z[:, None], z])
+    sigma_z = z**2 / (500.0 * 0.12) * 0.3
+    covariances = ray_covariances(truth, sigma_z, CAMERA, np.full(num_points, SIGMA_PX))
+    measured = truth + np.einsum(
+        "nij,nj->ni", np.linalg.cholesky(covariances), rng.standard_normal((num_points, 3))
+    )
+    observations = [
+        view(
+            truth,
+            Rigid3(exp_so3(rng.normal(0, 0.05, 3)), rng.uniform(-1, 1, 3) * [1, 0.3, 0.5]),
+            rng,
+        )
+        for _ in range(8)
+    ]
+    return Scene(truth, measured, covariances, observations)
+
+
+def view(points: np.ndarray, cam_from_node: Rigid3, rng: np.random.Generator) -> Observations:
+    """Seven of ten points, where they are imaged, with noise."""
+    rows = np.flatnonzero(rng.random(len(points)) < 0.7)
+    seen = cam_from_node.apply(points[rows])
+    normalized = seen[:, :2] / seen[:, 2:] + rng.normal(0, SIGMA_PX / 500.0, (len(rows), 2))
+    return Observations(rows, normalized, np.full(len(rows), SIGMA_PX / 500.0), cam_from_node)
+
+
+def test_errors_shrink_and_covariances_stay_honest():
+    s = scene()
+    refined = refine_points(s.measured, s.covariances, s.observations, CONFIG)
+    before, after = (np.linalg.norm(p - s.truth, axis=1) for p in (s.measured, refined.points_cam))
+    assert np.median(after) < 0.3 * np.median(before)
+    error = refined.points_cam - s.truth
+    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(refined.covariances), error)
+    # 3 on average were it exact; the robust weights make it a little too careful
+    assert 1.5 < nees.mean() < 3.6
+    assert refined.agrees.mean() > 0.99
+    assert refined.num_observations.sum() == sum(len(seen.rows) for seen in s.observations)
+
+
+def test_covariance_never_grows():
+    s = scene()
+    refined = refine_points(s.measured, s.covariances, s.observations, CONFIG)
+    assert (np.linalg.eigvalsh(s.covariances - refined.covariances) > -1e-9).all()
+
+
+def test_a_point_that_moved_is_dropped_and_its_neighbours_are_not():
+    s = scene()
+    moved = np.arange(20)
+    s.truth[moved, 0] += 1.0
+    rng = np.random.default_rng(5)
+    observations = [view(s.truth, seen.cam_from_node, rng) for seen in s.observations]
+    refined = refine_points(s.measured, s.covariances, observations, CONFIG)
+    assert not refined.agrees[moved].any()
+    assert refined.agrees[20:].mean() > 0.99
+
+
+def test_one_wrong_observation_does_not_pull_a_point_away():
+    s = scene()
+    s.observations[3].normalized[:, 0] += 30.0 / 500.0
+    refined = refine_points(s.measured, s.covariances, s.observations, CONFIG)
+    clean = refine_points(s.measured, s.covariances, scene().observations, CONFIG)
+    assert np.median(np.linalg.norm(refined.points_cam - s.truth, axis=1)) < 1.5 * np.median(
+        np.linalg.norm(clean.points_cam - s.truth, axis=1)
+    )
+
+
+def test_without_observations_everything_stays_as_measured():
+    s = scene(10)
+    refined = refine_points(s.measured, s.covariances, [], CONFIG)
+    np.testing.assert_allclose(refined.points_cam, s.measured)
+    np.testing.assert_allclose(refined.covariances, s.covariances, rtol=1e-6)
+    assert refined.agrees.all()
+    assert refined.num_observations.tolist() == [0] * 10
+
+
+def features_at(points_img: np.ndarray, seed: int = 3) -> Features:
+    """One descriptor of its own a point; the same seed gives the same ones."""
+    num = len(points_img)
+    descriptors = np.random.default_rng(seed).standard_normal((num, 64)).astype(np.float32)
+    descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+    same = np.full(num, 15.0, np.float32)
+    return Features(points_img.astype(np.float32), same, 0 * same, same, descriptors)
+
+
+def observed(offset_px: np.ndarray) -> tuple[Observations, np.ndarray]:
+    """What another image sees of the scene's points whose key points are displaced by this."""
+    s, cam_from_node = (
+        scene(60),
+        Rigid3(exp_so3(np.array([0.0, 0.1, 0.0])), np.array([0.3, 0.0, 0.1])),
+    )
+    points_img = CAMERA.img_from_cam(cam_from_node.apply(s.truth))
+    sigmas = np.full(60, SIGMA_PX)
+    seen = observe_points(
+        features_at(points_img),
+        s.truth,
+        s.covariances,
+        features_at(points_img + offset_px),
+        sigmas,
+        CAMERA,
+        cam_from_node,
+        CONFIG,
+    )
+    return seen, points_img
+
+
+def test_points_are_found_by_descriptor_where_they_must_be():
+    seen, points_img = observed(np.zeros((60, 2)))
+    assert sorted(seen.rows.tolist()) == list(range(60))
+    np.testing.assert_allclose(
+        seen.normalized, CAMERA.normalized_from_img(points_img)[seen.rows], atol=1e-6
+    )
+    assert seen.sigmas == pytest.approx(np.hypot(SIGMA_PX, CONFIG.pose_sigma_px) / 500.0)
+
+
+def test_a_match_that_geometry_forbids_is_no_observation():
+    offset = np.zeros((60, 2))
+    offset[:10, 1] = 40.0  # across the direction in which depth is uncertain
+    seen, _ = observed(offset)
+    assert sorted(seen.rows.tolist()) == list(range(10, 60))
+
+
+def test_points_behind_the_other_camera_are_not_observed():
+    s = scene(30)
+    behind = Rigid3(exp_so3(np.array([0.0, np.pi, 0.0])), np.zeros(3))
+    features = features_at(CAMERA.img_from_cam(s.truth))
+    seen = observe_points(
+        features, s.truth, s.covariances, features, np.full(30, 1.0), CAMERA, behind, CONFIG
+    )
+    assert len(seen.rows) == 0

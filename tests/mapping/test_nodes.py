@@ -1,0 +1,110 @@
+"""Where nodes are placed: Eq. 1 and its two parameters."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.mapping.nodes import (
+    DEPTH_SHARE,
+    RADIANS_PER_NODE,
+    NearestNodes,
+    NodeConfig,
+    NodePoses,
+    node_distances,
+    place_nodes,
+)
+
+
+def moved(x: float, yaw: float = 0.0) -> Rigid3:
+    return Rigid3(exp_so3(np.array([0.0, 0.0, yaw])), np.array([x, 0.0, 0.0]))
+
+
+def test_distance_is_translation_plus_lambda_times_angle():
+    nodes = NodePoses.of([moved(0.0), moved(3.0, 0.5)])
+    np.testing.assert_allclose(
+        node_distances(moved(1.0, 0.2), nodes, lambda_rot=2.0),
+        [1.0 + 2.0 * 0.2, 2.0 + 2.0 * 0.3],
+        atol=1e-12,
+    )
+
+
+def test_angle_is_that_of_the_relative_rotation_up_to_half_a_turn():
+    rng = np.random.default_rng(1)
+    for angle in (0.0, 1e-6, 0.3, np.pi - 1e-6, np.pi):
+        axis = rng.standard_normal(3)
+        base = exp_so3(rng.standard_normal(3))
+        turned = Rigid3(base @ exp_so3(axis / np.linalg.norm(axis) * angle), np.zeros(3))
+        distance = node_distances(turned, NodePoses.of([Rigid3(base, np.zeros(3))]), 1.0)[0]
+        assert distance == pytest.approx(angle, abs=1e-7)
+
+
+def test_a_straight_walk_places_a_node_where_the_threshold_is_passed():
+    walk = [moved(0.25 * k) for k in range(9)]
+    # 0.5 m is not more than the threshold of 0.5 m
+    assert place_nodes(walk, NodeConfig(0.5, 1.0)).tolist() == [0, 3, 6]
+
+
+def test_a_turn_on_the_spot_places_nodes_by_lambda():
+    turn = [moved(0.0, 0.1 * k) for k in range(7)]
+    assert place_nodes(turn, NodeConfig(0.5, 2.0)).tolist() == [0, 3, 6]
+    assert place_nodes(turn, NodeConfig(0.5, 0.0)).tolist() == [0]
+
+
+def test_a_second_lap_joins_the_nodes_of_the_first():
+    lap = [moved(float(k)) for k in range(6)]
+    assert len(place_nodes(lap + lap[::-1], NodeConfig(0.9, 1.0))) == len(lap)
+
+
+def test_one_frame_is_one_node():
+    assert place_nodes([moved(0.0)], NodeConfig(1.0, 1.0)).tolist() == [0]
+
+
+@given(
+    st.lists(st.tuples(st.floats(-20, 20), st.floats(-3, 3)), min_size=1, max_size=40),
+    st.floats(0.1, 5),
+    st.floats(0, 5),
+)
+def test_every_frame_is_near_a_node_and_no_two_nodes_are_near(
+    steps: list[tuple[float, float]], d_thresh: float, lambda_rot: float
+):
+    poses = [moved(x, yaw) for x, yaw in steps]
+    frame_idx = place_nodes(poses, NodeConfig(d_thresh, lambda_rot))
+    nodes = NodePoses.of([poses[i] for i in frame_idx])
+    rounding = (
+        1.0 + 1e-12
+    )  # a step of 1e-124 from where a node just is none is seen in one order of the sums and not in the other  # noqa: E501
+    assert all(
+        node_distances(pose, nodes, lambda_rot).min() <= d_thresh * rounding for pose in poses
+    )
+    between = np.array([node_distances(poses[i], nodes, lambda_rot) for i in frame_idx])
+    assert (between[~np.eye(len(frame_idx), dtype=bool)] > d_thresh / rounding).all()
+
+
+@given(
+    st.lists(st.tuples(st.floats(-20, 20), st.floats(-3, 3)), min_size=1, max_size=120),
+    st.tuples(st.floats(-30, 30), st.floats(-3, 3)),
+    st.integers(1, 4),
+    st.floats(0, 30),
+)
+def test_the_nearest_nodes_are_those_of_all(
+    nodes: list[tuple[float, float]], camera: tuple[float, float], count: int, lambda_rot: float
+):
+    poses = NodePoses.of(
+        [moved(round(x, 1), round(yaw, 1)) for x, yaw in nodes]
+    )  # equal ones among them
+    right = np.argsort(node_distances(moved(*camera), poses, lambda_rot), kind="stable")[:count]
+    assert NearestNodes(poses, lambda_rot).rows(moved(*camera), count).tolist() == right.tolist()
+
+
+def test_unset_parameters_follow_from_the_scene():
+    resolved = NodeConfig().resolved(median_depth=4.0)
+    assert resolved.d_thresh == pytest.approx(4.0 * DEPTH_SHARE)
+    assert resolved.lambda_rot == pytest.approx(4.0 * DEPTH_SHARE / RADIANS_PER_NODE)
+    assert NodeConfig(d_thresh=1.5).resolved(100.0).lambda_rot == pytest.approx(
+        1.5 / RADIANS_PER_NODE
+    )
+    assert NodeConfig(0.7, 0.2).resolved(100.0) == NodeConfig(0.7, 0.2)

@@ -1,0 +1,147 @@
+"""A map of several kinds of features: what goes in comes out, and it can be taken for a map of each
+of them."""
+
+from __future__ import annotations
+
+import sqlite3
+import sys
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from built_room import room_of_two_kinds, unseen_views
+from tiny_world import CAMERA
+from topoloc.errors import FeatureKindError, WeightsError
+from topoloc.features import learned
+from topoloc.features.kinds import learned_kind
+from topoloc.geometry.alignment import translation_error
+from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.result import Localization
+from topoloc.mapping.build import BuildConfig
+from topoloc.mapping.checking import damages
+from topoloc.mapping.config import MapConfig
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.open import open_sequence
+from topoloc.retrieval.cell_grid import CellGrid
+
+
+@pytest.fixture(scope="module")
+def of_two(tiny_recording: Path) -> TopoMetricMap:
+    return room_of_two_kinds(tiny_recording)
+
+
+@pytest.fixture
+def path(of_two: TopoMetricMap, tmp_path: Path) -> Path:
+    of_two.save(tmp_path / "room.topo")
+    return tmp_path / "room.topo"
+
+
+def test_both_kinds_come_back_and_are_saved_again_to_the_byte(
+    of_two: TopoMetricMap, path: Path, tmp_path: Path
+):
+    loaded = TopoMetricMap.load(path)
+    assert loaded.kinds == of_two.kinds == ["surf", "sift"]
+    assert loaded.config == of_two.config
+    assert loaded.config.other_kinds == ("sift",)
+    assert set(loaded.coarse_models) == {"surf-vlad", "surf-vlad@sift"}
+    for kind in loaded.kinds:
+        one, other = loaded.by_kind(kind), of_two.by_kind(kind)
+        assert one.shared_errors == other.shared_errors is not None
+        for node, was in zip(one.nodes, other.nodes, strict=True):
+            assert node.features.descriptors.shape == was.features.descriptors.shape
+            np.testing.assert_array_equal(node.features.points_img, was.features.points_img)
+            np.testing.assert_array_equal(node.points_cam, was.points_cam)
+            assert node.summary.num_points == was.summary.num_points == len(node.features)
+    loaded.save(tmp_path / "again.topo")
+    assert (tmp_path / "again.topo").read_bytes() == path.read_bytes()
+    assert damages(path) == []
+
+
+def test_the_first_kind_is_what_it_would_be_alone(of_two: TopoMetricMap, tiny_map: TopoMetricMap):
+    assert len(of_two.nodes) == len(tiny_map.nodes)
+    for one, other in zip(of_two.nodes, tiny_map.nodes, strict=True):
+        np.testing.assert_array_equal(one.points_cam, other.points_cam)
+        np.testing.assert_array_equal(one.features.descriptors, other.features.descriptors)
+
+
+def test_a_damaged_point_of_the_second_kind_is_found(path: Path):
+    content = path.read_bytes()
+    with closing(sqlite3.connect(path)) as database:
+        (packed,) = database.execute(
+            "SELECT points_cam FROM node_points WHERE kind = 'sift' ORDER BY node_id LIMIT 1"
+        ).fetchone()
+    place = content.index(packed[:40]) + 20
+    path.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
+    assert any("node_points" in damage for damage in damages(path))
+
+
+def test_it_localizes_by_the_second_kind_alone(path: Path):
+    by_sift = TopoMetricMap.load(path).by_kind("sift")
+    assert (by_sift.kinds, by_sift.config.kinds, by_sift.sides) == (["sift"], ["sift"], None)
+    localizer = Localizer(by_sift)
+    results = [(localizer.localize(picture, CAMERA), truth) for picture, truth in unseen_views()]
+    assert all(
+        isinstance(result, Localization) and translation_error(result.world_from_cam, truth) < 0.03
+        for result, truth in results
+    )
+
+
+def test_it_is_itself_by_its_first_kind_and_nothing_by_one_that_it_does_not_hold(
+    of_two: TopoMetricMap,
+):
+    assert of_two.by_kind("surf") is of_two
+    with pytest.raises(FeatureKindError, match=r"no features orb \(it holds: surf, sift\)"):
+        of_two.by_kind("orb")
+
+
+def test_the_cells_of_a_network_are_learnt_kept_and_asked(
+    tiny_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    build_map(
+        open_sequence(f"{tiny_recording}@0::2"), BuildConfig(other_kinds=("topoloc-net",))
+    ).save(tmp_path / "room.topo")
+    loaded = TopoMetricMap.load(tmp_path / "room.topo")
+    assert "cell_vectors" not in loaded.coarse_models["surf-vlad"].arrays
+    assert len(loaded.coarse_models["surf-vlad@topoloc-net"].arrays["cell_vectors"]) == len(
+        loaded.place_images
+    )
+    assert damages(tmp_path / "room.topo") == []
+    likeness, asked = CellGrid.likeness, list[tuple[int, ...]]()
+    monkeypatch.setattr(
+        CellGrid,
+        "likeness",
+        lambda self, cells, images: asked.append(cells.shape) or likeness(self, cells, images),
+    )
+    for kind, expected in (("surf", []), ("topoloc-net", [(4, 6, 64)])):
+        ((picture, truth), *_) = unseen_views()
+        result = Localizer(loaded, LocalizerConfig(kinds=(kind,))).localize(picture, CAMERA)
+        assert isinstance(result, Localization)
+        assert translation_error(result.world_from_cam, truth) < 0.05
+        assert asked == expected
+
+
+def test_kinds_that_cannot_be_had_are_told_before_the_work(tiny_recording: Path):
+    for kinds, said in ((("orb",), FeatureKindError), (("edgepoint2-s64",), WeightsError)):
+        done: list[str] = []
+        with pytest.raises(said):
+            build_map(
+                open_sequence(tiny_recording),
+                BuildConfig(other_kinds=kinds),
+                lambda stage, k, n, done=done: done.append(stage),
+            )
+        assert not done
+
+
+def test_beside_surf_stand_the_learned_ones_that_are_here_unless_others_are_named(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    assert MapConfig().kinds == ["surf", learned_kind()]
+    learned.close_networks()
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    assert MapConfig().kinds == ["surf"]
+    assert MapConfig(other_kinds=("sift",)).kinds == ["surf", "sift"]
+    sift = MapConfig(other_kinds=("sift",)).features_of("sift")
+    assert (sift.kind, sift.max_features) == ("sift", MapConfig().features.max_features)

@@ -1,0 +1,3 @@
+"""The fixtures of tiny recordings."""
+
+from recording_fixtures import *  # noqa: F403

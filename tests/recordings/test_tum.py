@@ -1,0 +1,71 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_recordings import assert_same_pose, picture, pose
+
+from topoloc.errors import CalibrationError, RecordingError, TrajectoryError
+from topoloc.recordings.tum import open_tum
+
+
+def test_frames(tum: Path):
+    sequence = open_tum(tum)
+    assert sequence.t_ns == [1305031102175304000, 1305031102275326000]
+    assert sequence.names == ["rgb/1305031102.175304.png", "rgb/1305031102.275326.png"]
+    frame = sequence[1]
+    np.testing.assert_array_equal(frame.image, picture(2, 3, 640, 480)[:, :, ::-1])
+    np.testing.assert_array_equal(frame.depth.depth, np.full((480, 640), 3.0, np.float32))
+    assert frame.depth.camera == frame.camera
+    np.testing.assert_array_equal(frame.depth.cam_from_depth.matrix(), np.eye(4))
+    assert_same_pose(sequence[0].world_from_cam, pose(0))
+    assert_same_pose(frame.world_from_cam, pose(2))
+
+
+@pytest.mark.parametrize(
+    ("number", "fx", "k3"), [("1", 517.3, 1.1633), ("2", 520.9, 0.9172), ("3", 535.4, 0.0)]
+)
+def test_the_three_cameras(tum: Path, number: str, fx: float, k3: float):
+    camera = open_tum(tum.rename(tum.with_name(f"rgbd_dataset_freiburg{number}_desk"))).camera
+    assert camera.fx == fx
+    assert camera.distortion()[4] == k3
+
+
+def test_other_recordings_need_a_camera(tum: Path):
+    other = tum.rename(tum.with_name("my_desk"))
+    with pytest.raises(CalibrationError, match=r"camera\.json"):
+        open_tum(other)
+    (other / "camera.json").write_text(
+        '{"width": 640, "height": 480, "fx": 600, "fy": 600, "cx": 320, "cy": 240, "depth_factor":'
+        " 1000}"
+    )
+    frame = open_tum(other)[0]
+    assert frame.camera.fx == 600
+    assert frame.depth.depth[0, 0] == 5.0
+
+
+def test_no_truth(tum: Path):
+    (tum / "groundtruth.txt").unlink()
+    assert open_tum(tum).poses == [None, None]
+
+
+def test_truth_of_another_day(tum: Path):
+    (tum / "groundtruth.txt").write_text("5 0 0 0 0 0 0 1\n")
+    with pytest.raises(TrajectoryError, match=r"groundtruth\.txt: no frame"):
+        open_tum(tum)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("# none\n", "nothing in"),
+        ("1.0\n", "line 1"),
+        ("2 a.png\n1 b.png\n", "line 2.*not after"),
+        ("1 a.png\n", ""),
+    ],
+)
+def test_bad_lists(tum: Path, text: str, says: str):
+    (tum / "depth.txt").write_text(text)
+    with pytest.raises(
+        RecordingError, match=says or "none of 3 colour pictures has one of 1 depth"
+    ):
+        open_tum(tum)
