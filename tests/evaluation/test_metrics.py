@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hand_made import answer, elsewhere, lost
 
+from hand_made import answer, elsewhere, lost
 from topoloc.apps.viewer.result_files import read_results
 from topoloc.evaluation.metrics import summarize
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from room_frames import depth_frame, stereo_frame
 
 import tiny_world
+from room_frames import depth_frame, stereo_frame
 from topoloc.points.disparity import DisparityConfig, measure_disparities, measured_view
 from topoloc.points.tracking import TrackingConfig, find_corners
 

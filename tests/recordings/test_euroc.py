@@ -2,8 +2,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_recordings import BODY_FROM_CAM, EUROC_TIMES, assert_same_pose, picture, pose, sensor_yaml
 
+from tiny_recordings import BODY_FROM_CAM, EUROC_TIMES, assert_same_pose, picture, pose, sensor_yaml
 from topoloc.errors import CalibrationError, RecordingError, TrajectoryError, UnreadableImageError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3

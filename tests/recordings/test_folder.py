@@ -3,8 +3,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_recordings import CAMERA, assert_same_pose, kitti_row, picture, pose, tum_line
 
+from tiny_recordings import CAMERA, assert_same_pose, kitti_row, picture, pose, tum_line
 from topoloc.errors import CalibrationError, RecordingError, TrajectoryError, UnreadableImageError
 from topoloc.geometry.camera import Camera
 from topoloc.recordings.open import open_sequence

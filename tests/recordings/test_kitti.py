@@ -2,8 +2,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_recordings import CALIB, assert_same_pose, kitti_row, picture, pose, tum_line, write
 
+from tiny_recordings import CALIB, assert_same_pose, kitti_row, picture, pose, tum_line, write
 from topoloc.errors import CalibrationError, RecordingError, TrajectoryError, UnreadableImageError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3

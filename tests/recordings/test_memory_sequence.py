@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_recordings import HEIGHT, WIDTH, picture, pose
 
 import topoloc
+from tiny_recordings import HEIGHT, WIDTH, picture, pose
 from topoloc.errors import RecordingError
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.frame_checks import picture_problem

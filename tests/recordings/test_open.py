@@ -3,8 +3,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_recordings import assert_same_pose, picture, write
 
+from tiny_recordings import assert_same_pose, picture, write
 from topoloc.errors import RecordingError, UnknownFormatError, UnreadableImageError
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.frame_view import frame_view

@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from tiny_recordings import picture, write
 
+from tiny_recordings import picture, write
 from topoloc.errors import UnreadableImageError
 from topoloc.recordings.pictures import grey_image, image_size, read_depth, read_image
 

@@ -3,8 +3,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from tiny_recordings import assert_same_pose, picture, pose
 
+from tiny_recordings import assert_same_pose, picture, pose
 from topoloc.errors import RecordingError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.open import open_sequence

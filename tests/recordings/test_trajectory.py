@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tiny_recordings import assert_same_pose, kitti_row, pose, tum_line
 
+from tiny_recordings import assert_same_pose, kitti_row, pose, tum_line
 from topoloc.errors import TopolocError, TrajectoryError
 from topoloc.geometry.pose_conventions import PoseReading
 from topoloc.geometry.rigid import Rigid3

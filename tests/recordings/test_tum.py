@@ -2,8 +2,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_recordings import assert_same_pose, picture, pose
 
+from tiny_recordings import assert_same_pose, picture, pose
 from topoloc.errors import CalibrationError, RecordingError, TrajectoryError
 from topoloc.recordings.tum import open_tum
 

@@ -12,8 +12,8 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-from room_frames import FrameList
 
+from room_frames import FrameList
 from tiny_world import BASELINE, LEVEL_FROM_CAM, Panel, render, right_pose, smooth_texture
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig

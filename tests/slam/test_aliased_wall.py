@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 from aliased_wall import PERIOD, STEP, walk_along
-from room_frames import FrameList
 
+from room_frames import FrameList
 from topoloc.slam.slam import SlamResult, run_slam
 
 GONE = range(10, 14)

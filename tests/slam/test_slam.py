@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from room_frames import FrameList, blackened, changed, depth_frame, stereo_frame, walk
 
 import tiny_world
 import topoloc
+from room_frames import FrameList, blackened, changed, depth_frame, stereo_frame, walk
 from topoloc.errors import CalibrationError, RecordingError
 from topoloc.geometry.alignment import absolute_trajectory_errors
 from topoloc.geometry.rig import StereoRig

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from aliased_wall import walk_along
-from room_frames import RIG, FrameList, walk
 
 import tiny_world
+from room_frames import RIG, FrameList, walk
 from topoloc.geometry.alignment import absolute_trajectory_errors
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.points.disparity import measured_view

@@ -3,6 +3,7 @@ paper's."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
@@ -13,7 +14,9 @@ from topoloc_paper.datasets import Dataset
 from topoloc_paper.maps import MapKind
 from topoloc_paper.settings import Bench
 
-UNGUIDED = GuidedConfig(num_nodes=0)
+SURF_ALONE = LocalizerConfig(kinds=("surf",))
+# With a second feature type, guided matching is also how the types confirm each other's poses.
+UNGUIDED = replace(SURF_ALONE, guided=GuidedConfig(num_nodes=0))
 
 
 def rows(bench: Bench, datasets: list[Dataset]) -> list[dict[str, Any]]:
@@ -38,10 +41,8 @@ def ways_of(dataset: Dataset) -> dict[str, tuple[str, Way]]:
             "coarse",
             Way(paper, config=LocalizerConfig(num_candidates=1)),
         ),
-        "no second, guided match": (
-            "matching",
-            Way(paper, config=LocalizerConfig(guided=UNGUIDED)),
-        ),
+        "SURF alone": ("features", Way(paper, config=SURF_ALONE)),
+        "SURF alone, no second, guided match": ("matching", Way(paper, config=UNGUIDED)),
         "SIFT instead of SURF": (
             "matching",
             Way(MapKind(dataset.d_thresh, dataset.lambda_rot, kind="sift")),

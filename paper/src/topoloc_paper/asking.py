@@ -14,7 +14,7 @@ from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import open_sequence
 from topoloc.recordings.recording import sequence_subset
 from topoloc_paper.datasets import Dataset
-from topoloc_paper.known_nodes import KnownNodes
+from topoloc_paper.known_nodes import answer_with_known_nodes
 from topoloc_paper.maps import MapKind, opened
 from topoloc_paper.settings import Bench, evenly, sequence_digest
 from topoloc_paper.stage_code import StageCode, asking
@@ -66,18 +66,15 @@ def asked(bench: Bench, dataset: Dataset, label: str, way: Way) -> Done:
                 localizer.localize(frame.image, frame.camera)
         told = f"{dataset.name} {label}: {way.name}"
         known = dataset.map_from_query_truth()
+
+        def progress(_: str, done: int, total: int) -> None:
+            bench.progress(told, done, total)
+
         if way.knows_node:
-            truths = [known @ pose for pose in sequence.poses if pose is not None]
-            localizer = Localizer(topomap, config, KnownNodes(topomap, truths))
-        return rows_of(
-            answer_queries(
-                localizer,
-                sequence,
-                known,
-                lambda _, done, total: bench.progress(told, done, total),
-                label,
-            )
-        )
+            found = answer_with_known_nodes(topomap, config, sequence, known, progress, label)
+        else:
+            found = answer_queries(localizer, sequence, known, progress, label)
+        return rows_of(found)
 
     settings = {
         "map": digest,

@@ -62,8 +62,14 @@ class MapKind:
         return "default nodes" if self.d_thresh is None else f"D_thresh {self.d_thresh:g} m"
 
     def config(self) -> BuildConfig:
+        """Return the build settings.
+
+        Every map also has the default learned feature type, if its network is available.
+        """
         features = FeatureConfig(kind=self.kind, normalization=self.normalization)
-        return BuildConfig(nodes=NodeConfig(self.d_thresh, self.lambda_rot), features=features)
+        learned = tuple(BuildConfig().kinds[1:])
+        nodes = NodeConfig(self.d_thresh, self.lambda_rot)
+        return BuildConfig(nodes=nodes, features=features, other_kinds=learned)
 
 
 def built(bench: Bench, dataset: Dataset, kind: MapKind) -> Done:
@@ -203,8 +209,7 @@ def why_not(bench: Bench, method: str) -> str | None:
 
 
 def _training_config(bench: Bench, num_images: int) -> CoarseTrainingConfig:
-    picture = PictureConfig(
-        112, 84
-    )  # a quarter of the work of the default; tables show what it costs
+    # a quarter of the work of the default; tables show what it costs
+    picture = PictureConfig(112, 84)
     training = bench.config.training(bench.config.epochs, num_images)
     return replace(CoarseTrainingConfig(), cnn_fc=CnnFcConfig(picture=picture, training=training))

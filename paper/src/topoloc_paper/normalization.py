@@ -5,12 +5,15 @@ from __future__ import annotations
 
 from typing import Any
 
+from topoloc.localization.localizer import LocalizerConfig
 from topoloc_paper.asking import Way, summary
 from topoloc_paper.datasets import Dataset
 from topoloc_paper.maps import MapKind, Normalization
 from topoloc_paper.settings import Bench
 
 KINDS: tuple[Normalization, ...] = ("none", "paper", "wide")
+# The images of learned features have the normalization of their network in every map.
+NORMALIZED_FEATURES = LocalizerConfig(kinds=("surf",))
 
 
 def rows(bench: Bench, datasets: list[Dataset]) -> list[dict[str, Any]]:
@@ -27,7 +30,8 @@ def rows(bench: Bench, datasets: list[Dataset]) -> list[dict[str, Any]]:
 def _rows(bench: Bench, dataset: Dataset, label: str) -> list[dict[str, Any]]:
     found = []
     for kind in KINDS:
-        result = summary(bench, dataset, label, Way(MapKind.as_paper(dataset, kind)))
+        way = Way(MapKind.as_paper(dataset, kind), config=NORMALIZED_FEATURES)
+        result = summary(bench, dataset, label, way)
         row: dict[str, Any] = {
             "dataset": dataset.name,
             "queries": label,

@@ -238,7 +238,7 @@ def _viewpoints(search: Search) -> Iterator[Proposal]:
 def _of_other_features(search: Search) -> Iterator[Proposal]:
     """The poses that other features left open, where these features did not settle it."""
     config, before = search.config, search.before
-    if before is None or search.is_clear:
+    if before is None or search.is_clear or config.guided.num_nodes == 0:
         return
     for hypothesis in before.belief.ranked(before.weights.rivals)[:_MAX_OTHERS]:
         fit = _around_pose(

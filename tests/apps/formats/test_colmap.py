@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+
+import topoloc
 from tiny_recordings import (
     HEIGHT,
     WIDTH,
@@ -20,8 +22,6 @@ from tiny_recordings import (
     tum_line,
     write,
 )
-
-import topoloc
 from topoloc.apps.formats.colmap import aligned, open_colmap
 from topoloc.errors import (
     CalibrationError,

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_recordings import HEIGHT, WIDTH, picture, write
 
+from tiny_recordings import HEIGHT, WIDTH, picture, write
 from topoloc.errors import CalibrationError, RecordingError, TopolocError
 from topoloc.geometry.camera import Camera
 from topoloc.recordings.open import find_format, open_sequence

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_recordings import assert_same_pose, pose
 
+from tiny_recordings import assert_same_pose, pose
 from topoloc.apps.formats.capture.folder_writer import FolderWriter
 from topoloc.errors import RecordingError, TopolocError
 from topoloc.geometry.camera import Camera

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_recordings import HEIGHT, WIDTH, assert_same_pose, picture, pose, write
 
+from tiny_recordings import HEIGHT, WIDTH, assert_same_pose, picture, pose, write
 from topoloc.errors import CalibrationError, RecordingError, TopolocError, TrajectoryError
 from topoloc.geometry.camera import Camera
 from topoloc.recordings.open import find_format, open_sequence

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_recordings import HEIGHT, WIDTH, assert_same_pose, picture, pose, write
 
+from tiny_recordings import HEIGHT, WIDTH, assert_same_pose, picture, pose, write
 from topoloc.errors import (
     CalibrationError,
     MissingExtraError,

@@ -10,8 +10,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from tiny_recordings import CALIB, CAMERA, HEIGHT, WIDTH, picture, write
 
+from tiny_recordings import CALIB, CAMERA, HEIGHT, WIDTH, picture, write
 from topoloc.errors import CalibrationError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hand_made import MAP_INFO, answer, elsewhere, lost, two_nodes
 
+from hand_made import MAP_INFO, answer, elsewhere, lost, two_nodes
 from topoloc.apps.report.map_figure import _with_gaps, draw_map, horizontal_axes
 from topoloc.apps.report.query_gallery import gallery, typical_queries, worst_queries
 from topoloc.apps.report.report import write_report

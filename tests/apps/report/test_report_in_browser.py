@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hand_made import MAP_INFO, answer, elsewhere, lost, two_nodes
 
+from hand_made import MAP_INFO, answer, elsewhere, lost, two_nodes
 from in_browser import CONTRASTS, UNNAMED, chromium, opened
 from topoloc.apps.report.report import write_report
 from topoloc.evaluation.metrics import summarize
